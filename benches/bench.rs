@@ -18,9 +18,7 @@ use needle_bench::session::{
     Input, Machine, Output, PlaneOutOfReach, Session, SessionConfig, Steering,
 };
 use needle_bench::study::{insert, trial_seed};
-use needle_bench::tracker::openigtlink::{
-    Body, Message, Quaternion, Tool, ToolKind, Version, encode,
-};
+use needle_bench::tracker::openigtlink::{Body, Message, Quaternion, Tool, encode, tool_kind};
 use needle_bench::tracker::{Event, Protocol, Reader, Sample, Validity};
 use needle_bench::units::Time;
 use std::hint::black_box;
@@ -207,14 +205,8 @@ fn decoder(c: &mut Criterion) {
     let transform = Message::new("NeedleToTracker", None, Body::Transform(turned));
     let quaternion = Quaternion::Full([0.5; 4]);
     let position = Body::Position { position_mm: [1.0, 2.0, 3.0], quaternion };
-    let tool = |name: &str| Tool { name: name.to_owned(), kind: ToolKind::SixD, pose: turned };
+    let tool = |name: &str| Tool { name: name.to_owned(), kind: tool_kind::SIX_D, pose: turned };
     let tools = ["NeedleToTracker", "ProbeToTracker", "ReferenceToTracker"].map(tool);
-    let metadata = [("TransformValid", "True"), ("TransformStatus", "OK")];
-    let with_metadata = Message {
-        version: Version::V2 { message_id: 7 },
-        metadata: metadata.map(|(key, value)| (key.to_owned(), value.to_owned())).to_vec(),
-        ..transform.clone()
-    };
     let line = concat!(
         r#"{"tool":"NeedleToTracker","position_tracker_mm":[12.53,-3.25,100.125],"#,
         r#""orientation_tracker_wxyz":[0.5,0.5,0.5,0.5],"source_unix_ns":1700000000500000000}"#,
@@ -223,7 +215,6 @@ fn decoder(c: &mut Criterion) {
     let igtl = Protocol::OpenIgtLink;
     let streams = [
         ("transform", igtl, encode(&transform)),
-        ("transform with metadata", igtl, encode(&with_metadata)),
         ("position", igtl, encode(&Message::new("NeedleToTracker", None, position))),
         ("tdata of 3", igtl, encode(&Message::new("T", None, Body::TrackingData(tools.into())))),
         ("ndjson", Protocol::Ndjson, line.as_bytes().to_vec()),

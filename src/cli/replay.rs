@@ -61,7 +61,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
             "git": option_env!("NEEDLE_BENCH_GIT"),
         },
         "identical": replayed.difference.is_none(),
-        "difference": replayed.difference.as_ref().map(ToString::to_string),
+        "difference": replayed.difference,
         "rows": replayed.rows,
         "frames_sent": replayed.frames,
         "samples": replayed.samples,

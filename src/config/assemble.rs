@@ -3,6 +3,7 @@
 use super::needle::torsion;
 use super::{AxisSection, CanInterface, Config, ConfigError, ReadMask, TrackerSource, rehearsal};
 use crate::canopen::ObjectAddress;
+use crate::emulator::fault::Fault;
 use crate::emulator::{TargetModel, VirtualStageConfig, drive};
 use crate::observer::InvariantConfig;
 use crate::session::{InsertionConfig, ObserverConfig, SessionConfig};
@@ -104,8 +105,8 @@ impl Config {
             *switches = rehearsal::switches(*switches, along, per_mm);
             *switches_turned = rehearsal::switches(*switches_turned, about, per_turn / TAU);
         }
-        let faults = emulator.fault.iter().map(|fault| fault.to_fault(self.can.bench_node));
-        let faults: Result<_, _> = faults.collect();
+        let bench = Some(self.can.bench_node);
+        let faults = emulator.fault.iter().map(|fault| Fault { bench, ..fault.clone() });
         Ok(VirtualStageConfig {
             insertion,
             rotation,
@@ -118,7 +119,7 @@ impl Config {
             target: self.goal.tool.as_ref().and(self.goal.position_mm).map(|start_mm| {
                 TargetModel { start_mm, drift_mm_per_mm: emulator.target_drift_mm_per_mm }
             }),
-            faults: faults.map_err(|(_, message)| ConfigError::of(message))?,
+            faults: faults.collect(),
         })
     }
 

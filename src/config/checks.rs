@@ -6,10 +6,9 @@ use super::goal;
 use super::reader::{REGISTRATION, Reader};
 use super::registration::GivenRegistration;
 use super::study::StudyConfig;
-use super::tracker::{STANDARD_INPUT, TrackerSource};
+use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
 use super::{CanInterface, Config, GoalKind};
-use crate::canopen::NodeId;
-use crate::emulator::fault::FaultConfig;
+use crate::emulator::fault::Fault;
 use crate::keys::{Key, expanded};
 use crate::needle::{Torsion, TorsionConfig};
 use crate::session::InsertionConfig;
@@ -287,7 +286,7 @@ fn source(config: &Config, reader: &mut Reader) {
     reader.check(&[address, key], no_lines, || {
         format!("{address} is \"-\", allowed with {key} = \"ndjson\", which is \"{source}\"")
     });
-    let asked = tracker.request.is_some() && source != TrackerSource::OpenIgtLink;
+    let asked = tracker.request != TrackerRequest::None && source != TrackerSource::OpenIgtLink;
     reader.check(&[request, key], asked, || {
         format!("{request} is given, allowed with {key} = \"openigtlink\", which is \"{source}\"")
     });
@@ -305,12 +304,10 @@ fn source(config: &Config, reader: &mut Reader) {
 
 /// A kind of fault has keys of its own, and needs some of them.
 fn faults(config: &Config, reader: &mut Reader) {
-    // Any node will do: what is missing does not depend on it.
-    let bench = const { NodeId::new(127).unwrap() };
     for (i, fault) in config.emulator.fault.iter().enumerate() {
         let (at, what) =
             (format!("emulator.fault[{i}]"), format!("a fault of kind \"{}\"", fault.kind));
-        let others = &FaultConfig::KEYS[1..];
-        reader.check_own_keys(&at, &what, others, &fault.kind.keys(), fault.to_fault(bench));
+        let others = &Fault::KEYS[1..];
+        reader.check_own_keys(&at, &what, others, &fault.kind.keys(), fault.check());
     }
 }

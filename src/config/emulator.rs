@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::needle::{Arc, TIP_AHEAD};
 use super::pose::{PoseConfig, TIP_PITCH};
 use crate::emulator::drive::{Model, Switches};
-use crate::emulator::fault::FaultConfig;
+use crate::emulator::fault::Fault;
 use crate::emulator::{self, CorrelatedNoise, TrackerModel};
 use crate::keys::{Rule, choice, over, section, within};
 use crate::needle::TorsionConfig;
@@ -62,7 +62,7 @@ section! {
         /// Where the switches of the rotation axis close, degrees, likewise.
         rotation_switches_deg: SwitchesConfig => "{}";
         /// Faults to try the bench with, as many as needed.
-        fault: Vec<FaultConfig> [Rule::Fields("kind, at_mm or at_s, axis and more")] = [];
+        fault: Vec<Fault> [Rule::Fields("kind, at_mm or at_s, axis and more")] = [];
     }
 }
 

@@ -5,7 +5,7 @@ use super::reader::Reader;
 use super::{Config, ControlKind, TrackerSource};
 use crate::keys::{Rule, choice, named, over, section, within};
 use crate::plan::{Obstacle, Problem, Tip, Workspace, World};
-use crate::session::{Goal, TargetTool, Unreachable};
+use crate::session::{Goal, TargetTool};
 use crate::tracker::{Gate, Registration};
 use nalgebra::Vector3;
 use std::path::Path;
@@ -180,11 +180,11 @@ impl Config {
     /// The target of a run, with the path planned to it; `None` if the needle is steered into the plane.
     ///
     /// # Errors
-    /// As [`Config::to_plan`]; [`Unreachable`] inside if there is no path.
+    /// As [`Config::to_plan`]; The text inside says why there is no path.
     pub fn to_goal(
         &self,
         read_mask: ReadMask<'_>,
-    ) -> Result<Result<Option<Goal>, Unreachable>, super::ConfigError> {
+    ) -> Result<Result<Option<Goal>, String>, super::ConfigError> {
         if self.goal.kind == GoalKind::Plane {
             return Ok(Ok(None));
         }

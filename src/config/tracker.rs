@@ -9,7 +9,7 @@ use crate::geometry::{FixedAngles, Pose};
 use crate::keys::{Rule, choice, named, section, within};
 use crate::observer::PositionNoise;
 use crate::session::{self, HoldConfig};
-use crate::tracker::openigtlink::{StartStream, ToolStream};
+use crate::tracker::openigtlink::ToolStream;
 use crate::tracker::{
     AcquisitionClock, CsvMapping, Gate, Protocol, Registration, StampPolicy, TrackSettings,
     TrackerKind, Workspace,
@@ -33,7 +33,7 @@ section! {
         /// For "ndjson" and "csv": a recording in place of a connection, replayed at its own pace.
         file: Option<String> [FILE];
         /// For "openigtlink": the stream that the server is asked for, or "none".
-        request: Option<ToolStream> [Rule::Or("none", "\"tdata\" or \"qtdata\"")] = "none";
+        request: TrackerRequest = "none";
         /// Shortest time between two messages of that stream, ms; 0 is as fast as the server can.
         request_period_ms: i32 [within(0.0, 60_000.0)] = 25;
         /// The name of the tool that is the needle's tip.
@@ -106,7 +106,10 @@ choice! {
 }
 
 choice! {
-    for ToolStream {
+    /// A stream that a server sends once it is asked to.
+    pub enum TrackerRequest {
+        /// The server is not asked.
+        None = "none",
         /// TDATA, with matrices.
         Tdata = "tdata",
         /// QTDATA, with quaternions.
@@ -202,10 +205,14 @@ impl TrackerConfig {
         }
     }
 
-    /// The stream that a server is asked for, if any.
-    pub fn to_request(&self) -> Option<StartStream> {
-        let (period_ms, coordinates) = (self.request_period_ms, String::new());
-        Some(StartStream { stream: self.request?, period_ms, coordinates })
+    /// What a server is asked for, if anything.
+    pub fn to_request(&self) -> Option<ToolStream> {
+        let name = match self.request {
+            TrackerRequest::None => return None,
+            TrackerRequest::Tdata => "TDATA",
+            TrackerRequest::Qtdata => "QTDATA",
+        };
+        Some(ToolStream { name, period_ms: self.request_period_ms })
     }
 
     /// True where positions come by standard input.

@@ -3,17 +3,13 @@
 pub mod drive;
 pub mod fault;
 mod noise;
-mod seed;
-mod target;
 mod tissue;
 mod tracker;
 mod truth;
 mod virtual_stage;
 
-pub use noise::{CorrelatedNoise, Noise};
-pub use seed::counted;
-pub use target::TargetModel;
+pub use noise::{CorrelatedNoise, Noise, counted};
 pub(crate) use tissue::Tissue;
-pub use tracker::{TrackedTip, TrackerModel};
+pub use tracker::{TargetModel, TrackedTip, TrackerModel};
 pub use truth::Truth;
 pub use virtual_stage::{StageOutput, VirtualStage, VirtualStageConfig};

@@ -1,12 +1,9 @@
 //! The emulated stage as the bench sees it: drives, needle and tracker.
 
 use super::drive::{Drive, DriveConfig};
-use super::fault::{
-    BusFault, Change, Fault, FaultKind, FaultyLine, FrameAction, FrameFault, Script, Toward,
-};
-use super::target::TargetModel;
+use super::fault::{Change, Fault, FaultKind, FaultyLine, FrameFault, Script, Toward};
 use super::tissue::Tissue;
-use super::tracker::{EmulatedTracker, TrackedTip, TrackerModel};
+use super::tracker::{EmulatedTracker, TargetModel, TrackedTip, TrackerModel};
 use super::truth::Truth;
 use crate::canopen::Frame;
 use crate::geometry::Pose;
@@ -18,7 +15,7 @@ use std::f64::consts::TAU;
 
 /// Maximum number of frames forwarded in one call; the rest waits for the next call. So two drives that
 /// are mapped to answer each other's PDOs cannot block the caller.
-const HANDED_ON_MAX: usize = 256;
+const FORWARDED_MAX: usize = 256;
 
 /// The configuration of the virtual stage.
 ///
@@ -50,7 +47,7 @@ pub struct VirtualStageConfig {
 }
 
 /// An output of the virtual stage.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum StageOutput {
     /// A frame of one of the drives.
     Frame(Frame),
@@ -83,8 +80,8 @@ pub struct VirtualStage {
     tracker: EmulatedTracker,
     target: Option<(TargetModel, EmulatedTracker)>,
     script: Script,
-    bus_fault: Option<BusFault>,
-    /// Frames for the drives that wait for the end of [`BusFault::Stuck`].
+    bus_fault: Option<FaultKind>,
+    /// Frames for the drives that wait for the end of [`FaultKind::BusStuck`].
     held: Vec<Frame>,
     outputs: VecDeque<StageOutput>,
 }
@@ -123,8 +120,8 @@ impl VirtualStage {
         self.handle_timeout(now);
         match self.bus_fault {
             None => (0..2).for_each(|drive| self.carry_to(drive, now, frame)),
-            Some(BusFault::Stuck) => self.held.push(*frame),
-            Some(BusFault::Off | BusFault::Down | BusFault::Full) => {}
+            Some(FaultKind::BusStuck) => self.held.push(*frame),
+            Some(_) => {}
         }
         self.drain_drives(now);
     }
@@ -191,11 +188,11 @@ impl VirtualStage {
     }
 
     /// The present fault of the bus. A bus with a fault carries no frame.
-    pub fn bus_fault(&self) -> Option<BusFault> {
+    pub fn bus_fault(&self) -> Option<FaultKind> {
         self.bus_fault
     }
 
-    /// How many frames for the drives wait for the end of [`BusFault::Stuck`].
+    /// How many frames for the drives wait for the end of [`FaultKind::BusStuck`].
     pub fn frames_held(&self) -> usize {
         self.held.len()
     }
@@ -250,7 +247,7 @@ impl VirtualStage {
 
     /// Forwards the frames that the drives send.
     fn drain_drives(&mut self, now: Time) {
-        for _ in 0..HANDED_ON_MAX {
+        for _ in 0..FORWARDED_MAX {
             let sent = (0..2).find_map(|n| Some((n, self.drives[n].poll_transmit()?)));
             let Some((drive, frame)) = sent else { return };
             self.from_drive[drive].handle(now, &frame);
@@ -262,25 +259,25 @@ impl VirtualStage {
     fn change(&mut self, now: Time, change: Change) {
         match change {
             Change::Begins(fault, end) => {
-                self.outputs.push_back(StageOutput::FaultBegan(fault));
-                if let FaultKind::Bus(what) = fault.kind {
-                    self.bus_fault = Some(what);
+                self.outputs.push_back(StageOutput::FaultBegan(fault.clone()));
+                if fault.kind.is_of_bus() {
+                    self.bus_fault = Some(fault.kind);
                 }
-                for n in (0..2).filter(|n| fault.drives.has(*n)) {
+                for n in (0..2).filter(|n| fault.concerns(*n)) {
                     self.add_frame_faults(n, end, &fault);
-                    self.change_drive(n, now, fault.kind, true);
+                    self.change_drive(n, now, &fault, true);
                 }
             }
             Change::Ends(fault) => {
-                if let FaultKind::Bus(_) = fault.kind {
+                if fault.kind.is_of_bus() {
                     self.bus_fault = None;
                     for frame in std::mem::take(&mut self.held) {
                         (0..2).for_each(|drive| self.carry_to(drive, now, &frame));
                         self.drain_drives(now);
                     }
                 }
-                let drives = (0..2).filter(|n| fault.drives.has(*n));
-                drives.for_each(|n| self.change_drive(n, now, fault.kind, false));
+                let drives = (0..2).filter(|n| fault.concerns(*n));
+                drives.for_each(|n| self.change_drive(n, now, &fault, false));
             }
             Change::Foreign(frame) if self.bus_fault.is_none() => {
                 (0..2).for_each(|drive| self.carry_to(drive, now, &frame));
@@ -292,29 +289,29 @@ impl VirtualStage {
 
     /// Adds what `fault` does to the frames of drive `n` until `end`.
     fn add_frame_faults(&mut self, n: usize, end: Time, fault: &Fault) {
-        let of = |action| FrameFault { action, id: None, until: end, count: None };
-        match fault.kind {
-            FaultKind::Frames { action, frames, toward, count } => {
-                let id = frames.id(self.drives[n].id(), toward);
+        let all = FrameFault { fault: fault.clone(), id: None, until: end, count: None };
+        match (fault.kind, fault.toward) {
+            (kind, toward) if kind.has("frames") => {
+                let id = fault.id(self.drives[n].id());
                 let line = match toward {
                     Toward::Bench => &mut self.from_drive[n],
                     Toward::Drives => &mut self.to_drive[n],
                 };
-                line.add(FrameFault { id, count, ..of(action) });
+                line.add(FrameFault { id, count: fault.count, ..all });
             }
             // A restart without a duration takes no time.
-            FaultKind::Restart if fault.duration.is_none() => {}
-            FaultKind::Silent | FaultKind::Restart => {
-                self.to_drive[n].add(of(FrameAction::Drop));
-                self.from_drive[n].add(of(FrameAction::Drop));
+            (FaultKind::Restart, _) if fault.duration.is_none() => {}
+            (FaultKind::Silent | FaultKind::Restart, _) => {
+                self.to_drive[n].add(all.clone());
+                self.from_drive[n].add(all);
             }
             _ => {}
         }
     }
 
     /// A fault of drive `n` (0 insertion, 1 rotation) begins or ends; what is due by `now` has been done.
-    pub fn change_drive(&mut self, n: usize, now: Time, kind: FaultKind, begins: bool) {
-        self.drives[n].suffer(now, kind, begins);
+    pub fn change_drive(&mut self, n: usize, now: Time, fault: &Fault, begins: bool) {
+        self.drives[n].apply_fault(now, fault, begins);
         // The drive's answer goes through the lines as they are now.
         self.drain_drives(now);
     }

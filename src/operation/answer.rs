@@ -118,7 +118,7 @@ impl Answering {
         self.counts.count(admitted.as_ref().err());
         let refused = admitted.as_ref().err().cloned();
         shell.record(Record::Sample(SampleRecord {
-            refused: refused.clone().map(Box::new),
+            refused: refused.clone(),
             ..SampleRecord::received(sample)
         }));
         let Leg::Resting { since: Some(since) } = self.leg else { return };
@@ -272,6 +272,6 @@ impl Task for Answering {
     }
 
     fn gate_counts(&self) -> GateCounts {
-        self.counts
+        self.counts.clone()
     }
 }

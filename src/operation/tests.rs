@@ -4,7 +4,7 @@ use super::*;
 use crate::canopen::Frame;
 use crate::canopen::cia402::DriveState;
 use crate::config::Config;
-use crate::emulator::fault::FaultKind;
+use crate::emulator::fault::{Fault, FaultKind};
 use crate::emulator::{StageOutput, VirtualStage};
 use crate::session::{Input, Machine, Outcome, Output, Session};
 use crate::tracker::{Event, Sample, Validity};
@@ -243,7 +243,7 @@ fn what_stops_a_run_stops_an_operation() {
     }
     let mut bench = Bench::new(&config(&[]), Operation::Move(by(Axis::Insertion, 10.0)));
     bench.run_until_moved(3.0);
-    bench.stage.change_drive(1, bench.now, FaultKind::NoVoltage, true);
+    bench.stage.change_drive(1, bench.now, &Fault::of(FaultKind::NoVoltage), true);
     let reason = bench.reason();
     assert!(reason.starts_with("stage: rotation: emergency 0x3220"), "{reason}");
 }

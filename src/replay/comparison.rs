@@ -1,7 +1,5 @@
 //! What leaves a session, set against what the record holds.
 
-use super::ReplayError;
-use super::difference::Difference;
 use super::inputs::unsent_unix_us;
 use super::recorded::{Entries, Logged, Recorded, unix_us};
 use crate::archive::{
@@ -23,20 +21,24 @@ pub(super) struct Comparison<'a> {
     pub(super) samples: Entries<String>,
     pub(super) columns: RecordedColumns,
     pub(super) rows: Entries<String>,
-    pub(super) difference: Option<Difference>,
+    /// The first thing that comes out different, as text.
+    pub(super) difference: Option<String>,
     /// Of a record that was cut: the first file that holds no more, and since when.
     pub(super) ended: Option<(Time, &'static str)>,
 }
 
 impl<'a> Comparison<'a> {
-    pub(super) fn open(recorded: &'a Recorded<'a>) -> Result<Self, ReplayError> {
-        let text = |numbered: Result<(usize, String), ReplayError>| Ok(numbered?.1);
+    pub(super) fn open(recorded: &'a Recorded<'a>) -> Result<Self, String> {
+        let text = |numbered: Result<(usize, String), String>| Ok(numbered?.1);
         let mut rows = recorded.numbered(file::STEPS)?.map(text);
         let columns = match rows.next().transpose()? {
             None => RecordedColumns::default(),
             // An older record lacks the columns that were added at the end since.
             Some(header) if !(steps_csv_header() + ",").starts_with(&format!("{header},")) => {
-                return Err(ReplayError::Columns(header));
+                return Err(format!(
+                    "{} begins with {header:?}: not the columns of this bench",
+                    file::STEPS
+                ));
             }
             Some(header) => RecordedColumns::of(&header),
         };
@@ -65,14 +67,10 @@ impl<'a> Comparison<'a> {
     }
 
     /// `file` holds another line, from 1, than was replayed; `None` where one side has no more.
-    fn differs(
-        &mut self,
-        file: &'static str,
-        line: usize,
-        recorded: Option<String>,
-        replayed: Option<String>,
-    ) {
-        self.difference.get_or_insert(Difference::Line { file, line, recorded, replayed });
+    fn differs(&mut self, file: &str, line: usize, recorded: Option<&str>, replayed: Option<&str>) {
+        let [recorded, replayed] = [recorded, replayed].map(|text| text.unwrap_or("nothing more"));
+        let words = format!("{file} line {line}: recorded {recorded}, replayed {replayed}");
+        self.difference.get_or_insert(words);
     }
 
     /// A frame that the session sends, in answer to `input`.
@@ -81,7 +79,7 @@ impl<'a> Comparison<'a> {
         time: Time,
         frame: &Frame,
         input: Option<&Input>,
-    ) -> Result<(), ReplayError> {
+    ) -> Result<(), String> {
         let recorded = self.sent.next();
         let logged = recorded.and_then(|logged| LoggedFrame::parse(&logged.text));
         let interface = logged.map_or("can", |logged| logged.interface);
@@ -96,7 +94,7 @@ impl<'a> Comparison<'a> {
                     Some(logged) => (logged.line, Some(logged.text)),
                     None => (self.recorded.lines(file::CAN)?.count() + 1, None),
                 };
-                self.differs(file::CAN, at, recorded, Some(line));
+                self.differs(file::CAN, at, recorded.as_deref(), Some(&line));
             }
         }
         Ok(())
@@ -114,77 +112,80 @@ impl<'a> Comparison<'a> {
     }
 
     /// A sample that the session is done with.
-    pub(super) fn sample(&mut self, sample: &SampleRecord) -> Result<(), ReplayError> {
+    pub(super) fn sample(&mut self, sample: &SampleRecord) -> Result<(), String> {
         // A sample that JSON cannot hold could not have been recorded either.
         let line = tracker_line(sample).unwrap_or_default();
         let number = self.samples.taken + 1;
         match self.samples.take()? {
             Some(recorded) if recorded == line => {}
             None if self.is_cut() => self.ends(file::TRACKER, sample.received.receive_time),
-            recorded => self.differs(file::TRACKER, number, recorded, Some(line)),
+            recorded => self.differs(file::TRACKER, number, recorded.as_deref(), Some(&line)),
         }
         Ok(())
     }
 
     /// A step that the session takes; gives its row, as recorded.
-    pub(super) fn step(&mut self, step: &StepRecord) -> Result<Option<String>, ReplayError> {
+    pub(super) fn step(&mut self, step: &StepRecord) -> Result<Option<String>, String> {
         let replayed = StepRow { step, truth: None }.to_string();
         // The header is line 1.
         let line = self.rows.taken + 2;
         let Some(recorded) = self.rows.take()? else {
             match self.is_cut() {
                 true => self.ends(file::STEPS, step.time),
-                false => self.differs(file::STEPS, line, None, Some(replayed)),
+                false => self.differs(file::STEPS, line, None, Some(&replayed)),
             }
             return Ok(None);
         };
         if recorded.split(',').count() != self.columns.0.len() {
-            self.differs(file::STEPS, line, Some(recorded.clone()), Some(replayed));
+            self.differs(file::STEPS, line, Some(&recorded), Some(&replayed));
         } else if let Some(difference) = self.first_value(line, &recorded, &replayed) {
             self.difference.get_or_insert(difference);
         }
         Ok(Some(recorded))
     }
 
-    fn first_value(&self, line: usize, recorded: &str, replayed: &str) -> Option<Difference> {
+    /// The first value in which two rows differ, in words.
+    fn first_value(&self, line: usize, recorded: &str, replayed: &str) -> Option<String> {
+        let step = recorded.split(',').next().unwrap_or_default();
         let values = recorded.split(',').zip(replayed.split(','));
-        let (column, (recorded_value, replayed)) =
+        let (column, (recorded, replayed)) =
             self.columns.0.iter().zip(values).find(|(column, (recorded, replayed))| {
                 !is_of_truth(column) && recorded != replayed
             })?;
-        Some(Difference::Value {
-            line,
-            step: recorded.split(',').next().unwrap_or_default().to_owned(),
-            column: column.clone(),
-            recorded: recorded_value.to_owned(),
-            replayed: replayed.to_owned(),
-        })
+        let more = match (recorded.parse::<f64>(), replayed.parse::<f64>()) {
+            (Ok(was), Ok(is)) => format!(" ({:.1e} more)", is - was),
+            _ => String::new(),
+        };
+        let [recorded, replayed] =
+            [recorded, replayed].map(|value| if value.is_empty() { "nothing" } else { value });
+        let at = format!("{} line {line}, step {step}, {column}", file::STEPS);
+        Some(format!("{at}: recorded {recorded}, replayed {replayed}{more}"))
     }
 
     /// The session has been given everything and has ended as `outcome`; what the record holds
     /// beyond that is a difference.
-    pub(super) fn close(&mut self, outcome: Option<&Outcome>) -> Result<(), ReplayError> {
+    pub(super) fn close(&mut self, outcome: Option<&Outcome>) -> Result<(), String> {
         let Some(recorded) = self.outcome.take() else { return Ok(()) };
         for (file, line, text) in [
             (file::STEPS, self.rows.taken + 2, self.rows.take()?),
             (file::TRACKER, self.samples.taken + 1, self.samples.take()?),
         ] {
             if text.is_some() {
-                self.differs(file, line, text, None);
+                self.differs(file, line, text.as_deref(), None);
             }
         }
         if let Some(Logged { line, text, .. }) = self.sent.take()? {
-            self.differs(file::CAN, line, Some(text), None);
+            self.differs(file::CAN, line, Some(&text), None);
         }
         if outcome != Some(&recorded) {
             let words = |outcome: &Outcome| match outcome {
                 Outcome::Completed => "completed".to_owned(),
                 Outcome::Stopped(reason) => format!("stopped: {reason}"),
             };
-            self.difference.get_or_insert(Difference::Outcome {
-                recorded: words(&recorded),
-                replayed: outcome.map_or("not ended".to_owned(), words),
-            });
+            let replayed = outcome.map_or("not ended".to_owned(), words);
+            let recorded = words(&recorded);
+            let words = format!("outcome: recorded {recorded}, replayed {replayed}");
+            self.difference.get_or_insert(words);
         }
         Ok(())
     }

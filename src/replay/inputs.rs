@@ -1,6 +1,5 @@
 //! What a session was given, from `inputs.log` and the files that it refers to.
 
-use super::ReplayError;
 use super::recorded::{Entries, Logged, Recorded, unix_us};
 use crate::archive::{Inputs, RecordedInput, file};
 use crate::session::{Direction, HELD_UP, Input};
@@ -27,15 +26,15 @@ pub(super) enum Next {
 }
 
 impl RecordedInputs {
-    pub(super) fn open(recorded: &Recorded<'_>) -> Result<Self, ReplayError> {
-        let inputs = Inputs::read(recorded.lines(file::INPUTS)?)?;
+    pub(super) fn open(recorded: &Recorded<'_>) -> Result<Self, String> {
         let samples = recorded.numbered(file::TRACKER)?.map(|numbered| {
             let (line, text) = numbered?;
-            Ok(ndjson::recorded(line as u64, &text)?)
+            ndjson::recorded(line as u64, &text)
+                .map_err(|error| format!("{}: {error}", file::TRACKER))
         });
         Ok(RecordedInputs {
             started_unix_us: recorded.started_unix_us()?,
-            inputs,
+            inputs: recorded.inputs()?,
             line: 1,
             received: recorded.frames(Direction::Received)?,
             samples: Entries::new(samples)?,
@@ -48,8 +47,9 @@ impl RecordedInputs {
     }
 
     /// The next input; `None` after the last.
-    pub(super) fn next(&mut self) -> Result<Option<Next>, ReplayError> {
-        let Some((time, given)) = self.inputs.next().transpose()? else { return Ok(None) };
+    pub(super) fn next(&mut self) -> Result<Option<Next>, String> {
+        let next = self.inputs.next().transpose().map_err(|error| error.to_string())?;
+        let Some((time, given)) = next else { return Ok(None) };
         self.line += 1;
         Ok(Some(match given {
             RecordedInput::Input(input) => Next::Input(time, input),
@@ -64,18 +64,16 @@ impl RecordedInputs {
         }))
     }
 
-    fn frame(&self, time: Time, logged: &Logged) -> Result<Input, ReplayError> {
+    fn frame(&self, time: Time, logged: &Logged) -> Result<Input, String> {
         let apart_us = logged.unix_us.abs_diff(unix_us(self.started_unix_us, time));
-        match apart_us {
-            0 => Ok(Input::Frame(logged.frame)),
-            _ => {
-                let (name, line) = (file::CAN, logged.line);
-                Err(self.mixed(&format!("and {name} line {line} are {apart_us} us apart")))
-            }
+        if apart_us > 0 {
+            let (name, line) = (file::CAN, logged.line);
+            return Err(self.mixed(&format!("and {name} line {line} are {apart_us} us apart")));
         }
+        Ok(Input::Frame(logged.frame))
     }
 
-    fn sample(&self, time: Time, sample: Sample) -> Result<Input, ReplayError> {
+    fn sample(&self, time: Time, sample: Sample) -> Result<Input, String> {
         if sample.receive_time > time {
             let late_s = sample.receive_time.seconds_after(time);
             let (name, line) = (file::TRACKER, self.samples.taken);
@@ -85,8 +83,8 @@ impl RecordedInputs {
     }
 
     /// The refusal of files that do not fit together, at the input read last.
-    pub(super) fn mixed(&self, what: &str) -> ReplayError {
-        ReplayError::Mixed(format!("{} line {} {what}", file::INPUTS, self.line))
+    pub(super) fn mixed(&self, what: &str) -> String {
+        format!("the files are not of one run: {} line {} {what}", file::INPUTS, self.line)
     }
 
     /// A received frame that was given to no session.
@@ -97,11 +95,11 @@ impl RecordedInputs {
 
 /// When frames that were made may have been left unsent, UTC µs: the bus failed, or the bench was held
 /// up.
-pub(super) fn unsent_unix_us(recorded: &Recorded<'_>) -> Result<Vec<i64>, ReplayError> {
+pub(super) fn unsent_unix_us(recorded: &Recorded<'_>) -> Result<Vec<i64>, String> {
     let started_unix_us = recorded.started_unix_us()?;
     let mut unsent = Vec::new();
-    for input in Inputs::read(recorded.lines(file::INPUTS)?)? {
-        let (time, given) = input?;
+    for input in recorded.inputs()? {
+        let (time, given) = input.map_err(|error| error.to_string())?;
         let is_fault = match given {
             RecordedInput::Input(Input::BusFault(_)) => true,
             RecordedInput::Input(Input::Stop(reason)) => reason.starts_with(HELD_UP),

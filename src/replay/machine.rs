@@ -1,9 +1,6 @@
 //! The session of a recorded run, given what it was given.
 
 use super::comparison::Comparison;
-use super::cut::Cut;
-use super::difference::Difference;
-use super::error::ReplayError;
 use super::inputs::{Next, RecordedInputs};
 use super::recorded::Recorded;
 use crate::archive::{STEP_COLUMNS, StepRow, file, is_of_truth, steps_csv_header};
@@ -15,11 +12,47 @@ use crate::session::{
 use crate::study::{FigureReport, RunFigures};
 use crate::units::Time;
 
+/// The files of a record that was cut end at different times: those of a killed bench within 0.2 s,
+/// those of a machine that lost power within a second and a quarter more, in which each is put on
+/// the disk in its turn. One that ends earlier than this was not cut with the others.
+const APART_MAX_S: f64 = 1.5;
+
+/// Where a record ends that was cut.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Cut {
+    /// Its last entry, in whichever file.
+    pub end: Time,
+    /// The file that ends first.
+    pub file: &'static str,
+    /// The time of what that file does not hold any more.
+    pub file_end: Time,
+    /// Rows of `steps.csv` that come after what the session could be given.
+    pub rows_beyond: usize,
+}
+
+impl Cut {
+    /// How long before the record's end the first file's is, s.
+    pub fn apart_s(&self) -> f64 {
+        self.end.seconds_after(self.file_end).max(0.0)
+    }
+
+    /// The difference it makes that a file lacks more than a cut takes.
+    fn difference(&self) -> Option<String> {
+        let (file, apart_s) = (self.file, self.apart_s());
+        (apart_s > APART_MAX_S).then(|| {
+            format!(
+                "{file} ends {apart_s:.3} s before the record does: a cut leaves its files within \
+                 {APART_MAX_S:.1} s of each other"
+            )
+        })
+    }
+}
+
 /// What a replay came to.
 #[derive(Debug, Clone)]
 pub struct Replayed {
     /// The first difference from the record; `None` where there is none.
-    pub difference: Option<Difference>,
+    pub difference: Option<String>,
     /// Rows of `steps.csv` compared.
     pub rows: usize,
     /// Frames sent compared.
@@ -61,15 +94,19 @@ impl Replayed {
 /// back; what is compared is the recorded observer's all the same.
 ///
 /// # Errors
-/// [`ReplayError`] where records were dropped, the session refuses its configuration or the files do
+/// Where records were dropped, the session refuses its configuration or the files do
 /// not fit together.
 pub fn replay(
     recorded: &Recorded<'_>,
     what_if: Option<ObserverConfig>,
-) -> Result<Replayed, ReplayError> {
+) -> Result<Replayed, String> {
     match recorded.manifest.dropped.unwrap_or_default().text_files {
         0 => replay_to(recorded, what_if, &mut |_, _| {}),
-        dropped => Err(ReplayError::Dropped(dropped)),
+        dropped => Err(format!(
+            "{dropped} records were dropped while this run was recorded (manifest.json, \
+             dropped.text_files): what the session was given is not whole, and no replay of it can \
+             be exact"
+        )),
     }
 }
 
@@ -80,22 +117,24 @@ pub type TakeRecord<'a> = &'a mut dyn FnMut(Record, Option<Truth>);
 /// difference. Where records were dropped that is as far as the replay is the run.
 ///
 /// # Errors
-/// [`ReplayError`] where the session refuses its configuration or the files do not fit together.
+/// Where the session refuses its configuration or the files do not fit together.
 pub fn replay_to(
     recorded: &Recorded<'_>,
     what_if: Option<ObserverConfig>,
     take: TakeRecord<'_>,
-) -> Result<Replayed, ReplayError> {
+) -> Result<Replayed, String> {
     let mut plan = recorded.plan.clone();
     match (&mut plan, what_if) {
         (Plan::Insertion(config), what_if) => config.shadows.extend(what_if),
-        (Plan::Operation(_), Some(_)) => return Err(ReplayError::NoObserver),
+        (Plan::Operation(_), Some(_)) => {
+            return Err("an operation of the stage has no observer to ask about".to_owned());
+        }
         (Plan::Operation(_), None) => {}
     }
     let mut inputs = RecordedInputs::open(recorded)?;
     let mut end = inputs.begun();
     let mut replay = Replay {
-        session: plan.begin(end)?,
+        session: plan.begin(end).map_err(|error| format!("{}: {error}", file::CONFIG))?,
         comparison: Comparison::open(recorded)?,
         take,
         asks: what_if.is_some(),
@@ -123,8 +162,11 @@ pub fn replay_to(
     if let Some(logged) = inputs.left_over()
         && !replay.comparison.is_cut()
     {
-        let what = format!("{} line {} was given to no session", file::CAN, logged.line);
-        return Err(ReplayError::Mixed(what));
+        return Err(format!(
+            "the files are not of one run: {} line {} was given to no session",
+            file::CAN,
+            logged.line
+        ));
     }
     replay.finish(recorded, (inputs.begun(), end))
 }
@@ -142,7 +184,7 @@ struct Replay<'a> {
 
 impl Replay<'_> {
     /// Takes what leaves the session in answer to `input`.
-    fn drain(&mut self, input: Option<&Input>) -> Result<(), ReplayError> {
+    fn drain(&mut self, input: Option<&Input>) -> Result<(), String> {
         while let Some(output) = self.session.poll() {
             match output {
                 Output::Transmit { time, frame } => self.comparison.sent(time, &frame, input)?,
@@ -152,7 +194,7 @@ impl Replay<'_> {
         Ok(())
     }
 
-    fn record(&mut self, record: Record) -> Result<(), ReplayError> {
+    fn record(&mut self, record: Record) -> Result<(), String> {
         let truth = match &record {
             Record::Sample(sample) | Record::Target(sample) => {
                 self.comparison.sample(sample)?;
@@ -173,7 +215,7 @@ impl Replay<'_> {
     }
 
     /// The truth at `step`, as recorded.
-    fn step(&mut self, mut step: StepRecord) -> Result<Option<Truth>, ReplayError> {
+    fn step(&mut self, mut step: StepRecord) -> Result<Option<Truth>, String> {
         let asked = if self.asks { step.shadows.pop() } else { None };
         let recorded = self.comparison.step(&step)?.unwrap_or_default();
         let truth = self.comparison.columns.truth(&recorded);
@@ -187,11 +229,7 @@ impl Replay<'_> {
         Ok(truth)
     }
 
-    fn finish(
-        mut self,
-        recorded: &Recorded<'_>,
-        span: (Time, Time),
-    ) -> Result<Replayed, ReplayError> {
+    fn finish(mut self, recorded: &Recorded<'_>, span: (Time, Time)) -> Result<Replayed, String> {
         let outcome = self.session.outcome().cloned();
         let is_cut = self.comparison.is_cut();
         let Comparison { rows, samples, sent, .. } = &self.comparison;

@@ -10,15 +10,9 @@
 //! one, which steers and gates as it did.
 
 mod comparison;
-mod cut;
-mod difference;
-mod error;
 mod inputs;
 mod machine;
 mod recorded;
 
-pub use cut::Cut;
-pub use difference::Difference;
-pub use error::ReplayError;
-pub use machine::{Replayed, TakeRecord, replay, replay_to};
+pub use machine::{Cut, Replayed, TakeRecord, replay, replay_to};
 pub use recorded::Recorded;

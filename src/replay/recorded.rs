@@ -1,6 +1,5 @@
 //! What a run folder holds of a run, read along with its replay.
 
-use super::ReplayError;
 use crate::archive::{
     Inputs, Lines, LoggedFrame, Manifest, RecordedColumns, RunOutcome, file, unix_us_of,
 };
@@ -23,32 +22,41 @@ pub struct Recorded<'a> {
 }
 
 impl Recorded<'_> {
-    pub(super) fn lines(&self, name: &'static str) -> Result<Lines, ReplayError> {
-        (self.open)(name).map_err(|source| ReplayError::File { name, source })
+    pub(super) fn lines(&self, name: &'static str) -> Result<Lines, String> {
+        (self.open)(name).map_err(|error| format!("{name}: {error}"))
+    }
+
+    /// What the session was given.
+    pub(super) fn inputs(&self) -> Result<Inputs, String> {
+        Inputs::read(self.lines(file::INPUTS)?).map_err(|error| error.to_string())
     }
 
     /// The lines of the file `name` with their numbers, from 1.
-    pub(super) fn numbered(&self, name: &'static str) -> Result<NumberedLines, ReplayError> {
-        let unreadable = move |source| ReplayError::File { name, source };
+    pub(super) fn numbered(&self, name: &'static str) -> Result<NumberedLines, String> {
+        let unreadable = move |error: io::Error| format!("{name}: {error}");
         let lines = self.lines(name)?.zip(1..);
         Ok(Box::new(lines.map(move |(text, line)| Ok((line, text.map_err(unreadable)?)))))
     }
 
     /// UTC of the run's origin, µs since 1970.
-    pub(super) fn started_unix_us(&self) -> Result<i64, ReplayError> {
+    pub(super) fn started_unix_us(&self) -> Result<i64, String> {
         let started_utc = &self.manifest.started_utc;
-        unix_us_of(started_utc).ok_or_else(|| ReplayError::Started(started_utc.clone()))
+        unix_us_of(started_utc)
+            .ok_or_else(|| format!("{}: started_utc is {started_utc:?}, no time", file::MANIFEST))
     }
 
     /// The frames of `can.log` that went this way.
-    pub(super) fn frames(&self, way: Direction) -> Result<Entries<Logged>, ReplayError> {
+    pub(super) fn frames(&self, way: Direction) -> Result<Entries<Logged>, String> {
         let frames = self.numbered(file::CAN)?.map(|numbered| {
             let (line, text) = numbered?;
             match LoggedFrame::parse(&text) {
                 Some(LoggedFrame { unix_us, direction, frame, .. }) => {
                     Ok((direction, Logged { line, unix_us, frame, text }))
                 }
-                None => Err(ReplayError::Frame { line, text }),
+                None => Err(format!(
+                    "{} line {line}: {text:?} is not a frame as candump -L -x writes it",
+                    file::CAN
+                )),
             }
         });
         let of_this_way = frames.filter_map(move |logged| match logged {
@@ -70,9 +78,9 @@ impl Recorded<'_> {
     }
 
     /// The time of the last entry of the record, in whichever file.
-    pub(super) fn end(&self, columns: &RecordedColumns) -> Result<Time, ReplayError> {
+    pub(super) fn end(&self, columns: &RecordedColumns) -> Result<Time, String> {
         let started_unix_us = self.started_unix_us()?;
-        let last = |name| -> Result<Option<String>, ReplayError> {
+        let last = |name| -> Result<Option<String>, String> {
             Ok(self.numbered(name)?.last().transpose()?.map(|(_, text)| text))
         };
         let frame = last(file::CAN)?.and_then(|line| Some(LoggedFrame::parse(&line)?.unix_us));
@@ -81,16 +89,17 @@ impl Recorded<'_> {
         });
         let sample = last(file::TRACKER)?.and_then(|line| ndjson::recorded(1, &line).ok());
         let step = last(file::STEPS)?.and_then(|row| columns.time(&row));
-        let inputs = Inputs::read(self.lines(file::INPUTS)?)?;
+        let inputs = self.inputs()?;
         let begun = inputs.begun;
-        let input = inputs.last().transpose()?.map(|(time, _)| time);
+        let input = inputs.last().transpose().map_err(|error| error.to_string())?;
+        let input = input.map(|(time, _)| time);
         let times = [frame, sample.map(|sample| sample.receive_time), step, input];
         Ok(times.into_iter().flatten().fold(begun, Time::max))
     }
 }
 
 /// Lines of a file with their numbers, from 1.
-type NumberedLines = Box<dyn Iterator<Item = Result<(usize, String), ReplayError>>>;
+type NumberedLines = Box<dyn Iterator<Item = Result<(usize, String), String>>>;
 
 /// When `time` of a run that began at `started_unix_us` is in UTC, as `can.log` has it: µs since 1970.
 pub(super) fn unix_us(started_unix_us: i64, time: Time) -> i64 {
@@ -108,7 +117,7 @@ pub(super) struct Logged {
 
 /// The entries of a file in their order, of which the next one is known.
 pub(super) struct Entries<T> {
-    entries: Box<dyn Iterator<Item = Result<T, ReplayError>>>,
+    entries: Box<dyn Iterator<Item = Result<T, String>>>,
     next: Option<T>,
     /// Entries taken so far.
     pub(super) taken: usize,
@@ -116,8 +125,8 @@ pub(super) struct Entries<T> {
 
 impl<T> Entries<T> {
     pub(super) fn new(
-        mut entries: impl Iterator<Item = Result<T, ReplayError>> + 'static,
-    ) -> Result<Self, ReplayError> {
+        mut entries: impl Iterator<Item = Result<T, String>> + 'static,
+    ) -> Result<Self, String> {
         let next = entries.next().transpose()?;
         Ok(Entries { entries: Box::new(entries), next, taken: 0 })
     }
@@ -126,7 +135,7 @@ impl<T> Entries<T> {
         self.next.as_ref()
     }
 
-    pub(super) fn take(&mut self) -> Result<Option<T>, ReplayError> {
+    pub(super) fn take(&mut self) -> Result<Option<T>, String> {
         let taken = self.next.take();
         if taken.is_some() {
             self.taken += 1;

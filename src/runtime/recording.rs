@@ -138,7 +138,7 @@ fn make_from_text_files(
             }
         });
         why = match replayed {
-            Ok(replayed) => replayed.difference.map(|difference| difference.to_string()),
+            Ok(replayed) => replayed.difference,
             Err(error) => Some(error.to_string()),
         };
     }

@@ -3,7 +3,7 @@
 use super::interrupt::Interrupt;
 use super::timing::Clock;
 use crate::canopen::Frame;
-use crate::emulator::fault::{BusFault, Fault, FaultKind};
+use crate::emulator::fault::{Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
 use crate::geometry::FixedAngles;
 use crate::session::Direction;
@@ -112,7 +112,7 @@ impl TipServer {
 /// listener hears; an interface is taken down by hand, `ip link set … down`.
 fn strike(fault: &Fault, bus: &mut dyn CanBus) {
     tracing::warn!("emulated fault: {fault}");
-    if fault.kind == FaultKind::Bus(BusFault::Off)
+    if fault.kind == FaultKind::BusOff
         && let Err(error) = bus.report(&BusError::bus_off())
     {
         tracing::warn!("{error}");

@@ -3,7 +3,7 @@
 use super::virtual_time::{TipSource, run_unwatched};
 use crate::emulator::{Noise, TrackerModel, Truth, VirtualStage, VirtualStageConfig};
 use crate::geometry::Pose;
-use crate::session::{Goal, Outcome, Record, Session, SessionConfig, SessionError, Unreachable};
+use crate::session::{Goal, Outcome, Record, Session, SessionConfig, SessionError};
 use crate::study::{Prior, Timetable, TimetableBuilder, TrialResult, TrialScore, insert};
 use crate::units::Time;
 use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
@@ -29,7 +29,7 @@ pub struct Study<'a> {
 }
 
 /// A target with the path to it, or why there is none.
-pub type DrawnGoal = Result<Option<Goal>, Unreachable>;
+pub type DrawnGoal = Result<Option<Goal>, String>;
 
 /// Why there is no study.
 #[derive(Debug, Clone, PartialEq, Error)]

@@ -6,7 +6,7 @@ use super::interrupt::Interrupt;
 use super::pace::Pace;
 use super::sink::{RunReport, Sink};
 use crate::canopen::Frame;
-use crate::emulator::fault::{BusFault, Fault, FaultKind};
+use crate::emulator::fault::{Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
 use crate::geometry::so3;
 use crate::session::{Input, Lane, Machine, OperatorCommand, Outcome, Record, Severity, State};
@@ -133,13 +133,13 @@ impl<'a, W: Witness> VirtualRun<'a, W> {
         let interface = INTERFACE.to_owned();
         let full = |interface| CanError::TransmitQueueFull { interface, frame: *frame };
         match self.stage.bus_fault()? {
-            BusFault::Off => None,
-            BusFault::Down => Some(CanError::Down(interface)),
-            BusFault::Full => Some(full(interface)),
-            BusFault::Stuck => match self.unconfirmed.too_many() {
+            FaultKind::BusDown => Some(CanError::Down(interface)),
+            FaultKind::BusFull => Some(full(interface)),
+            FaultKind::BusStuck => match self.unconfirmed.too_many() {
                 Some(frames) => Some(CanError::NotConfirmed { interface, frames }),
                 None => (self.stage.frames_held() >= QUEUE_MAX).then(|| full(interface)),
             },
+            _ => None,
         }
     }
 
@@ -153,11 +153,11 @@ impl<'a, W: Witness> VirtualRun<'a, W> {
 
     fn begin_fault(&mut self, fault: Fault) {
         let now = self.now;
-        self.emulated.add_fault(fault, &self.stage, now);
+        self.emulated.add_fault(fault.clone(), &self.stage, now);
         let (lane, severity) = (Lane::Stage, Severity::Warning);
         let text = format!("emulated fault: {fault}");
         self.record(Record::Event { time: now, lane, severity, text });
-        if fault.kind == FaultKind::Bus(BusFault::Off) {
+        if fault.kind == FaultKind::BusOff {
             self.give(Input::BusFault(BusError::bus_off().to_string()));
         }
     }
@@ -178,7 +178,7 @@ impl<W: Witness> World for VirtualRun<'_, W> {
         }
         self.stage.handle_frame(self.now, frame);
         match self.stage.bus_fault() {
-            Some(BusFault::Stuck) => self.unconfirmed.sent(*frame),
+            Some(FaultKind::BusStuck) => self.unconfirmed.sent(*frame),
             _ => self.unconfirmed.give_up(),
         }
         self.emulated.update(&self.stage, self.now);

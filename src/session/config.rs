@@ -1,17 +1,28 @@
-//! What a session is told.
+//! The configuration of a session.
 
-use super::error::SessionError;
 use super::goal::Goal;
 use super::reach::check_reach;
 use crate::control::ControlConfig;
 use crate::geometry::Pose;
 use crate::keys::{choice, over, section, within};
 use crate::needle::{Needle, Torsion};
-use crate::observer::{InvariantConfig, ObserverConfig, PositionNoise};
-use crate::stage::StageConfig;
+use crate::observer::{InvariantConfig, ObserverConfig, ObserverError, PositionNoise};
+use crate::stage::{StageConfig, StageConfigError};
 use crate::tracker::{AcquisitionClock, Gate, TrackSettings};
 use nalgebra::Vector3;
 use std::time::Duration;
+use thiserror::Error;
+
+/// A configuration that a session cannot start with.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum SessionError {
+    /// An observer refuses it.
+    #[error("observer: {0}")]
+    Observer(#[from] ObserverError),
+    /// The stage refuses it.
+    #[error("stage: {0}")]
+    Stage(#[from] StageConfigError),
+}
 
 /// Everything a run needs to know, in internal units.
 #[derive(Debug, Clone)]
@@ -26,7 +37,7 @@ pub struct SessionConfig {
     pub needle_torsion: Torsion,
     /// The observer that steers.
     pub observer: ObserverConfig,
-    /// What the watch over the stream's handedness is told.
+    /// Settings of the watch over the stream's handedness.
     pub handedness: InvariantConfig,
     /// Observers that run alongside on the same measurements and never steer.
     pub shadows: Vec<ObserverConfig>,

@@ -5,7 +5,7 @@ use super::steering::{Decision, Steering};
 use crate::geometry::Pose;
 use crate::needle::{Increment, Needle, TipPosition};
 use crate::observer::ObserverError;
-use crate::tracker::{PairingError, Prediction, Refusal, StageHistory, StageIncrement};
+use crate::tracker::{GateName, Prediction, Refusal, StageHistory, StageIncrement};
 use crate::units::Time;
 use nalgebra::{Matrix3, Vector3};
 use std::time::Duration;
@@ -41,14 +41,14 @@ pub(crate) struct Corrections {
 /// The run's steering, along the stage's measured path. All observers stand at the same instant;
 /// between a measurement and now they are carried forward by estimate only.
 pub(crate) struct Estimation {
-    steering: Steering,
+    pub(super) steering: Steering,
     /// The instant at which the observers' states stand.
     at: Option<Time>,
     needle: Needle,
     /// Where the observer that steers has the tip there; `None` while it has no estimate.
     expected: Option<Expected>,
-    /// Since the last step.
-    corrections: Option<Corrections>,
+    /// What corrected the observers since the last step.
+    pub(super) corrections: Option<Corrections>,
     /// When the measurement that corrected last was acquired.
     corrected_at: Option<Time>,
     /// When the newest position was acquired, and its time after the one before, s.
@@ -126,12 +126,12 @@ impl Estimation {
     /// measurement from before where the observers stand comes too late, and is left out.
     ///
     /// # Errors
-    /// [`PairingError`] where the stage's path to the measurement is not known.
+    /// Where the stage's path to the measurement is not known.
     pub(crate) fn take(
         &mut self,
         measurement: &Measurement,
         history: &StageHistory,
-    ) -> Result<(), PairingError> {
+    ) -> Result<(), String> {
         if self.at.is_some_and(|at| at >= measurement.acquisition_time) {
             return Ok(());
         }
@@ -155,16 +155,6 @@ impl Estimation {
         Ok(())
     }
 
-    /// The target is there, plane frame, mm.
-    pub(crate) fn set_target(&mut self, target_mm: Vector3<f64>) {
-        self.steering.set_target(target_mm);
-    }
-
-    /// What corrected the observers since this was asked last.
-    pub(crate) fn corrections(&mut self) -> Option<Corrections> {
-        self.corrections.take()
-    }
-
     /// Takes note of a believed position for the watch over the stream's handedness.
     pub(crate) fn gather(&mut self, measurement: &Measurement) {
         let time = measurement.acquisition_time;
@@ -182,13 +172,13 @@ impl Estimation {
     /// `oldest`, so that the history need not reach back further.
     ///
     /// # Errors
-    /// [`PairingError`] where the stage's path is not known.
+    /// Where the stage's path is not known.
     pub(crate) fn watch(
         &mut self,
         due: Time,
         oldest: Time,
         history: &StageHistory,
-    ) -> Result<(), PairingError> {
+    ) -> Result<(), String> {
         match self.batch.mean() {
             None => self.carry_watch_to(oldest, history),
             Some((time, tip_meas)) if self.batch.first.is_some_and(|first| first <= due) => {
@@ -202,7 +192,7 @@ impl Estimation {
         }
     }
 
-    fn carry_watch_to(&mut self, time: Time, history: &StageHistory) -> Result<(), PairingError> {
+    fn carry_watch_to(&mut self, time: Time, history: &StageHistory) -> Result<(), String> {
         if self.steering.handedness().is_decided() {
             return Ok(());
         }
@@ -219,12 +209,8 @@ impl Estimation {
     /// last one.
     ///
     /// # Errors
-    /// [`PairingError`] where the stage's path to `time` is not known.
-    pub(crate) fn carry_to(
-        &mut self,
-        time: Time,
-        history: &StageHistory,
-    ) -> Result<(), PairingError> {
+    /// Where the stage's path to `time` is not known.
+    pub(crate) fn carry_to(&mut self, time: Time, history: &StageHistory) -> Result<(), String> {
         if self.at.is_some_and(|at| at < time) {
             let increments = self.increments(time, history)?;
             self.expected = self.expected.map(|tip| tip.after(&self.needle, &increments));
@@ -238,17 +224,21 @@ impl Estimation {
     /// while it has no estimate.
     ///
     /// # Errors
-    /// `Late` unless `time` is after the instant at which the observers stand: they cannot go back
-    /// to it. `Unpaired` where the stage's path to `time` is not known.
+    /// [`Refusal`] unless `time` is after the instant at which the observers stand: they cannot go
+    /// back to it; and where the stage's path to `time` is not known.
     pub(crate) fn prediction(
         &self,
         time: Time,
         history: &StageHistory,
     ) -> Result<Option<Prediction>, Refusal> {
         if let Some(at) = self.at.filter(|at| *at >= time) {
-            return Err(Refusal::Late { by_s: at.seconds_after(time) });
+            let by_s = at.seconds_after(time);
+            let why =
+                format!("acquired {by_s:.3} s before the measurement taken last, it came too late");
+            return Err(Refusal::new(GateName::Pairing, why));
         }
-        let increments = self.increments(time, history)?;
+        let increments = self.increments(time, history);
+        let increments = increments.map_err(|why| Refusal::new(GateName::Pairing, why))?;
         Ok(self.expected.map(|tip| tip.after(&self.needle, &increments)).map(|tip| Prediction {
             position_mm: tip.x_pb.translation,
             heading: tip.x_pb.rotation * Vector3::z(),
@@ -260,34 +250,26 @@ impl Estimation {
     /// Decides on the next step from the estimates as they are at `time`.
     ///
     /// # Errors
-    /// [`PairingError`] where the stage's path to `time` is not known.
+    /// Where the stage's path to `time` is not known.
     pub(crate) fn decide(
         &mut self,
         time: Time,
         history: &StageHistory,
         is_last: bool,
-    ) -> Result<Decision, PairingError> {
+    ) -> Result<Decision, String> {
         let ahead = self.increments(time, history)?;
         Ok(self.steering.decide(&ahead, is_last))
     }
 
     /// The stage's measured increments from where the observers stand to `time`.
-    fn increments(
-        &self,
-        time: Time,
-        history: &StageHistory,
-    ) -> Result<Vec<Increment>, PairingError> {
+    fn increments(&self, time: Time, history: &StageHistory) -> Result<Vec<Increment>, String> {
         self.at.map_or(Ok(Vec::new()), |from| increments(from, time, history))
     }
 }
 
 /// The stage's measured increments between two times. Insertion never counts backwards: an encoder
 /// that steps back by a count has cut no tissue.
-fn increments(
-    from: Time,
-    to: Time,
-    history: &StageHistory,
-) -> Result<Vec<Increment>, PairingError> {
+fn increments(from: Time, to: Time, history: &StageHistory) -> Result<Vec<Increment>, String> {
     let path = history.between(from, to)?;
     // An increment that is refused is not finite, which the stage's integers cannot be.
     let increment = |moved: StageIncrement| {

@@ -1,13 +1,11 @@
 //! Steering to a target: the path planned anew each step, and the law that follows it.
 
-use super::steering::SteeringError;
 use super::target::TargetTool;
 use crate::control::{Bend, BendLaw, Command, ControlConfig};
 use crate::needle::Needle;
 use crate::observer::Estimate;
 use crate::plan::{self, Path, Problem, Replanner, RoomyPath, Step, Tip, World, plan_with_reserve};
 use nalgebra::Vector3;
-use thiserror::Error;
 
 /// A target, the obstacles, and the path with which a run begins.
 #[derive(Debug, Clone, PartialEq)]
@@ -24,46 +22,28 @@ pub struct Goal {
     pub tool: Option<TargetTool>,
 }
 
-/// Why no run can begin: there is no path to the target.
-#[derive(Debug, Clone, PartialEq, Error)]
-#[error("goal: {reason}{}", nearest(.nearest_mm.as_ref(), .target_mm))]
-pub struct Unreachable {
-    /// Why, in words.
-    pub reason: String,
-    /// The target, plane frame, mm.
-    pub target_mm: Vector3<f64>,
-    /// The reachable point nearest to the target, plane frame, mm.
-    pub nearest_mm: Option<Vector3<f64>>,
-}
-
-fn nearest(nearest_mm: Option<&Vector3<f64>>, target_mm: &Vector3<f64>) -> String {
-    let text = |at: &Vector3<f64>| {
-        let off_mm = (at - target_mm).norm();
-        format!("; nearest is [{:.1}, {:.1}, {:.1}], {off_mm:.1} mm from it", at.x, at.y, at.z)
-    };
-    nearest_mm.map(text).unwrap_or_default()
-}
-
 impl Goal {
     /// Plans the path with which the run begins by `problem.expansions_max` expansions. It keeps at least
     /// `reserve_mm` more from the obstacles than the clearance. Each step of the run may spend
     /// `step_expansions_max`.
     ///
     /// # Errors
-    /// [`Unreachable`] if no path is found.
+    /// Why no path is found, and the reachable point that is nearest to the target.
     pub fn new(
         mut world: World,
         problem: Problem,
         reserve_mm: f64,
         curvature_margin: f64,
         step_expansions_max: u32,
-    ) -> Result<Self, Unreachable> {
+    ) -> Result<Self, String> {
         let (shortest, target_mm) = (plan::plan(&world, &problem), problem.target_mm);
         let roomy = plan_with_reserve(&world, &problem, reserve_mm, &shortest);
-        let RoomyPath { path, .. } = roomy.map_err(|reason| Unreachable {
-            reason,
-            target_mm,
-            nearest_mm: shortest.nearest_mm,
+        let RoomyPath { path, .. } = roomy.map_err(|reason| {
+            let nearest = shortest.nearest_mm.map(|at| {
+                let (at, off_mm) = (text(&at), (at - target_mm).norm());
+                format!("; nearest is {at}, {off_mm:.1} mm from it")
+            });
+            format!("goal: {reason}{}", nearest.unwrap_or_default())
         })?;
         let problem = Problem { expansions_max: step_expansions_max, ..problem };
         world.workspace.start_mm = Some(problem.start.position_mm);
@@ -90,7 +70,7 @@ impl Goal {
         let Problem { start, clearance_mm, .. } = problem;
         let (world, path) = (self.world.clone(), Some(self.path.clone()));
         let mut replanner = Replanner::new(world, problem, self.curvature_margin, path);
-        let seen = format!("[{:.1}, {:.1}, {:.1}]", tip_mm.x, tip_mm.y, tip_mm.z);
+        let seen = text(tip_mm);
         replanner.check_start(start).map_err(|reason| {
             format!("no path to the target from {seen}, where the tip is seen: {reason}")
         })?;
@@ -103,6 +83,10 @@ impl Goal {
         }
         Ok(())
     }
+}
+
+fn text(at_mm: &Vector3<f64>) -> String {
+    format!("[{:.1}, {:.1}, {:.1}]", at_mm.x, at_mm.y, at_mm.z)
 }
 
 /// What a step knows of the target.
@@ -153,15 +137,22 @@ impl Pursuit {
     }
 
     /// Refuses a target that has moved where no path may end.
-    fn check_target(&self) -> Result<(), SteeringError> {
+    fn check_target(&self) -> Result<(), String> {
         let Problem { target_mm, tolerance_mm, clearance_mm, .. } = self.goal.problem;
         let off_mm = (self.target_mm - target_mm).norm();
         if off_mm > tolerance_mm {
-            return Err(SteeringError::TargetOffPlane { off_mm, tolerance_mm });
+            return Err(format!(
+                "goal: the target is {off_mm:.1} mm off the plane, allowed is goal.tolerance_mm, \
+                 {tolerance_mm}"
+            ));
         }
         let slack_mm = self.goal.world.slack_mm(&target_mm, clearance_mm) + tolerance_mm;
         if slack_mm < 0.0 {
-            return Err(SteeringError::TargetNotAllowed { over_mm: -slack_mm });
+            return Err(format!(
+                "goal: the target has moved {:.1} mm too far: out of goal.workspace_mm, or to an \
+                 obstacle",
+                -slack_mm
+            ));
         }
         Ok(())
     }
@@ -181,7 +172,7 @@ impl Pursuit {
         depth_mm: f64,
         step_mm: f64,
         needle: Needle,
-    ) -> (Approach, Result<Option<Command>, SteeringError>) {
+    ) -> (Approach, Result<Option<Command>, String>) {
         let heading = estimate.x_pb.rotation * Vector3::z();
         let told_per_mm = needle.curvature_per_mm();
         let curvature_per_mm =
@@ -210,10 +201,10 @@ impl Pursuit {
                 let command = self.law.command(estimate, &bend, step_mm);
                 let path = self.replanner.path().cloned();
                 let approach = Approach { error_mm: steer.error_mm, path, ..end };
-                (approach, command.map(Some).map_err(SteeringError::from))
+                (approach, command.map(Some).map_err(|error| format!("control: {error}")))
             }
             Step::Arrived { .. } => (end, Ok(None)),
-            Step::Hold(why) => (end, Err(SteeringError::Goal(why))),
+            Step::Hold(why) => (end, Err(format!("goal: {why}"))),
         }
     }
 }

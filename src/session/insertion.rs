@@ -32,7 +32,8 @@ pub(crate) struct Insertion {
     config: InsertionConfig,
     origin_meas: SetPoint,
     origin_cmd: SetPoint,
-    profile: Profile,
+    /// The commanded depth; a hold brakes it, and rotation stands with it.
+    pub(super) profile: Profile,
     /// Set-point at which the present rotation rate was commanded.
     anchor: SetPoint,
     rotation_cmd_rad_per_mm: f64,
@@ -117,26 +118,6 @@ impl Insertion {
         None
     }
 
-    /// Brakes the insertion to a standstill; rotation stands with it.
-    pub(crate) fn hold(&mut self, braking_mm_per_s2: f64) {
-        self.profile.hold(braking_mm_per_s2);
-    }
-
-    /// Lets a held insertion go on: to its depth, or by a single step of `step_mm`.
-    pub(crate) fn release(&mut self, step_mm: Option<f64>) {
-        self.profile.release(step_mm);
-    }
-
-    /// True from the begin of a single step until the next hold ends.
-    pub(crate) fn is_stepping(&self) -> bool {
-        self.profile.is_stepping()
-    }
-
-    /// True when a single step has come to its end.
-    pub(crate) fn has_stepped(&self) -> bool {
-        self.profile.has_stepped()
-    }
-
     /// Depth that is left to insert, mm.
     pub(crate) fn left_mm(&self) -> f64 {
         self.config.depth_mm - self.profile.position_mm()
@@ -152,13 +133,8 @@ impl Insertion {
         if !(speed_mm_per_s > 0.0 && speed_mm_per_s <= max) {
             return Err(format!("allowed: over 0 and up to {max} mm/s (insertion.speed_mm_per_s)"));
         }
-        self.profile.set_speed(speed_mm_per_s);
+        self.profile.speed_max_mm_per_s = speed_mm_per_s;
         Ok(())
-    }
-
-    /// The speed of the insertion while nothing holds it, mm/s.
-    pub(crate) fn speed_mm_per_s(&self) -> f64 {
-        self.profile.speed_max_mm_per_s()
     }
 
     /// Time that is left at this speed, s: stepwise with the pauses, but without their samples.
@@ -167,7 +143,7 @@ impl Insertion {
             InsertionMode::Continuous => 0,
             InsertionMode::Stepwise => self.last_step + 1 - self.next_step,
         };
-        self.left_mm() / self.speed_mm_per_s()
+        self.left_mm() / self.profile.speed_max_mm_per_s
             + f64::from(pauses) * self.config.settle.as_secs_f64()
     }
 
@@ -175,11 +151,6 @@ impl Insertion {
     pub(crate) fn is_standing(&self, insertion_meas_mm: f64) -> bool {
         let off_mm = (self.profile.position_mm() - insertion_meas_mm).abs();
         self.profile.is_at_rest() && off_mm <= self.config.arrival_mm
-    }
-
-    /// Depth at which a hold that began at the next SYNC would end, mm.
-    pub(crate) fn held_at_mm(&self, braking_mm_per_s2: f64, sync_period: Duration) -> f64 {
-        self.profile.held_at_mm(braking_mm_per_s2, sync_period)
     }
 
     /// The needle must come to where its set-points end: a run that waits there would never end.

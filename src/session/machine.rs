@@ -14,8 +14,8 @@ use crate::units::Time;
 use derive_more::Display;
 use std::time::Duration;
 
-/// So begins the reason of a run that the runtime stops because nothing was done for it for longer
-/// than the drives bear. Frames that were made before and not sent are never sent.
+/// The reason begins with this if the runtime stops a run because the bench itself stalled for longer than
+/// [`Machine::silence_max`]. Frames that were made before the stall and not sent are never sent.
 pub const HELD_UP: &str = "bench: was held up for ";
 
 /// Something that reaches the session from outside.
@@ -74,7 +74,7 @@ pub enum Output {
     Record(Record),
 }
 
-/// How far a run is.
+/// The progress of a run.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Progress {
     /// When.
@@ -134,8 +134,9 @@ pub trait Machine {
     /// What did not go as it should on the stage's bus, and did no harm.
     fn stage_counters(&self) -> Counters;
 
-    /// How long the drives bear not to hear of the bench, and an insertion not to hear of the tip, whatever it is
-    /// that holds the bench up; `None` before the drives are enabled and once they are being stopped.
+    /// The longest that the bench may stall, for whatever reason: the drives' heartbeat timeout, or during an
+    /// insertion the maximum age of the tip, if that is less; `None` before the drives are enabled and once
+    /// they are being stopped.
     fn silence_max(&self) -> Option<Duration>;
 
     /// What it has left of the stage.
@@ -243,7 +244,7 @@ impl Machine for Session {
     fn handle(&mut self, now: Time, input: Input) {
         self.shell.now = now;
         if self.outcome().is_some() {
-            // Of the last frame, which a replay would miss.
+            // The bus may refuse the last frame. A replay needs to know.
             if matches!(input, Input::BusFault(_)) {
                 self.shell.record(Record::Input { time: now, input });
             }

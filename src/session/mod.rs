@@ -6,7 +6,6 @@
 //! of the stage alone (`crate::operation`).
 
 mod config;
-mod error;
 mod estimation;
 mod goal;
 mod insert;
@@ -29,16 +28,15 @@ pub use crate::control::ControlConfig;
 pub use crate::observer::ObserverConfig;
 pub use config::{
     HoldConfig, InsertionConfig, InsertionMode, PlaneOutOfReach, Resume, Samples, SessionConfig,
-    TrackerConfig,
+    SessionError, TrackerConfig,
 };
-pub use error::SessionError;
-pub use goal::{Approach, Goal, Unreachable};
+pub use goal::{Approach, Goal};
 pub use machine::{Done, HELD_UP, Input, Machine, OperatorCommand, Output, Progress, Session};
 pub use outcome::{Left, Outcome};
 pub use peak::{PROFILE_PEAK, rotation_peak};
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StepRecord};
 pub use state::State;
-pub use steering::{Decision, Steering, SteeringError};
+pub use steering::{Decision, Steering};
 pub use target::{MovingMean, TargetTool};
 
 pub(crate) use news::{news, tracker_news};

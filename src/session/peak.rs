@@ -98,10 +98,10 @@ mod tests {
             let mut last_mm = 0.0;
             for (event, periods, part) in events {
                 match event {
-                    0 => insertion.hold(braking),
-                    1 => insertion.release(None),
+                    0 => insertion.profile.hold(braking),
+                    1 => insertion.profile.release(None),
                     // A step begins at rest.
-                    4 if insertion.is_standing(last_mm) => insertion.release(Some(part.abs())),
+                    4 if insertion.is_standing(last_mm) => insertion.profile.release(Some(part.abs())),
                     4 => {}
                     5 => insertion.set_speed(speed * (1.0 - 0.9 * part.abs())).expect("within"),
                     2 => insertion.steer(rate * part),

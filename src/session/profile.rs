@@ -3,9 +3,10 @@
 use std::time::Duration;
 
 /// A trapezoid of speed towards a goal, sampled once a SYNC.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(crate) struct Profile {
-    speed_max_mm_per_s: f64,
+    /// Speed to go on with, mm/s; a faster one is braked evenly.
+    pub(super) speed_max_mm_per_s: f64,
     acceleration_mm_per_s2: f64,
     position_mm: f64,
     speed_mm_per_s: f64,
@@ -19,15 +20,7 @@ pub(crate) struct Profile {
 impl Profile {
     /// At rest at 0 mm, with 0 mm for a goal.
     pub(crate) fn new(speed_max_mm_per_s: f64, acceleration_mm_per_s2: f64) -> Self {
-        Profile {
-            speed_max_mm_per_s,
-            acceleration_mm_per_s2,
-            position_mm: 0.0,
-            speed_mm_per_s: 0.0,
-            goal_mm: 0.0,
-            step_end_mm: None,
-            held_mm_per_s2: None,
-        }
+        Profile { speed_max_mm_per_s, acceleration_mm_per_s2, ..Profile::default() }
     }
 
     /// Sets the depth to stop at; it is never less than where the present speed can be braked.
@@ -61,16 +54,6 @@ impl Profile {
     /// True when a single step has come to its end.
     pub(crate) fn has_stepped(&self) -> bool {
         self.step_end_mm.is_some_and(|end_mm| self.position_mm >= end_mm)
-    }
-
-    /// Speed to go on with, mm/s; a faster one is braked evenly.
-    pub(crate) fn set_speed(&mut self, speed_max_mm_per_s: f64) {
-        self.speed_max_mm_per_s = speed_max_mm_per_s;
-    }
-
-    /// Speed that is gone up to, mm/s.
-    pub(crate) fn speed_max_mm_per_s(&self) -> f64 {
-        self.speed_max_mm_per_s
     }
 
     /// Depth at which the way ends for now, mm.

@@ -6,7 +6,7 @@ use nalgebra::Vector3;
 
 /// Standard deviations of the position and of the heading that are allowed in the run's favour.
 const SDS: f64 = 3.0;
-/// A shorter insertion than this is a trial, of which nobody expects the plane, mm.
+/// A shorter insertion is a trial, which need not reach the plane, mm.
 const TRIAL_MM: f64 = 60.0;
 /// Positions and headings tried, from one end of what is allowed to the other.
 const POSITIONS: u32 = 8;

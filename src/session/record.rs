@@ -8,8 +8,8 @@ use crate::observer::Estimate;
 use crate::stage::{Axis, Feedback, Identity};
 use crate::tracker::{Refusal, Sample};
 use crate::units::Time;
+use derive_more::Display;
 use nalgebra::Vector3;
-use std::fmt;
 
 /// Which way a frame went, seen from the bench.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -21,7 +21,8 @@ pub enum Direction {
 }
 
 /// The parts of the bench that have a state of their own.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Display)]
+#[display(rename_all = "lowercase")]
 pub enum Lane {
     /// The run itself.
     Session,
@@ -39,18 +40,6 @@ impl Lane {
     /// Every lane, in the order in which they are shown.
     pub const ALL: [Lane; 5] =
         [Lane::Session, Lane::Stage, Lane::Tracker, Lane::Observer, Lane::Control];
-}
-
-impl fmt::Display for Lane {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Lane::Session => "session",
-            Lane::Stage => "stage",
-            Lane::Tracker => "tracker",
-            Lane::Observer => "observer",
-            Lane::Control => "control",
-        })
-    }
 }
 
 /// How much an event matters to the operator.
@@ -74,7 +63,7 @@ pub struct SampleRecord {
     /// When the tip was there, by the stamp policy and latency, where the sample was accepted.
     pub acquisition_time: Option<Time>,
     /// Why the sample was refused; `None` when it was accepted.
-    pub refused: Option<Box<Refusal>>,
+    pub refused: Option<Refusal>,
 }
 
 impl SampleRecord {

@@ -161,8 +161,8 @@ impl Shell {
         self.stage.fall_silent();
     }
 
-    /// How long the drives bear not to hear of the bench; `None` before they are enabled, once they
-    /// are being stopped, and while the bench is silent on purpose.
+    /// The drives' heartbeat timeout; `None` before they are enabled, once they are being stopped, and
+    /// while the bench is silent on purpose.
     pub(super) fn silence_max(&self) -> Option<Duration> {
         let is_missed = matches!(self.power, Power::On(_)) && self.is_running() && !self.is_silent;
         is_missed.then_some(self.config.heartbeat.consumer_time)

@@ -1,10 +1,10 @@
 //! The states of the parts of the bench.
 
 use super::record::Lane;
-use std::fmt;
 
 /// The state that a part of the bench is in. Each belongs to one part, its [lane](State::lane).
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, derive_more::Display)]
+#[display("{}", self.as_str())]
 pub enum State {
     /// The run: the stage is brought up, and a tip awaited.
     #[default]
@@ -109,12 +109,6 @@ impl State {
     /// The state's name, as `events.log` has it.
     pub const fn as_str(self) -> &'static str {
         State::TABLE[self as usize].2
-    }
-}
-
-impl fmt::Display for State {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.as_str())
     }
 }
 

@@ -1,15 +1,11 @@
-//! What is believed and decided at each step: observers and control law, without stage or time.
+//! The estimates and the command of each step: observers and control law, without stage or time.
 
 use super::config::{Samples, SessionConfig};
 use super::goal::{Approach, Pursuit};
-use crate::control::{Command, ControlError, Controller};
+use crate::control::{Command, Controller};
 use crate::needle::{Increment, Needle, TipPosition};
-use crate::observer::{
-    Divergence, Estimate, HandednessWatch, Observer, ObserverError, StreamContradiction, Whiteness,
-};
-use crate::plan::Hold;
+use crate::observer::{Estimate, HandednessWatch, Observer, ObserverError, Whiteness};
 use nalgebra::Vector3;
-use thiserror::Error;
 
 /// The observers of a run and its control law.
 ///
@@ -31,11 +27,11 @@ pub struct Steering {
     step_mm: f64,
 }
 
-/// Of positions between the steps nothing is seen but their mean: no more than every second is taken
-/// for independent.
+/// Between the steps only the mean of the positions is known: at most every second one counts as
+/// independent.
 const UNSEEN_INFLATION: f64 = 2.0;
 
-/// What a step came to.
+/// The result of a step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Decision {
     /// The estimate that steers; `None` while its observer has none.
@@ -50,42 +46,7 @@ pub struct Decision {
     /// What is known of the target; `None` without one, and without an estimate.
     pub approach: Option<Approach>,
     /// Why there is no command: the run is to be stopped.
-    pub refused: Option<SteeringError>,
-}
-
-/// Why a step has no command.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-pub enum SteeringError {
-    /// The positions contradict what the bench is told of the stream.
-    #[error("tracker: {0}")]
-    Stream(#[from] StreamContradiction),
-    /// The estimate is not to be believed.
-    #[error("observer: {0}")]
-    Observer(#[from] Divergence),
-    /// The law does not hold.
-    #[error("control: {0}")]
-    Control(#[from] ControlError),
-    /// The target cannot be reached any more.
-    #[error("goal: {0}")]
-    Goal(Hold),
-    /// The target has left the plane that the path is in.
-    #[error(
-        "goal: the target is {off_mm:.1} mm off the plane, allowed is goal.tolerance_mm, {tolerance_mm}"
-    )]
-    TargetOffPlane {
-        /// Distance from the plane, mm.
-        off_mm: f64,
-        /// How far from the target a path may end, mm.
-        tolerance_mm: f64,
-    },
-    /// The target has moved where no path may end.
-    #[error(
-        "goal: the target has moved {over_mm:.1} mm too far: out of goal.workspace_mm, or to an obstacle"
-    )]
-    TargetNotAllowed {
-        /// How far beyond the tolerance, mm.
-        over_mm: f64,
-    },
+    pub refused: Option<String>,
 }
 
 impl Steering {
@@ -211,9 +172,9 @@ impl Steering {
 
     /// A lost observer and a stream of the wrong hand end a run; which of them shows first is
     /// chance, and the stream's is the cause.
-    fn check(&self) -> Result<(), SteeringError> {
-        self.handedness.check()?;
-        Ok(self.observer.check()?)
+    fn check(&self) -> Result<(), String> {
+        self.handedness.check().map_err(|error| format!("tracker: {error}"))?;
+        self.observer.check().map_err(|error| format!("observer: {error}"))
     }
 
     /// What the step knows of the target, and the command; none where the insertion ends.
@@ -222,7 +183,7 @@ impl Steering {
         estimate: &Estimate,
         depth_mm: f64,
         is_last: bool,
-    ) -> (Option<Approach>, Result<Option<Command>, SteeringError>) {
+    ) -> (Option<Approach>, Result<Option<Command>, String>) {
         match &mut self.pursuit {
             Some(pursuit) if is_last => (Some(pursuit.end(estimate)), Ok(None)),
             Some(pursuit) => {
@@ -233,7 +194,7 @@ impl Steering {
             None if is_last => (None, Ok(None)),
             None => {
                 let command = self.control.command(estimate, self.step_mm);
-                (None, command.map(Some).map_err(SteeringError::from))
+                (None, command.map(Some).map_err(|error| format!("control: {error}")))
             }
         }
     }
@@ -248,7 +209,8 @@ impl Steering {
 mod tests {
     use super::*;
     use crate::config::Config;
-    use crate::observer::PositionNoise;
+    use crate::control::ControlError;
+    use crate::observer::{Divergence, PositionNoise};
     use rand::{RngExt, SeedableRng};
     use rand_pcg::Pcg64;
     use std::time::Duration;

@@ -4,7 +4,8 @@ use super::config::TrackerConfig;
 use super::record::SampleRecord;
 use crate::geometry::Pose;
 use crate::tracker::gate::is_tool;
-use crate::tracker::{AcquisitionClock, Fix, Gate, Prediction, Refusal, Sample, Track};
+use crate::tracker::refusal::short;
+use crate::tracker::{AcquisitionClock, Fix, Gate, GateName, Prediction, Refusal, Sample, Track};
 use crate::units::Time;
 use nalgebra::{Matrix3, Vector3};
 use std::collections::VecDeque;
@@ -60,8 +61,8 @@ impl MovingMean {
     }
 }
 
-/// What has been heard of the target: the same gates as for the tip, and in place of the observer's
-/// prediction the mean of the last positions.
+/// The track of the target: the same gates as for the tip, and the mean of the last positions instead of
+/// the observer's prediction.
 pub(super) struct TargetTracking {
     tool: TargetTool,
     x_pw: Pose,
@@ -110,10 +111,10 @@ impl TargetTracking {
             }
             Err(refusal) => {
                 // Before the insertion a target may be anywhere, and is looked for anew.
-                if insertion_mm.is_none() && matches!(refusal, Refusal::Step { .. }) {
+                if insertion_mm.is_none() && refusal.gate == GateName::Step {
                     self.mean = MovingMean::new(self.tool.average);
                 }
-                record.refused = Some(Box::new(refusal.clone()));
+                record.refused = Some(refusal.clone());
                 self.last_refusal = Some(refusal);
             }
         }
@@ -149,7 +150,14 @@ impl TargetTracking {
         // Written so that NaN is refused.
         match off_mm <= limit_mm {
             true => Ok((self.clock.acquisition_time(sample)?, position_mm)),
-            false => Err(Refusal::TargetElsewhere { off_mm, limit_mm }),
+            false => {
+                let why = format!(
+                    "the target is {} mm from goal.position_mm (limit {limit_mm:.1}); another frame, \
+                     or tool?",
+                    short(off_mm)
+                );
+                Err(Refusal::new(GateName::Workspace, why))
+            }
         }
     }
 

@@ -25,15 +25,15 @@ pub(crate) trait Task {
         Ok(true)
     }
 
-    /// Takes news of the stage. Feedback comes while the axes are stopped, too; everything else
+    /// Takes an event of the stage. Feedback comes while the axes are stopped, too; everything else
     /// comes before.
     ///
     /// # Errors
     /// The reason to stop for.
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String>;
 
-    /// Takes news of the tracker's link. A task that makes no use of it records what comes, and does not
-    /// miss a tracker that is not there.
+    /// Takes an event of the tracker's link. A task that does not use the tracker records the events, and
+    /// ignores that no connection can be made.
     fn take_tracker_event(&mut self, shell: &mut Shell, event: Event) {
         if let Event::Unreachable { .. } = event {
             return;
@@ -46,7 +46,7 @@ pub(crate) trait Task {
         }
     }
 
-    /// How long the task may go on without news of what it moves; `None` where it needs none but the drives'.
+    /// The longest that the task may go on without a new tip position; `None` if it needs none.
     fn blind_max(&self) -> Option<Duration> {
         None
     }

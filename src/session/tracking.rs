@@ -9,11 +9,10 @@ use crate::session::{Lane, State};
 use crate::tracker::gate::is_tool;
 use crate::tracker::openigtlink::Status;
 use crate::tracker::{
-    AcquisitionClock, Census, Event, Fix, GateCounts, Refusal, Sample, StageHistory, Track,
-    TrackState, TravelCheck, TravelError,
+    AcquisitionClock, Census, Effect, Event, Fix, GateCounts, GateName, Refusal, Sample,
+    StageHistory, Track, TrackState, TravelCheck,
 };
 use crate::units::Time;
-use nalgebra::Vector3;
 use std::collections::VecDeque;
 use std::time::Duration;
 
@@ -22,10 +21,10 @@ const PENDING_MAX: usize = 256;
 /// Once a run is being stopped, a position that no feedback has come for waits no longer than this, or
 /// two SYNC periods: what is heard of the tracker is recorded as it comes, to the end.
 const UNPAIRED_MAX: Duration = Duration::from_millis(100);
-/// Code of a STATUS message that says all is well.
-const STATUS_OK: u16 = 1;
+/// Why a position that still waits at the end is refused.
+const NEVER_PAIRED: &str = "the stage gave no position at its acquisition before the run ended";
 
-/// What has been heard from the tracker.
+/// The stream of the tracker.
 ///
 /// A sample first passes the gates that look at it alone ([`Tracking::take`]). During an insertion
 /// it then waits until the stage's position at its acquisition is known, and is judged against the
@@ -35,19 +34,20 @@ pub(crate) struct Tracking {
     config: TrackerConfig,
     x_pw: Pose,
     clock: AcquisitionClock,
-    track: Track,
-    travel: TravelCheck,
-    counts: GateCounts,
+    pub(super) track: Track,
+    pub(super) travel: TravelCheck,
+    /// What the gates did with the samples so far.
+    pub(super) counts: GateCounts,
     census: Census,
     unpaired_max: Duration,
     /// Samples in order of receipt, from the first that is not decided yet.
     waiting: VecDeque<Waiting>,
     /// What has happened and is not recorded yet.
-    records: VecDeque<Record>,
+    pub(super) records: VecDeque<Record>,
     was: TrackState,
     last_refusal: Option<String>,
     /// The refusal by which the mean of the last positions contradicted the model, until one is believed.
-    jump: Option<String>,
+    pub(super) jump: Option<String>,
     link_trouble: Option<String>,
     /// Why the last message that could not be read was refused, until a position is believed.
     malformed: Option<String>,
@@ -100,19 +100,19 @@ impl Tracking {
             Event::Unreachable { reason } | Event::Disconnected { reason } => {
                 self.link_trouble = Some(reason.clone());
             }
-            Event::Status { status, .. } => self.status_is_ok = is_ok(status),
+            Event::Status { status, .. } => self.status_is_ok = status.code == Status::OK,
             Event::Malformed(error) => self.malformed = Some(error.clone()),
             Event::Sample(_) | Event::SawTool { .. } | Event::PassedOver { .. } => {}
         }
     }
 
-    /// Counts samples that the link dropped. They are told of at the first, and whenever there are
-    /// twice as many.
+    /// Counts samples that the link dropped. Gives a message at the first, and at each doubling of the
+    /// count.
     pub(crate) fn count_dropped(&mut self, dropped: u64) -> Option<String> {
         let before = self.dropped;
         self.dropped += dropped;
-        let is_told = self.dropped.checked_ilog2() > before.checked_ilog2();
-        is_told.then(|| {
+        let is_reported = self.dropped.checked_ilog2() > before.checked_ilog2();
+        is_reported.then(|| {
             format!(
                 "{} samples dropped so far: they come faster than the bench takes them; the newest \
                  are used; lower the tracker's rate",
@@ -125,7 +125,7 @@ impl Tracking {
     /// [`Tracking::judge`].
     pub(crate) fn take(&mut self, now: Time, sample: Sample, is_inserting: bool) {
         let admitted = self.admit(&sample);
-        self.tell_of_the_clock(now);
+        self.report_clock(now);
         self.census.note(&Event::Sample(sample.clone()));
         let mut record = SampleRecord::received(sample);
         let mut position = None;
@@ -147,7 +147,7 @@ impl Tracking {
         }
         self.waiting.push_back(Waiting { record, is_target: false, position });
         if self.waiting.len() > PENDING_MAX {
-            self.give_up_on(now, 1);
+            self.refuse_oldest(now, 1);
         }
         self.release();
     }
@@ -163,8 +163,8 @@ impl Tracking {
     fn admit(&mut self, sample: &Sample) -> Result<(Time, TipPosition), Refusal> {
         let position_bench_mm = self.config.gate.admit(sample)?;
         let position_plane_mm = self.x_pw.transform(&position_bench_mm);
-        let tip_meas =
-            TipPosition::new(position_plane_mm).ok_or(Refusal::NotFinite(position_plane_mm))?;
+        let tip_meas = TipPosition::new(position_plane_mm)
+            .ok_or_else(|| Refusal::not_finite(&position_plane_mm))?;
         Ok((self.clock.acquisition_time(sample)?, tip_meas))
     }
 
@@ -215,7 +215,9 @@ impl Tracking {
         history: &StageHistory,
         estimation: &Estimation,
     ) -> Result<f64, Refusal> {
-        let insertion_mm = history.at(acquisition_time)?.insertion_mm;
+        let stage = history.at(acquisition_time);
+        let stage = stage.map_err(|why| Refusal::new(GateName::Pairing, why))?;
+        let insertion_mm = stage.insertion_mm;
         let prediction = estimation.prediction(acquisition_time, history)?;
         let fix = fix(record, acquisition_time, tip_meas, Some(insertion_mm));
         self.track.judge(fix, prediction.as_ref())?;
@@ -233,7 +235,7 @@ impl Tracking {
                 self.status_is_ok = false;
             }
             Some(refusal) => {
-                if matches!(refusal, Refusal::Jump { .. }) {
+                if refusal.effect == Effect::Loses {
                     self.jump = Some(refusal.to_string());
                 }
                 if is_tool(&record.received.tool, &self.config.gate.tool) {
@@ -241,14 +243,14 @@ impl Tracking {
                 }
                 record.position_plane_mm = None;
                 record.acquisition_time = None;
-                record.refused = Some(Box::new(refusal));
+                record.refused = Some(refusal);
             }
         }
-        self.tell_of_the_track(now);
+        self.report_track(now);
     }
 
-    /// Tells of a track that was lost or found again.
-    fn tell_of_the_track(&mut self, time: Time) {
+    /// Records that the track was lost or found again.
+    fn report_track(&mut self, time: Time) {
         let state = self.track.state(time);
         let was = std::mem::replace(&mut self.was, state);
         let (severity, text) = match (was, state) {
@@ -267,37 +269,38 @@ impl Tracking {
     }
 
     /// Decides that the `count` oldest samples are never judged, where they still wait.
-    fn give_up_on(&mut self, now: Time, count: usize) {
+    fn refuse_oldest(&mut self, now: Time, count: usize) {
         let mut waiting = std::mem::take(&mut self.waiting);
         for sample in waiting.iter_mut().take(count) {
             if sample.position.take().is_some() {
-                self.decide(now, &mut sample.record, Some(Refusal::NeverPaired));
+                let refusal = Refusal::new(GateName::Pairing, NEVER_PAIRED);
+                self.decide(now, &mut sample.record, Some(refusal));
             }
         }
         self.waiting = waiting;
     }
 
-    /// Tells of what the sender's clock did.
-    fn tell_of_the_clock(&mut self, time: Time) {
-        if let Some(news) = self.clock.news() {
-            let (lane, severity, text) = (Lane::Tracker, Severity::Warning, news.to_string());
+    /// Records what the sender's clock did.
+    fn report_clock(&mut self, time: Time) {
+        if let Some(text) = self.clock.news() {
+            let (lane, severity) = (Lane::Tracker, Severity::Warning);
             self.records.push_back(Record::Event { time, lane, severity, text });
         }
     }
 
-    /// Gives up on the samples that wait for a feedback that does not come, now that the run is being
+    /// Refuses the samples that wait for a feedback that does not come, now that the run is being
     /// stopped.
-    pub(crate) fn give_up_on_the_unpaired(&mut self, now: Time) {
+    pub(crate) fn refuse_unpaired(&mut self, now: Time) {
         let oldest = now - self.unpaired_max;
         let is_late = |sample: &&Waiting| sample.record.received.receive_time < oldest;
         let late = self.waiting.iter().take_while(is_late).count();
-        self.give_up_on(now, late);
+        self.refuse_oldest(now, late);
         self.release();
     }
 
     /// Nothing is judged any more: what still waits is recorded as it is.
     pub(crate) fn close(&mut self, now: Time) {
-        self.give_up_on(now, usize::MAX);
+        self.refuse_oldest(now, usize::MAX);
         self.release();
     }
 
@@ -309,11 +312,6 @@ impl Tracking {
                 false => Record::Sample(decided.record),
             });
         }
-    }
-
-    /// The next record; `None` when there is none for now.
-    pub(crate) fn poll(&mut self) -> Option<Record> {
-        self.records.pop_front()
     }
 
     /// The state of the stream, for the operator.
@@ -337,43 +335,9 @@ impl Tracking {
         self.age_s(now).is_some_and(|age_s| age_s <= self.config.hold.after.as_secs_f64())
     }
 
-    /// True once the tip is found and while it is not lost.
-    pub(crate) fn is_held(&self) -> bool {
-        self.track.is_held()
-    }
-
-    /// Whether the believed positions travel as far as the needle was inserted.
-    ///
-    /// # Errors
-    /// [`TravelError`]: the run is to be stopped.
-    pub(crate) fn check_travel(&self) -> Result<(), TravelError> {
-        self.travel.check()
-    }
-
     /// When the newest believed position was acquired.
     pub(crate) fn last_acquisition(&self) -> Option<Time> {
         self.track.last().map(|fix| fix.acquisition_time)
-    }
-
-    /// The newest believed position, plane frame, mm.
-    pub(crate) fn tip_mm(&self) -> Option<Vector3<f64>> {
-        self.track.last().map(|fix| fix.position_mm)
-    }
-
-    /// The stage's depth at which the newest believed position was acquired, mm; `None` before the
-    /// first of an insertion.
-    pub(crate) fn seen_at_mm(&self) -> Option<f64> {
-        self.track.last().and_then(|fix| fix.insertion_mm)
-    }
-
-    /// How the mean of the last positions contradicts the model, where it does.
-    pub(crate) fn jump(&self) -> Option<&str> {
-        self.jump.as_deref()
-    }
-
-    /// What the gates did with the samples so far.
-    pub(crate) fn counts(&self) -> GateCounts {
-        self.counts
     }
 
     /// Why there is no tip to steer by, and what to do: for the operator.
@@ -407,8 +371,4 @@ fn fix(
 ) -> Fix {
     let (receive_time, position_mm) = (record.received.receive_time, tip_meas.mm());
     Fix { receive_time, acquisition_time, position_mm, insertion_mm }
-}
-
-fn is_ok(status: &Status) -> bool {
-    status.code == STATUS_OK
 }

@@ -281,7 +281,7 @@ mod tests {
     use crate::geometry::Pose;
     use crate::observer::Estimate;
     use crate::stage::SetPoint;
-    use crate::tracker::{Refusal, Sample, Validity};
+    use crate::tracker::{GateName, Refusal, Sample, Validity};
     use nalgebra::Vector3;
 
     fn step(depth: f64, x: f64) -> StepRecord {
@@ -368,7 +368,7 @@ mod tests {
                 },
                 position_plane_mm: None,
                 acquisition_time: Some(time),
-                refused: (n > 10).then(|| Box::new(Refusal::ZeroPose)),
+                refused: (n > 10).then(|| Refusal::new(GateName::Zero, "not seen")),
             });
             figures.follow(&Feedback {
                 time,

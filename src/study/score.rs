@@ -7,7 +7,7 @@ use super::statistics::{mean, rms};
 use crate::emulator::{Truth, VirtualStageConfig};
 use crate::needle::{Reduced, shortest_into_plane_mm};
 use crate::plan::World;
-use crate::session::{Goal, Outcome, StepRecord, Unreachable};
+use crate::session::{Goal, Outcome, StepRecord};
 
 /// The result of one trial.
 #[derive(Debug, Clone)]
@@ -61,7 +61,7 @@ impl TrialResult {
 
 impl TrialResult {
     /// The result of a trial that was refused before the insertion.
-    pub fn refused(seed: u64, stage: VirtualStageConfig, prior: &Prior, why: &Unreachable) -> Self {
+    pub fn refused(seed: u64, stage: VirtualStageConfig, prior: &Prior, why: &str) -> Self {
         let target = TargetScore {
             is_refused: true,
             error_mm: None,

@@ -66,7 +66,7 @@ pub fn insert(
         let ahead = needle.base.between(seen_mm, due.insertion_mm);
         let decision = steering.decide(&ahead, is_last);
         let command = decision.rotation_cmd_rad_per_mm;
-        let refused = decision.refused;
+        let refused = decision.refused.clone();
         let path = decision.approach.as_ref().and_then(|approach| approach.path.as_ref());
         let end_mm = path.map(|path| due.insertion_mm + path.length_mm());
         let record = StepRecord {

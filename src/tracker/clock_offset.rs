@@ -1,6 +1,6 @@
 //! The offset of the sender's clock from the bench's.
 
-use super::timing::TimingError;
+use super::refusal::{Effect, GateName, Refusal};
 use crate::units::Time;
 use std::time::Duration;
 
@@ -51,27 +51,7 @@ pub(super) struct ClockOffset {
     /// A stamp went back, and none since has matched the old offset.
     went_back: bool,
     late: Option<Late>,
-    news: Option<ClockNews>,
-}
-
-/// What the operator is told of the sender's clock.
-#[derive(Debug, Clone, Copy, PartialEq, derive_more::Display)]
-pub enum ClockNews {
-    /// Its stamps show that it was set back.
-    #[display("the sender's clock was set back by {by_s:.2} s; its offset was learnt again")]
-    SetBack {
-        /// By how much, s.
-        by_s: f64,
-    },
-    /// By their stamps, positions come later than before; no stamp went back.
-    #[display(
-        "by their stamps, positions come {by_s:.2} s later than before: delayed, or the sender's clock \
-         was set back; they are dated as delayed; if it was the clock, reconnect the tracker"
-    )]
-    Late {
-        /// By how much at least, s.
-        by_s: f64,
-    },
+    news: Option<String>,
 }
 
 /// A run of stamps that are all late.
@@ -87,11 +67,12 @@ impl ClockOffset {
     /// What to add to `source_ns` to bring it to our time line: at most `receive − source`.
     ///
     /// # Errors
-    /// [`TimingError`]; the stamp must not be used.
-    pub(super) fn update(&mut self, receive: Time, source_ns: i64) -> Result<i64, TimingError> {
+    /// [`Refusal`]; the stamp must not be used.
+    pub(super) fn update(&mut self, receive: Time, source_ns: i64) -> Result<i64, Refusal> {
         let back_ns = self.last_source_ns.map(|last_ns| last_ns.saturating_sub(source_ns));
         if back_ns == Some(0) {
-            return Err(TimingError::Duplicate { unix_ns: source_ns });
+            let why = format!("sent twice (stamp {source_ns} ns)");
+            return Err(Refusal::new(GateName::Duplicate, why));
         }
         let offset_ns = receive.as_nanos().saturating_sub(source_ns);
         let known_ns = self.known.as_ref().map(Minimum::ns);
@@ -104,7 +85,7 @@ impl ClockOffset {
         if let Some(known) = self.known.as_mut().filter(|_| !is_ahead && !self.went_back) {
             self.candidate = Settling::default();
             if let Some(by_ns) = back_ns.filter(|_| has_gone_back) {
-                return Err(TimingError::Backwards { by_s: seconds(by_ns) });
+                return Err(went_back(by_ns));
             }
             self.last_source_ns = Some(source_ns);
             let dated_by_ns = known.update(receive, offset_ns);
@@ -119,25 +100,36 @@ impl ClockOffset {
             Ok(settled) => {
                 let settled_ns = settled.ns();
                 let set_back_ns = known_ns.filter(|_| self.went_back);
-                let news = set_back_ns.map(|known_ns| ClockNews::SetBack {
-                    by_s: seconds(settled_ns.saturating_sub(known_ns)),
+                let news = set_back_ns.map(|known_ns| {
+                    let by_s = seconds(settled_ns.saturating_sub(known_ns));
+                    format!(
+                        "the sender's clock was set back by {by_s:.2} s; its offset was learnt again"
+                    )
                 });
                 let (known, last_source_ns) = (Some(settled), Some(source_ns));
                 *self = ClockOffset { known, last_source_ns, news, ..ClockOffset::default() };
                 Ok(settled_ns)
             }
             Err(samples) => Err(match (back_ns, behind_ns) {
-                (Some(by_ns @ 1..), _) => TimingError::Backwards { by_s: seconds(by_ns) },
+                (Some(by_ns @ 1..), _) => went_back(by_ns),
                 (_, Some(behind_ns @ ..0)) => {
-                    TimingError::Ahead { by_s: seconds(behind_ns.saturating_neg()) }
+                    let by_s = seconds(behind_ns.saturating_neg());
+                    let why =
+                        format!("{by_s:.3} s ahead of the sender's clock so far; was it set?");
+                    Refusal::new(GateName::Stamp, why)
                 }
-                _ => TimingError::Unsettled { samples },
+                _ => {
+                    let why = format!(
+                        "the sender's clock is still being learnt, from {samples} samples so far"
+                    );
+                    Refusal { effect: Effect::None, ..Refusal::new(GateName::Stamp, why) }
+                }
             }),
         }
     }
 
     /// What to tell the operator about the sender's clock.
-    pub(super) fn news(&mut self) -> Option<ClockNews> {
+    pub(super) fn news(&mut self) -> Option<String> {
         self.news.take()
     }
 
@@ -153,9 +145,19 @@ impl ClockOffset {
         late.least_ns = late.least_ns.min(late_ns);
         let lasts = late.samples >= LATE_SAMPLES && receive.since(late.since) >= LATE_TIME;
         if lasts && !std::mem::replace(&mut late.is_told, lasts) {
-            self.news = Some(ClockNews::Late { by_s: seconds(late.least_ns) });
+            self.news = Some(format!(
+                "by their stamps, positions come {:.2} s later than before: delayed, or the sender's \
+                 clock was set back; they are dated as delayed; if it was the clock, reconnect the \
+                 tracker",
+                seconds(late.least_ns)
+            ));
         }
     }
+}
+
+fn went_back(by_ns: i64) -> Refusal {
+    let why = format!("went back by {:.3} s; was the sender's clock set?", seconds(by_ns));
+    Refusal::new(GateName::Stamp, why)
 }
 
 fn seconds(ns: i64) -> f64 {
@@ -243,21 +245,18 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
-    fn update(
-        offset: &mut ClockOffset,
-        receive_ms: i64,
-        source_ms: i64,
-    ) -> Result<i64, TimingError> {
-        let offset_ns = offset.update(Time::from_nanos(receive_ms * MS), source_ms * MS)?;
-        Ok(offset_ns / MS)
+    fn update(offset: &mut ClockOffset, receive_ms: i64, source_ms: i64) -> Result<i64, String> {
+        let offset_ns = offset.update(Time::from_nanos(receive_ms * MS), source_ms * MS);
+        offset_ns.map(|ns| ns / MS).map_err(|refusal| refusal.to_string())
+    }
+
+    /// The clock is still being learnt.
+    fn is_learning(dated: &Result<i64, String>) -> bool {
+        matches!(dated, Err(why) if why.contains("is still being learnt"))
     }
 
     /// Samples every 25 ms, delivered at once, of a sender whose clock is ahead by `ahead_ms`.
-    fn listen(
-        offset: &mut ClockOffset,
-        from_ms: i64,
-        ahead_ms: i64,
-    ) -> Vec<Result<i64, TimingError>> {
+    fn listen(offset: &mut ClockOffset, from_ms: i64, ahead_ms: i64) -> Vec<Result<i64, String>> {
         let times = (0..12).map(|n| from_ms + 25 * n);
         times.map(|ms| update(offset, ms, ms + ahead_ms)).collect()
     }
@@ -266,8 +265,8 @@ mod tests {
     fn an_offset_is_known_after_a_while() {
         let mut offset = ClockOffset::default();
         let learnt = listen(&mut offset, 0, 500);
-        assert!(learnt[..8].iter().all(|o| matches!(o, Err(TimingError::Unsettled { .. }))));
-        assert_eq!(learnt[8..], [Ok(-500); 4], "200 ms later");
+        assert!(learnt[..8].iter().all(is_learning));
+        assert_eq!(learnt[8..], vec![Ok(-500); 4], "200 ms later");
     }
 
     /// A server that kept two seconds of measurements and sends them all when it is called.
@@ -276,7 +275,7 @@ mod tests {
         let mut offset = ClockOffset::default();
         for n in 0..80 {
             let dated = update(&mut offset, 0, -2000 + 25 * n);
-            assert!(matches!(dated, Err(TimingError::Unsettled { .. })), "{n}: {dated:?}");
+            assert!(is_learning(&dated), "{n}: {dated:?}");
         }
         assert_eq!(listen(&mut offset, 25, 0).last(), Some(&Ok(0)));
     }
@@ -295,7 +294,8 @@ mod tests {
         let mut offset = ClockOffset::default();
         assert!(update(&mut offset, 0, 10_000).is_err());
         assert_eq!(listen(&mut offset, 25, 0).last(), Some(&Ok(0)));
-        assert_eq!(update(&mut offset, 400, 10_400), Err(TimingError::Ahead { by_s: 10.0 }));
+        let ahead = "stamp: 10.000 s ahead of the sender's clock so far; was it set?";
+        assert_eq!(update(&mut offset, 400, 10_400), Err(ahead.to_owned()));
         assert_eq!(update(&mut offset, 425, 425), Ok(0));
     }
 
@@ -304,8 +304,10 @@ mod tests {
         let mut offset = ClockOffset::default();
         listen(&mut offset, 0, 0);
         let after = listen(&mut offset, 300, 10_000);
-        assert!(after[..8].iter().all(|o| matches!(o, Err(TimingError::Ahead { .. }))));
-        assert_eq!(after[8..], [Ok(-10_000); 4]);
+        let is_ahead =
+            |dated: &Result<_, String>| matches!(dated, Err(why) if why.contains(" s ahead of "));
+        assert!(after[..8].iter().all(is_ahead));
+        assert_eq!(after[8..], vec![Ok(-10_000); 4]);
     }
 
     /// The offset is learnt after 200 ms, and reported. Until then no sample is dated.
@@ -316,8 +318,8 @@ mod tests {
             listen(&mut offset, 0, 0);
             let after = listen(&mut offset, 300, -by_ms);
             assert!(after[..8].iter().all(Result::is_err), "{by_ms}: {after:?}");
-            assert_eq!(after[8..], [Ok(by_ms); 4]);
-            let told = offset.news().map(|news| news.to_string()).unwrap();
+            assert_eq!(after[8..], vec![Ok(by_ms); 4]);
+            let told = offset.news().unwrap();
             let by_s = by_ms as f64 * 1e-3;
             assert_eq!(
                 told,
@@ -350,10 +352,8 @@ mod tests {
             assert_eq!(update(&mut offset, 25 * n + 300, 25 * n), Ok(0), "{n}");
             told.extend(offset.news());
         }
-        assert!(
-            matches!(told[..], [ClockNews::Late { by_s }] if (by_s - 0.3).abs() < 1e-9),
-            "{told:?}"
-        );
+        let late = "by their stamps, positions come 0.30 s later than before: ";
+        assert!(told.len() == 1 && told[0].starts_with(late), "{told:?}");
     }
 
     /// One that was sent again, or overtaken, in a stream that is late: its stamp goes back, those
@@ -362,10 +362,8 @@ mod tests {
     fn one_stamp_that_goes_back_is_no_clock_that_was_set() {
         let mut offset = ClockOffset::default();
         listen(&mut offset, 0, 0);
-        assert_eq!(
-            update(&mut offset, 300, -1000),
-            Err(TimingError::Backwards { by_s: seconds(1275 * MS) })
-        );
+        let back = "stamp: went back by 1.275 s; was the sender's clock set?";
+        assert_eq!(update(&mut offset, 300, -1000), Err(back.to_owned()));
         assert_eq!(update(&mut offset, 325, 325), Ok(0));
         assert!(update(&mut offset, 350, -950).is_err());
         for n in 15..60 {

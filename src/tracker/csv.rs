@@ -13,7 +13,6 @@ use crate::table::{Column, Row, Table, TableError};
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::time::Duration;
-use thiserror::Error;
 
 const COLUMN: Rule = named("the name of a column");
 
@@ -59,48 +58,30 @@ impl TimeColumns {
     }
 }
 
-/// Why a file was refused.
-#[derive(Debug, Clone, PartialEq, Error)]
-pub enum CsvError {
-    /// A column is missing, or a row or field is wrong.
-    #[error(transparent)]
-    Table(#[from] TableError),
-    /// A replay cannot keep a pace that goes back.
-    #[error("line {line}: time goes back by {by_ns} ns; is that the column to pace by?")]
-    Backwards {
-        /// Line in the file, from 1.
-        line: usize,
-        /// How far back, ns.
-        by_ns: i64,
-    },
-    /// The file has no sample.
-    #[error("no sample below the header")]
-    Empty,
-    /// The file has no sample after the time that is left out.
-    #[error("no sample after the first {} s, which are left out", .0.as_secs_f64())]
-    AllSkipped(Duration),
-}
-
 /// Reads all samples of `tool` in a recording, each with its time on the recording's own time line.
 ///
 /// # Errors
-/// [`CsvError`], with the line.
+/// What is wrong, with the line: a missing column, a wrong row, times that go back, no sample.
 pub fn recording(
     text: &str,
     mapping: &CsvMapping,
     tool: &str,
-) -> Result<Vec<(Time, Event)>, CsvError> {
+) -> Result<Vec<(Time, Event)>, String> {
     let table = Table::parse(text);
-    let columns = Columns::find(&table, mapping)?;
-    table.check_row_lengths()?;
+    let columns = Columns::find(&table, mapping).map_err(|error| error.to_string())?;
+    table.check_row_lengths().map_err(|error| error.to_string())?;
     let (mut events, mut first, mut newest) = (Vec::new(), None, None);
     for row in table.rows() {
-        let Some(sample) = columns.sample(row, mapping, tool)? else { continue };
+        let sample = columns.sample(row, mapping, tool).map_err(|error| error.to_string())?;
+        let Some(sample) = sample else { continue };
         let time = sample.receive_time;
         let by_ns =
             newest.map_or(0, |newest: Time| newest.as_nanos().saturating_sub(time.as_nanos()));
         if by_ns > 0 {
-            return Err(CsvError::Backwards { line: row.line, by_ns });
+            return Err(format!(
+                "line {}: time goes back by {by_ns} ns; is that the column to pace by?",
+                row.line
+            ));
         }
         newest = Some(time);
         if time.since(*first.get_or_insert(time)) >= mapping.skip {
@@ -109,8 +90,11 @@ pub fn recording(
     }
     match (events.is_empty(), newest) {
         (false, _) => Ok(events),
-        (true, Some(_)) => Err(CsvError::AllSkipped(mapping.skip)),
-        (true, None) => Err(CsvError::Empty),
+        (true, Some(_)) => {
+            let skip_s = mapping.skip.as_secs_f64();
+            Err(format!("no sample after the first {skip_s} s, which are left out"))
+        }
+        (true, None) => Err("no sample below the header".to_owned()),
     }
 }
 
@@ -151,18 +135,16 @@ impl Columns {
         if blank(&self.position) {
             return Ok(None);
         }
-        let mut position_mm = Vector3::zeros();
-        for (value, column) in position_mm.iter_mut().zip(&self.position) {
-            *value = row.number(column)? * mapping.position_unit_mm;
-        }
-        let mut wxyz = [0.0; 4];
-        let orientation = if blank(&self.quaternion_wxyz) {
-            Orientation::Absent
-        } else {
-            for (value, column) in wxyz.iter_mut().zip(&self.quaternion_wxyz) {
-                *value = row.number(column)?;
-            }
-            Orientation::of_quaternion(wxyz)
+        let numbers = |columns: &[Column]| -> Result<Vec<f64>, TableError> {
+            columns.iter().map(|column| row.number(column)).collect()
+        };
+        let position_mm = Vector3::from_vec(numbers(&self.position)?) * mapping.position_unit_mm;
+        let orientation = match blank(&self.quaternion_wxyz) {
+            true => Orientation::Absent,
+            false => match numbers(&self.quaternion_wxyz)?[..] {
+                [w, x, y, z] => Orientation::of_quaternion([w, x, y, z]),
+                _ => Orientation::Absent,
+            },
         };
         let stamp_ns = if self.stamp.is_empty() { 0 } else { sum_ns(row, &self.stamp)? };
         let sample = Sample {
@@ -267,7 +249,7 @@ mod tests {
     fn what_is_wrong_is_named_with_its_line() {
         let header = "sec,nanosec,x,y,z\n";
         let refusal = |text: &str, mapping: &CsvMapping| {
-            recording(text, mapping, "Tip").expect_err("refused").to_string()
+            recording(text, mapping, "Tip").expect_err("refused")
         };
         let row = |row: &str| refusal(&format!("{header}1,0,1,2,3\n{row}\n"), &mapping());
         assert_eq!(row("1,0,1,2"), "line 3: 4 fields where the header has 5");

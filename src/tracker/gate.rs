@@ -1,15 +1,19 @@
 //! What a sample must pass by itself, before it is dated and set against the others.
 
 use super::openigtlink::DEVICE_NAME_LEN;
-use super::refusal::Refusal;
+use super::refusal::{GateName, Refusal, short};
 use super::registration::Registration;
 use super::sample::{Sample, Validity};
-use crate::geometry::Pose;
 use crate::keys::{Rule, section, within};
+use crate::text::clipped;
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 
 /// How far the squared length of a quaternion may be from 1: rounding alone.
 const ROTATION_TOLERANCE: f64 = 1e-6;
+/// A message shows this many characters of what a peer chose.
+const SHOWN_MAX: usize = 40;
+/// Senders send this when they have no measurement.
+const ZERO_POSE: &str = "the exact zero pose, which stands for a tool that was not seen";
 
 /// Passes samples that can be a measurement at all. It checks in this order: the tool, finite
 /// numbers, a rotation, not the exact zero or identity that stands for "nothing seen", valid by the
@@ -48,15 +52,7 @@ impl Gate {
     /// True for a sample that is a measurement by itself, wherever the tracker stands: finite, a
     /// rotation, not the exact zero, and valid by the tracker's own word.
     pub fn is_measurement(sample: &Sample) -> bool {
-        let gate = Gate {
-            tool: sample.tool.clone(),
-            registration: Registration::new(Pose::identity()),
-            workspace: None,
-            rotation: true,
-            zero: true,
-            status: true,
-        };
-        gate.admit(sample).is_ok()
+        is_finite(&sample.position_mm) && check_word(sample, true, true, true).is_ok()
     }
 
     /// The tip's position on the bench, `p_WB` in mm, finite.
@@ -65,40 +61,23 @@ impl Gate {
     /// [`Refusal`], by the first check that fails.
     pub fn admit(&self, sample: &Sample) -> Result<Vector3<f64>, Refusal> {
         if !is_tool(&sample.tool, &self.tool) {
-            return Err(Refusal::OtherTool(sample.tool.clone()));
+            let sent = clipped(&sample.tool, SHOWN_MAX);
+            let why = format!("\"{sent}\" is not the tool steered by");
+            return Err(Refusal::new(GateName::Tool, why));
         }
         if !is_finite(&sample.position_mm) {
-            return Err(Refusal::NotFinite(sample.position_mm));
+            return Err(Refusal::not_finite(&sample.position_mm));
         }
-        self.check_word(sample)?;
+        check_word(sample, self.rotation, self.zero, self.status)?;
         let p_wb_mm = self.registration.tip_mm(sample)?;
         // The registration can overflow what was finite.
         if !is_finite(&p_wb_mm) {
-            return Err(Refusal::NotFinite(p_wb_mm));
+            return Err(Refusal::not_finite(&p_wb_mm));
         }
         if let Some(workspace) = &self.workspace {
             workspace.check(&p_wb_mm)?;
         }
         Ok(p_wb_mm)
-    }
-
-    /// Checks what the sample says itself: its orientation, its zeros, its status.
-    fn check_word(&self, sample: &Sample) -> Result<(), Refusal> {
-        let Gate { rotation, zero, status, .. } = *self;
-        let turned = sample.orientation.as_ref().is_none_or(is_rotation);
-        if rotation && !(turned && sample.validity != Validity::NotARotation) {
-            return Err(Refusal::NotARotation);
-        }
-        let at_zero = sample.position_mm == Vector3::zeros()
-            && sample.orientation.is_none_or(|q| q.to_rotation_matrix() == Rotation3::identity());
-        if zero && at_zero {
-            return Err(Refusal::ZeroPose);
-        }
-        match &sample.validity {
-            Validity::Valid | Validity::NotARotation => Ok(()),
-            invalid if status => Err(Refusal::Invalid(invalid.clone())),
-            _ => Ok(()),
-        }
     }
 }
 
@@ -106,17 +85,42 @@ impl Workspace {
     /// Whether the tip can be there.
     ///
     /// # Errors
-    /// [`Refusal::OutsideWorkspace`], by the first coordinate outside.
+    /// [`Refusal`], by the first coordinate outside.
     pub fn check(&self, p_wb_mm: &Vector3<f64>) -> Result<(), Refusal> {
         let limits = self.min_mm.iter().zip(&self.max_mm);
         for ((axis, &value_mm), (&min_mm, &max_mm)) in
             ['x', 'y', 'z'].iter().zip(p_wb_mm).zip(limits)
         {
             if !(min_mm..=max_mm).contains(&value_mm) {
-                return Err(Refusal::OutsideWorkspace { axis: *axis, value_mm, min_mm, max_mm });
+                let why = format!(
+                    "tip at {axis} = {} mm, outside {min_mm:.1} to {max_mm:.1} mm; check the registration",
+                    short(value_mm)
+                );
+                return Err(Refusal::new(GateName::Workspace, why));
             }
         }
         Ok(())
+    }
+}
+
+/// Checks what the sample says itself: its orientation, its zeros, its status.
+fn check_word(sample: &Sample, rotation: bool, zero: bool, status: bool) -> Result<(), Refusal> {
+    let turned = sample.orientation.as_ref().is_none_or(is_rotation);
+    if rotation && !(turned && sample.validity != Validity::NotARotation) {
+        return Err(Refusal::new(GateName::Rotation, "the orientation sent is not a rotation"));
+    }
+    let at_zero = sample.position_mm == Vector3::zeros()
+        && sample.orientation.is_none_or(|q| q.to_rotation_matrix() == Rotation3::identity());
+    if zero && at_zero {
+        return Err(Refusal::new(GateName::Zero, ZERO_POSE));
+    }
+    match &sample.validity {
+        Validity::Valid | Validity::NotARotation => Ok(()),
+        invalid if status => {
+            let why = clipped(&invalid.to_string(), SHOWN_MAX).into_owned();
+            Err(Refusal::new(GateName::Status, why))
+        }
+        _ => Ok(()),
     }
 }
 
@@ -138,8 +142,8 @@ pub fn is_tool(sent: &str, wanted: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::super::refusal::GateName;
     use super::*;
+    use crate::geometry::Pose;
     use crate::units::Time;
     use nalgebra::Quaternion;
     use proptest::prelude::*;
@@ -246,7 +250,7 @@ mod tests {
             error.to_string(),
             "registration: a tip offset of 8.00 mm needs an orientation; send TRANSFORM"
         );
-        assert_eq!(error.gate(), GateName::Registration);
+        assert_eq!(error.gate, GateName::Registration);
     }
 
     #[test]

@@ -2,8 +2,6 @@
 
 use crate::units::Time;
 use std::collections::VecDeque;
-use std::time::Duration;
-use thiserror::Error;
 
 /// A measured position of the stage.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -30,45 +28,6 @@ pub struct StageIncrement {
 pub struct StageHistory {
     points: VecDeque<StagePoint>,
     capacity: usize,
-    tolerance: Duration,
-}
-
-/// A time for which the history has no stage position.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-pub enum PairingError {
-    /// No position yet.
-    #[error("tracker: no stage position is known yet to pair a sample with")]
-    Empty,
-    /// From before the oldest position kept.
-    #[error(
-        "tracker: sample of {time} is {by_s:.3} s older than the oldest stage position kept; is \
-         tracker.latency_ms right, and does the sender's clock run?"
-    )]
-    TooOld {
-        /// The time asked for.
-        time: Time,
-        /// How much too old, s.
-        by_s: f64,
-    },
-    /// From after the newest position, by more than the tolerance.
-    #[error(
-        "tracker: sample of {time} is {by_s:.3} s newer than the last stage position (limit \
-         {limit_s:.3}); the stage's positions have stopped"
-    )]
-    TooNew {
-        /// The time asked for.
-        time: Time,
-        /// How much newer than the last position, s.
-        by_s: f64,
-        /// The tolerance, s.
-        limit_s: f64,
-    },
-    /// A stage position no later than the newest that is kept.
-    #[error("stage: position of {0} came after that of {1}")]
-    OutOfOrder(Time, Time),
-    /// An end before its beginning.
-    #[error("tracker: no stage motion from {0} back to {1}")]
-    Reversed(Time, Time),
 }
 
 impl StagePoint {
@@ -95,21 +54,24 @@ impl StagePoint {
 
 impl StageHistory {
     /// A history of the last `capacity` positions (at least two; a thousand are 10 s of SYNCs
-    /// every 10 ms). A sample up to `tolerance` newer than the last position is paired with that.
-    pub fn new(capacity: usize, tolerance: Duration) -> Self {
+    /// every 10 ms).
+    pub fn new(capacity: usize) -> Self {
         let capacity = capacity.max(2);
-        StageHistory { points: VecDeque::with_capacity(capacity), capacity, tolerance }
+        StageHistory { points: VecDeque::with_capacity(capacity), capacity }
     }
 
     /// Takes in the position of a SYNC; the oldest goes when the history is full.
     ///
     /// # Errors
-    /// `OutOfOrder` unless it is later than all before; it is left out.
-    pub fn push(&mut self, point: StagePoint) -> Result<(), PairingError> {
+    /// Unless it is later than all before; it is left out.
+    pub fn push(&mut self, point: StagePoint) -> Result<(), String> {
         if let Some(newest) = self.newest()
             && point.time <= newest.time
         {
-            return Err(PairingError::OutOfOrder(point.time, newest.time));
+            return Err(format!(
+                "stage: position of {} came after that of {}",
+                point.time, newest.time
+            ));
         }
         if self.points.len() == self.capacity {
             self.points.pop_front();
@@ -123,25 +85,27 @@ impl StageHistory {
         self.points.back()
     }
 
-    /// The stage at `time`: on the line between the positions before and after, or the newest
-    /// position as it is, for up to the tolerance.
+    /// The stage at `time`: on the line between the positions before and after.
     ///
     /// # Errors
-    /// `Empty`, `TooOld`, `TooNew`.
-    pub fn at(&self, time: Time) -> Result<StagePoint, PairingError> {
+    /// No position is kept of before `time`, or none of after it.
+    pub fn at(&self, time: Time) -> Result<StagePoint, String> {
         let (Some(oldest), Some(newest)) = (self.points.front(), self.points.back()) else {
-            return Err(PairingError::Empty);
+            return Err("tracker: no stage position is known yet to pair a sample with".to_owned());
         };
         if time < oldest.time {
-            return Err(PairingError::TooOld { time, by_s: oldest.time.seconds_after(time) });
+            return Err(format!(
+                "tracker: sample of {time} is {:.3} s older than the oldest stage position kept; is \
+                 tracker.latency_ms right, and does the sender's clock run?",
+                oldest.time.seconds_after(time)
+            ));
         }
-        let beyond = time.since(newest.time);
-        if beyond > self.tolerance {
-            return Err(PairingError::TooNew {
-                time,
-                by_s: beyond.as_secs_f64(),
-                limit_s: self.tolerance.as_secs_f64(),
-            });
+        if time > newest.time {
+            return Err(format!(
+                "tracker: sample of {time} is {:.3} s newer than the last stage position; the stage's \
+                 positions have stopped",
+                time.seconds_after(newest.time)
+            ));
         }
         let next = self.points.partition_point(|point| point.time <= time);
         Ok(match (next.checked_sub(1).and_then(|i| self.points.get(i)), self.points.get(next)) {
@@ -154,14 +118,14 @@ impl StageHistory {
     /// next, the first and last cut to the times asked for. Their sum is the whole motion.
     ///
     /// # Errors
-    /// As [`StageHistory::at`] for both ends; `Reversed`.
+    /// As [`StageHistory::at`] for both ends; an end before its beginning.
     pub fn between(
         &self,
         from: Time,
         to: Time,
-    ) -> Result<impl Iterator<Item = StageIncrement> + '_, PairingError> {
+    ) -> Result<impl Iterator<Item = StageIncrement> + '_, String> {
         if to < from {
-            return Err(PairingError::Reversed(from, to));
+            return Err(format!("tracker: no stage motion from {from} back to {to}"));
         }
         let (start, end) = (self.at(from)?, self.at(to)?);
         let first = self.points.partition_point(|point| point.time <= from);
@@ -179,8 +143,7 @@ impl StageHistory {
 mod tests {
     use super::*;
     use proptest::prelude::*;
-
-    const TOLERANCE: Duration = Duration::from_millis(15);
+    use std::time::Duration;
 
     fn ms(ms: f64) -> Time {
         Time::from_secs_f64(ms * 1e-3)
@@ -191,7 +154,7 @@ mod tests {
     }
 
     fn history() -> StageHistory {
-        let mut history = StageHistory::new(4, TOLERANCE);
+        let mut history = StageHistory::new(4);
         for (i, depth, turn) in [(0, 0.0, 0.0), (1, 1.0, 2.0), (2, 3.0, 2.0), (3, 3.0, -4.0)] {
             history.push(point(f64::from(i) * 10.0, depth, turn)).expect("in order");
         }
@@ -204,23 +167,25 @@ mod tests {
         assert_eq!(history.at(ms(5.0)), Ok(point(5.0, 0.5, 1.0)));
         assert_eq!(history.at(ms(10.0)), Ok(point(10.0, 1.0, 2.0)));
         assert_eq!(history.at(ms(30.0)), Ok(point(30.0, 3.0, -4.0)));
-        assert_eq!(history.at(ms(45.0)), Ok(point(45.0, 3.0, -4.0)));
     }
 
     #[test]
     fn times_outside_are_refused_with_numbers() {
-        assert_eq!(StageHistory::new(4, TOLERANCE).at(ms(0.0)), Err(PairingError::Empty));
+        assert!(StageHistory::new(4).at(ms(0.0)).is_err());
         let mut history = history();
         assert_eq!(
-            history.at(ms(50.0)).expect_err("too new").to_string(),
-            "tracker: sample of 0.050 s is 0.020 s newer than the last stage position (limit \
-             0.015); the stage's positions have stopped"
+            history.at(ms(50.0)).expect_err("too new"),
+            "tracker: sample of 0.050 s is 0.020 s newer than the last stage position; the stage's \
+             positions have stopped"
         );
         history.push(point(40.0, 3.0, 0.0)).expect("in order"); // the oldest goes
-        assert_eq!(history.at(ms(4.0)), Err(PairingError::TooOld { time: ms(4.0), by_s: 0.006 }));
+        let old =
+            "tracker: sample of 0.004 s is 0.006 s older than the oldest stage position kept; ";
+        let error = history.at(ms(4.0)).expect_err("too old");
+        assert!(error.starts_with(old), "{error}");
         assert_eq!(
-            history.push(point(40.0, 4.0, 0.0)),
-            Err(PairingError::OutOfOrder(ms(40.0), ms(40.0)))
+            history.push(point(40.0, 4.0, 0.0)).expect_err("out of order"),
+            "stage: position of 0.040 s came after that of 0.040 s"
         );
     }
 
@@ -232,12 +197,9 @@ mod tests {
         assert_eq!(path, [increment(0.5, 1.0), increment(2.0, 0.0), increment(0.0, -3.0)]);
         let whole: Vec<_> = history.between(ms(10.0), ms(20.0)).expect("known").collect();
         assert_eq!(whole, [increment(2.0, 0.0)]);
-        let still: Vec<_> = history.between(ms(40.0), ms(40.0)).expect("tolerated").collect();
+        let still: Vec<_> = history.between(ms(30.0), ms(30.0)).expect("known").collect();
         assert_eq!(still, [increment(0.0, 0.0)]);
-        assert!(matches!(
-            history.between(ms(2.0), ms(1.0)).err(),
-            Some(PairingError::Reversed { .. })
-        ));
+        assert!(history.between(ms(2.0), ms(1.0)).is_err(), "back");
     }
 
     proptest! {
@@ -247,7 +209,7 @@ mod tests {
             a in 0.0..1.0f64,
             b in 0.0..1.0f64,
         ) {
-            let mut history = StageHistory::new(32, TOLERANCE);
+            let mut history = StageHistory::new(32);
             let mut at = point(0.0, 0.0, 0.0);
             for (step_ms, depth, turn) in motions {
                 history.push(at).expect("in order");

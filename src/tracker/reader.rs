@@ -44,7 +44,7 @@ impl Reader {
         Reader {
             decoder: match protocol {
                 Protocol::OpenIgtLink => Decoder::OpenIgtLink(StreamDecoder::new()),
-                Protocol::Ndjson => Decoder::Ndjson(LineDecoder::new()),
+                Protocol::Ndjson => Decoder::Ndjson(LineDecoder::default()),
             },
             received: Time::ZERO,
             names: BTreeSet::new(),
@@ -79,7 +79,7 @@ impl Reader {
     pub fn finish(&self) -> Result<(), String> {
         match &self.decoder {
             Decoder::OpenIgtLink(decoder) => decoder.finish().map_err(|error| error.to_string()),
-            Decoder::Ndjson(decoder) => decoder.finish().map_err(|error| error.to_string()),
+            Decoder::Ndjson(decoder) => decoder.finish(),
         }
     }
 
@@ -94,7 +94,7 @@ impl Reader {
             Decoder::OpenIgtLink(decoder) => match decoder.poll() {
                 Ok(None) => return Ok(false),
                 Ok(Some(message)) => self.take_message(message),
-                Err(error) if error.loses_framing() => return Err(error.to_string()),
+                Err(error) if error.loses_framing => return Err(error.to_string()),
                 Err(error) => self.events.push_back(Event::Malformed(error.to_string())),
             },
             Decoder::Ndjson(decoder) => match decoder.poll() {
@@ -103,7 +103,7 @@ impl Reader {
                     self.messages += 1;
                     self.take_sample(line.into_sample(self.received), "NDJSON");
                 }
-                Err(error) => self.events.push_back(Event::Malformed(error.to_string())),
+                Err(error) => self.events.push_back(Event::Malformed(error)),
             },
         }
         Ok(true)
@@ -142,7 +142,7 @@ impl Reader {
 
 #[cfg(test)]
 mod tests {
-    use super::super::openigtlink::{Status, Tool, ToolKind, encode};
+    use super::super::openigtlink::{Status, Tool, encode, tool_kind};
     use super::*;
     use proptest::prelude::*;
     use proptest::sample::Index;
@@ -153,7 +153,7 @@ mod tests {
     fn openigtlink() -> Vec<u8> {
         let tool = |name: &str| Tool {
             name: name.to_owned(),
-            kind: ToolKind::SixD,
+            kind: tool_kind::SIX_D,
             pose: [0.0, 1.0, 2.0, 1.0, 0.0, 0.0, 0.0],
         };
         let status = Status {

@@ -1,6 +1,6 @@
 //! From the tracker's frame to the bench's, and from the sensor to the needle's tip.
 
-use super::refusal::Refusal;
+use super::refusal::{GateName, Refusal};
 use super::sample::Sample;
 use crate::geometry::Pose;
 use nalgebra::{Rotation3, Vector3};
@@ -34,14 +34,18 @@ impl Registration {
     /// overflow.
     ///
     /// # Errors
-    /// [`Refusal::NoOrientation`] when the tip is off the sensor and the sample has no orientation.
+    /// [`Refusal`] if the tip is off the sensor and the sample has no orientation.
     pub fn tip_mm(&self, sample: &Sample) -> Result<Vector3<f64>, Refusal> {
         let p_sb_mm = self.x_sb.translation;
         let offset_mm = match sample.orientation {
             _ if p_sb_mm == Vector3::zeros() => Vector3::zeros(),
             Some(orientation) => orientation * p_sb_mm,
             None => {
-                return Err(Refusal::NoOrientation { offset_mm: p_sb_mm.norm() });
+                let offset_mm = p_sb_mm.norm();
+                let why = format!(
+                    "a tip offset of {offset_mm:.2} mm needs an orientation; send TRANSFORM"
+                );
+                return Err(Refusal::new(GateName::Registration, why));
             }
         };
         Ok(self.x_wt.transform(&(sample.position_mm + offset_mm)))
@@ -100,9 +104,10 @@ mod tests {
         let turned = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), FRAC_PI_2);
         let tip = registration.tip_mm(&sample(Some(turned))).expect("has orientation");
         assert!((tip - Vector3::new(6.0, 2.0, 3.0)).norm() < 1e-12);
+        let refusal = registration.tip_mm(&sample(None)).expect_err("no orientation");
         assert_eq!(
-            registration.tip_mm(&sample(None)),
-            Err(Refusal::NoOrientation { offset_mm: 5.0 })
+            refusal.to_string(),
+            "registration: a tip offset of 5.00 mm needs an orientation; send TRANSFORM"
         );
     }
 

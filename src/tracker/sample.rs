@@ -1,7 +1,7 @@
 //! One measurement of a tool, whatever protocol it came by.
 
 use super::gate::is_tool;
-use super::openigtlink::{Body, Message, Quaternion, ToolKind};
+use super::openigtlink::{Body, Message, Quaternion, tool_kind};
 use super::orientation::Orientation;
 use crate::units::Time;
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};
@@ -110,7 +110,7 @@ impl Sample {
                 .iter()
                 .map(|tool| of_tool(&tool.name, tool.kind, quaternion_pose(&tool.pose)))
                 .collect(),
-            Body::Start(_) | Body::Stop(_) | Body::Status(_) | Body::Other(_) => Vec::new(),
+            Body::Status(_) | Body::Other(_) => Vec::new(),
         }
     }
 
@@ -176,13 +176,13 @@ fn quaternion_orientation(sent: &Quaternion) -> Orientation {
 }
 
 /// The orientation as far as a tool of this kind has one.
-fn as_known(kind: ToolKind, orientation: Orientation) -> Orientation {
-    if kind == ToolKind::ThreeD { Orientation::Absent } else { orientation }
+fn as_known(kind: u8, orientation: Orientation) -> Orientation {
+    if kind == tool_kind::THREE_D { Orientation::Absent } else { orientation }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::openigtlink::{IgtlStamp, Tool, Version};
+    use super::super::openigtlink::{IgtlStamp, Tool};
     use super::*;
 
     const AT: Time = Time::from_nanos(5);
@@ -191,7 +191,6 @@ mod tests {
     /// The samples of a version 2 message with `metadata`.
     fn samples(body: Body, metadata: &[(&str, &str)]) -> Vec<Sample> {
         let message = Message {
-            version: Version::V2 { message_id: 0 },
             metadata: metadata.iter().map(|(k, v)| (k.to_string(), v.to_string())).collect(),
             ..Message::new("Tip", IgtlStamp::from_unix_ns(1_500_000_000), body)
         };
@@ -205,9 +204,9 @@ mod tests {
     fn tools(metadata: &[(&str, &str)]) -> Vec<Sample> {
         let tool = |name: &str, kind| Tool { name: name.to_owned(), kind, pose: QUARTER_TURN };
         let tools = vec![
-            tool("Needle", ToolKind::SixD),
-            tool("ReferenceToTrackerBa", ToolKind::FiveD),
-            tool("Ball", ToolKind::ThreeD),
+            tool("Needle", tool_kind::SIX_D),
+            tool("ReferenceToTrackerBa", tool_kind::FIVE_D),
+            tool("Ball", tool_kind::THREE_D),
         ];
         samples(Body::TrackingData(tools), metadata)
     }
@@ -259,7 +258,7 @@ mod tests {
     fn qtdata_has_its_quaternion_w_last() {
         let half = std::f32::consts::FRAC_1_SQRT_2;
         let pose = [4.0, 5.0, 6.0, 0.0, 0.0, half, half];
-        let tool = Tool { name: "Needle".to_owned(), kind: ToolKind::SixD, pose };
+        let tool = Tool { name: "Needle".to_owned(), kind: tool_kind::SIX_D, pose };
         let sample = sample(Body::QuaternionTrackingData(vec![tool]));
         assert_eq!(sample.position_mm, Vector3::new(4.0, 5.0, 6.0));
         let orientation = sample.orientation.expect("unit");

@@ -1,11 +1,11 @@
 //! When a sample was measured, on the session's time line.
 
-use super::clock_offset::{ClockNews, ClockOffset};
+use super::clock_offset::ClockOffset;
+use super::refusal::{GateName, Refusal};
 use super::sample::Sample;
 use crate::keys::choice;
 use crate::units::Time;
 use std::time::Duration;
-use thiserror::Error;
 
 choice! {
     /// The stamp that dates a sample.
@@ -34,38 +34,7 @@ pub struct AcquisitionClock {
     offset: ClockOffset,
 }
 
-/// A sample that cannot be dated.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-pub enum TimingError {
-    /// The sender sends no stamps.
-    #[error("stamp: none is sent, and tracker.stamp is \"source\"; set \"receive\" or \"auto\"")]
-    NoStamp,
-    /// The last measurement was sent again.
-    #[error("duplicate: sent twice (stamp {unix_ns} ns)")]
-    Duplicate {
-        /// The stamp, ns since 1970.
-        unix_ns: i64,
-    },
-    /// The measurement is older than the one before.
-    #[error("stamp: went back by {by_s:.3} s; was the sender's clock set?")]
-    Backwards {
-        /// How far back, s.
-        by_s: f64,
-    },
-    /// The stamp is in the future, by the offset known so far.
-    #[error("stamp: {by_s:.3} s ahead of the sender's clock so far; was it set?")]
-    Ahead {
-        /// How far ahead, s.
-        by_s: f64,
-    },
-    /// Too few samples have come on this connection to know the sender's clock: the first ones may
-    /// have waited long before they were sent.
-    #[error("stamp: the sender's clock is still being learnt, from {samples} samples so far")]
-    Unsettled {
-        /// Samples it is being learnt from.
-        samples: u32,
-    },
-}
+const NO_STAMP: &str = "none is sent, and tracker.stamp is \"source\"; set \"receive\" or \"auto\"";
 
 impl AcquisitionClock {
     /// A clock with a fixed `latency` from measurement to stamp.
@@ -76,12 +45,12 @@ impl AcquisitionClock {
     /// When the sample was measured; never later than its receipt.
     ///
     /// # Errors
-    /// [`TimingError`]; never with [`StampPolicy::Receive`].
-    pub fn acquisition_time(&mut self, sample: &Sample) -> Result<Time, TimingError> {
+    /// [`Refusal`] of a sample that cannot be dated; never with [`StampPolicy::Receive`].
+    pub fn acquisition_time(&mut self, sample: &Sample) -> Result<Time, Refusal> {
         let stamp = match (self.policy, sample.source_unix_ns) {
             (StampPolicy::Receive, _) | (StampPolicy::Auto, None) => sample.receive_time,
             (StampPolicy::Source, None) => {
-                return Err(TimingError::NoStamp);
+                return Err(Refusal::new(GateName::Stamp, NO_STAMP));
             }
             (StampPolicy::Auto | StampPolicy::Source, Some(unix_ns)) => {
                 let offset_ns = self.offset.update(sample.receive_time, unix_ns)?;
@@ -97,7 +66,7 @@ impl AcquisitionClock {
     }
 
     /// What to tell the operator about the sender's clock since the last sample.
-    pub fn news(&mut self) -> Option<ClockNews> {
+    pub fn news(&mut self) -> Option<String> {
         self.offset.news()
     }
 }
@@ -127,16 +96,19 @@ mod tests {
         clock: &mut AcquisitionClock,
         receive_ms: i64,
         source_ms: Option<i64>,
-    ) -> Result<i64, TimingError> {
-        clock.acquisition_time(&sample(receive_ms, source_ms)).map(|time| time.as_nanos() / MS)
+    ) -> Result<i64, String> {
+        let dated = clock.acquisition_time(&sample(receive_ms, source_ms));
+        dated.map(|time| time.as_nanos() / MS).map_err(|refusal| refusal.to_string())
     }
+
+    const LEARNING: &str = "stamp: the sender's clock is still being learnt, from 1 samples so far";
 
     /// A clock that has learnt, at 1000 ms, that the sender's clock is 1000 ms ahead.
     fn settled(latency_ms: u64) -> AcquisitionClock {
         let mut clock = AcquisitionClock::new(StampPolicy::Auto, Duration::from_millis(latency_ms));
         let dated: Vec<_> =
             (0..11).map(|n| at_ms(&mut clock, n * 100, Some(1000 + n * 100))).collect();
-        assert!(matches!(dated[0], Err(TimingError::Unsettled { samples: 1 })));
+        assert_eq!(dated[0], Err(LEARNING.to_owned()));
         assert_eq!(dated[10], Ok(1000 - latency_ms as i64));
         clock
     }
@@ -157,17 +129,17 @@ mod tests {
         assert_eq!(at_ms(&mut receive, 100, Some(5)), Ok(90));
         assert_eq!(at_ms(&mut receive, 500, Some(1)), Ok(490));
         assert_eq!(at_ms(&mut clock(StampPolicy::Auto), 500, None), Ok(490));
-        let error = at_ms(&mut clock(StampPolicy::Source), 1, None);
-        assert_eq!(error, Err(TimingError::NoStamp));
+        let error = at_ms(&mut clock(StampPolicy::Source), 1, None).unwrap_err();
+        assert!(error.starts_with("stamp: none is sent, "), "{error}");
     }
 
     #[test]
     fn a_stamp_must_be_later_than_the_one_before() {
         let mut clock = settled(0);
-        let unix_ns = UNIX_NS + 2000 * MS;
-        assert_eq!(at_ms(&mut clock, 1010, Some(2000)), Err(TimingError::Duplicate { unix_ns }));
-        let back = at_ms(&mut clock, 1010, Some(1990));
-        assert_eq!(back, Err(TimingError::Backwards { by_s: 0.01 }));
+        let again = at_ms(&mut clock, 1010, Some(2000)).unwrap_err();
+        assert_eq!(again, "duplicate: sent twice (stamp 1700000002000000000 ns)");
+        let back = at_ms(&mut clock, 1010, Some(1990)).unwrap_err();
+        assert_eq!(back, "stamp: went back by 0.010 s; was the sender's clock set?");
         assert_eq!(at_ms(&mut clock, 1010, Some(2001)), Ok(1001));
     }
 
@@ -175,8 +147,9 @@ mod tests {
     #[test]
     fn one_stamp_ahead_changes_nothing_for_those_after_it() {
         let mut clock = settled(0);
-        let ahead = at_ms(&mut clock, 1025, Some(12_025));
-        assert_eq!(ahead, Err(TimingError::Ahead { by_s: 10.0 }));
+        let ahead = at_ms(&mut clock, 1025, Some(12_025)).unwrap_err();
+        let told = "stamp: 10.000 s ahead of the sender's clock so far; was it set?";
+        assert_eq!(ahead, told);
         assert_eq!(at_ms(&mut clock, 1050, Some(2050)), Ok(1050));
     }
 
@@ -185,7 +158,7 @@ mod tests {
         let mut clock = settled(0);
         clock.reconnected();
         let first = at_ms(&mut clock, 2000, Some(-500));
-        assert_eq!(first, Err(TimingError::Unsettled { samples: 1 }));
+        assert_eq!(first, Err(LEARNING.to_owned()));
     }
 
     proptest! {

@@ -1,6 +1,6 @@
 //! Whether the positions of a stream are one needle's: against one another, and the model.
 
-use super::refusal::Refusal;
+use super::refusal::{Effect, GateName, Refusal, short};
 use crate::keys::{choice, over, section, within};
 use crate::units::Time;
 use nalgebra::{Matrix3, Vector3};
@@ -110,6 +110,7 @@ const JUMP_CHI2_TIMES: f64 = 2.5;
 const LAG_CHI2_SHARE: f64 = 0.77;
 /// … and the standard deviation, mm, that any model is given besides what it says of itself.
 const JUMP_MODEL_SD_MM: f64 = 0.2;
+const NO_MODEL: &str = "no observer has an estimate yet to find the tip again";
 /// The period is averaged over about so many positions.
 const PERIOD_MEMORY: f64 = 16.0;
 
@@ -187,29 +188,21 @@ impl Track {
             Ok(()) => self.believe(fix),
             Err(refusal) => self.refuse(refusal),
         }
-        if matches!(judged, Err(Refusal::Jump { .. })) {
-            self.lose();
-        }
         judged
     }
 
     /// Takes note of a sample that another gate has refused.
     pub fn refuse(&mut self, refusal: &Refusal) {
-        let counts = match refusal {
-            Refusal::Repeat { .. } => self.settings.kind == TrackerKind::Electromagnetic,
-            _ => refusal.is_against_the_track(),
-        };
-        if counts {
+        let is_no_news =
+            refusal.gate == GateName::Repeat && self.settings.kind == TrackerKind::Imaging;
+        if refusal.effect != Effect::None && !is_no_news {
             self.refused = self.refused.saturating_add(1);
         }
-        if self.is_held() && self.refused >= self.settings.lost_after {
-            self.lose();
+        let is_over = self.is_held() && self.refused >= self.settings.lost_after;
+        if is_over || refusal.effect == Effect::Loses {
+            self.is_lost = true;
+            self.agreeing = 0;
         }
-    }
-
-    fn lose(&mut self) {
-        self.is_lost = true;
-        self.agreeing = 0;
     }
 
     /// What the operator sees at `now`.
@@ -247,7 +240,7 @@ impl Track {
         self.check_repeat(fix)?;
         let step = if self.is_lost { Ok(()) } else { self.check_step(fix) };
         let Some(prediction) = prediction else {
-            return if self.is_lost { Err(Refusal::NoModel) } else { step };
+            return if self.is_lost { Err(Refusal::new(GateName::Lost, NO_MODEL)) } else { step };
         };
         let agrees = self.check_innovation(fix, prediction);
         if self.innovations_mm.len() == JUMP_POSITIONS {
@@ -268,7 +261,8 @@ impl Track {
         agrees?;
         let (agreeing, needed) = (self.agreeing, self.settings.found_after);
         if agreeing < needed {
-            return Err(Refusal::NotFoundYet { agreeing, needed });
+            let why = format!("agrees with the model, {agreeing} of {needed} needed in a row");
+            return Err(Refusal::new(GateName::Lost, why));
         }
         let positions = self.innovations_mm.len().min(agreeing as usize);
         let limit = self.settings.innovation_chi2;
@@ -291,7 +285,7 @@ impl Track {
         let moved_mm = fix.insertion_mm.map_or(0.0, |mm| mm - came_at_mm);
         let is_measured_anew =
             self.settings.kind == TrackerKind::Electromagnetic && moved_mm.abs() <= STANDSTILL_MM;
-        if is_measured_anew { Ok(()) } else { Err(Refusal::Repeat { times: value.times }) }
+        if is_measured_anew { Ok(()) } else { Err(Refusal::repeat(value.times)) }
     }
 
     fn check_step(&self, fix: &Fix) -> Result<(), Refusal> {
@@ -301,7 +295,14 @@ impl Track {
         let after_s = fix.acquisition_time.seconds_after(last.acquisition_time).max(0.0);
         let limit_mm = tip_speed_max_mm_per_s * after_s + step_sds * noise_sd_mm;
         // Written so that NaN is refused.
-        if step_mm <= limit_mm { Ok(()) } else { Err(Refusal::Step { step_mm, after_s, limit_mm }) }
+        if step_mm <= limit_mm {
+            return Ok(());
+        }
+        let why = format!(
+            "{} mm in {after_s:.3} s since the last tip (limit {limit_mm:.1}); is it another tool?",
+            short(step_mm)
+        );
+        Err(Refusal::new(GateName::Step, why))
     }
 
     fn check_innovation(&mut self, fix: &Fix, prediction: &Prediction) -> Result<(), Refusal> {
@@ -317,7 +318,15 @@ impl Track {
             }
             self.innovations_mm.push_back(innovation);
         }
-        if agrees { Ok(()) } else { Err(Refusal::Innovation { distance_mm, chi2, limit }) }
+        if agrees {
+            return Ok(());
+        }
+        let why = format!(
+            "{} mm off the model, chi2 {} (limit {limit:.1}); a jump, or needle.radius_mm?",
+            short(distance_mm),
+            short(chi2)
+        );
+        Err(Refusal::new(GateName::Innovation, why))
     }
 
     /// Sets the mean of the last innovations, so many of them independent, against the model, and how far
@@ -339,7 +348,14 @@ impl Track {
             if chi2 <= limit {
                 continue;
             }
-            return Err(Refusal::Jump { distance_mm: off.norm(), positions, chi2, limit });
+            let why = format!(
+                "the mean of {positions} is {} mm off the model, chi2 {} (limit {limit:.1}): frozen \
+                 or jumped",
+                short(off.norm()),
+                short(chi2)
+            );
+            let refusal = Refusal::new(GateName::Innovation, why);
+            return Err(Refusal { effect: Effect::Loses, ..refusal });
         }
         Ok(())
     }

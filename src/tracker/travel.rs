@@ -7,7 +7,6 @@
 
 use nalgebra::Vector3;
 use std::collections::VecDeque;
-use thiserror::Error;
 
 /// Positions are summed over so much depth, mm.
 const BIN_MM: f64 = 0.25;
@@ -28,23 +27,6 @@ const LONG: (f64, f64) = (0.03, 0.5);
 /// much more than it is told to.
 const BEND_MORE: f64 = 1.3;
 
-/// The tip's travel contradicts the insertion.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-#[error(
-    "over the last {stretch_mm:.1} mm the tip travelled {ratio:.3} mm per mm inserted (expected {min:.3} \
-     to {max:.3}): is the stream frozen or of wrong scale, or needle.radius_mm wrong?"
-)]
-pub struct TravelError {
-    /// Depth over which it was seen, mm.
-    pub stretch_mm: f64,
-    /// Length of the slope of position over depth.
-    pub ratio: f64,
-    /// The least and the most that a needle may show there.
-    pub min: f64,
-    /// See `min`.
-    pub max: f64,
-}
-
 /// Follows the slope of the believed positions over the depth.
 #[derive(Debug, Clone)]
 pub struct TravelCheck {
@@ -53,7 +35,7 @@ pub struct TravelCheck {
     bins: VecDeque<Bin>,
     /// Number of the bin at the back.
     number: i64,
-    error: Option<TravelError>,
+    error: Option<String>,
 }
 
 /// Sums over the positions of a stretch: `Σ 1, Σ ℓ, Σ ℓ², Σ p, Σ ℓ p, Σ pᵀp`, depth and position
@@ -117,10 +99,9 @@ impl TravelCheck {
     /// Whether the tip may travel like this.
     ///
     /// # Errors
-    /// [`TravelError`] from the first stretch that contradicts the insertion on: the run is to be
-    /// stopped.
-    pub fn check(&self) -> Result<(), TravelError> {
-        self.error.map_or(Ok(()), Err)
+    /// From the first stretch on that contradicts the insertion: the run is to be stopped.
+    pub fn check(&self) -> Result<(), String> {
+        self.error.clone().map_or(Ok(()), Err)
     }
 
     /// Looks at every stretch that ends with the newest bin, the shortest first.
@@ -133,13 +114,13 @@ impl TravelCheck {
             if next == Some(&bins) {
                 next = stretches.next();
                 let error = self.contradiction(&sum, bins as f64 * BIN_MM);
-                self.error = self.error.or(error);
+                self.error = self.error.take().or(error);
             }
         }
     }
 
     /// What the sums over a stretch say against the insertion.
-    fn contradiction(&self, sum: &Bin, stretch_mm: f64) -> Option<TravelError> {
+    fn contradiction(&self, sum: &Bin, stretch_mm: f64) -> Option<String> {
         let n = sum.count;
         if n < POSITIONS_MIN {
             return None;
@@ -162,7 +143,13 @@ impl TravelCheck {
         // Noise makes the length of a slope longer, never shorter.
         let max = (1.0 + 2.0 * sd * sd).sqrt() + LONG.0 + LONG.1 / filled_mm + SDS * sd;
         // Written so that NaN is no contradiction: the positions are finite, and so is the slope.
-        (ratio < min || ratio > max).then_some(TravelError { stretch_mm, ratio, min, max })
+        (ratio < min || ratio > max).then(|| {
+            format!(
+                "over the last {stretch_mm:.1} mm the tip travelled {ratio:.3} mm per mm inserted \
+                 (expected {min:.3} to {max:.3}): is the stream frozen or of wrong scale, or \
+                 needle.radius_mm wrong?"
+            )
+        })
     }
 }
 
@@ -220,7 +207,7 @@ mod tests {
     fn a_contradiction_is_told_with_its_numbers() {
         let mut check = TravelCheck::new(0.6, 1.0 / 122.0);
         (0..100).for_each(|k| check.take(0.05 * f64::from(k), &Vector3::zeros()));
-        let text = check.check().unwrap_err().to_string();
+        let text = check.check().unwrap_err();
         assert!(
             text.contains(" mm the tip travelled 0.000 mm per mm inserted (expected 0."),
             "{text}"

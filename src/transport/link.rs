@@ -1,6 +1,6 @@
 //! A tracker's stream: a queue of events that a reader task or thread fills.
 
-use crate::tracker::openigtlink::StartStream;
+use crate::tracker::openigtlink::ToolStream;
 use crate::tracker::{Event, Protocol, Reader, Sieve};
 use crate::units::Time;
 use rtrb::{Consumer, Producer, RingBuffer};
@@ -18,7 +18,7 @@ pub struct LinkSettings {
     /// The tools whose samples are handed on; none for every tool.
     pub tools: Vec<String>,
     /// The stream to request from an OpenIGTLink peer when it is connected.
-    pub request: Option<StartStream>,
+    pub request: Option<ToolStream>,
     /// Wait before the first new attempt to connect; it doubles with each attempt.
     pub retry_first: Duration,
     /// A peer that is silent for this long may be gone. The bench reconnects to a server; a client is

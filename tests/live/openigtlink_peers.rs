@@ -5,7 +5,7 @@
 use crate::support::needed::skip;
 use crate::support::programs::beside_others;
 use needle_bench::tracker::openigtlink::{
-    Body, IgtlStamp, Message, Quaternion, StartStream, Status, Tool, ToolKind, ToolStream,
+    Body, IgtlStamp, Message, Quaternion, Status, Tool, ToolStream, tool_kind,
 };
 use needle_bench::tracker::{Event, Sample, Validity};
 use needle_bench::transport::link::{Link, LinkSettings};
@@ -78,7 +78,7 @@ fn free_port() -> u16 {
 fn served(
     program: &str,
     more_args: &[&str],
-    request: Option<StartStream>,
+    request: Option<ToolStream>,
     wanted: usize,
 ) -> Option<Vec<Event>> {
     let port = free_port();
@@ -140,12 +140,9 @@ fn positions_of_the_tracker_server_arrive() {
 #[test]
 fn a_stream_that_is_asked_for_arrives() {
     let _machine = beside_others();
-    let streams = [
-        ("TrackingDataServer", ToolStream::Tdata),
-        ("QuaternionTrackingDataServer", ToolStream::Qtdata),
-    ];
-    for (program, stream) in streams {
-        let request = StartStream { stream, period_ms: 5, coordinates: String::new() };
+    let streams = [("TrackingDataServer", "TDATA"), ("QuaternionTrackingDataServer", "QTDATA")];
+    for (program, name) in streams {
+        let request = ToolStream { name, period_ms: 5 };
         let Some(events) = served(program, &[], Some(request), 60) else { return };
         let samples = samples(events);
         for message in samples.chunks(3) {
@@ -186,10 +183,10 @@ fn what_the_bench_serves_is_printed_by_the_receiving_client() {
     runtime.block_on(async { timeout(HANGING, wait).await }).expect("it connects");
 
     let turned = [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 12.5, -3.25, 100.0];
-    let tool = |name: &str| Tool { name: name.to_owned(), kind: ToolKind::SixD, pose: turned };
+    let tool = |name: &str| Tool { name: name.to_owned(), kind: tool_kind::SIX_D, pose: turned };
     let quaternion = Tool {
         name: "NeedleToTracker".to_owned(),
-        kind: ToolKind::FiveD,
+        kind: tool_kind::FIVE_D,
         pose: [1.5, 2.0, 3.0, 0.5, -0.5, 0.5, 0.5],
     };
     let status = Status {

@@ -5,7 +5,7 @@ use needle_bench::canopen::cia402::{DriveState, Mode};
 use needle_bench::canopen::emcy::EmcyCode;
 use needle_bench::canopen::{Frame, NodeId};
 use needle_bench::config::Config;
-use needle_bench::emulator::fault::FaultKind;
+use needle_bench::emulator::fault::{Fault, FaultKind};
 use needle_bench::emulator::{StageOutput, VirtualStage};
 use needle_bench::runtime::talk_virtual;
 use needle_bench::stage::{
@@ -281,7 +281,12 @@ fn a_reset_clears_a_fault_whose_cause_is_gone() {
     let config = Config::from_sources(&[], &[]).unwrap();
     let stage_config = config.stage.to_stage(&config.can).unwrap();
     let mut stage = VirtualStage::new(config.virtual_stage().unwrap(), Time::ZERO);
-    stage.change_drive(0, Time::ZERO, FaultKind::Drive(EmcyCode(0x4210)), true);
+    stage.change_drive(
+        0,
+        Time::ZERO,
+        &Fault { code: Some(0x4210), ..Fault::of(FaultKind::DriveFault) },
+        true,
+    );
     stage.handle_timeout(Time::from_secs_f64(0.01));
     let status = |stage: &mut VirtualStage| {
         let mut reader = StatusReader::new(&stage_config, Time::ZERO);
@@ -299,8 +304,13 @@ fn a_reset_clears_a_fault_whose_cause_is_gone() {
         assert_eq!((after.error_history.len(), after.error_code), (0, None));
     }
     // An open safety input takes the torque: the drive stays in fault.
-    stage.change_drive(1, Time::ZERO, FaultKind::Drive(EmcyCode(0x4210)), true);
-    stage.change_drive(1, Time::ZERO, FaultKind::Interlock, true);
+    stage.change_drive(
+        1,
+        Time::ZERO,
+        &Fault { code: Some(0x4210), ..Fault::of(FaultKind::DriveFault) },
+        true,
+    );
+    stage.change_drive(1, Time::ZERO, &Fault::of(FaultKind::EmergencyStop), true);
     stage.handle_timeout(Time::from_secs_f64(20.0));
     let mut reset = Reset::new(&stage_config, Time::ZERO);
     talk_virtual(&mut reset, &mut stage);

@@ -8,7 +8,7 @@ use needle_bench::canopen::nmt::NmtState;
 use needle_bench::canopen::{Frame, NodeId};
 use needle_bench::config::Config;
 use needle_bench::emulator::drive::{Drive, DriveConfig, Identity};
-use needle_bench::emulator::fault::FaultKind;
+use needle_bench::emulator::fault::{Fault, FaultKind};
 use needle_bench::stage::{
     Axis, AxisConfig, AxisLimits, CountsRatio, Feedback, HomingConfig, Output, PerAxis, Reference,
     SetPoint, Sign, Stage, StageConfig, StageEvent, Zero,
@@ -198,7 +198,7 @@ fn fifteen_millimetres_and_five_turns_to_the_count() {
 fn an_emergency_stop_of_one_drive_stops_both() {
     let mut bench = Bench::new();
     bench.drive_on(100);
-    bench.drives[1].suffer(bench.now, FaultKind::NoVoltage, true);
+    bench.drives[1].apply_fault(bench.now, &Fault::of(FaultKind::NoVoltage), true);
     let struck_counts = bench.drives[0].position_counts_at(bench.now).round() as i64;
     let fault = bench.fault();
     assert!(fault.starts_with("rotation: emergency 0x3220 DC link undervoltage"), "{fault}");

@@ -9,6 +9,7 @@ use crate::session::{
     Approach, Direction, Lane, Progress, Record, SampleRecord, Severity, State, StepRecord,
 };
 use crate::stage::Axis;
+use crate::tracker::GateName;
 use crate::units::Time;
 use std::collections::{BTreeMap, VecDeque};
 use std::mem;
@@ -83,7 +84,7 @@ pub(super) struct Screen {
     /// Depth, and the estimated x, y and z at each step, mm.
     pub(super) path: Vec<[f64; 4]>,
     samples: VecDeque<(Time, ())>,
-    pub(super) refused: BTreeMap<&'static str, u64>,
+    pub(super) refused: BTreeMap<GateName, u64>,
     innovations: VecDeque<f64>,
     pub(super) drives: [Drive; 2],
     frames: VecDeque<(Time, u64)>,
@@ -180,7 +181,7 @@ impl Screen {
         let time = sample.received.receive_time;
         push_recent(&mut self.samples, time, ());
         if let Some(refusal) = &sample.refused {
-            *self.refused.entry(refusal.gate().name()).or_default() += 1;
+            *self.refused.entry(refusal.gate).or_default() += 1;
         }
     }
 

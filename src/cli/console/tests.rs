@@ -9,7 +9,7 @@ use crate::observer::Estimate;
 use crate::session::news;
 use crate::session::{Approach, Direction, SampleRecord, State, StepRecord};
 use crate::stage::{Axis, Feedback, SetPoint, StageEvent};
-use crate::tracker::{Refusal, Sample, Validity};
+use crate::tracker::{GateName, Refusal, Sample, Validity};
 use insta::assert_snapshot;
 use nalgebra::Vector3;
 use proptest::prelude::*;
@@ -58,8 +58,8 @@ fn inserted() -> Screen {
                 orientation: None,
                 validity: Validity::Valid,
             });
-            let refusal = Refusal::Innovation { distance_mm: 3.1, chi2: 30.0, limit: 16.3 };
-            sample.refused = (n % 400 == 0).then(|| Box::new(refusal));
+            let refusal = Refusal::new(GateName::Innovation, "3.1 mm off the model");
+            sample.refused = (n % 400 == 0).then_some(refusal);
             screen.take(&Record::Sample(sample));
         }
         if n % 50 == 0 {

@@ -217,7 +217,7 @@ impl Watch {
             let time = self.dates.acquisition_time(sample)?;
             // A value that is sent again is no new measurement, whatever its stamp.
             match self.last {
-                Some((_, last_mm)) if last_mm == position_mm => Err(Refusal::Repeat { times: 2 }),
+                Some((_, last_mm)) if last_mm == position_mm => Err(Refusal::repeat(2)),
                 _ => Ok((time, position_mm)),
             }
         });

@@ -3,12 +3,7 @@
 use std::time::Duration;
 
 use super::*;
-use crate::canopen::Frame;
-use crate::canopen::emcy::EmcyCode;
 use crate::emulator::drive::{Model, Switches};
-use crate::emulator::fault::{
-    Fault, FaultKind, FaultyDrives, FrameAction, FrameClass, Toward, Trigger,
-};
 
 #[test]
 fn faults_are_told_in_the_order_they_are_written() {
@@ -19,25 +14,15 @@ fn faults_are_told_in_the_order_they_are_written() {
          [[emulator.fault]]\nat_s = 0\nkind = \"foreign\"\nframe = \"181#0102\"\nperiod_ms = 20\n",
         &[],
     );
-    let millis = Duration::from_millis;
-    let delay = FaultKind::Frames {
-        action: FrameAction::Delay(Duration::from_micros(2500)),
-        frames: FrameClass::Pdo,
-        toward: Toward::Drives,
-        count: Some(3),
-    };
-    let foreign = FaultKind::Foreign { frame: Frame::new(0x181, &[1, 2]), every: Some(millis(20)) };
-    let fault = |trigger, kind| Fault { trigger, kind, drives: FaultyDrives::Both, duration: None };
+    let stage = config.virtual_stage().expect("valid");
+    let told: Vec<_> = stage.faults.iter().map(|f| (f.at_mm, f.at, f.to_string())).collect();
+    let at = |ms| Some(Duration::from_millis(ms));
     let expected = [
-        Fault {
-            drives: FaultyDrives::Rotation,
-            duration: Some(millis(100)),
-            ..fault(Trigger::AtDepth(10.0), delay)
-        },
-        fault(Trigger::AtTime(millis(1500)), FaultKind::Drive(EmcyCode(0x8611))),
-        fault(Trigger::AtTime(Duration::ZERO), foreign),
+        (Some(10.0), None, "rotation: PDOs to the drives late by 2.5 ms, 3 of them, for 0.1 s"),
+        (None, at(1500), "both drives: fault 0x8611 following error"),
+        (None, at(0), "foreign frame 181#0102 every 20 ms"),
     ];
-    assert_eq!(config.virtual_stage().expect("valid").faults, expected);
+    assert_eq!(told, expected.map(|(mm, after, text)| (mm, after, text.to_owned())));
     let again = loaded(&config.to_toml().expect("TOML"), &[]);
     assert_eq!(again, config);
 }
@@ -48,8 +33,8 @@ fn heartbeats_to_the_drives_are_the_benchs() {
     let set = "emulator.fault=[{ at_s = 1, kind = \"drop\", frames = \"heartbeat\", \
                toward = \"drives\" }]";
     let stage = loaded("", &[set, "can.bench_node=100"]).virtual_stage().expect("valid");
-    let FaultKind::Frames { frames, .. } = stage.faults[0].kind else { panic!("of frames") };
-    assert_eq!(frames.to_string(), "heartbeats of node 100");
+    let told = stage.faults[0].to_string();
+    assert_eq!(told, "both drives: heartbeats of node 100 to the drives lost");
 }
 
 #[test]

@@ -1,20 +1,18 @@
 //! The drive's program: state machine, stops and faults.
 
-mod statusword;
-
 use super::homing::{self, Homing};
 use super::inputs::{End, Inputs};
 use super::motion::Motion;
 use super::state_machine::{Command, transition};
 use super::{DriveConfig, Model};
 use crate::canopen::ObjectAddress;
-use crate::canopen::cia402::{Controlword, DriveState, Mode, object};
+use crate::canopen::cia402::{Controlword, DriveState, Mode, Statusword, object};
 use crate::canopen::emcy::{EmcyCode, error_register};
 use crate::canopen::nmt::NmtState;
 use crate::canopen::node::{Application, Device};
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::canopen::sdo::AbortCode;
-use crate::emulator::fault::FaultKind;
+use crate::emulator::fault::{Fault, FaultKind};
 use crate::units::Time;
 
 /// The modes that the drive supports.
@@ -24,15 +22,14 @@ const NEGATIVE_LIMIT_SWITCH: EmcyCode = EmcyCode(0xff06);
 const POSITIVE_LIMIT_SWITCH: EmcyCode = EmcyCode(0xff07);
 /// Emergency code of the safety input: an external error.
 const INTERLOCK: EmcyCode = EmcyCode(0x9000);
+/// Bit 15, manufacturer-specific: the axis was homed.
+const REFERENCED: u16 = 1 << 15;
 
 /// The axis behind the node. Positions are encoder counts, not wrapped to 32 bits; positions on the
 /// bus are relative to `zero`.
 #[derive(Debug, Clone)]
 pub struct Axis {
-    model: Model,
-    pub(super) speed_max_counts_per_s: f64,
-    pub(super) acceleration_max_counts_per_s2: f64,
-    pub(super) index_counts: u32,
+    pub(super) config: DriveConfig,
     pub(super) inputs: Inputs,
     state: DriveState,
     pub(super) motion: Motion,
@@ -66,12 +63,8 @@ pub struct Axis {
 }
 
 impl Axis {
-    pub(super) fn new(config: &DriveConfig) -> Self {
+    pub(super) fn new(config: DriveConfig) -> Self {
         Axis {
-            model: config.model,
-            speed_max_counts_per_s: config.speed_max_counts_per_s.into(),
-            acceleration_max_counts_per_s2: config.acceleration_max_counts_per_s2.into(),
-            index_counts: config.index_counts,
             inputs: Inputs { switches: config.switches, ..Inputs::default() },
             state: DriveState::SwitchOnDisabled,
             motion: Motion::Hold { at: config.start_counts as f64 },
@@ -90,6 +83,7 @@ impl Axis {
             homing: Homing::default(),
             onto: None,
             referenced: config.homed,
+            config,
         }
     }
 
@@ -102,8 +96,15 @@ impl Axis {
     }
 
     /// A fault of the axis begins or ends.
-    pub(super) fn suffer(&mut self, now: Time, kind: FaultKind, begins: bool, device: &mut Device) {
-        match kind {
+    pub(super) fn apply_fault(
+        &mut self,
+        now: Time,
+        fault: &Fault,
+        begins: bool,
+        device: &mut Device,
+    ) {
+        let stuck = |end| begins.then_some(end);
+        match fault.kind {
             FaultKind::Stall => {
                 self.stalled = begins;
                 if begins {
@@ -115,9 +116,13 @@ impl Axis {
                     }
                 }
             }
-            FaultKind::Drive(code) if begins => self.fault(now, code, code.register(), device),
-            FaultKind::Switch(end) => self.inputs.stuck = begins.then_some(end),
-            FaultKind::Interlock => {
+            FaultKind::DriveFault if begins => {
+                let code = EmcyCode(fault.code.unwrap_or_default());
+                self.fault(now, code, code.register(), device);
+            }
+            FaultKind::NegativeSwitch => self.inputs.stuck = stuck(End::Negative),
+            FaultKind::PositiveSwitch => self.inputs.stuck = stuck(End::Positive),
+            FaultKind::EmergencyStop => {
                 self.inputs.interlocked = begins;
                 self.without_torque(now, INTERLOCK, 0, device);
             }
@@ -292,7 +297,7 @@ impl Axis {
             }
             return;
         }
-        match (self.model, end) {
+        match (self.config.model, end) {
             (Model::Generic, _) => self.quick_stop(now, &device.objects),
             (Model::Epos4, End::Negative) => self.fault(now, NEGATIVE_LIMIT_SWITCH, 0, device),
             (Model::Epos4, End::Positive) => self.fault(now, POSITIVE_LIMIT_SWITCH, 0, device),
@@ -319,6 +324,40 @@ impl Axis {
         if ramped || self.mode(&device.objects) == Mode::NONE {
             self.brake(now, halt_deceleration(&device.objects));
         }
+    }
+
+    /// Object 0x6041.
+    fn statusword(&self, now: Time, device: &Device) -> u16 {
+        let follows = self.follows(device);
+        let powered =
+            matches!(self.state, DriveState::OperationEnabled | DriveState::QuickStopActive);
+        let stands = self.motion.end().is_none_or(|end| now >= end);
+        let limited = self.target_limited || self.lag != 0;
+        let on_switch = [End::Negative, End::Positive]
+            .into_iter()
+            .any(|end| self.inputs.is_closed(end, self.counts));
+        // The meaning of bits 10, 12 and 13 depends on the mode. In CSP bit 10 is reserved; this drive
+        // sets it when a halt or quick stop is over.
+        let following_error = device.is_active(EmcyCode::FOLLOWING_ERROR);
+        let (reached, bit_12, bit_13) = match self.mode(&device.objects) {
+            Mode::HOMING => {
+                let failed = self.homing == Homing::Failed;
+                (powered && stands, self.referenced && !failed, failed)
+            }
+            _ => (powered && stands && !follows, follows && !limited, following_error),
+        };
+        let flags = [
+            (Statusword::VOLTAGE_ENABLED, self.voltage),
+            (Statusword::REMOTE, device.nmt_state() == NmtState::Operational),
+            (Statusword::TARGET_REACHED, reached),
+            (Statusword::INTERNAL_LIMIT, follows && limited || powered && on_switch),
+            // These two bits have other names in homing.
+            (Statusword::FOLLOWS_COMMAND, bit_12),
+            (Statusword::FOLLOWING_ERROR, bit_13),
+            (REFERENCED, self.referenced && self.config.model == Model::Epos4),
+        ];
+        let set = flags.iter().filter(|(_, set)| *set).map(|(bit, _)| *bit);
+        set.fold(Statusword::state_bits(self.state), |word, bit| word | bit)
     }
 
     /// When the axis will reach a limit switch.

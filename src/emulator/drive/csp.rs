@@ -62,7 +62,7 @@ impl Axis {
         let distance = self.demand as f64 - from;
         let reach = self.speed_limit(objects) * seconds;
         let set = objects.integer(MAX_ACCELERATION) as f64;
-        let change = set.min(self.acceleration_max_counts_per_s2) * seconds * seconds;
+        let change = set.min(self.config.acceleration_max_counts_per_s2.into()) * seconds * seconds;
         let on = self.motion.velocity_at(now) * seconds;
         let way = distance.clamp(-reach, reach).clamp(on - change, on + change);
         if way == distance { self.demand as f64 } else { (from + way).round() }
@@ -70,7 +70,7 @@ impl Axis {
 
     pub(super) fn speed_limit(&self, objects: &ObjectDictionary) -> f64 {
         let set = objects.integer(object::MAX_PROFILE_VELOCITY) as f64;
-        set.min(self.speed_max_counts_per_s)
+        set.min(self.config.speed_max_counts_per_s.into())
     }
 }
 

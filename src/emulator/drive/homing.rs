@@ -4,7 +4,7 @@ use super::axis::{Axis, whole};
 use super::inputs::{End, Switches};
 use super::motion::Motion;
 use super::objects::MAX_ACCELERATION;
-use super::profile::{Profile, Ramps};
+use super::profile::Profile;
 use crate::canopen::cia402::{Controlword, Mode, object};
 use crate::canopen::emcy::{EmcyCode, error_register};
 use crate::canopen::node::Device;
@@ -109,39 +109,44 @@ impl Axis {
         }
     }
 
-    fn ramps(&self, fast: bool, objects: &ObjectDictionary) -> Ramps {
+    /// The limits of a move of homing: counts/s and counts/s².
+    fn limits(&self, fast: bool, objects: &ObjectDictionary) -> (f64, f64) {
         let speed = if fast { object::HOMING_SPEED_SWITCH } else { object::HOMING_SPEED_ZERO };
-        let rate = (objects.integer(object::HOMING_ACCELERATION) as f64)
+        let acceleration = (objects.integer(object::HOMING_ACCELERATION) as f64)
             .min(objects.integer(MAX_ACCELERATION) as f64)
-            .min(self.acceleration_max_counts_per_s2)
-            .max(1.0);
-        let speed = (objects.integer(speed) as f64).min(self.speed_limit(objects)).max(1.0);
-        Ramps { speed, acceleration: rate, deceleration: rate }
+            .min(self.config.acceleration_max_counts_per_s2.into());
+        let speed = (objects.integer(speed) as f64).min(self.speed_limit(objects));
+        (speed.max(1.0), acceleration.max(1.0))
     }
 
-    /// Starts a move. A blocked axis faults with a following error.
-    fn begin_move(&mut self, now: Time, to: i64, ramps: Ramps, device: &mut Device) {
+    /// Starts a move of an axis at rest. A blocked axis faults with a following error.
+    fn begin_move(&mut self, now: Time, leg: Leg, device: &mut Device) {
         if self.stalled {
             let register = error_register::PROFILE;
             return self.fault(now, EmcyCode::FOLLOWING_ERROR, register, device);
         }
-        let (from, speed) = (self.motion.position_at(now), self.motion.velocity_at(now));
-        self.demand = to;
-        self.motion = Motion::Ramped(Profile::new(now, from, speed, to as f64, ramps));
+        let (speed, acceleration) = self.limits(leg.fast, &device.objects);
+        let (from, to) = (self.motion.position_at(now), leg.to_counts as f64);
+        self.demand = leg.to_counts;
+        self.motion = Motion::Ramped(Profile::new(now, from, to, speed, acceleration));
     }
 
+    /// Plans homing from where the axis stands, or will stand.
     fn begin_homing(&mut self, now: Time, device: &mut Device) {
         self.referenced = false;
         let objects = &device.objects;
         let method = objects.integer(object::HOMING_METHOD);
-        let Ramps { speed, deceleration, .. } = self.ramps(true, objects);
-        let overrun = whole(speed * speed / (2.0 * deceleration)).max(1);
-        let (at, switches) = (whole(self.motion.position_at(now)), &self.inputs.switches);
-        self.homing = match plan(method, at, switches, self.index_counts, overrun) {
+        let (speed, acceleration) = self.limits(true, objects);
+        let overrun = whole(speed * speed / (2.0 * acceleration)).max(1);
+        self.brake(now, whole(acceleration));
+        let (at, switches) = (whole(self.motion.to()), &self.inputs.switches);
+        self.homing = match plan(method, at, switches, self.config.index_counts, overrun) {
             Some((legs, home_counts)) => Homing::Under { legs, home_counts },
             None => Homing::Failed,
         };
-        self.begin_next_leg(now, device);
+        if matches!(self.motion, Motion::Hold { .. }) {
+            self.begin_next_leg(now, device);
+        }
     }
 
     /// Starts the next leg of homing; the axis stands.
@@ -155,8 +160,7 @@ impl Axis {
         } else {
             let leg = legs.remove(0);
             self.onto = leg.onto;
-            let ramps = self.ramps(leg.fast, &device.objects);
-            self.begin_move(now, leg.to_counts, ramps, device);
+            self.begin_move(now, leg, device);
         }
     }
 

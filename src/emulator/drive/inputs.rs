@@ -1,13 +1,11 @@
 //! The drive's switches and safety input.
 
 /// An end of the axis's travel.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, derive_more::Display)]
-pub enum End {
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum End {
     /// Towards smaller counts.
-    #[display("negative")]
     Negative,
     /// Towards larger counts.
-    #[display("positive")]
     Positive,
 }
 

@@ -17,10 +17,10 @@ mod state_machine;
 #[cfg(test)]
 mod tests;
 
-pub use self::inputs::{End, Switches};
+pub use self::inputs::Switches;
 
 use self::axis::Axis;
-use super::fault::FaultKind;
+use super::fault::{Fault, FaultKind};
 use crate::canopen::cia402::DriveState;
 use crate::canopen::nmt::{NmtCommand, nmt_frame};
 use crate::canopen::node::Node;
@@ -125,8 +125,9 @@ pub type Drive = Node<Axis>;
 impl Drive {
     /// A drive that has just been switched on; its boot-up message waits to be sent.
     pub fn new(config: DriveConfig) -> Self {
-        let objects = objects::data_sheet(&config).objects(config.node);
-        Node::switched_on(Time::ZERO, config.node, objects, Axis::new(&config))
+        let node = config.node;
+        let objects = objects::data_sheet(&config).objects(node);
+        Node::switched_on(Time::ZERO, node, objects, Axis::new(config))
     }
 
     /// The state of the CiA 402 state machine.
@@ -135,23 +136,21 @@ impl Drive {
     }
 
     /// A fault of the drive or its axis begins or ends; faults of frames and of the bus do nothing here.
-    pub fn suffer(&mut self, now: Time, kind: FaultKind, begins: bool) {
-        match kind {
+    pub fn apply_fault(&mut self, now: Time, fault: &Fault, begins: bool) {
+        match fault.kind {
             // It restarts again at the end, so that its boot-up message is received.
             FaultKind::Restart => {
                 self.handle_frame(now, &nmt_frame(NmtCommand::ResetNode, Some(self.id())));
             }
             FaultKind::Stall
-            | FaultKind::Drive(_)
-            | FaultKind::Switch(_)
-            | FaultKind::Interlock
+            | FaultKind::DriveFault
+            | FaultKind::NegativeSwitch
+            | FaultKind::PositiveSwitch
+            | FaultKind::EmergencyStop
             | FaultKind::NoVoltage => {
-                self.apply(now, |axis, device| axis.suffer(now, kind, begins, device));
+                self.apply(now, |axis, device| axis.apply_fault(now, fault, begins, device));
             }
-            FaultKind::Frames { .. }
-            | FaultKind::Silent
-            | FaultKind::Bus(_)
-            | FaultKind::Foreign { .. } => {}
+            _ => {}
         }
     }
 

@@ -4,23 +4,14 @@ use std::time::Duration;
 
 use crate::units::Time;
 
-/// Limits of a move in counts and seconds; each is over zero.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Ramps {
-    pub(super) speed: f64,
-    pub(super) acceleration: f64,
-    pub(super) deceleration: f64,
-}
-
-/// A move from any speed to standstill at `to`.
+/// A move that ends with the axis at rest at `to`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Profile {
     start: Time,
     from: f64,
     to: f64,
-    /// Braking, if the axis moves away from the target or is too fast to stop in time; then
-    /// acceleration, constant speed, deceleration.
-    phases: [Phase; 4],
+    /// Acceleration, constant speed, deceleration.
+    phases: [Phase; 3],
 }
 
 /// Uniform acceleration for some time.
@@ -33,49 +24,34 @@ struct Phase {
 }
 
 impl Phase {
-    /// From one speed to another. It takes no time when they are equal.
-    fn ramp(from: f64, to: f64, rate: f64) -> Self {
-        let acceleration = rate.copysign(to - from);
-        Phase { seconds: (to - from) / acceleration, speed: from, acceleration }
-    }
-
     fn distance(&self, seconds: f64) -> f64 {
         self.speed * seconds + 0.5 * self.acceleration * seconds * seconds
     }
 }
 
 impl Profile {
-    /// The move to `to` of an axis at `from` that has `speed`.
-    pub(super) fn new(now: Time, from: f64, speed: f64, to: f64, ramps: Ramps) -> Self {
-        let Ramps { speed: speed_max, acceleration, deceleration } = ramps;
-        let stops_at = from + speed * speed.abs() / (2.0 * deceleration);
-        let overshoots = speed * (to - from) < 0.0 || (to - stops_at) * speed < 0.0;
-        let (brake, from_then, speed_then) = if overshoots {
-            (Phase::ramp(speed, 0.0, deceleration), stops_at, 0.0)
-        } else {
-            (Phase::default(), from, speed)
+    /// The move to `to` of an axis at rest at `from`, with the limits of speed, counts/s, and of
+    /// acceleration, counts/s².
+    pub(super) fn new(now: Time, from: f64, to: f64, speed_max: f64, acceleration: f64) -> Self {
+        let distance = (to - from).abs();
+        let top = (distance * acceleration).sqrt().min(speed_max);
+        let ramp_s = top / acceleration;
+        let along_s = if top > 0.0 { (distance / top - ramp_s).max(0.0) } else { 0.0 };
+        let direction = if to < from { -1.0 } else { 1.0 };
+        let phase = |seconds, speed: f64, acceleration: f64| Phase {
+            seconds,
+            speed: direction * speed,
+            acceleration: direction * acceleration,
         };
-        let direction = if to < from_then { -1.0 } else { 1.0 };
-        let (distance, begin) = ((to - from_then).abs(), speed_then.abs());
-        // The peak speed of a move without a part at constant speed.
-        let peak = ((distance + begin * begin / (2.0 * acceleration))
-            / (0.5 / acceleration + 0.5 / deceleration))
-            .sqrt();
-        let top = peak.min(speed_max);
-        let rate = if top < begin { deceleration } else { acceleration };
-        let up = Phase::ramp(direction * begin, direction * top, rate);
-        let down = Phase::ramp(direction * top, 0.0, deceleration);
-        let ramps = (up.distance(up.seconds) + down.distance(down.seconds)).abs();
-        let seconds = if top > 0.0 { ((distance - ramps) / top).max(0.0) } else { 0.0 };
-        let along = Phase { seconds, speed: direction * top, acceleration: 0.0 };
-        Profile { start: now, from, to, phases: [brake, up, along, down] }
+        let up = phase(ramp_s, 0.0, acceleration);
+        let phases = [up, phase(along_s, top, 0.0), phase(ramp_s, top, -acceleration)];
+        Profile { start: now, from, to, phases }
     }
 
     /// Uniform braking from `speed`, to stand at `to` after this time.
     pub(super) fn braking(now: Time, from: f64, speed: f64, to: f64, seconds: f64) -> Self {
         let brake = Phase { seconds, speed, acceleration: -speed / seconds };
-        let phases = [brake, Phase::default(), Phase::default(), Phase::default()];
-        Profile { start: now, from, to, phases }
+        Profile { start: now, from, to, phases: [brake, Phase::default(), Phase::default()] }
     }
 
     /// When the axis will stand.
@@ -122,46 +98,45 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    const RAMPS: Ramps = Ramps { speed: 1000.0, acceleration: 2000.0, deceleration: 4000.0 };
+    /// A move at up to 1000 counts/s, with 2000 counts/s².
+    fn profile(from: f64, to: f64) -> Profile {
+        Profile::new(at(0.0), from, to, 1000.0, 2000.0)
+    }
 
     fn at(seconds: f64) -> Time {
         Time::from_secs_f64(seconds)
     }
 
-    /// Up in 0.5 s (250 counts), along, down in 0.25 s (125 counts).
+    /// Up in 0.5 s (250 counts), along, down in as much.
     #[test]
     fn a_long_move_is_a_trapezoid() {
-        let profile = Profile::new(at(0.0), 0.0, 0.0, -1375.0, RAMPS);
-        assert!((profile.end().as_secs_f64() - 1.75).abs() < 1e-9);
+        let profile = profile(0.0, -1500.0);
+        assert!((profile.end().as_secs_f64() - 2.0).abs() < 1e-9);
         assert!((profile.position_at(at(0.5)) + 250.0).abs() < 1e-6);
         assert!((profile.velocity_at(at(1.0)) + 1000.0).abs() < 1e-6);
         assert!((profile.position_at(at(1.5)) + 1250.0).abs() < 1e-6);
-        assert_eq!(profile.position_at(at(2.0)), -1375.0);
-        assert_eq!(profile.velocity_at(at(2.0)), 0.0);
+        assert_eq!(profile.position_at(at(2.1)), -1500.0);
+        assert_eq!(profile.velocity_at(at(2.1)), 0.0);
     }
 
-    /// 1.5 counts: 0.5 at 2000 counts/s² or so up, the rest at twice that down.
     #[test]
     fn a_short_move_is_a_triangle() {
-        let profile = Profile::new(at(0.0), 0.0, 0.0, 300.0, RAMPS);
-        let peak = (300.0_f64 / (1.0 / 4000.0 + 1.0 / 8000.0)).sqrt();
+        let peak = (300.0_f64 * 2000.0).sqrt();
         assert!(peak < 1000.0);
-        let seconds = peak / 2000.0 + peak / 4000.0;
-        assert!((profile.end().as_secs_f64() - seconds).abs() < 1e-8);
+        let seconds = 2.0 * peak / 2000.0;
+        assert!((profile(0.0, 300.0).end().as_secs_f64() - seconds).abs() < 1e-8);
     }
 
     proptest! {
-        /// Whatever the axis does at the begin: it moves without a jump, never faster than it may
-        /// or did, and stands at the target at the end.
+        /// It moves without a jump, never faster than it may, and stands at the target at the end.
         #[test]
         fn moves_are_smooth_and_end_at_their_target(
             from in -5000.0..5000.0f64,
-            speed in -3000.0..3000.0f64,
             to in -5000.0..5000.0f64,
         ) {
-            let profile = Profile::new(at(0.0), from, speed, to, RAMPS);
+            let profile = profile(from, to);
             let end = profile.end().as_secs_f64();
-            let fastest = speed.abs().max(1000.0) + 1e-6;
+            let fastest = 1000.0 + 1e-6;
             let steps = 500;
             let dt = end / f64::from(steps);
             let mut before = from;

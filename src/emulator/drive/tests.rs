@@ -10,7 +10,6 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::canopen::cia402::{EnableSequence, Statusword, object};
-use crate::canopen::emcy::EmcyCode;
 use crate::canopen::nmt::NmtState;
 use crate::canopen::nmt::heartbeat_frame;
 use crate::canopen::pdo::MappedObject;
@@ -324,7 +323,7 @@ fn software_limits_cut_the_target() {
 #[test]
 fn without_voltage_there_is_no_power() {
     let mut bench = moving();
-    bench.drive.suffer(bench.now, FaultKind::NoVoltage, true);
+    bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::NoVoltage), true);
     bench.take();
     bench.pass(PERIOD);
     assert_eq!((bench.state(), bench.position()), (DriveState::Fault, 300.0));
@@ -332,7 +331,7 @@ fn without_voltage_there_is_no_power() {
     bench.cycle(0x00, 300);
     bench.cycle(0x80, 300);
     assert_eq!(bench.state(), DriveState::Fault);
-    bench.drive.suffer(bench.now, FaultKind::NoVoltage, false);
+    bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::NoVoltage), false);
     bench.enable();
 }
 
@@ -399,7 +398,7 @@ proptest! {
                 Input::Sync => { bench.give(sync_frame()); }
                 Input::Nmt(command) => bench.nmt(command),
                 Input::Voltage(on) => {
-                    bench.drive.suffer(bench.now, FaultKind::NoVoltage, !on);
+                    bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::NoVoltage), !on);
                     bench.take();
                 }
                 Input::Wait(ms) => bench.pass(Duration::from_millis(ms)),

@@ -3,36 +3,14 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use super::{Fault, FaultKind};
 use crate::canopen::{CanId, Frame};
 use crate::units::Time;
 
-/// What a fault does to a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, derive_more::Display)]
-pub enum FrameAction {
-    /// It is lost.
-    #[display("lost")]
-    Drop,
-    /// It arrives later by this time; the frames after it may overtake it.
-    #[display("late by {} ms", _0.as_secs_f64() * 1e3)]
-    Delay(Duration),
-    /// It arrives twice.
-    #[display("doubled")]
-    Duplicate,
-    /// It arrives after the next frame; if there is no next frame, it is lost.
-    #[display("out of order")]
-    Reorder,
-    /// The bits of this data byte, counted from 0, are inverted. A shorter frame is not changed.
-    #[display("with byte {_0} corrupted")]
-    Corrupt(u8),
-    /// It has this many data bytes, at most 8: cut off, or filled up with zeros.
-    #[display("of {_0} bytes")]
-    Resize(u8),
-}
-
 /// A fault on a line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone)]
 pub(in crate::emulator) struct FrameFault {
-    pub(in crate::emulator) action: FrameAction,
+    pub(in crate::emulator) fault: Fault,
     /// The identifier of the frames it acts on; `None` for all frames.
     pub(in crate::emulator) id: Option<CanId>,
     /// The first time at which it acts no more.
@@ -73,16 +51,17 @@ impl FaultyLine {
         let (mut late, mut held) = (Duration::ZERO, false);
         for fault in self.faults.iter_mut().filter(|fault| fault.acts_on(now, frame)) {
             fault.count = fault.count.map(|left| left - 1);
-            match fault.action {
-                FrameAction::Drop => {
+            match fault.fault.kind {
+                FaultKind::Delay => late += fault.fault.delay.unwrap_or_default(),
+                FaultKind::Duplicate => copies *= 2,
+                FaultKind::Reorder => held = true,
+                FaultKind::Corrupt | FaultKind::Resize => {
+                    changed = fault.fault.applied_to(&changed)
+                }
+                _ => {
                     copies = 0;
                     break;
                 }
-                FrameAction::Delay(delay) => late += delay,
-                FrameAction::Duplicate => copies *= 2,
-                FrameAction::Reorder => held = true,
-                FrameAction::Corrupt(byte) => changed = corrupted(&changed, byte),
-                FrameAction::Resize(len) => changed = resized(&changed, len),
             }
         }
         for _ in 0..copies {
@@ -114,23 +93,20 @@ impl FaultyLine {
     }
 }
 
-/// `frame` with the bits of data byte number `byte` inverted.
-fn corrupted(frame: &Frame, byte: u8) -> Frame {
-    let mut data = [0; 8];
-    let data = &mut data[..frame.data().len()];
-    data.copy_from_slice(frame.data());
-    if let Some(byte) = data.get_mut(usize::from(byte)) {
-        *byte = !*byte;
+impl Fault {
+    /// `frame` with a byte inverted, or of another length: cut off, or filled up with zeros.
+    fn applied_to(&self, frame: &Frame) -> Frame {
+        let (mut data, mut len) = ([0; 8], frame.data().len());
+        data[..len].copy_from_slice(frame.data());
+        match self.kind {
+            FaultKind::Resize => len = usize::from(self.length.unwrap_or(0).min(8)),
+            _ => {
+                let byte = usize::from(self.byte.unwrap_or(0));
+                data[..len].iter_mut().skip(byte).take(1).for_each(|byte| *byte = !*byte);
+            }
+        }
+        Frame::from_parts(frame.id(), frame.is_remote(), &data[..len]).unwrap_or(*frame)
     }
-    Frame::from_parts(frame.id(), frame.is_remote(), data).unwrap_or(*frame)
-}
-
-/// `frame` with `len` bytes of data.
-fn resized(frame: &Frame, len: u8) -> Frame {
-    let mut data = [0; 8];
-    data.iter_mut().zip(frame.data()).for_each(|(to, from)| *to = *from);
-    let data = &data[..usize::from(len.min(8))];
-    Frame::from_parts(frame.id(), frame.is_remote(), data).unwrap_or(*frame)
 }
 
 #[cfg(test)]
@@ -146,8 +122,8 @@ mod tests {
         Time::from_nanos(ms * 1_000_000)
     }
 
-    fn on_all(action: FrameAction) -> FrameFault {
-        FrameFault { action, id: None, until: Time::NEVER, count: None }
+    fn on_all(kind: FaultKind) -> FrameFault {
+        FrameFault { fault: Fault::of(kind), id: None, until: Time::NEVER, count: None }
     }
 
     /// What arrives, and when in ms, of frames 0 to 3 sent 10 ms apart; the fault begins with frame 1.
@@ -156,7 +132,7 @@ mod tests {
         let mut arrivals = Vec::new();
         for ms in 0..60 {
             if ms == 10 {
-                line.add(fault);
+                line.add(fault.clone());
             }
             if ms % 10 == 0 && ms < 40 {
                 line.handle(at(ms), &frame(ms as u8 / 10));
@@ -171,40 +147,45 @@ mod tests {
     }
 
     /// A fault on frames 1 and 2 at most.
-    fn to_the_middle(action: FrameAction) -> FrameFault {
-        FrameFault { until: at(30), ..on_all(action) }
+    fn to_the_middle(kind: FaultKind) -> FrameFault {
+        FrameFault { until: at(30), ..on_all(kind) }
     }
 
     #[test]
     fn each_action_does_what_it_says() {
-        let once = |action| arrivals(FrameFault { count: Some(1), ..to_the_middle(action) });
+        let once = |fault: Fault| {
+            arrivals(FrameFault { count: Some(1), fault, ..to_the_middle(FaultKind::Drop) })
+        };
         let order = |arrivals: Vec<(i64, Vec<u8>)>| {
             arrivals.into_iter().map(|(ms, data)| (ms, data[0])).collect::<Vec<_>>()
         };
-        assert_eq!(order(arrivals(to_the_middle(FrameAction::Drop))), [(0, 0), (30, 3)]);
-        let late = FrameAction::Delay(Duration::from_millis(15));
+        assert_eq!(order(arrivals(to_the_middle(FaultKind::Drop))), [(0, 0), (30, 3)]);
+        let delay = Some(Duration::from_millis(15));
+        let late = Fault { delay, ..Fault::of(FaultKind::Delay) };
         assert_eq!(order(once(late)), [(0, 0), (20, 2), (25, 1), (30, 3)]);
-        assert_eq!(
-            order(once(FrameAction::Duplicate)),
-            [(0, 0), (10, 1), (10, 1), (20, 2), (30, 3)]
-        );
-        assert_eq!(order(once(FrameAction::Reorder)), [(0, 0), (20, 2), (20, 1), (30, 3)]);
-        let second = |action| once(action)[1].1.clone();
-        assert_eq!(second(FrameAction::Corrupt(1)), [1, 0x00]);
-        assert_eq!(second(FrameAction::Corrupt(2)), [1, 0xFF]);
-        assert_eq!(second(FrameAction::Resize(1)), [1]);
-        assert_eq!(second(FrameAction::Resize(9)), [1, 0xFF, 0, 0, 0, 0, 0, 0]);
+        let twice = once(Fault::of(FaultKind::Duplicate));
+        assert_eq!(order(twice), [(0, 0), (10, 1), (10, 1), (20, 2), (30, 3)]);
+        let swapped = once(Fault::of(FaultKind::Reorder));
+        assert_eq!(order(swapped), [(0, 0), (20, 2), (20, 1), (30, 3)]);
+        let corrupt = |byte| Fault { byte, ..Fault::of(FaultKind::Corrupt) };
+        let resize = |length| Fault { length, ..Fault::of(FaultKind::Resize) };
+        let second = |fault| once(fault)[1].1.clone();
+        assert_eq!(second(corrupt(None)), [0xFE, 0xFF]);
+        assert_eq!(second(corrupt(Some(1))), [1, 0x00]);
+        assert_eq!(second(corrupt(Some(2))), [1, 0xFF]);
+        assert_eq!(second(resize(Some(1))), [1]);
+        assert_eq!(second(resize(Some(8))), [1, 0xFF, 0, 0, 0, 0, 0, 0]);
     }
 
     #[test]
     fn a_fault_acts_on_its_own_identifier_and_in_order() {
-        let only = |id| FrameFault { id: Some(CanId::Base(id)), ..on_all(FrameAction::Drop) };
+        let only = |id| FrameFault { id: Some(CanId::Base(id)), ..on_all(FaultKind::Drop) };
         let mut line = FaultyLine::default();
         line.add(only(0x182));
         line.handle(at(0), &frame(7));
         assert_eq!(line.poll(at(0)), Some(frame(7)));
         line.add(only(0x181));
-        line.add(on_all(FrameAction::Duplicate));
+        line.add(on_all(FaultKind::Duplicate));
         line.handle(at(0), &frame(7));
         assert_eq!(line.poll(at(0)), None);
     }

@@ -1,42 +1,101 @@
-//! Faults scripted into an emulated stage: what goes wrong, where, when and for how long.
+//! `[[emulator.fault]]`: faults scripted into the emulated stage.
 
 mod line;
 mod script;
-mod settings;
 
-pub use line::FrameAction;
 pub(super) use line::{FaultyLine, FrameFault};
 pub(super) use script::{Change, Script};
-pub use settings::{FaultConfig, FaultName};
 
+use crate::canopen::emcy::EmcyCode;
+use crate::canopen::{CanId, Frame, NodeId, cob};
+use crate::keys::{Field, Rule, choice, over, section, within};
 use std::fmt;
 use std::time::Duration;
 
-use super::drive::End;
-use crate::canopen::emcy::EmcyCode;
-use crate::canopen::{CanId, Frame, NodeId, cob};
+const FRAME: Rule =
+    Rule::Text("a frame such as \"181#37020000\"", |text| data_frame(text).is_some());
 
-/// A scripted fault. It begins once.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Fault {
-    /// When it begins.
-    pub trigger: Trigger,
-    /// What goes wrong.
-    pub kind: FaultKind,
-    /// The drives it concerns, if it concerns a drive.
-    pub drives: FaultyDrives,
-    /// How long it lasts; `None` for the rest of the run.
-    pub duration: Option<Duration>,
+section! {
+    /// One `[[emulator.fault]]`: what goes wrong in the emulated stage, when, and for how long. It begins
+    /// once.
+    pub struct Fault {
+        /// What goes wrong.
+        kind: FaultKind;
+        /// It begins when the needle truly passes this depth, either way, mm.
+        at_mm: Option<f64> [within(-1000.0, 1000.0)];
+        /// It begins so long after the stage was switched on.
+        at as "at_s": Option<Duration> [within(0.0, 86_400.0)], instead_of("at_mm");
+        /// The drives that have the fault.
+        axis: FaultyDrives = "both";
+        /// How long the fault lasts; left out, for good.
+        duration as "duration_s": Option<Duration> [over(0.0, 86_400.0)];
+        /// Of faults of frames: which frames. Heartbeats toward the drives are the bench's.
+        frames: FrameClass = "any";
+        /// Of faults of frames: on their way to whom.
+        toward: Toward = "bench";
+        /// Of faults of frames: so many frames; left out, all.
+        count: Option<u32> [within(1.0, u32::MAX as f64)];
+        /// Of "delay": how late the frames are; with frames = "sdo" a slow server.
+        delay as "delay_ms": Option<Duration> [over(0.0, 60_000.0)];
+        /// Of "corrupt": the byte that is inverted, from 0; left out, the first.
+        byte: Option<u8> [within(0.0, 7.0)];
+        /// Of "resize": bytes.
+        length: Option<u8> [within(0.0, 8.0)];
+        /// Of "drive-fault": its emergency code.
+        code: Option<u16> [within(1.0, u16::MAX as f64)];
+        /// Of "foreign": the frame, as candump writes it.
+        frame: Option<String> [FRAME];
+        /// Of "foreign": time between two frames; left out, one frame.
+        period as "period_ms": Option<Duration> [within(0.1, 60_000.0)];
+    }
+    beside {
+        /// The node of the bench, whose heartbeat the drives watch.
+        pub bench: Option<NodeId> = None,
+    }
 }
 
-/// When a fault begins.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Trigger {
-    /// When the true depth passes this value in either direction, mm from the position at power-on.
-    /// The depth is checked every millisecond and at every frame.
-    AtDepth(f64),
-    /// This long after power-on.
-    AtTime(Duration),
+choice! {
+    /// What goes wrong.
+    pub enum FaultKind {
+        /// Frames are lost.
+        Drop = "drop",
+        /// Frames come late.
+        Delay = "delay",
+        /// Frames come twice.
+        Duplicate = "duplicate",
+        /// Frames come after the next.
+        Reorder = "reorder",
+        /// A byte of frames is inverted.
+        Corrupt = "corrupt",
+        /// Frames have another length.
+        Resize = "resize",
+        /// A node is off the bus.
+        Silent = "silent",
+        /// A node restarts.
+        Restart = "restart",
+        /// An axis is blocked.
+        Stall = "stall",
+        /// A drive finds a fault by itself.
+        DriveFault = "drive-fault",
+        /// The negative limit switch closes.
+        NegativeSwitch = "negative-switch",
+        /// The positive limit switch closes.
+        PositiveSwitch = "positive-switch",
+        /// The safety input opens.
+        EmergencyStop = "emergency-stop",
+        /// The power stage loses its supply.
+        NoVoltage = "no-voltage",
+        /// The bench's controller goes bus-off.
+        BusOff = "bus-off",
+        /// The bench's interface is down.
+        BusDown = "bus-down",
+        /// Its transmit queue is full.
+        BusFull = "bus-full",
+        /// Its frames are held, and leave in a burst at the end.
+        BusStuck = "bus-stuck",
+        /// Another node sends a frame.
+        Foreign = "foreign",
+    }
 }
 
 /// The drives of a fault.
@@ -51,62 +110,6 @@ pub enum FaultyDrives {
     /// Both.
     #[display("both drives")]
     Both,
-}
-
-impl FaultyDrives {
-    /// True for drive number `drive`: 0 is insertion, 1 is rotation.
-    pub(super) fn has(self, drive: usize) -> bool {
-        matches!((self, drive), (Self::Both, _) | (Self::Insertion, 0) | (Self::Rotation, 1))
-    }
-}
-
-/// What goes wrong.
-#[derive(Debug, Clone, Copy, PartialEq, derive_more::Display)]
-pub enum FaultKind {
-    /// Frames from or to the drives.
-    #[display("{frames} {toward} {action}{}", of_them(*count))]
-    Frames {
-        /// What happens to them.
-        action: FrameAction,
-        /// Which frames.
-        frames: FrameClass,
-        /// Their direction.
-        toward: Toward,
-        /// How many frames at most; `None` for all while the fault lasts.
-        count: Option<u32>,
-    },
-    /// The node is off the bus: it sends and receives nothing, and goes on by itself.
-    #[display("off the bus")]
-    Silent,
-    /// The node restarts; while the fault lasts it is off the bus.
-    #[display("restart")]
-    Restart,
-    /// Something blocks the axis.
-    #[display("blocked")]
-    Stall,
-    /// The drive detects a fault, such as 0x8611, a following error.
-    #[display("fault {_0}")]
-    Drive(EmcyCode),
-    /// A limit switch closes.
-    #[display("{_0} limit switch closed")]
-    Switch(End),
-    /// The safety input opens: no torque.
-    #[display("safety input open")]
-    Interlock,
-    /// The power stage loses its supply.
-    #[display("no voltage")]
-    NoVoltage,
-    /// The bus, as the bench sees it. No frame passes either way.
-    #[display("{_0}")]
-    Bus(BusFault),
-    /// Another node sends this frame.
-    #[display("foreign frame {frame}{}", repeated(*every))]
-    Foreign {
-        /// The frame.
-        frame: Frame,
-        /// The time until it sends the frame again; `None`: it sends it once.
-        every: Option<Duration>,
-    },
 }
 
 /// Frames by what they carry.
@@ -124,33 +127,12 @@ pub enum FrameClass {
     /// Heartbeats and boot-up messages of the drive.
     #[display("heartbeats")]
     Heartbeat,
-    /// Heartbeats of this other node, such as the bench's.
-    #[display("heartbeats of node {_0}")]
-    HeartbeatOf(NodeId),
     /// Emergency messages of the drive.
     #[display("emergency messages")]
     Emergency,
     /// SYNC.
     #[display("SYNCs")]
     Sync,
-}
-
-impl FrameClass {
-    /// The identifier of these frames of `node` in that direction; `None` for all frames.
-    pub(super) fn id(self, node: NodeId, toward: Toward) -> Option<CanId> {
-        let cob_id = match (self, toward) {
-            (FrameClass::Any, _) => return None,
-            (FrameClass::Pdo, Toward::Bench) => cob::tpdo(node),
-            (FrameClass::Pdo, Toward::Drives) => cob::rpdo(node),
-            (FrameClass::Sdo, Toward::Bench) => cob::sdo_tx(node),
-            (FrameClass::Sdo, Toward::Drives) => cob::sdo_rx(node),
-            (FrameClass::Heartbeat, _) => cob::heartbeat(node),
-            (FrameClass::HeartbeatOf(other), _) => cob::heartbeat(other),
-            (FrameClass::Emergency, _) => cob::emcy(node),
-            (FrameClass::Sync, _) => cob::SYNC,
-        };
-        Some(CanId::Base(cob_id))
-    }
 }
 
 /// The direction of a frame.
@@ -164,41 +146,207 @@ pub enum Toward {
     Drives,
 }
 
-/// What is wrong with the bus.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, derive_more::Display)]
-pub enum BusFault {
-    /// The bench's controller went bus-off, and says so.
-    #[display("bus off")]
-    Off,
-    /// The bench's interface is down: it takes no frame.
-    #[display("interface down")]
-    Down,
-    /// Its transmit queue is full (ENOBUFS): it takes no frame.
-    #[display("transmit queue full")]
-    Full,
-    /// Nobody acknowledges: what it takes is held, and leaves in a burst at the end.
-    #[display("frames held by the interface")]
-    Stuck,
+choice! {
+    for FaultyDrives {
+        /// Both.
+        Both = "both",
+        /// The insertion drive.
+        Insertion = "insertion",
+        /// The rotation drive.
+        Rotation = "rotation",
+    }
 }
 
-fn of_them(count: Option<u32>) -> String {
-    count.map_or(String::new(), |count| format!(", {count} of them"))
+choice! {
+    for FrameClass {
+        /// All.
+        Any = "any",
+        /// Process data.
+        Pdo = "pdo",
+        /// Service data.
+        Sdo = "sdo",
+        /// Heartbeats and boot-up messages.
+        Heartbeat = "heartbeat",
+        /// Emergency messages.
+        Emergency = "emergency",
+        /// SYNC.
+        Sync = "sync",
+    }
 }
 
-fn repeated(every: Option<Duration>) -> String {
-    every.map_or(String::new(), |every| format!(" every {} ms", every.as_secs_f64() * 1e3))
+choice! {
+    for Toward {
+        /// From the drives.
+        Bench = "bench",
+        /// To the drives.
+        Drives = "drives",
+    }
+}
+
+impl Fault {
+    /// A fault of this kind; all other keys have their defaults.
+    pub fn of(kind: FaultKind) -> Self {
+        Fault { kind, ..Fault::take(None) }
+    }
+
+    /// Refuses a fault without its moment, a kind without the key that it needs, and frames that go
+    /// the other way.
+    ///
+    /// # Errors
+    /// The key that is wrong, and why.
+    pub(crate) fn check(&self) -> Result<(), (&'static str, String)> {
+        let needs = match self.kind {
+            _ if self.at_mm.is_none() && self.at.is_none() => Some("at_mm or at_s"),
+            FaultKind::Delay if self.delay.is_none() => Some("delay_ms"),
+            FaultKind::Resize if self.length.is_none() => Some("length"),
+            FaultKind::DriveFault if self.code.is_none() => Some("code"),
+            FaultKind::Foreign if self.frame.is_none() => Some("frame"),
+            _ => None,
+        };
+        if let Some(key) = needs {
+            return Err(("kind", format!("a fault of kind \"{}\" needs {key}", self.kind)));
+        }
+        let message = match (self.frames, self.toward) {
+            (FrameClass::Emergency, Toward::Drives) => {
+                "frames = \"emergency\" go toward = \"bench\" alone: no drive reads them"
+            }
+            (FrameClass::Sync, Toward::Bench) => {
+                "frames = \"sync\" go toward = \"drives\" alone: the bench sends them"
+            }
+            _ => return Ok(()),
+        };
+        Err(("frames", message.to_owned()))
+    }
+
+    /// True for drive number `drive`: 0 is insertion, 1 is rotation.
+    pub(super) fn concerns(&self, drive: usize) -> bool {
+        matches!(
+            (self.axis, drive),
+            (FaultyDrives::Both, _) | (FaultyDrives::Insertion, 0) | (FaultyDrives::Rotation, 1)
+        )
+    }
+
+    /// The identifier of the frames of `node` that it acts on; `None` for all frames.
+    pub(super) fn id(&self, node: NodeId) -> Option<CanId> {
+        let cob_id = match (self.frames, self.toward) {
+            (FrameClass::Any, _) => return None,
+            (FrameClass::Pdo, Toward::Bench) => cob::tpdo(node),
+            (FrameClass::Pdo, Toward::Drives) => cob::rpdo(node),
+            (FrameClass::Sdo, Toward::Bench) => cob::sdo_tx(node),
+            (FrameClass::Sdo, Toward::Drives) => cob::sdo_rx(node),
+            (FrameClass::Heartbeat, Toward::Bench) => cob::heartbeat(node),
+            (FrameClass::Heartbeat, Toward::Drives) => cob::heartbeat(self.bench?),
+            (FrameClass::Emergency, _) => cob::emcy(node),
+            (FrameClass::Sync, _) => cob::SYNC,
+        };
+        Some(CanId::Base(cob_id))
+    }
+
+    /// The frame of another node.
+    pub(super) fn foreign(&self) -> Option<Frame> {
+        self.frame.as_deref().and_then(data_frame)
+    }
+
+    /// What happens to frames, in words.
+    fn action(&self) -> String {
+        match self.kind {
+            FaultKind::Delay => {
+                let delay = self.delay.unwrap_or_default();
+                format!("late by {} ms", delay.as_secs_f64() * 1e3)
+            }
+            FaultKind::Duplicate => "doubled".to_owned(),
+            FaultKind::Reorder => "out of order".to_owned(),
+            FaultKind::Corrupt => format!("with byte {} corrupted", self.byte.unwrap_or(0)),
+            FaultKind::Resize => format!("of {} bytes", self.length.unwrap_or(0)),
+            _ => "lost".to_owned(),
+        }
+    }
 }
 
 /// `insertion: PDOs to the bench lost`.
 impl fmt::Display for Fault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if !matches!(self.kind, FaultKind::Bus(_) | FaultKind::Foreign { .. }) {
-            write!(f, "{}: ", self.drives)?;
+        if self.kind.has("axis") {
+            write!(f, "{}: ", self.axis)?;
         }
-        write!(f, "{}", self.kind)?;
-        match self.duration {
-            Some(duration) => write!(f, ", for {} s", duration.as_secs_f64()),
-            None => Ok(()),
-        }
+        match self.kind {
+            FaultKind::Silent => write!(f, "off the bus"),
+            FaultKind::Restart => write!(f, "restart"),
+            FaultKind::Stall => write!(f, "blocked"),
+            FaultKind::DriveFault => write!(f, "fault {}", EmcyCode(self.code.unwrap_or(0))),
+            FaultKind::NegativeSwitch => write!(f, "negative limit switch closed"),
+            FaultKind::PositiveSwitch => write!(f, "positive limit switch closed"),
+            FaultKind::EmergencyStop => write!(f, "safety input open"),
+            FaultKind::NoVoltage => write!(f, "no voltage"),
+            FaultKind::BusOff => write!(f, "bus off"),
+            FaultKind::BusDown => write!(f, "interface down"),
+            FaultKind::BusFull => write!(f, "transmit queue full"),
+            FaultKind::BusStuck => write!(f, "frames held by the interface"),
+            FaultKind::Foreign => {
+                write!(f, "foreign frame {}", self.frame.as_deref().unwrap_or_default())?;
+                self.period
+                    .map_or(Ok(()), |period| write!(f, " every {} ms", period.as_secs_f64() * 1e3))
+            }
+            _ => {
+                write!(f, "{}", self.frames)?;
+                let bench = self.bench.filter(|_| self.frames == FrameClass::Heartbeat);
+                if let (Toward::Drives, Some(bench)) = (self.toward, bench) {
+                    write!(f, " of node {bench}")?;
+                }
+                write!(f, " {} {}", self.toward, self.action())?;
+                self.count.map_or(Ok(()), |count| write!(f, ", {count} of them"))
+            }
+        }?;
+        self.duration.map_or(Ok(()), |duration| write!(f, ", for {} s", duration.as_secs_f64()))
+    }
+}
+
+impl FaultKind {
+    /// True if such a fault has this key.
+    pub(super) fn has(self, key: &str) -> bool {
+        self.keys().contains(&key)
+    }
+
+    /// True for a fault of the bus as the bench sees it: no frame passes either way.
+    pub(super) fn is_of_bus(self) -> bool {
+        matches!(
+            self,
+            FaultKind::BusOff | FaultKind::BusDown | FaultKind::BusFull | FaultKind::BusStuck
+        )
+    }
+
+    /// The keys that such a fault has beside its kind.
+    pub(crate) fn keys(self) -> Vec<&'static str> {
+        let own: &[_] = match self {
+            FaultKind::Drop | FaultKind::Duplicate | FaultKind::Reorder => {
+                &["axis", "frames", "toward", "count"]
+            }
+            FaultKind::Delay => &["axis", "frames", "toward", "count", "delay_ms"],
+            FaultKind::Corrupt => &["axis", "frames", "toward", "count", "byte"],
+            FaultKind::Resize => &["axis", "frames", "toward", "count", "length"],
+            FaultKind::DriveFault => &["axis", "code"],
+            FaultKind::Foreign => &["frame", "period_ms"],
+            FaultKind::BusOff | FaultKind::BusDown | FaultKind::BusFull | FaultKind::BusStuck => {
+                &[]
+            }
+            _ => &["axis"],
+        };
+        [&["at_mm", "at_s", "duration_s"], own].concat()
+    }
+}
+
+/// A data frame as candump writes it.
+fn data_frame(text: &str) -> Option<Frame> {
+    text.parse().ok().filter(|frame: &Frame| !frame.is_remote())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_foreign_frame_is_a_data_frame() {
+        assert_eq!(data_frame("181#00"), Some(Frame::new(0x181, &[0])));
+        assert_eq!((data_frame("181#R"), data_frame("181")), (None, None));
     }
 }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::{Fault, FaultKind, Trigger};
+use super::Fault;
 use crate::canopen::Frame;
 use crate::units::Time;
 
@@ -13,7 +13,7 @@ const DEPTH_CHECK_INTERVAL: Duration = Duration::from_millis(1);
 const FOREIGN_SPACING_MIN: Duration = Duration::from_micros(100);
 
 /// What the script does to the stage.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(in crate::emulator) enum Change {
     /// A fault begins, and ends at this time.
     Begins(Fault, Time),
@@ -43,7 +43,7 @@ pub(in crate::emulator) struct Script {
 
 impl Script {
     pub(in crate::emulator) fn new(faults: &[Fault], now: Time) -> Self {
-        let faults = faults.iter().map(|fault| (*fault, State::Waiting)).collect();
+        let faults = faults.iter().map(|fault| (fault.clone(), State::Waiting)).collect();
         Script { faults, begun: now, next_check: now, depth_mm: 0.0 }
     }
 
@@ -56,23 +56,20 @@ impl Script {
         for (fault, state) in &mut self.faults {
             match *state {
                 State::Waiting => {
-                    let begins = match fault.trigger {
-                        Trigger::AtDepth(mm) => passed(mm),
-                        Trigger::AtTime(after) => now >= self.begun + after,
-                    };
-                    if begins {
+                    let is_due = fault.at.is_some_and(|after| now >= self.begun + after);
+                    if is_due || fault.at_mm.is_some_and(passed) {
                         let end = fault.duration.map_or(Time::NEVER, |duration| now + duration);
                         *state = State::Active(end, now);
-                        return Some(Change::Begins(*fault, end));
+                        return Some(Change::Begins(fault.clone(), end));
                     }
                 }
                 State::Active(end, _) if now >= end => {
                     *state = State::Over;
-                    return Some(Change::Ends(*fault));
+                    return Some(Change::Ends(fault.clone()));
                 }
                 State::Active(end, due) if now >= due => {
-                    if let FaultKind::Foreign { frame, every } = fault.kind {
-                        let again = every.map(|every| due + every.max(FOREIGN_SPACING_MIN));
+                    if let Some(frame) = fault.foreign() {
+                        let again = fault.period.map(|every| due + every.max(FOREIGN_SPACING_MIN));
                         *state = State::Active(end, again.unwrap_or(Time::NEVER));
                         return Some(Change::Foreign(frame));
                     }
@@ -86,12 +83,11 @@ impl Script {
 
     /// When [`poll`](Self::poll) is due.
     pub(in crate::emulator) fn deadline(&self) -> Time {
-        let due = |(fault, state): &(Fault, State)| match (state, fault.trigger, fault.kind) {
-            (State::Waiting, Trigger::AtDepth(_), _) => self.next_check,
-            (State::Waiting, Trigger::AtTime(after), _) => self.begun + after,
-            (State::Active(end, due), _, FaultKind::Foreign { .. }) => *end.min(due),
-            (State::Active(end, _), ..) => *end,
-            (State::Over, ..) => Time::NEVER,
+        let due = |(fault, state): &(Fault, State)| match *state {
+            State::Waiting => fault.at.map_or(self.next_check, |after| self.begun + after),
+            State::Active(end, due) if fault.frame.is_some() => end.min(due),
+            State::Active(end, _) => end,
+            State::Over => Time::NEVER,
         };
         self.faults.iter().map(due).min().unwrap_or(Time::NEVER)
     }
@@ -99,26 +95,26 @@ impl Script {
 
 #[cfg(test)]
 mod tests {
-    use super::super::FaultyDrives;
+    use super::super::FaultKind;
     use super::*;
 
     fn at(ms: i64) -> Time {
         Time::from_nanos(ms * 1_000_000)
     }
 
-    fn fault(trigger: Trigger, kind: FaultKind, lasts_ms: Option<u64>) -> Fault {
-        let duration = lasts_ms.map(Duration::from_millis);
-        Fault { trigger, kind, drives: FaultyDrives::Both, duration }
+    fn at_mm(mm: f64) -> Fault {
+        Fault { at_mm: Some(mm), ..Fault::of(FaultKind::Stall) }
     }
 
     #[test]
     fn faults_begin_once_at_their_time_or_depth_and_end() {
-        let deep = fault(Trigger::AtDepth(10.0), FaultKind::Stall, None);
-        let timed = fault(Trigger::AtTime(Duration::from_millis(5)), FaultKind::Silent, Some(20));
-        let mut script = Script::new(&[deep, timed], at(100));
+        let deep = at_mm(10.0);
+        let [after, duration] = [5, 20].map(|ms| Some(Duration::from_millis(ms)));
+        let timed = Fault { at: after, duration, ..Fault::of(FaultKind::Silent) };
+        let mut script = Script::new(&[deep.clone(), timed.clone()], at(100));
         assert_eq!(script.poll(at(100), 0.0), None);
         assert_eq!(script.deadline(), at(101), "a depth is looked for every millisecond");
-        assert_eq!(script.poll(at(106), 9.0), Some(Change::Begins(timed, at(126))));
+        assert_eq!(script.poll(at(106), 9.0), Some(Change::Begins(timed.clone(), at(126))));
         assert_eq!(script.poll(at(107), 10.0), Some(Change::Begins(deep, Time::NEVER)));
         assert_eq!(script.poll(at(107), 10.0), None);
         assert_eq!(script.deadline(), at(126));
@@ -129,7 +125,6 @@ mod tests {
     /// Withdrawing passes depths too.
     #[test]
     fn a_depth_is_passed_either_way() {
-        let at_mm = |mm| fault(Trigger::AtDepth(mm), FaultKind::Stall, None);
         let mut script = Script::new(&[at_mm(-3.0), at_mm(0.0)], at(0));
         assert_eq!(script.poll(at(0), 0.0), Some(Change::Begins(at_mm(0.0), Time::NEVER)));
         assert_eq!(script.poll(at(1), 5.0), None);
@@ -139,11 +134,11 @@ mod tests {
 
     #[test]
     fn a_foreign_node_sends_again_and_again() {
-        let frame = Frame::new(0x181, &[1]);
-        let every = Some(Duration::from_millis(2));
-        let kind = FaultKind::Foreign { frame, every };
+        let [after, period, duration] = [0, 2, 5].map(|ms| Some(Duration::from_millis(ms)));
+        let frame = Some("181#01".to_owned());
+        let foreign = Fault::of(FaultKind::Foreign);
         let mut script =
-            Script::new(&[fault(Trigger::AtTime(Duration::ZERO), kind, Some(5))], at(0));
+            Script::new(&[Fault { at: after, frame, period, duration, ..foreign }], at(0));
         let mut seen = Vec::new();
         for ms in 0..10 {
             while let Some(change) = script.poll(at(ms), 0.0) {

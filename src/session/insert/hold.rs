@@ -72,8 +72,8 @@ impl Insert {
             if let Some((cause, why)) = found {
                 let text = format!("{cause}; insertion held; {why}");
                 let text = clipped(&text, MESSAGE_MAX).into_owned();
-                insertion.hold(self.config.tracker.hold.braking_mm_per_s2);
-                let in_step = insertion.is_stepping();
+                insertion.profile.hold(self.config.tracker.hold.braking_mm_per_s2);
+                let in_step = insertion.profile.is_stepping();
                 let by = HeldBy::Tracker { cause, why, in_step };
                 let before = self.ended_hold.map_or(Duration::ZERO, |ended| {
                     ended.lasted.saturating_sub(now.since(ended.at))
@@ -81,7 +81,7 @@ impl Insert {
                 self.hold = Some(Hold { since: now, before, by });
                 shell.state_at(now, State::Holding);
                 shell.event_at(now, Lane::Tracker, Severity::Warning, text);
-            } else if insertion.has_stepped() {
+            } else if insertion.profile.has_stepped() {
                 self.hold_after_step(shell, now, insertion);
             }
             return Ok(());
@@ -102,7 +102,7 @@ impl Insert {
             let held_s = held.as_secs_f64();
             let text = format!("the tip is seen again; insertion goes on, held for {held_s:.2} s");
             self.ended_hold = Some(EndedHold { at: now, lasted: held + hold.before });
-            insertion.release(None);
+            insertion.profile.release(None);
             self.hold = None;
             shell.state_at(now, State::Inserting);
             shell.event_at(now, Lane::Tracker, Severity::Info, text);
@@ -126,7 +126,7 @@ impl Insert {
 
     /// Holds the insertion after a single step, done or interrupted.
     fn hold_after_step(&mut self, shell: &mut Shell, now: Time, insertion: &mut Insertion) {
-        insertion.hold(self.config.tracker.hold.braking_mm_per_s2);
+        insertion.profile.hold(self.config.tracker.hold.braking_mm_per_s2);
         self.hold = Some(Hold { since: now, before: Duration::ZERO, by: HeldBy::Step });
         shell.state_at(now, State::HeldAfterStep);
         let text = format!("the step ends; held, {:.2} mm left", insertion.left_mm());
@@ -148,7 +148,7 @@ impl Insert {
             OperatorCommand::Step { mm } => self.go_on(shell, Some(mm)),
             OperatorCommand::Speed { mm_per_s } => {
                 let insertion = self.insertion.as_mut().ok_or(NOT_BEGUN)?;
-                let was = insertion.speed_mm_per_s();
+                let was = insertion.profile.speed_max_mm_per_s;
                 insertion.set_speed(mm_per_s)?;
                 Ok(format!("{command}, was {was:.3}"))
             }
@@ -168,7 +168,7 @@ impl Insert {
         let Some(insertion) = &mut self.insertion else {
             return Ok("hold: the insertion will begin held".to_owned());
         };
-        insertion.hold(self.config.tracker.hold.braking_mm_per_s2);
+        insertion.profile.hold(self.config.tracker.hold.braking_mm_per_s2);
         shell.state(State::HeldByOperator);
         Ok(format!("hold at {:.2} mm", self.progress.insertion_meas_mm))
     }
@@ -185,7 +185,7 @@ impl Insert {
             _ => {}
         }
         let held_s = shell.now.seconds_after(hold.since);
-        if !self.tracking.is_held() || !self.tracking.is_fresh(shell.now) {
+        if !self.tracking.track.is_held() || !self.tracking.is_fresh(shell.now) {
             let limit_s = self.config.tracker.hold.after.as_secs_f64();
             let last = match self.tracking.age_s(shell.now) {
                 Some(_) if self.tracking.is_fresh(shell.now) => {
@@ -218,7 +218,7 @@ impl Insert {
         }
         self.hold = None;
         if let Some(insertion) = &mut self.insertion {
-            insertion.release(step_mm);
+            insertion.profile.release(step_mm);
         }
         shell.state(if step_mm.is_some() { State::Stepping } else { State::Inserting });
         let what = step_mm.map_or("resume".to_owned(), |mm| format!("step of {mm} mm"));
@@ -227,8 +227,8 @@ impl Insert {
 
     /// What calls for a hold, and why it came to that or what to look at.
     fn cause(&self, now: Time, at: SetPoint, insertion: &Insertion) -> Option<(String, String)> {
-        if let Some(jump) = self.tracking.jump() {
-            return Some((jump.to_owned(), JUMP_ADVICE.to_owned()));
+        if let Some(jump) = &self.tracking.jump {
+            return Some((jump.clone(), JUMP_ADVICE.to_owned()));
         }
         if let Some(blindness) = self.blindness(now, at, insertion) {
             return Some((blindness, self.tracking.explain_silence()));
@@ -240,11 +240,13 @@ impl Insert {
     /// or because the needle would otherwise not stand before the limit.
     fn blindness(&self, now: Time, at: SetPoint, insertion: &Insertion) -> Option<String> {
         let tracker = &self.config.tracker;
-        let seen_at_mm = self.tracking.seen_at_mm().unwrap_or(f64::NEG_INFINITY);
+        let seen_at_mm = self.tracking.track.last().and_then(|fix| fix.insertion_mm);
+        let seen_at_mm = seen_at_mm.unwrap_or(f64::NEG_INFINITY);
         let seen_at = SetPoint { insertion_mm: seen_at_mm, rotation_rad: 0.0 };
         let seen_at_mm = insertion.measured(seen_at).insertion_mm.max(0.0);
-        let stands_at_mm =
-            insertion.held_at_mm(tracker.hold.braking_mm_per_s2, self.config.stage.sync_period);
+        let stands_at_mm = insertion
+            .profile
+            .held_at_mm(tracker.hold.braking_mm_per_s2, self.config.stage.sync_period);
         let (age_s, limit_s) =
             (self.tracking.age_s(now).unwrap_or(f64::INFINITY), tracker.hold.after.as_secs_f64());
         let (blind_mm, braking_mm) = (at.insertion_mm - seen_at_mm, stands_at_mm - at.insertion_mm);

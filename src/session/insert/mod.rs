@@ -36,7 +36,7 @@ pub(super) struct Insert {
     /// The tip was believed when the last input had been taken.
     tip_believed: bool,
     tracking: Tracking,
-    /// What is heard of the target, where that is a tool of its own.
+    /// The track of the target, if the target is a tool of its own.
     target: Option<TargetTracking>,
     /// Measured stage positions, depth never receding: what the needle has cut.
     history: StageHistory,
@@ -62,7 +62,7 @@ impl Insert {
                 .as_ref()
                 .and_then(|goal| goal.tool.clone())
                 .map(|tool| TargetTracking::new(tool, &config.tracker, &config.x_wp)),
-            history: StageHistory::new(history_points(&config), Duration::ZERO),
+            history: StageHistory::new(history_points(&config)),
             estimation: Estimation::new(&config)?,
             insertion: None,
             hold: None,
@@ -74,9 +74,7 @@ impl Insert {
 
     /// Everything the tracking has to record, and its state.
     fn drain_tracking(&mut self, shell: &mut Shell) {
-        while let Some(record) = self.tracking.poll() {
-            shell.record(record);
-        }
+        self.tracking.records.drain(..).for_each(|record| shell.record(record));
         shell.state(self.tracking.state(shell.now));
     }
 
@@ -100,7 +98,7 @@ impl Insert {
             insertion_mm: feedback.measured.insertion_mm.max(cut_mm),
             rotation_rad: feedback.measured.rotation_rad,
         };
-        self.history.push(point).map_err(|error| error.to_string())?;
+        self.history.push(point)?;
         let measurements = self.tracking.judge(shell.now, &self.history, &self.estimation);
         self.drain_tracking(shell);
         if self.insertion.is_none() && shell.is_running() {
@@ -123,7 +121,7 @@ impl Insert {
 
     fn check_reach(&mut self, shell: &mut Shell) -> Result<(), String> {
         let target_mm = self.target.as_ref().and_then(TargetTracking::position_mm);
-        let tip_mm = self.tracking.tip_mm();
+        let tip_mm = self.tracking.track.last().map(|fix| fix.position_mm);
         if let (Some(goal), Some(tip_mm)) = (&mut self.config.goal, &tip_mm) {
             target_mm.into_iter().for_each(|target_mm| goal.set_target(target_mm));
             goal.check_start(tip_mm).map_err(|why| format!("goal: {why}"))?;
@@ -153,14 +151,14 @@ impl Insert {
         match &self.hold {
             None => shell.state(State::Inserting),
             Some(_) => {
-                insertion.hold(self.config.tracker.hold.braking_mm_per_s2);
+                insertion.profile.hold(self.config.tracker.hold.braking_mm_per_s2);
                 shell.state(State::HeldByOperator);
             }
         }
         self.insertion = Some(insertion);
     }
 
-    /// Corrects the observers with what they are to be told at once. An error is the reason to stop
+    /// Corrects the observers with the measurements that are due at once. An error is the reason to stop
     /// for.
     fn correct(
         &mut self,
@@ -170,8 +168,7 @@ impl Insert {
         for measurement in measurements {
             self.estimation.gather(&measurement);
             if let Some(measurement) = insertion.measure(measurement) {
-                let taken = self.estimation.take(&measurement, &self.history);
-                taken.map_err(|error| error.to_string())?;
+                self.estimation.take(&measurement, &self.history)?;
             }
         }
         Ok(())
@@ -187,11 +184,11 @@ impl Insert {
         insertion: &mut Insertion,
     ) -> Result<(), String> {
         let oldest = feedback.time - self.config.tracker.hold.after;
-        self.estimation.carry_to(oldest, &self.history).map_err(|error| error.to_string())?;
+        self.estimation.carry_to(oldest, &self.history)?;
         let due = feedback.time - self.config.tracker.hold.after / 2;
-        self.estimation.watch(due, oldest, &self.history).map_err(|error| error.to_string())?;
+        self.estimation.watch(due, oldest, &self.history)?;
         if self.config.tracker.judges_stream {
-            self.tracking.check_travel().map_err(|error| format!("tracker: {error}"))?;
+            self.tracking.travel.check().map_err(|error| format!("tracker: {error}"))?;
         }
         self.watch_tip(shell, feedback.time, at, insertion)?;
         insertion.check_arrival(feedback.time, at.insertion_mm)?;
@@ -226,13 +223,12 @@ impl Insert {
     ) -> Result<Option<(f64, Option<f64>)>, String> {
         let history = &self.history;
         if let Some(measurement) = &due.measurement {
-            self.estimation.take(measurement, history).map_err(|error| error.to_string())?;
+            self.estimation.take(measurement, history)?;
         }
         let target_mm = self.target.as_ref().and_then(TargetTracking::position_mm);
-        target_mm.into_iter().for_each(|target_mm| self.estimation.set_target(target_mm));
-        let corrections = self.estimation.corrections();
+        target_mm.into_iter().for_each(|target_mm| self.estimation.steering.set_target(target_mm));
+        let corrections = self.estimation.corrections.take();
         let newest = corrections.map(|corrections| corrections.newest);
-        let decision = self.estimation.decide(time, history, due.is_last);
         let Decision {
             estimate,
             shadows,
@@ -240,7 +236,7 @@ impl Insert {
             command_saturated,
             approach,
             refused,
-        } = decision.map_err(|error| error.to_string())?;
+        } = self.estimation.decide(time, history, due.is_last)?;
         let path = approach.as_ref().and_then(|approach| approach.path.as_ref());
         let left_mm = path.map(Path::length_mm);
         let observer = match &estimate {
@@ -271,7 +267,7 @@ impl Insert {
             approach,
         })));
         match refused {
-            Some(error) => Err(error.to_string()),
+            Some(reason) => Err(reason),
             None => Ok(rotation_cmd_rad_per_mm.map(|rate| (rate, left_mm))),
         }
     }
@@ -279,7 +275,7 @@ impl Insert {
     /// True while the tip is believed, and the target where that is a tool of its own.
     fn is_seen(&self, now: Time) -> bool {
         let has_target = self.target.as_ref().is_none_or(|target| target.trouble(now).is_none());
-        self.tracking.is_held() && self.tracking.is_fresh(now) && has_target
+        self.tracking.track.is_held() && self.tracking.is_fresh(now) && has_target
     }
 
     /// When, before the insertion, a tip to begin with is awaited no longer: some time after the
@@ -298,7 +294,7 @@ impl Insert {
     /// Why there is no tip to begin with.
     fn explain_no_tip(&self, now: Time) -> String {
         let limit_s = self.config.tracker.timeout.as_secs_f64();
-        let has_tip = self.tracking.is_held() && self.tracking.is_fresh(now);
+        let has_tip = self.tracking.track.is_held() && self.tracking.is_fresh(now);
         let trouble = self.target.as_ref().filter(|_| has_tip);
         if let Some((trouble, why)) = trouble.and_then(|target| target.trouble(now)) {
             let text = format!("tracker: no target within {limit_s:.1} s; {trouble}; {why}");
@@ -376,7 +372,7 @@ impl Task for Insert {
 
     fn handle_timeout(&mut self, shell: &mut Shell) -> Result<(), String> {
         if !shell.is_running() {
-            self.tracking.give_up_on_the_unpaired(shell.now);
+            self.tracking.refuse_unpaired(shell.now);
             self.drain_tracking(shell);
         } else if shell.now >= self.deadline(shell) {
             return Err(self.explain_no_tip(shell.now));
@@ -407,7 +403,7 @@ impl Task for Insert {
     fn progress(&self, now: Time) -> Progress {
         let (insertion, is_held) = (self.insertion.as_ref(), self.hold.is_some());
         Progress {
-            speed_mm_per_s: insertion.map_or(0.0, Insertion::speed_mm_per_s),
+            speed_mm_per_s: insertion.map_or(0.0, |insertion| insertion.profile.speed_max_mm_per_s),
             to_go_s: insertion.filter(|_| !is_held).map(Insertion::to_go_s),
             tip_age_s: self.tracking.age_s(now),
             ..self.progress
@@ -415,7 +411,7 @@ impl Task for Insert {
     }
 
     fn gate_counts(&self) -> GateCounts {
-        self.tracking.counts()
+        self.tracking.counts.clone()
     }
 }
 

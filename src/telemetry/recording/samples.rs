@@ -3,7 +3,7 @@
 use super::log_row;
 use super::states::{Meaning, States};
 use crate::session::SampleRecord;
-use crate::tracker::{GateName, Refusal};
+use crate::tracker::GateName;
 use crate::units::Time;
 use rerun::{RecordingStream, RecordingStreamResult, TextLog};
 use std::time::Duration;
@@ -39,7 +39,7 @@ impl Samples {
             let delay_ms = sample.received.receive_time.seconds_after(acquisition_time) * 1e3;
             log_row(stream, SAMPLES, [("delay_ms", delay_ms)])?;
         }
-        let gate = sample.refused.as_deref().map(Refusal::gate);
+        let gate = sample.refused.as_ref().map(|refusal| refusal.gate);
         if gate == Some(GateName::Tool) {
             return Ok(());
         }

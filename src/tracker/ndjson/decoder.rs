@@ -1,6 +1,6 @@
 //! Splits a stream of bytes into lines.
 
-use super::{LINE_LIMIT, Line, LineError, LineProblem};
+use super::{LINE_LIMIT, Line, wrong};
 
 /// Turns the chunks of a connection into lines, wherever the chunks were cut. It skips blank lines.
 ///
@@ -17,10 +17,6 @@ pub(in crate::tracker) struct LineDecoder {
 }
 
 impl LineDecoder {
-    pub(in crate::tracker) fn new() -> Self {
-        Self::default()
-    }
-
     pub(in crate::tracker) fn push(&mut self, chunk: &[u8]) {
         self.buffer.drain(..self.used);
         self.used = 0;
@@ -30,8 +26,8 @@ impl LineDecoder {
     /// The next line, or none until more bytes are pushed.
     ///
     /// # Errors
-    /// [`LineError`] of one line; poll on.
-    pub(in crate::tracker) fn poll(&mut self) -> Result<Option<Line>, LineError> {
+    /// What is wrong with one line; poll on.
+    pub(in crate::tracker) fn poll(&mut self) -> Result<Option<Line>, String> {
         loop {
             let unread = self.buffer.get(self.used..).unwrap_or_default();
             let end = unread.iter().position(|byte| *byte == b'\n');
@@ -46,7 +42,7 @@ impl LineDecoder {
                         return Ok(None);
                     }
                     self.lines += 1;
-                    return Err(LineError { line: self.lines, problem: LineProblem::TooLong });
+                    return Err(self.too_long());
                 }
                 Some(len) => {
                     self.used += len + 1;
@@ -55,7 +51,7 @@ impl LineDecoder {
                     }
                     self.lines += 1;
                     if too_long {
-                        return Err(LineError { line: self.lines, problem: LineProblem::TooLong });
+                        return Err(self.too_long());
                     }
                     if !text.trim_ascii().is_empty() {
                         return Ok(Some(Line::parse(self.lines, text)?.printable()));
@@ -69,12 +65,18 @@ impl LineDecoder {
     ///
     /// # Errors
     /// The stream ends within a line.
-    pub(in crate::tracker) fn finish(&self) -> Result<(), LineError> {
+    pub(in crate::tracker) fn finish(&self) -> Result<(), String> {
         let unread = self.buffer.get(self.used..).unwrap_or_default();
         if self.skipping || unread.trim_ascii().is_empty() {
             return Ok(());
         }
-        Err(LineError { line: self.lines + 1, problem: LineProblem::Unfinished(unread.len()) })
+        let length = unread.len();
+        let problem = format_args!("{length} bytes and no end of line; it was cut off");
+        Err(wrong(self.lines + 1, problem))
+    }
+
+    fn too_long(&self) -> String {
+        wrong(self.lines, format_args!("longer than {LINE_LIMIT} bytes"))
     }
 }
 
@@ -84,7 +86,7 @@ mod tests {
 
     #[test]
     fn a_line_without_end_is_refused_once_and_not_kept() {
-        let mut decoder = LineDecoder::new();
+        let mut decoder = LineDecoder::default();
         let mut refused = Vec::new();
         for _ in 0..100 {
             decoder.push(&[b'x'; 4096]);
@@ -93,11 +95,11 @@ mod tests {
             }
             assert!(decoder.buffer.len() <= LINE_LIMIT + 4096);
         }
-        assert_eq!(refused, [LineError { line: 1, problem: LineProblem::TooLong }]);
+        assert_eq!(refused, ["ndjson: line 1: longer than 16384 bytes"]);
         decoder.push(b"x\n{\"tool\":\"N\",\"position_tracker_mm\":[1,2,3]}\n{\"to");
         assert!(matches!(decoder.poll(), Ok(Some(_))));
         assert!(matches!(decoder.poll(), Ok(None)));
-        let unfinished = LineError { line: 3, problem: LineProblem::Unfinished(4) };
-        assert_eq!(decoder.finish(), Err(unfinished));
+        let unfinished = "ndjson: line 3: 4 bytes and no end of line; it was cut off";
+        assert_eq!(decoder.finish(), Err(unfinished.to_owned()));
     }
 }

@@ -18,11 +18,10 @@
 //! ignored: a replay judges each sample again. A line with any other key is refused.
 
 mod decoder;
-mod recording;
 
 pub(super) use decoder::LineDecoder;
-pub use recording::{RecordingError, recorded, recording};
 
+use super::event::Event;
 use super::orientation::Orientation;
 use super::sample::{Sample, Validity};
 use crate::text::{clipped, escaped};
@@ -30,7 +29,7 @@ use crate::units::Time;
 use nalgebra::Vector3;
 use serde::Deserialize;
 use serde::de::IgnoredAny;
-use thiserror::Error;
+use std::fmt::Display;
 
 /// The longest line, bytes. A sample takes about 300.
 pub const LINE_LIMIT: usize = 16 * 1024;
@@ -38,34 +37,9 @@ pub const LINE_LIMIT: usize = 16 * 1024;
 /// The longest text of serde_json in an error, characters.
 const SHOWN_MAX: usize = 150;
 
-/// A line that is not a sample.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("ndjson: line {line}: {problem}")]
-pub struct LineError {
-    /// Which line, from 1.
-    pub line: u64,
-    /// What is wrong with it.
-    pub problem: LineProblem,
-}
-
-/// What is wrong with a line.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-pub enum LineProblem {
-    /// It is not JSON, or not an object of this form.
-    #[error("{0}")]
-    NotASample(String),
-    /// It is longer than [`LINE_LIMIT`]; the rest of it is skipped.
-    #[error("longer than {LINE_LIMIT} bytes")]
-    TooLong,
-    /// The stream ended before the line did.
-    #[error("{0} bytes and no end of line; it was cut off")]
-    Unfinished(usize),
-    /// It has no time, which a replay of a recording needs.
-    #[error("no receive_time_ns: a replay needs it to keep the pace of the recording")]
-    NoTime,
-    /// Its time goes back; the times of a recording must not.
-    #[error("receive_time_ns goes back by {0} ns")]
-    Backwards(i64),
+/// Says what is wrong with line `line` of a stream, from 1.
+fn wrong(line: u64, problem: impl Display) -> String {
+    format!("ndjson: line {line}: {problem}")
 }
 
 /// A line as it was sent.
@@ -88,15 +62,14 @@ pub(super) struct Line {
 
 impl Line {
     /// Parses `text`, which is line number `line` of a stream without its newline.
-    fn parse(line: u64, text: &[u8]) -> Result<Self, LineError> {
+    fn parse(line: u64, text: &[u8]) -> Result<Self, String> {
         serde_json::from_slice(text).map_err(|error| {
             let message = error.to_string();
             // serde_json sees one line only, so its " at line 1 column …" would mislead.
             let message = message.split(" at line ").next().unwrap_or_default();
             let message = escaped(message);
             let message = clipped(&message, SHOWN_MAX);
-            let problem = LineProblem::NotASample(format!("{message} (column {})", error.column()));
-            LineError { line, problem }
+            wrong(line, format_args!("{message} (column {})", error.column()))
         })
     }
 
@@ -122,6 +95,64 @@ impl Line {
         }
         .oriented(orientation)
     }
+}
+
+/// Reads all events of a recording, each with its time on the recording's own time line. A refused
+/// line is an event at the time of the line before it.
+///
+/// # Errors
+/// Nothing in it is a sample.
+pub fn recording(text: &str) -> Result<Vec<(Time, Event)>, String> {
+    let mut newest: Option<Time> = None;
+    let mut first_error = None;
+    let mut events: Vec<(Option<Time>, Event)> = Vec::new();
+    let lines = text.lines().zip(1u64..).filter(|(line, _)| !line.trim().is_empty());
+    for (text, line) in lines {
+        match timed_sample(line, text, newest) {
+            Ok(sample) => {
+                newest = Some(sample.receive_time);
+                events.push((newest, Event::Sample(sample)));
+            }
+            Err(error) => {
+                first_error.get_or_insert(error.clone());
+                events.push((newest, Event::Malformed(error)));
+            }
+        }
+    }
+    let Some(first) = events.iter().find_map(|(time, _)| *time) else {
+        return Err(match first_error {
+            Some(error) => format!("no line is a sample; the first: {error}"),
+            None => "no line".to_owned(),
+        });
+    };
+    Ok(events.into_iter().map(|(time, event)| (time.unwrap_or(first), event)).collect())
+}
+
+/// The sample in line `line` of the bench's own record, exactly as it was, even with a stamp of 0.
+///
+/// # Errors
+/// The line is not a sample, or has no time of receipt.
+pub fn recorded(line: u64, text: &str) -> Result<Sample, String> {
+    let (read, time) = timed_line(line, text)?;
+    let source_unix_ns = read.source_unix_ns;
+    Ok(Sample { source_unix_ns, ..read.into_sample(time) })
+}
+
+const NO_TIME: &str = "no receive_time_ns: a replay needs it to keep the pace of the recording";
+
+fn timed_line(line: u64, text: &str) -> Result<(Line, Time), String> {
+    let read = Line::parse(line, text.as_bytes())?;
+    let time_ns = read.receive_time_ns.ok_or_else(|| wrong(line, NO_TIME))?;
+    Ok((read, Time::from_nanos(time_ns)))
+}
+
+fn timed_sample(line: u64, text: &str, newest: Option<Time>) -> Result<Sample, String> {
+    let (read, time) = timed_line(line, text)?;
+    let back_ns = newest.map_or(0, |newest| newest.as_nanos().saturating_sub(time.as_nanos()));
+    if back_ns > 0 {
+        return Err(wrong(line, format_args!("receive_time_ns goes back by {back_ns} ns")));
+    }
+    Ok(read.printable().into_sample(time))
 }
 
 /// A JSON number, or the word for one that JSON lacks.
@@ -157,7 +188,7 @@ mod tests {
     use super::*;
 
     fn line(text: &str) -> Result<Sample, String> {
-        let line = Line::parse(3, text.as_bytes()).map_err(|error| error.to_string())?;
+        let line = Line::parse(3, text.as_bytes())?;
         Ok(line.into_sample(Time::from_nanos(9)))
     }
 
@@ -234,5 +265,61 @@ mod tests {
         let text =
             r#"{"tool":"N","position_tracker_mm":[1,2,3],"orientation_tracker_wxyz":[0,0,0,0]}"#;
         assert_eq!(line(text).unwrap().validity, Validity::NotARotation);
+    }
+
+    #[test]
+    fn a_recording_keeps_its_times_and_tells_of_its_bad_lines() {
+        let good = |ns: i64| {
+            format!(r#"{{"tool":"N","position_tracker_mm":[{ns},0,0],"receive_time_ns":{ns}}}"#)
+        };
+        let text = [
+            "bad".to_owned(),
+            good(50),
+            r#"{"tool":"N","position_tracker_mm":[1,2,3]}"#.to_owned(),
+            String::new(),
+            good(70),
+            good(60),
+            good(70),
+        ]
+        .join("\n");
+        let summary: Vec<String> = (recording(&text).unwrap().iter())
+            .map(|(time, event)| match event {
+                Event::Sample(sample) => format!("{} {}", time.as_nanos(), sample.position_mm.x),
+                Event::Malformed(error) => format!("{} {error}", time.as_nanos()),
+                other => panic!("{other:?}"),
+            })
+            .collect();
+        assert_eq!(
+            summary,
+            [
+                "50 ndjson: line 1: expected value (column 1)",
+                "50 50",
+                "50 ndjson: line 3: no receive_time_ns: a replay needs it to keep the pace of the \
+                 recording",
+                "70 70",
+                "70 ndjson: line 6: receive_time_ns goes back by 10 ns",
+                "70 70",
+            ]
+        );
+    }
+
+    #[test]
+    fn the_benchs_own_record_is_read_exactly() {
+        let line = r#"{"receive_time_ns":0,"source_unix_ns":0,"tool":"N","position_tracker_mm":[0.1,-0.0,"NaN"],"orientation_tracker_wxyz":null,"status":"OK"}"#;
+        let sample = recorded(1, line).unwrap();
+        assert_eq!((sample.receive_time, sample.source_unix_ns), (Time::ZERO, Some(0)));
+        assert_eq!(sample.position_mm.y.to_bits(), (-0.0f64).to_bits());
+        let given = recording(line).unwrap();
+        let Event::Sample(sample) = &given[0].1 else { panic!("{given:?}") };
+        assert_eq!(sample.source_unix_ns, None, "to a stream 0 is none");
+    }
+
+    #[test]
+    fn a_file_of_something_else_is_refused() {
+        assert_eq!(recording("\n").unwrap_err(), "no line");
+        assert_eq!(
+            recording("step,time_s\n0,1.5\n").unwrap_err(),
+            "no line is a sample; the first: ndjson: line 1: expected value (column 1)"
+        );
     }
 }

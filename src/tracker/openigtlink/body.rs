@@ -1,7 +1,66 @@
 //! The contents of the message types that the bench reads and writes.
+//!
+//! A server of TDATA or QTDATA, which hold several tools, sends nothing before it is asked to (STT_TDATA);
+//! STP_TDATA ends it. QTDATA has quaternions in place of matrices.
+//!
+//! Source: the specification's tables; `igtl_tdata.h` and `igtl_qtdata.h` of the reference library.
 
-use super::header::{padded, text};
-use super::tracking_data::{self, StartStream, Tool, ToolStream};
+use super::header::{NAME_LEN, padded, text};
+use super::message::packet;
+
+/// Bytes of the name of a coordinate system; zeros ask for the server's own.
+const COORDINATES_LEN: usize = 32;
+/// Name, kind, a reserved byte.
+const TOOL_HEAD_LEN: usize = NAME_LEN + 2;
+
+/// One tool of a TDATA or QTDATA message.
+///
+/// In TDATA `N` is 12, the numbers of a [TRANSFORM](super::Body::Transform). In QTDATA it is 7: the
+/// position in mm, then the quaternion x, y, z, w.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Tool<const N: usize> {
+    /// The tool's name, 20 bytes at most; 19 are sent, and a zero, since the reference library takes
+    /// a name without one for none.
+    pub name: String,
+    /// What is known of it: a [`tool_kind`].
+    pub kind: u8,
+    /// Its pose.
+    pub pose: [f32; N],
+}
+
+/// What a tool's pose says; other codes are kept.
+pub mod tool_kind {
+    /// The tracker itself.
+    pub const TRACKER: u8 = 1;
+    /// Position and orientation.
+    pub const SIX_D: u8 = 2;
+    /// The position of the tip alone; its orientation means nothing.
+    pub const THREE_D: u8 = 3;
+    /// Tip and axis; the turn about the axis means nothing.
+    pub const FIVE_D: u8 = 4;
+}
+
+/// A stream of tools that a server sends once it is asked to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ToolStream {
+    /// TDATA, with matrices, or QTDATA, with quaternions.
+    pub name: &'static str,
+    /// Shortest time between two messages, ms; 0 is as fast as the server can.
+    pub period_ms: i32,
+}
+
+impl ToolStream {
+    /// The message that asks a server to begin, in its own coordinate system.
+    pub fn start(&self) -> Vec<u8> {
+        let content = [&self.period_ms.to_be_bytes()[..], &[0; COORDINATES_LEN]].concat();
+        packet(&format!("STT_{}", self.name), "", None, &content)
+    }
+
+    /// The message that asks it to end.
+    pub fn stop(&self) -> Vec<u8> {
+        packet(&format!("STP_{}", self.name), "", None, &[])
+    }
+}
 
 /// The content of a message.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,10 +79,6 @@ pub enum Body {
     TrackingData(Vec<Tool<12>>),
     /// QTDATA: the poses of several tools, as quaternions.
     QuaternionTrackingData(Vec<Tool<7>>),
-    /// STT_TDATA or STT_QTDATA: asks a server to send that stream.
-    Start(StartStream),
-    /// STP_TDATA or STP_QTDATA: asks a server to stop that stream.
-    Stop(ToolStream),
     /// STATUS: the state of the device.
     Status(Status),
     /// A type that the bench does not read, by its name. Its content is skipped. When sent, it has no
@@ -67,16 +122,7 @@ const STATUS_NAME_LEN: usize = 20;
 pub(super) fn is_read(message_type: &[u8]) -> bool {
     matches!(
         message_type,
-        b"TRANSFORM"
-            | b"POSITION"
-            | b"QTRANS"
-            | b"STATUS"
-            | b"TDATA"
-            | b"QTDATA"
-            | b"STT_TDATA"
-            | b"STT_QTDATA"
-            | b"STP_TDATA"
-            | b"STP_QTDATA"
+        b"TRANSFORM" | b"POSITION" | b"QTRANS" | b"STATUS" | b"TDATA" | b"QTDATA"
     )
 }
 
@@ -88,10 +134,6 @@ impl Body {
             Body::Position { .. } => "POSITION",
             Body::TrackingData(_) => "TDATA",
             Body::QuaternionTrackingData(_) => "QTDATA",
-            Body::Start(StartStream { stream: ToolStream::Tdata, .. }) => "STT_TDATA",
-            Body::Start(StartStream { stream: ToolStream::Qtdata, .. }) => "STT_QTDATA",
-            Body::Stop(ToolStream::Tdata) => "STP_TDATA",
-            Body::Stop(ToolStream::Qtdata) => "STP_QTDATA",
             Body::Status(_) => "STATUS",
             Body::Other(name) => name,
         }
@@ -99,22 +141,13 @@ impl Body {
 
     pub(super) fn decode(message_type: &[u8], content: &[u8]) -> Result<Self, String> {
         let length = |expected| format!("content of {} bytes ({expected} expected)", content.len());
-        let start =
-            |stream| tracking_data::start(stream, content).map(Body::Start).ok_or(length("36"));
-        let stop = |stream| content.is_empty().then_some(Body::Stop(stream)).ok_or(length("none"));
         match message_type {
             b"TRANSFORM" => floats(content).map(Body::Transform).ok_or(length("48")),
             b"POSITION" | b"QTRANS" => position(content).ok_or(length("12, 24 or 28")),
-            b"TDATA" => tracking_data::tools(content)
-                .map(Body::TrackingData)
-                .ok_or(length("a multiple of 70")),
-            b"QTDATA" => tracking_data::tools(content)
-                .map(Body::QuaternionTrackingData)
-                .ok_or(length("a multiple of 50")),
-            b"STT_TDATA" => start(ToolStream::Tdata),
-            b"STT_QTDATA" => start(ToolStream::Qtdata),
-            b"STP_TDATA" => stop(ToolStream::Tdata),
-            b"STP_QTDATA" => stop(ToolStream::Qtdata),
+            b"TDATA" => tools(content).map(Body::TrackingData).ok_or(length("a multiple of 70")),
+            b"QTDATA" => {
+                tools(content).map(Body::QuaternionTrackingData).ok_or(length("a multiple of 50"))
+            }
             b"STATUS" => status(content).map(Body::Status).ok_or(length("30 or more")),
             _ => Ok(Body::Other(text(message_type))),
         }
@@ -134,9 +167,8 @@ impl Body {
                     Quaternion::Full(xyzw) => put(xyzw),
                 }
             }
-            Body::TrackingData(tools) => tracking_data::put_tools(tools, out),
-            Body::QuaternionTrackingData(tools) => tracking_data::put_tools(tools, out),
-            Body::Start(start) => tracking_data::put_start(start, out),
+            Body::TrackingData(tools) => put_tools(tools, out),
+            Body::QuaternionTrackingData(tools) => put_tools(tools, out),
             Body::Status(status) => {
                 out.extend_from_slice(&status.code.to_be_bytes());
                 out.extend_from_slice(&status.subcode.to_be_bytes());
@@ -144,16 +176,41 @@ impl Body {
                 out.extend_from_slice(status.message.as_bytes());
                 out.push(0);
             }
-            Body::Stop(_) | Body::Other(_) => {}
+            Body::Other(_) => {}
         }
     }
 }
 
 /// Exactly `N` floats; `None` if there are more or fewer.
-pub(super) fn floats<const N: usize>(bytes: &[u8]) -> Option<[f32; N]> {
+fn floats<const N: usize>(bytes: &[u8]) -> Option<[f32; N]> {
     let (chunks, rest) = bytes.as_chunks::<4>();
     let chunks: &[[u8; 4]; N] = chunks.try_into().ok()?;
     rest.is_empty().then(|| chunks.map(f32::from_be_bytes))
+}
+
+/// The tools of a TDATA (`N` = 12) or QTDATA (7) message; none if its length is no multiple of a
+/// tool's.
+fn tools<const N: usize>(content: &[u8]) -> Option<Vec<Tool<N>>> {
+    let chunks = content.chunks_exact(TOOL_HEAD_LEN + 4 * N);
+    if !chunks.remainder().is_empty() {
+        return None;
+    }
+    chunks.map(tool).collect()
+}
+
+fn tool<const N: usize>(bytes: &[u8]) -> Option<Tool<N>> {
+    let (name, rest) = bytes.split_first_chunk::<NAME_LEN>()?;
+    let ([kind, _reserved], numbers) = rest.split_first_chunk()?;
+    let pose = floats(numbers)?;
+    Some(Tool { name: text(name), kind: *kind, pose })
+}
+
+fn put_tools<const N: usize>(tools: &[Tool<N>], out: &mut Vec<u8>) {
+    for tool in tools {
+        out.extend_from_slice(&padded::<{ NAME_LEN - 1 }>(&tool.name));
+        out.extend_from_slice(&[0, tool.kind, 0]);
+        out.extend(tool.pose.iter().flat_map(|number| number.to_be_bytes()));
+    }
 }
 
 fn position(content: &[u8]) -> Option<Body> {
@@ -203,5 +260,44 @@ mod tests {
         let status = |len| Body::decode(b"STATUS", &[0; 64][..len]);
         assert_eq!(status(29), Err("content of 29 bytes (30 or more expected)".to_owned()));
         assert!(matches!(status(30), Ok(Body::Status(s)) if s.message.is_empty()));
+    }
+
+    #[test]
+    fn tools_come_whole_or_not_at_all() {
+        let sent = [tool_kind::SIX_D, tool_kind::THREE_D, 9];
+        let sent =
+            sent.map(|kind| Tool { name: format!("Tool{kind}"), kind, pose: [1.0; 7] }).to_vec();
+        let mut bytes = Vec::new();
+        put_tools(&sent, &mut bytes);
+        assert_eq!(bytes.len(), 3 * 50);
+        assert_eq!(tools(&bytes), Some(sent));
+        assert_eq!(tools::<7>(&[]), Some(Vec::new()));
+        for len in [1, 49, 51, 149] {
+            assert_eq!(tools::<7>(&bytes[..len]), None, "{len} bytes");
+        }
+    }
+
+    #[test]
+    fn a_name_of_20_bytes_is_read_and_sent_with_a_zero_at_its_end() {
+        let name = "ReferenceToTrackerBa".to_owned();
+        let sent = Tool { name: name.clone(), kind: tool_kind::SIX_D, pose: [0.0; 7] };
+        let mut bytes = Vec::new();
+        put_tools(&[sent], &mut bytes);
+        assert_eq!(bytes[..22], *b"ReferenceToTrackerB\0\x02\0");
+        bytes[19] = b'a';
+        assert_eq!(
+            tools::<7>(&bytes).and_then(|tools| Some(tools.first()?.name.clone())),
+            Some(name)
+        );
+    }
+
+    #[test]
+    fn a_start_is_36_bytes() {
+        let stream = ToolStream { name: "QTDATA", period_ms: 25 };
+        let bytes = stream.start();
+        assert_eq!(bytes.len(), 58 + 36);
+        assert_eq!(bytes[2..14], *b"STT_QTDATA\0\0");
+        assert_eq!(bytes[58..64], [0, 0, 0, 25, 0, 0]);
+        assert_eq!(stream.stop()[..14], *b"\0\x01STP_QTDATA\0\0");
     }
 }

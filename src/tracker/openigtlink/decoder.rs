@@ -1,10 +1,33 @@
 //! Splits a stream of bytes into messages.
 
 use super::body;
-use super::crc64::crc64;
-use super::error::DecodeError;
-use super::header::{BODY_LIMIT, HEADER_LEN, Header, SKIPPED_BODY_LIMIT};
+use super::header::{BODY_LIMIT, HEADER_LEN, Header, SKIPPED_BODY_LIMIT, crc64};
 use super::message::Message;
+use thiserror::Error;
+
+/// Bytes that are not a message the bench can take.
+///
+/// The protocol has no mark that shows where the next message starts. If only the content of a message
+/// is wrong, the sender made a mistake, and the reader goes on with the next message.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("openigtlink: {problem}")]
+pub struct DecodeError {
+    problem: String,
+    /// The start of the next message is lost: drop the connection and make a new one.
+    pub loses_framing: bool,
+}
+
+impl DecodeError {
+    pub(super) fn framing(problem: String) -> Self {
+        DecodeError { problem, loses_framing: true }
+    }
+
+    /// The content of the message is wrong.
+    pub(super) fn content(header: &Header, problem: &str) -> Self {
+        let problem = format!("{}: {problem}", header.type_and_device());
+        DecodeError { problem, loses_framing: false }
+    }
+}
 
 /// The largest body accepted of the header's type.
 fn limit(header: &Header) -> u64 {
@@ -58,12 +81,12 @@ impl StreamDecoder {
     /// becomes [`super::Body::Other`], without its content and unchecked.
     ///
     /// # Errors
-    /// [`DecodeError`]. If it [loses the framing](DecodeError::loses_framing), every later poll
-    /// gives the same error: drop the connection. Otherwise poll on.
+    /// [`DecodeError`]. If it [loses the framing](DecodeError::loses_framing), every later poll gives
+    /// the same error. Otherwise poll on.
     pub fn poll(&mut self) -> Result<Option<Message>, DecodeError> {
         let result = self.advance();
         if let Err(error) = &result
-            && error.loses_framing()
+            && error.loses_framing
         {
             *self = StreamDecoder { state: State::Lost(error.clone()), ..Self::default() };
         }
@@ -73,10 +96,13 @@ impl StreamDecoder {
     /// Ends the stream.
     ///
     /// # Errors
-    /// `Truncated` if it ends within a message, or the error that lost the framing before.
+    /// If it ends within a message, or the framing was lost before.
     pub fn finish(&self) -> Result<(), DecodeError> {
         let have = self.unread().len();
-        let truncated = |have, need| Err(DecodeError::Truncated { have, need });
+        let truncated = |have: usize, need: u64| {
+            let problem = format!("{have} bytes of a message of {need}; it was cut off");
+            Err(DecodeError::framing(problem))
+        };
         match &self.state {
             State::Header if have == 0 => Ok(()),
             State::Header => truncated(have, HEADER_LEN as u64),
@@ -103,7 +129,12 @@ impl StreamDecoder {
                 State::Header => {
                     let Some(bytes) = unread.first_chunk() else { return Ok(None) };
                     let header = Header::parse(bytes)?;
-                    header.check_size(limit(&header))?;
+                    let (size, limit) = (header.body_size, limit(&header));
+                    if size > limit {
+                        let message = header.type_and_device();
+                        let problem = format!("{message}: body of {size} bytes (limit {limit})");
+                        return Err(DecodeError::framing(problem));
+                    }
                     self.used += HEADER_LEN;
                     self.state = if body::is_read(header.type_bytes()) {
                         State::Body(header)
@@ -114,7 +145,14 @@ impl StreamDecoder {
                 State::Body(header) => {
                     let len = usize::try_from(header.body_size).unwrap_or(usize::MAX);
                     let Some(body) = unread.get(..len) else { return Ok(None) };
-                    header.check_crc(crc64(body))?;
+                    let (computed, stated) = (crc64(body), header.crc);
+                    if computed != stated {
+                        return Err(DecodeError::framing(format!(
+                            "{}: CRC {computed:016x}, header says {stated:016x}; bytes were lost or \
+                             changed on the way",
+                            header.type_and_device()
+                        )));
+                    }
                     let message = Message::from_parts(header, body);
                     self.used += len;
                     self.state = State::Header;

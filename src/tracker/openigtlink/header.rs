@@ -1,8 +1,8 @@
-//! The 58-byte header that every message starts with.
+//! The 58-byte header that every message starts with, its time stamp and its checksum.
 
-use super::error::DecodeError;
-use super::stamp::IgtlStamp;
+use super::decoder::DecodeError;
 use crate::text::escaped;
+use std::sync::LazyLock;
 
 /// Bytes of a header.
 pub const HEADER_LEN: usize = 58;
@@ -40,7 +40,9 @@ impl Header {
         let (crc, _) = take(rest);
         let version = u16::from_be_bytes(version);
         if !matches!(version, 1 | 2) {
-            return Err(DecodeError::Version(version));
+            return Err(DecodeError::framing(format!(
+                "header version {version} (1 or 2 expected); is that port an OpenIGTLink server?"
+            )));
         }
         Ok(Header {
             version,
@@ -68,21 +70,6 @@ impl Header {
 
     pub(super) fn timestamp(&self) -> Option<IgtlStamp> {
         IgtlStamp::from_bits(self.stamp_bits)
-    }
-
-    pub(super) fn check_size(&self, limit: u64) -> Result<(), DecodeError> {
-        if self.body_size <= limit {
-            return Ok(());
-        }
-        let (message, size) = (self.type_and_device(), self.body_size);
-        Err(DecodeError::BodyTooLarge { message, size, limit })
-    }
-
-    pub(super) fn check_crc(&self, computed: u64) -> Result<(), DecodeError> {
-        if self.crc == computed {
-            return Ok(());
-        }
-        Err(DecodeError::Crc { message: self.type_and_device(), stated: self.crc, computed })
     }
 
     /// Names the message in an error.
@@ -115,10 +102,67 @@ pub(super) fn text(field: &[u8]) -> String {
     escaped(&String::from_utf8_lossy(unpadded(field))).into_owned()
 }
 
+/// A time stamp as sent: 32.32 fixed-point seconds since 1970-01-01 UTC.
+///
+/// Zero means "no stamp" and is not an `IgtlStamp` but `None` in a message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct IgtlStamp(u64);
+
+const NANOS_PER_S: u64 = 1_000_000_000;
+
+impl IgtlStamp {
+    /// The stamp of the raw 64 bits; none for zero.
+    pub fn from_bits(bits: u64) -> Option<Self> {
+        (bits != 0).then_some(IgtlStamp(bits))
+    }
+
+    /// The raw 64 bits: seconds in the upper half, 2⁻³² seconds in the lower.
+    pub fn bits(self) -> u64 {
+        self.0
+    }
+
+    /// The stamp nearest to `ns` nanoseconds since 1970; none at or before 1970 and past 2106.
+    pub fn from_unix_ns(ns: i64) -> Option<Self> {
+        let ns = u64::try_from(ns).ok()?;
+        let seconds = u32::try_from(ns / NANOS_PER_S).ok()?;
+        // Under a second, so the fraction stays under 2³².
+        let fraction = (((ns % NANOS_PER_S) << 32) + NANOS_PER_S / 2) / NANOS_PER_S;
+        Self::from_bits((u64::from(seconds) << 32) + fraction)
+    }
+
+    /// Nanoseconds since 1970, rounded. Inverts [`IgtlStamp::from_unix_ns`] exactly.
+    pub fn unix_ns(self) -> i64 {
+        let (seconds, fraction) = (self.0 >> 32, self.0 & 0xFFFF_FFFF);
+        let ns = seconds * NANOS_PER_S + ((fraction * NANOS_PER_S + (1 << 31)) >> 32);
+        // At most 2³² seconds: fits.
+        i64::try_from(ns).unwrap_or(i64::MAX)
+    }
+}
+
+const POLYNOMIAL: u64 = 0x42F0_E1EB_A9EA_3693;
+
+/// The checksum's change for each value of the leading byte.
+static TABLE: LazyLock<[u64; 256]> = LazyLock::new(|| {
+    std::array::from_fn(|byte| {
+        (0..8).fold((byte as u64) << 56, |crc, _| match crc >> 63 {
+            1 => (crc << 1) ^ POLYNOMIAL,
+            _ => crc << 1,
+        })
+    })
+});
+
+/// CRC-64 of `bytes` as OpenIGTLink uses it: ECMA-182 polynomial, not reflected, zero at the start
+/// and no final inversion.
+pub fn crc64(bytes: &[u8]) -> u64 {
+    let table = &*TABLE;
+    bytes.iter().fold(0, |crc, byte| (crc << 8) ^ table[usize::from((crc >> 56) as u8 ^ byte)])
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::{Body, Message, encode};
     use super::*;
+    use proptest::prelude::*;
 
     #[test]
     fn a_header_is_58_bytes_and_comes_back() {
@@ -142,6 +186,46 @@ mod tests {
     #[test]
     fn something_else_on_the_port_is_named_by_its_version() {
         let bytes = [b'G'; HEADER_LEN];
-        assert_eq!(Header::parse(&bytes), Err(DecodeError::Version(0x4747)));
+        let error = Header::parse(&bytes).unwrap_err().to_string();
+        assert!(
+            error.starts_with("openigtlink: header version 18247 (1 or 2 expected)"),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn the_check_value_of_the_catalogue() {
+        // CRC-64/ECMA-182 in the RevEng catalogue of parametrised CRC algorithms.
+        assert_eq!(crc64(b"123456789"), 0x6C40_DF5F_0B49_7347);
+    }
+
+    proptest! {
+        #[test]
+        fn nanoseconds_survive(ns in 1..=i64::from(u32::MAX) * 1_000_000_000 + 999_999_999) {
+            let stamp = IgtlStamp::from_unix_ns(ns).expect("in range");
+            prop_assert_eq!(stamp.unix_ns(), ns);
+        }
+
+        #[test]
+        fn any_bits_are_a_time_to_the_nearest_nanosecond(bits in 1..=u64::MAX) {
+            let stamp = IgtlStamp::from_bits(bits).expect("not zero");
+            let exact_ns = (u128::from(bits) * 1_000_000_000) as f64 / 2f64.powi(32);
+            // A float holds such a time to 512 ns.
+            prop_assert!((stamp.unix_ns() as f64 - exact_ns).abs() <= 512.0);
+        }
+    }
+
+    #[test]
+    fn half_a_second_is_half_the_range() {
+        let stamp = IgtlStamp::from_unix_ns(1_500_000_000).expect("in range");
+        assert_eq!(stamp.bits(), 0x0000_0001_8000_0000);
+    }
+
+    #[test]
+    fn zero_and_times_outside_the_range_are_no_stamp() {
+        assert_eq!(IgtlStamp::from_bits(0), None);
+        assert_eq!(IgtlStamp::from_unix_ns(0), None);
+        assert_eq!(IgtlStamp::from_unix_ns(-1), None);
+        assert_eq!(IgtlStamp::from_unix_ns(i64::MAX), None);
     }
 }

@@ -1,17 +1,13 @@
 //! A whole message and its bytes.
 
 use super::body::Body;
-use super::crc64::crc64;
-use super::error::DecodeError;
-use super::header::{HEADER_LEN, Header, NAME_LEN, TYPE_LEN, padded};
-use super::stamp::IgtlStamp;
+use super::decoder::DecodeError;
+use super::header::{Header, IgtlStamp, NAME_LEN, TYPE_LEN, crc64, padded};
 use super::{DEVICE_NAME_KEY, metadata};
 
 /// One OpenIGTLink message.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Message {
-    /// The header version in which it came or will be sent.
-    pub version: Version,
     /// The device's name as in the header, where it is cut to 20 bytes; see
     /// [`Message::full_device_name`].
     pub device_name: String,
@@ -19,32 +15,14 @@ pub struct Message {
     pub timestamp: Option<IgtlStamp>,
     /// Type and content.
     pub body: Body,
-    /// Key and value pairs, in the order sent. Version 2 only: version 1 leaves them out.
+    /// Key and value pairs, in the order received. Header version 2 only.
     pub metadata: Vec<(String, String)>,
 }
 
-/// The version of a header.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Version {
-    /// Protocol versions 1 and 2; every peer reads it.
-    V1,
-    /// Protocol version 3: extended header and metadata.
-    V2 {
-        /// The sender's number of the message.
-        message_id: u32,
-    },
-}
-
 impl Message {
-    /// A version 1 message without metadata.
+    /// A message without metadata.
     pub fn new(device_name: &str, timestamp: Option<IgtlStamp>, body: Body) -> Self {
-        Message {
-            version: Version::V1,
-            device_name: device_name.to_owned(),
-            timestamp,
-            body,
-            metadata: Vec::new(),
-        }
+        Message { device_name: device_name.to_owned(), timestamp, body, metadata: Vec::new() }
     }
 
     /// The value of a metadata key.
@@ -59,24 +37,16 @@ impl Message {
 
     /// A message from its header and its whole body, whose checksum has been checked.
     pub(super) fn from_parts(header: &Header, body: &[u8]) -> Result<Self, DecodeError> {
-        let read = || -> Result<Self, String> {
-            let (version, content, metadata) = if header.version == 1 {
-                (Version::V1, body, Vec::new())
-            } else {
-                let extended = metadata::split(body)?;
-                let version = Version::V2 { message_id: extended.message_id };
-                (version, extended.content, extended.metadata)
-            };
-            Ok(Message {
-                version,
-                device_name: header.device_name(),
-                timestamp: header.timestamp(),
-                body: Body::decode(header.type_bytes(), content)?,
-                metadata,
-            })
+        Self::read(header, body).map_err(|problem| DecodeError::content(header, &problem))
+    }
+
+    fn read(header: &Header, body: &[u8]) -> Result<Self, String> {
+        let (content, metadata) = match header.version {
+            1 => (body, Vec::new()),
+            _ => metadata::split(body)?,
         };
-        read()
-            .map_err(|problem| DecodeError::Content { message: header.type_and_device(), problem })
+        let body = Body::decode(header.type_bytes(), content)?;
+        Ok(Message { metadata, ..Message::new(&header.device_name(), header.timestamp(), body) })
     }
 
     /// The message whose body was skipped.
@@ -85,31 +55,28 @@ impl Message {
     }
 }
 
-/// The bytes of a message, in the version it asks for.
-///
-/// A device name over 20 bytes is cut in the header; version 2 also sends it whole, as metadata
-/// `IGTL_DEVICE_NAME`.
+/// The bytes of a message, in version 1: a device name over 20 bytes is cut, metadata are left out.
 pub fn encode(message: &Message) -> Vec<u8> {
     let mut content = Vec::new();
     message.body.encode(&mut content);
-    let (version, body) = match message.version {
-        Version::V1 => (1_u16, content),
-        Version::V2 { message_id } => (2, {
-            let mut metadata = message.metadata.clone();
-            if message.device_name.len() > NAME_LEN && message.metadata(DEVICE_NAME_KEY).is_none() {
-                metadata.push((DEVICE_NAME_KEY.to_owned(), message.device_name.clone()));
-            }
-            metadata::join(message_id, &content, &metadata)
-        }),
-    };
-    let stamp_bits = message.timestamp.map_or(0, IgtlStamp::bits);
-    let mut bytes = Vec::with_capacity(HEADER_LEN + body.len());
-    bytes.extend_from_slice(&version.to_be_bytes());
-    bytes.extend_from_slice(&padded::<TYPE_LEN>(message.body.type_name()));
-    bytes.extend_from_slice(&padded::<NAME_LEN>(&message.device_name));
-    bytes.extend_from_slice(&stamp_bits.to_be_bytes());
-    bytes.extend_from_slice(&(body.len() as u64).to_be_bytes());
-    bytes.extend_from_slice(&crc64(&body).to_be_bytes());
-    bytes.extend_from_slice(&body);
-    bytes
+    packet(message.body.type_name(), &message.device_name, message.timestamp, &content)
+}
+
+/// The bytes of a version 1 message with this content.
+pub(super) fn packet(
+    message_type: &str,
+    device_name: &str,
+    timestamp: Option<IgtlStamp>,
+    content: &[u8],
+) -> Vec<u8> {
+    [
+        &1_u16.to_be_bytes()[..],
+        &padded::<TYPE_LEN>(message_type),
+        &padded::<NAME_LEN>(device_name),
+        &timestamp.map_or(0, IgtlStamp::bits).to_be_bytes(),
+        &(content.len() as u64).to_be_bytes(),
+        &crc64(content).to_be_bytes(),
+        content,
+    ]
+    .concat()
 }

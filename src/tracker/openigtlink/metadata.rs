@@ -10,30 +10,21 @@ use crate::text::escaped;
 const EXTENDED_HEADER_LEN: usize = 12;
 const ENTRY_LEN: usize = 8;
 
-/// IANA character sets of metadata values.
-const US_ASCII: u16 = 3;
-const UTF_8: u16 = 106;
+/// Key and value pairs.
+type Metadata = Vec<(String, String)>;
 
-/// The parts of a version 2 body.
-pub(super) struct Extended<'a> {
-    pub(super) message_id: u32,
-    pub(super) content: &'a [u8],
-    pub(super) metadata: Vec<(String, String)>,
-}
-
-/// Splits a version 2 body into its parts, and checks every size that it states.
-pub(super) fn split(body: &[u8]) -> Result<Extended<'_>, String> {
+/// Splits a version 2 body into content and metadata, and checks every size that it states.
+pub(super) fn split(body: &[u8]) -> Result<(&[u8], Metadata), String> {
     let short = |stated: u16| {
         let body = body.len();
         format!("extended header of {stated} bytes in a body of {body} (12 or more expected)")
     };
-    let Some(&[s0, s1, i0, i1, t0, t1, t2, t3, m0, m1, m2, m3]) = body.first_chunk() else {
+    let Some(&[s0, s1, i0, i1, t0, t1, t2, t3, _, _, _, _]) = body.first_chunk() else {
         return Err(short(0));
     };
     let size = u16::from_be_bytes([s0, s1]);
     let index_len = usize::from(u16::from_be_bytes([i0, i1]));
     let text_len = u32::from_be_bytes([t0, t1, t2, t3]);
-    let message_id = u32::from_be_bytes([m0, m1, m2, m3]);
 
     if usize::from(size) < EXTENDED_HEADER_LEN {
         return Err(short(size));
@@ -46,11 +37,11 @@ pub(super) fn split(body: &[u8]) -> Result<Extended<'_>, String> {
         .ok_or_else(|| format!("{stated} bytes of metadata where the body has {}", rest.len()))?;
     let (content, metadata) = rest.split_at(content_len);
     let (index, text) = metadata.split_at(index_len);
-    Ok(Extended { message_id, content, metadata: entries(index, text)? })
+    Ok((content, entries(index, text)?))
 }
 
 /// The key and value pairs of a metadata index and its text.
-fn entries(index: &[u8], mut text: &[u8]) -> Result<Vec<(String, String)>, String> {
+fn entries(index: &[u8], mut text: &[u8]) -> Result<Metadata, String> {
     let Some((count, index)) = index.split_first_chunk() else {
         return Ok(Vec::new()); // no metadata at all
     };
@@ -83,62 +74,16 @@ fn entries(index: &[u8], mut text: &[u8]) -> Result<Vec<(String, String)>, Strin
         .collect()
 }
 
-/// Builds a version 2 body. Entries that the index cannot hold (more than 8191, or keys over 64 KiB)
-/// are left out.
-pub(super) fn join(message_id: u32, content: &[u8], metadata: &[(String, String)]) -> Vec<u8> {
-    let (mut index, mut text, mut count) = (Vec::new(), Vec::new(), 0u16);
-    for (key, value) in metadata.iter().take((usize::from(u16::MAX) - 2) / ENTRY_LEN) {
-        let (Ok(key_len), Ok(value_len)) = (u16::try_from(key.len()), u32::try_from(value.len()))
-        else {
-            continue;
-        };
-        let encoding = if value.is_ascii() { US_ASCII } else { UTF_8 };
-        index.extend_from_slice(&key_len.to_be_bytes());
-        index.extend_from_slice(&encoding.to_be_bytes());
-        index.extend_from_slice(&value_len.to_be_bytes());
-        text.extend_from_slice(key.as_bytes());
-        text.extend_from_slice(value.as_bytes());
-        count += 1;
-    }
-    let index_len = 2 + ENTRY_LEN as u16 * count;
-    let mut body = Vec::with_capacity(EXTENDED_HEADER_LEN + content.len() + text.len() + 64);
-    body.extend_from_slice(&(EXTENDED_HEADER_LEN as u16).to_be_bytes());
-    body.extend_from_slice(&index_len.to_be_bytes());
-    body.extend_from_slice(&u32::try_from(text.len()).unwrap_or(u32::MAX).to_be_bytes());
-    body.extend_from_slice(&message_id.to_be_bytes());
-    body.extend_from_slice(content);
-    body.extend_from_slice(&count.to_be_bytes());
-    body.extend_from_slice(&index);
-    body.extend_from_slice(&text);
-    body
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    const PRINTABLE_KEY: &str = r"[^\p{C}\p{Z}]{0,12}";
-    const PRINTABLE_VALUE: &str = r"[^\p{C}\p{Z}]{0,40}";
-
     proptest! {
         #[test]
-        fn a_body_put_together_comes_apart(
-            message_id: u32,
-            content in prop::collection::vec(any::<u8>(), 0..64),
-            metadata in prop::collection::vec((PRINTABLE_KEY, PRINTABLE_VALUE), 0..6),
-        ) {
-            let body = join(message_id, &content, &metadata);
-            let parts = split(&body).expect("well formed");
-            prop_assert_eq!(parts.message_id, message_id);
-            prop_assert_eq!(parts.content, &content[..]);
-            prop_assert_eq!(parts.metadata, metadata);
-        }
-
-        #[test]
         fn any_bytes_are_split_or_refused(body in prop::collection::vec(any::<u8>(), 0..80)) {
-            if let Ok(parts) = split(&body) {
-                prop_assert!(parts.content.len() <= body.len() - EXTENDED_HEADER_LEN);
+            if let Ok((content, _)) = split(&body) {
+                prop_assert!(content.len() <= body.len() - EXTENDED_HEADER_LEN);
             }
         }
     }
@@ -146,9 +91,7 @@ mod tests {
     #[test]
     fn a_longer_extended_header_is_stepped_over() {
         let body = [&[0, 14, 0, 0, 0, 0, 0, 0, 0, 0, 0, 7, 0xAA, 0xBB][..], b"content"].concat();
-        let parts = split(&body).expect("well formed");
-        assert_eq!((parts.message_id, parts.content), (7, &b"content"[..]));
-        assert!(parts.metadata.is_empty());
+        assert_eq!(split(&body).expect("well formed"), (&b"content"[..], Vec::new()));
     }
 
     #[test]

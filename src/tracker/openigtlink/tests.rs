@@ -90,28 +90,27 @@ fn frozen() -> [(&'static str, Message); 11] {
     let tool = |name: &str, kind, pose| Tool { name: name.to_owned(), kind, pose };
     let Body::Transform(turned) = TURNED else { unreachable!("is one") };
     let ball = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 2.0, 3.0];
-    let matrices =
-        vec![tool("NeedleToTracker", ToolKind::SixD, turned), tool("Ball", ToolKind::ThreeD, ball)];
+    let matrices = vec![
+        tool("NeedleToTracker", tool_kind::SIX_D, turned),
+        tool("Ball", tool_kind::THREE_D, ball),
+    ];
     let quaternions = vec![Tool {
         name: "NeedleToTracker".to_owned(),
-        kind: ToolKind::FiveD,
+        kind: tool_kind::FIVE_D,
         pose: [1.0, 2.0, 3.0, 0.5, -0.5, 0.5, 0.5],
     }];
-    let start = |stream, period_ms, coordinates: &str| {
-        Body::Start(StartStream { stream, period_ms, coordinates: coordinates.to_owned() })
-    };
+    let request = |name: &str| stamped("Bench", Body::Other(name.to_owned()));
     [
         (TDATA_V1, stamped("Tracker", Body::TrackingData(matrices))),
         (QTDATA_V1, stamped("Tracker", Body::QuaternionTrackingData(quaternions))),
-        (STT_TDATA_V1, stamped("Bench", start(ToolStream::Tdata, 25, "Patient"))),
-        (STT_QTDATA_V1, stamped("Bench", start(ToolStream::Qtdata, 0, ""))),
-        (STP_TDATA_V1, stamped("Bench", Body::Stop(ToolStream::Tdata))),
-        (STP_QTDATA_V1, stamped("Bench", Body::Stop(ToolStream::Qtdata))),
+        (STT_TDATA_V1, request("STT_TDATA")),
+        (STT_QTDATA_V1, request("STT_QTDATA")),
+        (STP_TDATA_V1, request("STP_TDATA")),
+        (STP_QTDATA_V1, request("STP_QTDATA")),
         (TRANSFORM_V1, Message::new("NeedleToTracker", stamp(), TURNED)),
         (
             TRANSFORM_V2,
             Message {
-                version: Version::V2 { message_id: 7 },
                 metadata: metadata(&[
                     ("IGTL_DEVICE_NAME", "NeedleTipToTrackerBase"),
                     ("TransformValid", "False"),
@@ -130,7 +129,7 @@ fn frozen() -> [(&'static str, Message); 11] {
 fn bytes_of_others_are_read_and_written_the_same() {
     for (hex, message) in frozen() {
         assert_eq!(decode(&bytes(hex)).as_ref(), Ok(&message));
-        if !matches!(message.body, Body::Other(_)) {
+        if !matches!(message.body, Body::Other(_)) && message.metadata.is_empty() {
             assert_eq!(encode(&message), bytes(hex), "{}", message.body.type_name());
         }
     }
@@ -145,13 +144,19 @@ fn decode(bytes: &[u8]) -> Result<Message, DecodeError> {
 
 #[test]
 fn a_name_too_long_for_the_header_is_whole_in_version_2() {
-    let sent = Message {
-        version: Version::V2 { message_id: 0 },
-        ..Message::new("NeedleTipToTrackerBase", None, TURNED)
-    };
-    let read = decode(&encode(&sent)).expect("well formed");
+    let read = decode(&bytes(TRANSFORM_V2)).expect("well formed");
     assert_eq!(read.device_name, "NeedleTipToTrackerBa");
     assert_eq!(read.full_device_name(), "NeedleTipToTrackerBase");
+}
+
+/// A server reads what the bench asks for as the reference library's own.
+#[test]
+fn requests_are_those_of_the_reference_library() {
+    let stream = ToolStream { name: "QTDATA", period_ms: 0 };
+    for (sent, hex) in [(stream.start(), STT_QTDATA_V1), (stream.stop(), STP_QTDATA_V1)] {
+        let reference = bytes(hex);
+        assert_eq!((&sent[..14], &sent[42..]), (&reference[..14], &reference[42..]));
+    }
 }
 
 #[test]
@@ -162,7 +167,8 @@ fn a_damaged_body_loses_the_framing_for_good() {
     let mut decoder = StreamDecoder::new();
     decoder.push(&stream);
     let first = decoder.poll();
-    assert!(matches!(&first, Err(error @ DecodeError::Crc { .. }) if error.loses_framing()));
+    let error = first.clone().expect_err("damaged");
+    assert!(error.loses_framing && error.to_string().contains(": CRC "), "{error}");
     decoder.push(&bytes(TRANSFORM_V1));
     assert_eq!(decoder.poll(), first);
 }
@@ -181,7 +187,7 @@ fn a_message_wrong_inside_is_refused_and_the_next_is_read() {
     let mut decoder = StreamDecoder::new();
     decoder.push(&stream);
     let error = decoder.poll().expect_err("one float short");
-    assert!(!error.loses_framing());
+    assert!(!error.loses_framing);
     assert_eq!(
         error.to_string(),
         "openigtlink: TRANSFORM \"NeedleToTracker\": content of 47 bytes (48 expected)"
@@ -200,9 +206,8 @@ fn lengths_that_a_peer_states_are_bounded() {
     };
     for size in [BODY_LIMIT + 1, u64::MAX] {
         let error = with_size(TRANSFORM_V1, size).expect_err("too large");
-        assert!(
-            matches!(error, DecodeError::BodyTooLarge { size: s, limit: BODY_LIMIT, .. } if s == size)
-        );
+        let text = format!("body of {size} bytes (limit {BODY_LIMIT})");
+        assert!(error.to_string().ends_with(&text), "{error}");
     }
     assert_eq!(with_size(TRANSFORM_V1, BODY_LIMIT), Ok(None));
     // An image is skipped as it comes, and can be larger. Nothing of it is kept.
@@ -229,12 +234,10 @@ fn a_stream_that_ends_within_a_message_says_so() {
             let message = decoder.poll().expect("nothing wrong yet");
             assert_eq!(message.is_some(), cut == whole.len());
             let need = if cut < HEADER_LEN { HEADER_LEN } else { whole.len() } as u64;
-            let expected = if cut == 0 || cut == whole.len() {
-                Ok(())
-            } else {
-                Err(DecodeError::Truncated { have: cut, need })
-            };
-            assert_eq!(decoder.finish(), expected);
+            let expected = (cut != 0 && cut != whole.len()).then(|| {
+                format!("openigtlink: {cut} bytes of a message of {need}; it was cut off")
+            });
+            assert_eq!(decoder.finish().err().map(|error| error.to_string()), expected);
         }
     }
 }
@@ -247,7 +250,7 @@ fn drain(decoder: &mut StreamDecoder) -> Vec<Result<Message, DecodeError>> {
             Ok(None) => return out,
             Ok(Some(message)) => out.push(Ok(message)),
             Err(error) => {
-                let lost = error.loses_framing();
+                let lost = error.loses_framing;
                 out.push(Err(error));
                 if lost {
                     return out;
@@ -314,7 +317,6 @@ proptest! {
         unix_ns in 1..i64::from(u32::MAX) * 1_000_000_000,
         elements: [f32; 12],
         quaternion: [f32; 4],
-        version_2: bool,
         tools in 0..5usize,
     ) {
         let finite = |v: f32| if v.is_nan() { 0.0 } else { v };
@@ -325,15 +327,12 @@ proptest! {
                 quaternion: Quaternion::Full(quaternion.map(finite)),
             },
             Body::TrackingData(vec![
-                Tool { name: "Tip".to_owned(), kind: ToolKind::Unknown(9), pose: elements.map(finite) };
+                Tool { name: "Tip".to_owned(), kind: 9, pose: elements.map(finite) };
                 tools
             ]),
         ];
         for body in bodies {
-            let sent = Message {
-                version: if version_2 { Version::V2 { message_id: 1 } } else { Version::V1 },
-                ..Message::new(&name, IgtlStamp::from_unix_ns(unix_ns), body)
-            };
+            let sent = Message::new(&name, IgtlStamp::from_unix_ns(unix_ns), body);
             prop_assert_eq!(decode(&encode(&sent)), Ok(sent));
         }
     }

@@ -1,7 +1,7 @@
 //! The bench's end of a tracker's connection over TCP.
 
 use super::super::link::{Link, LinkSettings, Outlet};
-use crate::tracker::openigtlink::{Body, Message, StartStream, encode};
+use crate::tracker::openigtlink::ToolStream;
 use crate::tracker::{Event, Protocol, Reader};
 use crate::units::Time;
 use std::io;
@@ -196,7 +196,7 @@ struct Peer {
     reader: Reader,
     buffer: Vec<u8>,
     last_heard: Instant,
-    request: Option<StartStream>,
+    request: Option<ToolStream>,
 }
 
 impl Peer {
@@ -210,15 +210,14 @@ impl Peer {
             reader: Reader::new(settings.protocol),
             buffer: vec![0; Self::BUFFER_LEN],
             last_heard: Instant::now(),
-            request: settings.request.clone().filter(|_| speaks_openigtlink),
+            request: settings.request.filter(|_| speaks_openigtlink),
         }
     }
 
     /// Requests the stream, if one is to be requested.
     async fn ask(&mut self) -> Result<(), String> {
-        let Some(request) = self.request.clone() else { return Ok(()) };
-        let message = encode(&Message::new("", None, Body::Start(request)));
-        (self.stream.write_all(&message).await)
+        let Some(request) = self.request else { return Ok(()) };
+        (self.stream.write_all(&request.start()).await)
             .map_err(|error| format!("tracker: connection to {} lost: {error}", self.name))
     }
 
@@ -230,10 +229,9 @@ impl Peer {
 
 impl Drop for Peer {
     fn drop(&mut self) {
-        if let Some(StartStream { stream, .. }) = self.request {
+        if let Some(request) = self.request {
             // Best effort: the connection ends now anyway.
-            let stop = encode(&Message::new("", None, Body::Stop(stream)));
-            let _ = self.stream.try_write(&stop);
+            let _ = self.stream.try_write(&request.stop());
         }
     }
 }

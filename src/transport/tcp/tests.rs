@@ -3,7 +3,7 @@
 
 use super::*;
 use crate::tracker::openigtlink::{
-    Body, Message, Quaternion, StartStream, Status, Tool, ToolKind, ToolStream, encode,
+    Body, Message, Quaternion, Status, Tool, ToolStream, encode, tool_kind,
 };
 use crate::tracker::{Event, Protocol};
 use crate::transport::link::{Link, LinkSettings};
@@ -238,21 +238,18 @@ async fn heard(peer: &mut TcpStream, len: usize) -> Vec<u8> {
 
 #[tokio::test]
 async fn a_server_is_asked_for_its_stream_and_told_to_end_it() {
-    for (stream, stop) in [
-        (ToolStream::Tdata, Body::Stop(ToolStream::Tdata)),
-        (ToolStream::Qtdata, Body::Stop(ToolStream::Qtdata)),
-    ] {
-        let request = StartStream { stream, period_ms: 25, coordinates: String::new() };
-        let settings = LinkSettings { request: Some(request.clone()), ..quick() };
+    for name in ["TDATA", "QTDATA"] {
+        let request = ToolStream { name, period_ms: 25 };
+        let settings = LinkSettings { request: Some(request), ..quick() };
         let (mut link, mut peer, _) = bare_peer(settings).await;
-        let start = encode(&Message::new("", None, Body::Start(request)));
+        let start = request.start();
         assert_eq!(heard(&mut peer, start.len()).await, start);
-        let tool = Tool { name: "Needle".to_owned(), kind: ToolKind::SixD, pose: [0.5; 12] };
+        let tool = Tool { name: "Needle".to_owned(), kind: tool_kind::SIX_D, pose: [0.5; 12] };
         let tools = Message::new("Tracker", None, Body::TrackingData(vec![tool]));
         peer.write_all(&encode(&tools)).await.expect("sent");
         assert_eq!(until(&mut link, tool_of_sample).await, "Needle");
         drop(link);
-        let stop = encode(&Message::new("", None, stop));
+        let stop = request.stop();
         assert_eq!(heard(&mut peer, stop.len()).await, stop);
     }
 }

@@ -5,7 +5,7 @@ use crate::support::stop::{Stop, documented, stopped};
 use needle_bench::canopen::cia402::{DriveState, Statusword};
 use needle_bench::canopen::emcy::{Emcy, EmcyCode};
 use needle_bench::canopen::{Frame, NodeId};
-use needle_bench::emulator::fault::FaultKind;
+use needle_bench::emulator::fault::{Fault, FaultKind};
 use std::time::Duration;
 
 const TPDOS: [u16; 2] = [0x181, 0x182];
@@ -14,7 +14,7 @@ const TPDOS: [u16; 2] = [0x181, 0x182];
 fn set_voltage(bench: &mut Bench, drives: &[usize], on: bool) {
     bench.stage.handle_timeout(bench.now);
     for drive in drives {
-        bench.stage.change_drive(*drive, bench.now, FaultKind::NoVoltage, !on);
+        bench.stage.change_drive(*drive, bench.now, &Fault::of(FaultKind::NoVoltage), !on);
     }
 }
 

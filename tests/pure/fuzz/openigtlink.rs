@@ -4,23 +4,21 @@
 use super::fuzz;
 use crate::openigtlink_vectors::decode;
 use needle_bench::tracker::openigtlink::{
-    Body, HEADER_LEN, IgtlStamp, Message, Quaternion, StartStream, Status, Tool, ToolKind,
-    ToolStream, Version, crc64, encode,
+    Body, HEADER_LEN, IgtlStamp, Message, Quaternion, Status, Tool, ToolStream, crc64, encode,
+    tool_kind,
 };
 use needle_bench::tracker::{Event, Protocol, Reader, ndjson};
 use needle_bench::units::Time;
 
 fn corpus() -> Vec<Vec<u8>> {
     let turned = [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 12.5, -3.25, 100.0];
-    let tool = |name: &str| Tool { name: name.to_owned(), kind: ToolKind::SixD, pose: turned };
+    let tool = |name: &str| Tool { name: name.to_owned(), kind: tool_kind::SIX_D, pose: turned };
     let quaternion = Tool {
         name: "Ball".to_owned(),
-        kind: ToolKind::ThreeD,
+        kind: tool_kind::THREE_D,
         pose: [1.0, 2.0, 3.0, 0.5, 0.5, 0.5, 0.5],
     };
     let position = |quaternion| Body::Position { position_mm: [1.0, 2.0, 3.0], quaternion };
-    let start =
-        StartStream { stream: ToolStream::Tdata, period_ms: 25, coordinates: "Patient".to_owned() };
     let status = Status {
         code: 13,
         subcode: -5,
@@ -34,8 +32,6 @@ fn corpus() -> Vec<Vec<u8>> {
         position(Quaternion::Full([0.5; 4])),
         Body::TrackingData(vec![tool("NeedleToTracker"), tool("ReferenceToTrackerBa")]),
         Body::QuaternionTrackingData(vec![quaternion]),
-        Body::Start(start),
-        Body::Stop(ToolStream::Qtdata),
         Body::Status(status),
         Body::Other("GET_IMAGE".to_owned()),
     ];
@@ -45,18 +41,39 @@ fn corpus() -> Vec<Vec<u8>> {
         ("ReferenceToTrackerBaseStatus", "OUT_OF_VIEW"),
         ("Ünïcode", "ünïcode"),
     ];
+    let stream = ToolStream { name: "TDATA", period_ms: 25 };
     bodies
         .into_iter()
         .flat_map(|body| {
-            let plain = Message::new("NeedleTipToTrackerBase", stamp, body);
-            let rich = Message {
-                version: Version::V2 { message_id: 7 },
-                metadata: metadata.map(|(k, v)| (k.to_owned(), v.to_owned())).to_vec(),
-                ..plain.clone()
-            };
-            [encode(&plain), encode(&rich)]
+            let plain = encode(&Message::new("NeedleTipToTrackerBase", stamp, body));
+            [version_2(&plain, &metadata), plain]
         })
+        .chain([stream.start(), stream.stop()])
         .collect()
+}
+
+/// The message with an extended header and these metadata.
+fn version_2(plain: &[u8], metadata: &[(&str, &str)]) -> Vec<u8> {
+    let (header, content) = plain.split_at(HEADER_LEN);
+    let (mut index, mut text) = ((metadata.len() as u16).to_be_bytes().to_vec(), Vec::new());
+    for (key, value) in metadata {
+        index.extend_from_slice(&(key.len() as u16).to_be_bytes());
+        index.extend_from_slice(&106_u16.to_be_bytes());
+        index.extend_from_slice(&(value.len() as u32).to_be_bytes());
+        text.extend_from_slice(key.as_bytes());
+        text.extend_from_slice(value.as_bytes());
+    }
+    let extended = [
+        &12_u16.to_be_bytes()[..],
+        &(index.len() as u16).to_be_bytes(),
+        &(text.len() as u32).to_be_bytes(),
+        &7_u32.to_be_bytes(),
+    ]
+    .concat();
+    let mut message = [header, &extended, content, &index, &text].concat();
+    message[1] = 2;
+    repair(&mut message);
+    message
 }
 
 /// States the size and the checksum that the bytes have, so that the inside is looked at too.
@@ -82,6 +99,7 @@ fn a_message_is_read_or_refused() {
             return;
         }
         // What was understood is understood again when it is sent on.
+        let message = Message { metadata: Vec::new(), ..message };
         let again = decode(&encode(&message)).expect("was read");
         assert_eq!(again.body.type_name(), message.body.type_name());
         assert_eq!(encode(&again), encode(&message));

@@ -45,7 +45,7 @@ fn off_a_limit_switch_the_axis_may_move() {
 #[test]
 fn the_safety_input_takes_the_torque_away() {
     let mut bench = moving();
-    bench.drive.suffer(bench.now, FaultKind::Interlock, true);
+    bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::EmergencyStop), true);
     bench.take();
     bench.pass(PERIOD);
     assert_eq!((bench.state(), bench.position()), (DriveState::Fault, 300.0));
@@ -54,7 +54,7 @@ fn the_safety_input_takes_the_torque_away() {
     bench.cycle(0x00, 300);
     bench.cycle(0x80, 300);
     assert_eq!(bench.state(), DriveState::Fault, "not while it is open");
-    bench.drive.suffer(bench.now, FaultKind::Interlock, false);
+    bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::EmergencyStop), false);
     bench.enable();
 }
 
@@ -62,7 +62,7 @@ fn the_safety_input_takes_the_torque_away() {
 #[test]
 fn a_blocked_axis_falls_behind_and_faults() {
     let mut bench = moving();
-    bench.drive.suffer(bench.now, FaultKind::Stall, true);
+    bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::Stall), true);
     let mut target = 400;
     while bench.state() == DriveState::OperationEnabled {
         bench.pass(PERIOD);
@@ -80,7 +80,7 @@ fn a_blocked_axis_falls_behind_and_faults() {
 fn a_blocked_axis_is_given_the_time_of_6066() {
     let mut bench = moving();
     bench.write(object::FOLLOWING_ERROR_TIMEOUT, &25u16.to_le_bytes());
-    bench.drive.suffer(bench.now, FaultKind::Stall, true);
+    bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::Stall), true);
     let mut target = 400;
     while bench.state() == DriveState::OperationEnabled {
         bench.pass(PERIOD);
@@ -94,11 +94,11 @@ fn a_blocked_axis_is_given_the_time_of_6066() {
 #[test]
 fn an_axis_that_is_released_in_time_catches_up() {
     let mut bench = moving();
-    bench.drive.suffer(bench.now, FaultKind::Stall, true);
+    bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::Stall), true);
     bench.pass(PERIOD);
     bench.cycle(0x0f, 500);
     assert_eq!(bench.read(object::FOLLOWING_ERROR_ACTUAL), 200i32.to_le_bytes());
-    bench.drive.suffer(bench.now, FaultKind::Stall, false);
+    bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::Stall), false);
     bench.cycle(0x0f, 600);
     assert_eq!((bench.position(), bench.state()), (600.0, DriveState::OperationEnabled));
 }
@@ -112,7 +112,11 @@ fn a_fault_of_its_own_is_told_with_its_register() {
         (0xff01, "085#01FF810000000000"),
     ] {
         let mut bench = moving();
-        bench.drive.suffer(bench.now, FaultKind::Drive(EmcyCode(code)), true);
+        bench.drive.apply_fault(
+            bench.now,
+            &Fault { code: Some(code), ..Fault::of(FaultKind::DriveFault) },
+            true,
+        );
         bench.take();
         assert_eq!(bench.emergencies, [told]);
         assert_eq!(bench.read(object::ERROR_CODE), code.to_le_bytes());
@@ -159,7 +163,7 @@ fn an_epos4_lacks_what_it_lacks() {
 #[test]
 fn a_restart_is_told_and_forgets() {
     let mut bench = moving();
-    bench.drive.suffer(bench.now, FaultKind::Restart, true);
+    bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::Restart), true);
     assert_eq!(bench.take(), ["705#00"]);
     assert_eq!(bench.state(), DriveState::SwitchOnDisabled);
     assert_eq!(bench.read(object::INTERPOLATION_PERIOD_VALUE), [1]);
