@@ -2,12 +2,12 @@
 
 use super::configuration::Keys;
 use super::group::{Group, group};
-use super::run::{Condition, Folder};
-use super::text::{count, plain, utc};
+use super::run::{Condition, Folder, utc};
 use crate::archive::{VerdictKind, file};
 use crate::config::nearest_key;
-use crate::text::{fixed, screen};
+use crate::text::{escaped, fixed, screen};
 use minijinja::context;
+use minijinja::value::Serde;
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
@@ -133,8 +133,8 @@ impl Campaign {
         let rows = self.lines.iter().filter_map(|line| Some(row(line.run.as_deref()?)));
         let more = context! {
             rows => rows.collect::<Vec<_>>(),
-            totals => self.groups.iter().map(Group::to_text).collect::<Vec<_>>(),
-            folders => count(self.lines.len(), "folder"),
+            // In JSON infinite medians are null.
+            groups => minijinja::Value::from(Serde(&self.groups)),
             left_out => self.lines.len() - self.counted(),
         };
         screen(include_str!("campaign.txt"), &self.to_json(), more)
@@ -226,7 +226,7 @@ fn exclusion(folder: &Folder) -> Option<(Exclusion, String)> {
         Condition::Changed(_) => return Some((Exclusion::Edited, caution)),
     }
     if let Some(verdict) = manifest.verdict().filter(|v| v.verdict == VerdictKind::Invalid) {
-        return Some((Exclusion::Invalid, plain(&verdict.reason)));
+        return Some((Exclusion::Invalid, escaped(&verdict.reason).into_owned()));
     }
     let operation = manifest.operation.as_ref()?;
     Some((Exclusion::Operation, format!("the stage's {operation}")))

@@ -1,13 +1,25 @@
 //! Two runs side by side: differences in their settings, then their figures.
 
 use super::configuration::{Difference, Keys, differences};
-use super::figures::{Figure, errors};
+use super::figures::Figure;
 use super::run::Run;
-use super::text::plain;
 use crate::archive::{DriveIdentity, Manifest};
-use crate::text::screen;
+use crate::text::{escaped, screen};
 use minijinja::context;
 use serde_json::{Map, Value, json};
+
+/// What a manifest says of bench, rig and people, beside the drives.
+const SETTING: [&str; 9] = [
+    "version",
+    "git",
+    "calibration_sha256",
+    "bus",
+    "tracker",
+    "operator",
+    "phantom",
+    "note",
+    "operation",
+];
 
 /// The differences between two runs, and their figures.
 #[derive(Debug, Clone, PartialEq)]
@@ -31,8 +43,6 @@ impl Comparison {
         let mut keys = Vec::new();
         for Run { folder, .. } in [a, b] {
             warnings.extend(folder.caution().map(|caution| format!("{}: {caution}", folder.dir)));
-        }
-        for Run { folder, .. } in [a, b] {
             keys.push(folder.keys().unwrap_or_else(|error| {
                 warnings.push(format!("{}: configuration: {error}", folder.dir));
                 Keys::new()
@@ -54,7 +64,7 @@ impl Comparison {
     pub fn to_text(&self) -> Result<String, minijinja::Error> {
         let side = |value: &Option<String>| value.clone().unwrap_or_else(|| "-".to_owned());
         let row = |Difference { key, a, b }: &Difference| {
-            vec![format!("  {key}"), plain(&format!("{} → {}", side(a), side(b)))]
+            vec![format!("  {key}"), escaped(&format!("{} → {}", side(a), side(b))).into_owned()]
         };
         let rows = |all: &[Difference]| all.iter().map(row).collect::<Vec<_>>();
         let figures = self.figures.iter().map(|[a, b]| {
@@ -103,12 +113,7 @@ fn difference(a: &Figure, b: &Figure) -> Option<f64> {
 
 /// The figures of both runs, in the order of the first; unknown figures are left out.
 fn figures(a: &Run, b: &Run) -> Vec<[Figure; 2]> {
-    let all = |run: &Run| {
-        let mut all = run.limited_figures();
-        all.extend(errors(&run.folder, &run.figures()));
-        all
-    };
-    let (a, b) = (all(a), all(b));
+    let (a, b) = (a.all_figures(), b.all_figures());
     let unknown = |figure: &Figure| Figure { value: None, ..figure.clone() };
     let only_b = b.iter().filter(|figure| a.iter().all(|other| other.key != figure.key));
     let pairs = a.iter().map(|figure| {
@@ -121,18 +126,9 @@ fn figures(a: &Run, b: &Run) -> Vec<[Figure; 2]> {
 
 /// What a manifest says of bench, rig and people, other than the configuration.
 fn setting(manifest: &Manifest) -> Keys {
-    let said = [
-        ("version", Some(&manifest.version)),
-        ("git", manifest.git.as_ref()),
-        ("calibration_sha256", manifest.calibration_sha256.as_ref()),
-        ("bus", Some(&manifest.bus)),
-        ("tracker", Some(&manifest.tracker)),
-        ("operator", manifest.operator.as_ref()),
-        ("phantom", manifest.phantom.as_ref()),
-        ("note", manifest.note.as_ref()),
-        ("operation", manifest.operation.as_ref()),
-    ];
-    let said = said.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?.clone())));
+    let all = serde_json::to_value(manifest).unwrap_or_default();
+    let said = SETTING.into_iter().filter_map(|key| Some((key, all[key].as_str()?)));
+    let said = said.map(|(key, value)| (key.to_owned(), value.to_owned()));
     let drives = manifest.drives.iter().map(|d| (format!("{} drive", d.axis), drive(d)));
     said.chain(drives).collect()
 }

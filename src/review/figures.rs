@@ -157,7 +157,7 @@ pub(super) fn last_third(folder: &Folder, report: &FigureReport) -> String {
 }
 
 /// The estimate's errors, a figure for each coordinate.
-pub(super) fn errors(folder: &Folder, report: &FigureReport) -> Vec<Figure> {
+fn errors(folder: &Folder, report: &FigureReport) -> Vec<Figure> {
     let rms = format!("estimate's error, RMS over {},", last_third(folder, report));
     let sets = [
         ("estimate_rms", rms.as_str(), report.estimate_rms),
@@ -217,6 +217,13 @@ impl Run {
     /// The run's figures, with limits if its configuration can be read.
     pub(super) fn limited_figures(&self) -> Vec<Figure> {
         figures(&self.folder, &self.figures(), &self.folder.limits().unwrap_or_default())
+    }
+
+    /// These, and the errors of the estimate.
+    pub(super) fn all_figures(&self) -> Vec<Figure> {
+        let mut all = self.limited_figures();
+        all.extend(errors(&self.folder, &self.figures()));
+        all
     }
 }
 

@@ -3,10 +3,8 @@
 use super::configuration::Keys;
 use super::interval::{MedianInterval, Proportion};
 use super::run::Folder;
-use super::text::count;
 use crate::archive::RunOutcome;
 use crate::study::{FigureReport, OFF_PLANE_LIMIT_MM};
-use crate::text::fixed;
 use serde::Serialize;
 use std::collections::BTreeSet;
 
@@ -65,46 +63,4 @@ fn varied(runs: &[(&Folder, Keys)]) -> Vec<String> {
         values.len() > 1
     };
     all.into_iter().filter(differs).cloned().collect()
-}
-
-impl Group {
-    /// At most this many varied keys are listed in the text.
-    const VARIED_MAX: usize = 6;
-
-    pub(super) fn to_text(&self) -> String {
-        let mut text = format!("{}: {}", self.label, count(self.completed.of, "run"));
-        if self.configurations > 1 {
-            let shown: Vec<&str> =
-                self.varied.iter().take(Self::VARIED_MAX).map(String::as_str).collect();
-            let more = self.varied.len() - shown.len();
-            text += &format!(" of {} configurations, which differ in ", self.configurations);
-            text += &shown.join(", ");
-            text.extend((more > 0).then(|| format!(" and {more} more")));
-        }
-        let share = |proportion: &Proportion| {
-            let percent = |share: f64| format!("{:.0}", share * 100.0);
-            let interval = proportion.wilson_95.map(|[low, high]| {
-                format!(" ({} to {} %, Wilson 95 %)", percent(low), percent(high))
-            });
-            let share = proportion.fraction.map(percent).unwrap_or_default();
-            let interval = interval.unwrap_or_default();
-            format!("{} of {}, {share} %{interval}", proportion.count, proportion.of)
-        };
-        let median = |median: &MedianInterval, decimals: usize| {
-            let interval = match median.interval {
-                Some(interval) => {
-                    let [low, high] = interval.map(|value| fixed(Some(value), decimals));
-                    format!("({low} to {high}, order statistics, 95 % or more)")
-                }
-                None => "(a 95 % interval needs six runs)".to_owned(),
-            };
-            let unit = if median.value.is_finite() { " mm" } else { "" };
-            format!("median {}{unit} {interval}", fixed(Some(median.value), decimals))
-        };
-        text += &format!("\n  completed   {}", share(&self.completed));
-        text += &format!("\n  settled     {}: completed, under 1 mm RMS", share(&self.settled));
-        text.extend(self.off_plane_rms_mm.map(|m| format!("\n  off plane   {}", median(&m, 3))));
-        text.extend(self.settling_mm.map(|m| format!("\n  settled at  {}", median(&m, 1))));
-        text
-    }
 }

@@ -13,7 +13,6 @@ mod motion;
 mod report;
 mod run;
 mod summary;
-mod text;
 mod warnings;
 
 pub use campaign::{Campaign, Exclusion, Line, NoSuchKey};
@@ -26,5 +25,4 @@ pub use motion::{Motion, Stamped, stamped};
 pub use report::{GENERATOR, html};
 pub use run::{Condition, Folder, Run, StateChange, event};
 pub use summary::{to_json, to_text};
-pub use text::plain;
 pub use warnings::warnings;

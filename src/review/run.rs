@@ -3,11 +3,11 @@
 use super::configuration::{Keys, keys};
 use super::figures::{Limits, limits, report_of};
 use super::motion::Motion;
-use super::text::ending;
 use crate::archive::{EventKind, EventLine, Manifest, RunOutcome, StepsTable, TrackerTimes};
 use crate::config::CanInterface;
 use crate::session::{Lane, Severity, State};
 use crate::study::FigureReport;
+use crate::text::escaped;
 use serde::Serialize;
 use std::borrow::Cow;
 use std::fmt::Display;
@@ -147,6 +147,14 @@ pub fn event(line: &str) -> Option<EventLine<'static>> {
     Some(EventLine { text: Cow::Owned(line.text.into_owned()), ..line })
 }
 
+/// `2026-03-01 14:30:00 UTC` from `2026-03-01T14:30:00.123456Z`; other text is unchanged.
+pub(super) fn utc(rfc3339: &str) -> String {
+    match (rfc3339.get(..10), rfc3339.get(10..11), rfc3339.get(11..19)) {
+        (Some(date), Some("T"), Some(time)) => format!("{date} {time} UTC"),
+        _ => rfc3339.to_owned(),
+    }
+}
+
 fn gone<T>() -> Result<T, String> {
     Err("config.toml is missing".to_owned())
 }
@@ -194,9 +202,13 @@ impl Folder {
 
     /// How its run ended, with the reason where it was stopped.
     pub fn ending(&self) -> String {
-        match self.condition {
-            Condition::BeingWritten => "going on".to_owned(),
-            _ => ending(&self.manifest),
+        let Manifest { outcome, stop_reason, .. } = &self.manifest;
+        match (outcome, stop_reason) {
+            _ if self.condition == Condition::BeingWritten => "going on".to_owned(),
+            (None, _) => "not closed: the bench ended before the run did".to_owned(),
+            (Some(RunOutcome::Completed), _) => "completed".to_owned(),
+            (Some(RunOutcome::Stopped), Some(reason)) => format!("stopped: {}", escaped(reason)),
+            (Some(RunOutcome::Stopped), None) => "stopped".to_owned(),
         }
     }
 
@@ -286,6 +298,12 @@ pub(super) mod tests {
             events: events.iter().filter_map(|line| event(line)).collect(),
             unreadable: Vec::new(),
         }
+    }
+
+    #[test]
+    fn times_are_shown_to_the_second() {
+        assert_eq!(utc("2026-03-01T14:30:00.123456Z"), "2026-03-01 14:30:00 UTC");
+        assert_eq!(utc("yesterday"), "yesterday");
     }
 
     #[test]

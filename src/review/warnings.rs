@@ -1,10 +1,10 @@
 //! Warnings about a run: reasons to doubt its figures.
 
 use super::figures::Figure;
-use super::run::Run;
-use super::text::{count, plain, utc};
+use super::run::{Run, utc};
 use crate::archive::{Dropped, VerdictKind};
 use crate::session::Severity;
+use crate::text::escaped;
 use serde_json::Value;
 
 /// The warnings of `run`, the most serious first; its events with their times come last.
@@ -24,7 +24,7 @@ pub(super) fn doubts(run: &Run) -> Vec<String> {
     let mut all = Vec::new();
     all.extend(run.folder.caution());
     if let Some(verdict) = manifest.verdict().filter(|v| v.verdict == VerdictKind::Invalid) {
-        all.push(format!("invalid: {}", plain(&verdict.reason)));
+        all.push(format!("invalid: {}", escaped(&verdict.reason)));
     }
     if let Some(repaired) = &manifest.repaired_utc {
         all.push(format!("closed by a repair on {}, after the bench had ended", utc(repaired)));
@@ -61,16 +61,6 @@ pub(super) fn doubts(run: &Run) -> Vec<String> {
         all.push("the bench was built from uncommitted changes".to_owned());
     }
     all
-}
-
-/// The first `most` of `lines`, and the number of the others.
-pub(super) fn shortened(lines: &[String], most: usize) -> Vec<String> {
-    let mut shown: Vec<String> = lines.iter().take(most).cloned().collect();
-    let more = lines.len().saturating_sub(most);
-    if more > 0 {
-        shown.push(format!("and {} more, see events.log", count(more, "warning")));
-    }
-    shown
 }
 
 #[cfg(test)]
@@ -122,12 +112,5 @@ mod tests {
         assert!(figures.all(|figure| figure.limit.is_none()));
         let said = "the limits are unknown, because the configuration cannot be read: config.toml is missing";
         assert!(warnings(&run).contains(&said.to_owned()), "{:?}", warnings(&run));
-    }
-
-    #[test]
-    fn a_screen_is_not_overrun() {
-        let lines: Vec<String> = (0..9).map(|n| n.to_string()).collect();
-        assert_eq!(shortened(&lines, 7).last().unwrap(), "and 2 warnings more, see events.log");
-        assert_eq!(shortened(&lines, 9), lines);
     }
 }

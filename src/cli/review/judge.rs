@@ -5,11 +5,12 @@ use super::super::recording::describe;
 use super::{Failure, read};
 use crate::archive::{Verdict, VerdictKind, file};
 use crate::config::{Config, Source};
-use crate::review::{Condition, plain};
+use crate::review::Condition;
 use crate::runtime::make_recording;
 use crate::telemetry::{
     RunFolder, TelemetryError, lock, note_recording, repair, utc_text, write_manifest,
 };
+use crate::text::escaped;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use serde_json::json;
@@ -145,5 +146,5 @@ fn judge(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<
     if json {
         return say(json!({ "run_dir": folder.dir, "verdicts": manifest.verdicts }));
     }
-    say(format_args!("{}: {verdict}, {}", folder.dir, plain(reason)))
+    say(format_args!("{}: {verdict}, {}", folder.dir, escaped(reason)))
 }

@@ -110,7 +110,7 @@ fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
     let report = written.as_ref().and_then(|written| written.as_deref().ok());
     let mut object = to_json(&run);
     object["report"] = json!(report);
-    give(arguments.json, &object, || Ok(to_text(&run, report)))?;
+    give(arguments.json, &object, || to_text(&run, report))?;
     match written {
         // The summary was printed already; the error follows it.
         Some(Err(error)) => {
