@@ -181,13 +181,10 @@ fn errors(folder: &Folder, report: &FigureReport) -> Vec<Figure> {
     all
 }
 
-/// The figures that `steps.csv` alone gives; `None` if the text is not such a file.
+/// The figures that `steps.csv` alone gives, for a run that was not closed; `None` if the text is not
+/// such a file.
 pub fn figures_of_steps(steps_csv: &str) -> Option<FigureReport> {
-    StepsTable::parse(steps_csv).ok().map(|steps| report_of(&steps))
-}
-
-/// The figures that `steps.csv` alone gives: those of a run that was not closed.
-pub(super) fn report_of(steps: &StepsTable) -> FigureReport {
+    let steps = StepsTable::parse(steps_csv).ok()?;
     let six = |provenance: &str| {
         TipError::COORDINATES.map(|name| {
             let (coordinate, unit) = name.split_once('_').unwrap_or((name, ""));
@@ -210,7 +207,7 @@ pub(super) fn report_of(steps: &StepsTable) -> FigureReport {
         let error = est.zip(truth).map(|(est, truth)| TipError::between(est, truth));
         figures.take_scored(depth_mm, truth.or(est).map(|coordinates| coordinates[0]), error);
     }
-    FigureReport { steps_saturated: None, ..figures.report() }
+    Some(FigureReport { steps_saturated: None, ..figures.report() })
 }
 
 impl Run {
@@ -229,8 +226,8 @@ impl Run {
 
 #[cfg(test)]
 mod tests {
-    use super::super::run::tests::run;
-    use super::limits;
+    use super::super::run::tests::{run, steps_csv};
+    use super::{figures_of_steps, limits};
     use crate::session::Outcome;
 
     #[test]
@@ -248,6 +245,7 @@ mod tests {
         let mut run = run();
         let kept = run.figures();
         run.folder.manifest.figures.clear();
+        run.folder.figures_of_steps = figures_of_steps(&steps_csv());
         let told = run.figures();
         assert_eq!((told.insertion_mm, told.steps), (kept.insertion_mm, kept.steps));
         assert_eq!((told.off_plane_rms_mm, told.steps_saturated), (Some(0.5), None));

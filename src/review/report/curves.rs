@@ -135,7 +135,7 @@ fn insertion(run: &Run, limits: &Limits) -> Chart {
     Chart::new("Insertion", TIME, "depth (mm)", layers)
 }
 
-/// Where an axis of an operation was told to be, and where it was.
+/// The commanded and the measured position of an axis in an operation.
 fn motion(run: &Run, axis: Axis, title: &'static str, y: &'static str) -> Chart {
     let (commanded, measured) = (&run.motion.commanded[axis], &run.motion.measured[axis]);
     let mut layers = vec![
