@@ -1,4 +1,4 @@
-//! What earlier work is worth now: calibrations, the last proof, the last run.
+//! Judges earlier work: calibrations, the last proof, the last run.
 
 use super::Check;
 use super::Verdict::{Fail, Warn};
@@ -7,7 +7,7 @@ use crate::calibration::Provenance;
 use crate::config::{Config, RegistrationConfig};
 
 const DAY_US: f64 = 86_400e6;
-/// Two clocks may differ by an hour; what is dated further ahead has no date.
+/// Two clocks may differ by an hour; a date further ahead is not believed.
 const AHEAD_MAX_DAYS: f64 = 1.0 / 24.0;
 
 /// A run before this one.
@@ -40,8 +40,8 @@ fn ago(days: Option<f64>) -> String {
     }
 }
 
-/// The registration, the tip and the needle: how good and how old. On hardware one that was typed in is
-/// no PASS: nothing shows when and how it was measured.
+/// The registration, the tip and the needle: their quality and age. On hardware a value that was typed in
+/// does not pass: nothing shows when and how it was measured.
 pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
     let (tracker, is_emulated) = (&config.tracker, !config.stage.hardware);
     let days_max = config.calibration.max_age_days;

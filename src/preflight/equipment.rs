@@ -41,7 +41,7 @@ pub struct BusFacts {
     pub errors: Option<[u16; 2]>,
 }
 
-/// The bus of `config`, of which the system says `facts`; `None` of an interface that does not exist.
+/// The bus of `config`, from the `facts` of the system; `None` if the interface does not exist.
 pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Check> {
     const UP: &str = "up, error active";
     const BRING_UP: &str = "bitrate 1000000 restart-ms 0";
@@ -171,7 +171,7 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
     checks
 }
 
-/// The way that an axis at `position` has left, in mm or rad.
+/// The travel left for an axis at `position`, in mm or rad.
 fn room(axis: Axis, position: f64, way: f64, limits: &AxisLimits) -> Check {
     let AxisLimits { min, max, .. } = *limits;
     let goal = position + way;
@@ -185,7 +185,7 @@ fn room(axis: Axis, position: f64, way: f64, limits: &AxisLimits) -> Check {
     check.unless(position >= min && goal <= max, Fail, next)
 }
 
-/// What came of the tracker, listened to with the tool at rest.
+/// The tracker, from a report about the tool at rest.
 pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     let tool = &config.tracker.tool;
     let TrackerReport { accepted, refused, rate_hz, .. } = report;

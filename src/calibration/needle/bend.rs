@@ -7,8 +7,7 @@
 //! all insertions is summed, and the nearest bicycle model is fitted to it: `S = a (K_y, −K_x)`.
 
 use super::insertion::Insertion;
-use super::scatter;
-use super::{CalibrationError, refused};
+use super::{CalibrationError, covariance, refused};
 use crate::geometry::{Pose, Twist};
 use crate::math;
 use nalgebra::{Matrix3, Matrix4, Rotation3, SMatrix, SVector, Vector2, Vector3, Vector4, Vector6};
@@ -169,7 +168,7 @@ impl BendFit {
         let gradients: Vec<Vector3<f64>> =
             told.iter().map(|t| by.transpose() * (t.weighted - t.weight * model)).collect();
         let covariance =
-            scatter::covariance(&(by.transpose() * weight * by), &gradients).ok_or_else(no_bend)?;
+            covariance(&(by.transpose() * weight * by), &gradients).ok_or_else(no_bend)?;
         let curvature_per_mm = math::hypot(p.x, p.y);
         let along = Vector2::new(p.x, p.y) / curvature_per_mm;
         let across = Vector2::new(-along.y, along.x);

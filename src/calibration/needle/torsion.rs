@@ -1,8 +1,7 @@
 //! Fits the torsion from the recorded rotations of base and tip.
 
 use super::insertion::Insertion;
-use super::scatter;
-use super::{CalibrationError, refused};
+use super::{CalibrationError, covariance, refused};
 use crate::needle::{NeedleError, Play, Torsion, TorsionConfig};
 use nalgebra::{SMatrix, SVector};
 
@@ -161,7 +160,7 @@ impl TorsionFit {
             (0..OFFSET).for_each(|k| hold(&mut hessian, k));
             gradients.iter_mut().for_each(|g| g.fixed_rows_mut::<OFFSET>(0).fill(0.0));
         }
-        let covariance = scatter::covariance(&hessian, &gradients).ok_or_else(undetermined)?;
+        let covariance = covariance(&hessian, &gradients).ok_or_else(undetermined)?;
         // Each insertion's own offset, by one Newton step with the other parameters kept.
         let offsets = parts.iter().map(|part| part.1[OFFSET] / part.0[(OFFSET, OFFSET)]);
         let n = insertions.len() as f64;
