@@ -10,51 +10,10 @@ const QUATERNION: [&str; 4] = ["qw", "qx", "qy", "qz"];
 /// An error shows this many characters of what the file holds.
 const SHOWN_MAX: usize = 80;
 
-/// Why a table was refused.
-#[derive(Debug, Clone, PartialEq, Error)]
-pub enum TableError {
-    /// There are no rows.
-    #[error("no rows below the header")]
-    Empty,
-    /// The header lacks a column.
-    #[error("line 1: no column \"{column}\"; there are {}", clipped(.columns, SHOWN_MAX))]
-    NoColumn {
-        /// The column.
-        column: String,
-        /// The header's columns, with commas between them.
-        columns: String,
-    },
-    /// A row is shorter or longer than the header.
-    #[error("line {line}: {fields} fields where the header has {columns}")]
-    RowLength {
-        /// Line in the file, from 1.
-        line: usize,
-        /// Number of the row's fields.
-        fields: usize,
-        /// Number of the header's fields.
-        columns: usize,
-    },
-    /// A field does not hold what its column needs.
-    #[error("line {line}: {column} is {:?}, expected a {expected}", clipped(.field, SHOWN_MAX))]
-    Field {
-        /// Line in the file, from 1.
-        line: usize,
-        /// The column.
-        column: String,
-        /// The field's text; empty where the row is too short.
-        field: String,
-        /// What the column needs.
-        expected: &'static str,
-    },
-    /// A quaternion is zero, or too large to have a direction.
-    #[error("line {line}: qw,qx,qy,qz have the norm {norm}: no orientation")]
-    NoOrientation {
-        /// Line in the file, from 1.
-        line: usize,
-        /// The quaternion's norm.
-        norm: f64,
-    },
-}
+/// Why a table was refused: the line, what it holds and what was expected.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("{0}")]
+pub struct TableError(pub String);
 
 /// A table as text. Spaces around a field do not count; a byte order mark and blank lines are
 /// skipped.
@@ -114,11 +73,12 @@ impl Table {
     /// The column `name`.
     ///
     /// # Errors
-    /// [`TableError::NoColumn`].
+    /// The header does not have it.
     pub fn column(&self, name: &str) -> Result<Column, TableError> {
-        self.columns().find(|column| column.name == name).ok_or_else(|| TableError::NoColumn {
-            column: name.to_owned(),
-            columns: self.header.iter().collect::<Vec<_>>().join(", "),
+        self.columns().find(|column| column.name == name).ok_or_else(|| {
+            let columns = self.header.iter().collect::<Vec<_>>().join(", ");
+            let columns = clipped(&columns, SHOWN_MAX);
+            TableError(format!("line 1: no column \"{name}\"; there are {columns}"))
         })
     }
 
@@ -130,14 +90,15 @@ impl Table {
     /// Checks that each row is as long as the header.
     ///
     /// # Errors
-    /// [`TableError::RowLength`], for the first row that is not.
+    /// The first row that is not.
     pub fn check_row_lengths(&self) -> Result<(), TableError> {
         let columns = self.header.len();
         match self.rows.iter().find(|row| row.fields.len() != columns) {
             None => Ok(()),
-            Some(Row { line, fields }) => {
-                Err(TableError::RowLength { line: *line, fields: fields.len(), columns })
-            }
+            Some(Row { line, fields }) => Err(TableError(format!(
+                "line {line}: {} fields where the header has {columns}",
+                fields.len()
+            ))),
         }
     }
 
@@ -172,7 +133,10 @@ impl Table {
             let quaternion = Quaternion::new(w, x, y, z);
             let norm = quaternion.norm();
             if !(norm.is_finite() && norm > 1e-6) {
-                return Err(TableError::NoOrientation { line: row.line, norm });
+                let line = row.line;
+                return Err(TableError(format!(
+                    "line {line}: qw,qx,qy,qz have the norm {norm}: no orientation"
+                )));
             }
             Ok(Some(UnitQuaternion::new_normalize(quaternion).to_rotation_matrix()))
         };
@@ -196,7 +160,7 @@ impl Row {
     /// The number in `column`, which may be NaN or infinite.
     ///
     /// # Errors
-    /// [`TableError::Field`].
+    /// The field is not a number.
     pub fn number(&self, column: &Column) -> Result<f64, TableError> {
         self.text(column).parse().map_err(|_| self.error(column, "number"))
     }
@@ -207,13 +171,10 @@ impl Row {
     }
 
     /// The error of a field in `column` that is not what was `expected`.
-    pub fn error(&self, column: &Column, expected: &'static str) -> TableError {
-        TableError::Field {
-            line: self.line,
-            column: column.name.clone(),
-            field: self.text(column).to_owned(),
-            expected,
-        }
+    pub fn error(&self, column: &Column, expected: &str) -> TableError {
+        let (line, name) = (self.line, &column.name);
+        let field = clipped(self.text(column), SHOWN_MAX);
+        TableError(format!("line {line}: {name} is {field:?}, expected a {expected}"))
     }
 }
 

@@ -66,8 +66,8 @@ pub fn wrapped(text: &str) -> Cow<'_, str> {
 }
 
 /// The screen that `template` (minijinja) describes, with the fields of `object` and the values of
-/// `more`. A line with nothing but a statement leaves no line. The filters `fixed` and `table` are
-/// [`fixed`] and the lines of [`table`].
+/// `more`. A line with nothing but a statement leaves no line. The filters `escaped`, `fixed` and `table`
+/// are [`escaped`], [`fixed`] and the lines of [`table`].
 ///
 /// # Errors
 /// A fault in the template, or a value that it misses.
@@ -75,6 +75,7 @@ pub fn screen(template: &str, object: &impl Serialize, more: Value) -> Result<St
     let mut environment = Environment::new();
     environment.set_syntax(SyntaxConfig::builder().trim_blocks(true).lstrip_blocks(true).build()?);
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
+    environment.add_filter("escaped", |text: &str| escaped(text).into_owned());
     environment.add_filter("fixed", fixed);
     environment.add_filter("table", |rows: Vec<Vec<String>>| table(&rows).join("\n"));
     let values = context! { ..more, ..Value::from(Serde(object)) };

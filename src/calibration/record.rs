@@ -1,5 +1,5 @@
-//! What calibrated values say of themselves in a configuration. It is for the record alone: the bench
-//! does not use it.
+//! Where calibrated values in a configuration came from, and how good they are. For the record alone: the
+//! bench does not use it.
 
 use crate::keys::{Rule, section, within};
 use crate::needle::TorsionConfig;
@@ -9,7 +9,7 @@ const LENGTH: Rule = within(0.0, 10_000.0);
 const ERROR: Rule = within(0.0, 1e6);
 
 section! {
-    /// What a computed registration says of itself.
+    /// Origin and quality of a computed registration.
     pub struct RegistrationRecord {
         /// Where it came from.
         provenance: Provenance, flat;
@@ -37,7 +37,7 @@ section! {
 }
 
 section! {
-    /// What a computed tip offset and tilt say of themselves.
+    /// Origin and quality of a computed tip offset and tilt.
     pub struct TipRecord {
         /// Where they came from.
         provenance: Provenance, flat;
@@ -51,7 +51,7 @@ section! {
 }
 
 section! {
-    /// What a calibrated needle says of itself. The standard errors are from how
+    /// Origin and quality of a calibrated needle. The standard errors are from how
     /// the insertions differ.
     pub struct NeedleRecord {
         /// Where it came from.

@@ -1,7 +1,6 @@
 //! The tracker's pose on the bench from fiducials: points measured in both frames.
 
-use super::error::{CalibrationError, check_distances};
-use super::principal::principal;
+use super::{CalibrationError, check_distances, covariance, mean, principal};
 use crate::geometry::Pose;
 use crate::keys::{Rule, section, within};
 use crate::table::{Table, TableError};
@@ -67,7 +66,8 @@ pub struct RegistrationFit {
     pub worst_mm: f64,
     /// RMS extent of the fiducials along their principal axes, largest first, mm.
     pub spread_mm: [f64; 3],
-    centroid_bench_mm: Vector3<f64>,
+    /// Centroid of the fiducials on the bench, mm.
+    centre_bench: Vector3<f64>,
     /// Principal axes on the bench, in the order of `spread_mm`.
     axes: Matrix3<f64>,
 }
@@ -87,65 +87,40 @@ impl RegistrationFit {
     /// Fewer than three points, positions beyond 5 m, the same position twice, points on a line,
     /// or more than `rms_max_mm` RMS.
     pub fn of(pairs: &[FiducialPair], rms_max_mm: f64) -> Result<Self, CalibrationError> {
-        check_points(pairs)?;
-        let n = pairs.len() as f64;
-        let mean =
-            |of: fn(&FiducialPair) -> Vector3<f64>| pairs.iter().map(of).sum::<Vector3<_>>() / n;
-        let (centroid_tracker, centroid_bench) = (mean(|p| p.tracker_mm), mean(|p| p.bench_mm));
-        let covariance = |of: fn(Vector3<f64>, Vector3<f64>) -> Matrix3<f64>| {
-            let centred = pairs
-                .iter()
-                .map(|p| of(p.tracker_mm - centroid_tracker, p.bench_mm - centroid_bench));
-            centred.sum::<Matrix3<f64>>() / n
-        };
-        let (rotation, mirrored) = nearest_rotation(&covariance(|t, w| w * t.transpose()));
-        let x_wt = Pose { rotation, translation: centroid_bench - rotation * centroid_tracker };
-
-        let residuals_mm =
-            pairs.iter().map(|p| (p.bench_mm - x_wt.transform(&p.tracker_mm)).norm());
-        let (mut squares, mut worst_point, mut worst_mm) = (0.0, 1, 0.0);
-        for (index, residual_mm) in residuals_mm.enumerate() {
-            squares += residual_mm * residual_mm;
-            if residual_mm > worst_mm {
-                (worst_point, worst_mm) = (index + 1, residual_mm);
-            }
+        let points = pairs.len();
+        if points < 3 {
+            return refused(format!(
+                "too few points, {points} of at least 3; touch more fiducials"
+            ));
         }
-        let (spread_tracker_mm, _) = principal(covariance(|t, _| t * t.transpose()));
-        let (spread_mm, axes) = principal(covariance(|_, w| w * w.transpose()));
-        let fit = RegistrationFit {
-            x_wt,
-            points: pairs.len(),
-            rms_mm: (squares / n).sqrt(),
-            worst_point,
-            worst_mm,
-            spread_mm,
-            centroid_bench_mm: centroid_bench,
-            axes,
-        };
-        let hint = if mirrored && fit.is_solid() { MIRRORED } else { SCATTERED };
-        fit.check(spread_tracker_mm, rms_max_mm, hint)
-    }
+        let tracker_mm: Vec<Vector3<f64>> = pairs.iter().map(|pair| pair.tracker_mm).collect();
+        let bench_mm: Vec<Vector3<f64>> = pairs.iter().map(|pair| pair.bench_mm).collect();
+        check_positions("tracker", &tracker_mm)?;
+        check_positions("bench", &bench_mm)?;
+        let (centre_tracker, centre_bench) = (mean(&tracker_mm), mean(&bench_mm));
+        let tracker_mm: Vec<_> = tracker_mm.iter().map(|p| p - centre_tracker).collect();
+        let bench_mm: Vec<_> = bench_mm.iter().map(|p| p - centre_bench).collect();
+        let (rotation, is_mirrored) = nearest_rotation(&covariance(&bench_mm, &tracker_mm));
+        let x_wt = Pose { rotation, translation: centre_bench - rotation * centre_tracker };
 
-    /// True unless the fiducials lie in a plane.
-    fn is_solid(&self) -> bool {
-        self.spread_mm[2] > BREADTH_PER_LENGTH_MIN * self.spread_mm[0]
-    }
+        let residual_mm = |p: &FiducialPair| (p.bench_mm - x_wt.transform(&p.tracker_mm)).norm();
+        let residuals_mm: Vec<f64> = pairs.iter().map(residual_mm).collect();
+        let squares = residuals_mm.iter().map(|mm| mm * mm).sum::<f64>();
+        let rms_mm = (squares / points as f64).sqrt();
+        let worst = (1..).zip(residuals_mm).min_by(|a, b| b.1.total_cmp(&a.1));
+        let (worst_point, worst_mm) = worst.unwrap_or_default();
+        let (spread_tracker_mm, _) = principal(&tracker_mm);
+        let (spread_mm, axes) = principal(&bench_mm);
 
-    fn check(
-        self,
-        spread_tracker_mm: [f64; 3],
-        limit_mm: f64,
-        hint: &'static str,
-    ) -> Result<Self, CalibrationError> {
-        let RegistrationFit { points, rms_mm, worst_point, worst_mm, spread_mm, .. } = self;
-        let scale = size(&spread_tracker_mm) / size(&spread_mm);
+        let size_mm = |spread_mm: [f64; 3]| Vector3::from(spread_mm).norm();
+        let scale = size_mm(spread_tracker_mm) / size_mm(spread_mm);
         if !(1.0 / SCALE_MAX..=SCALE_MAX).contains(&scale) {
             return refused(format!(
                 "the tracker's points are {scale:.4} times as far apart as the bench's; give both in mm"
             ));
         }
         let breadth_mm = spread_tracker_mm[1].min(spread_mm[1]);
-        let broader_than = |limit_mm: f64| match breadth_mm >= limit_mm {
+        let check_breadth = |limit_mm: f64| match breadth_mm >= limit_mm {
             true => Ok(()),
             false => refused(format!(
                 "{points} points lie within {breadth_mm:.2} mm of a line (at least {limit_mm:.2} \
@@ -153,15 +128,27 @@ impl RegistrationFit {
                  its sides"
             )),
         };
-        broader_than(BREADTH_MIN_MM.max(BREADTH_PER_LENGTH_MIN * spread_mm[0]))?;
-        if rms_mm > limit_mm || limit_mm.is_nan() {
+        check_breadth(BREADTH_MIN_MM.max(BREADTH_PER_LENGTH_MIN * spread_mm[0]))?;
+        if rms_mm > rms_max_mm || rms_max_mm.is_nan() {
+            let is_solid = spread_mm[2] > BREADTH_PER_LENGTH_MIN * spread_mm[0];
+            let hint = if is_mirrored && is_solid { MIRRORED } else { SCATTERED };
             return refused(format!(
-                "{points} points, {rms_mm:.2} mm RMS (limit {limit_mm:.2}); worst is point \
+                "{points} points, {rms_mm:.2} mm RMS (limit {rms_max_mm:.2}); worst is point \
                  {worst_point}, {worst_mm:.1} mm; {hint}"
             ));
         }
-        broader_than(BREADTH_PER_ERROR_MIN * self.localisation_error_mm())?;
-        Ok(self)
+        let fit = RegistrationFit {
+            x_wt,
+            points,
+            rms_mm,
+            worst_point,
+            worst_mm,
+            spread_mm,
+            centre_bench,
+            axes,
+        };
+        check_breadth(BREADTH_PER_ERROR_MIN * fit.localisation_error_mm())?;
+        Ok(fit)
     }
 
     /// The RMS error of locating one fiducial (FLE), mm, from the remaining distances:
@@ -178,7 +165,7 @@ impl RegistrationFit {
     ///
     /// It is the same for all samples of a run; averaging does not reduce it.
     pub fn target_sd_mm(&self, p_w_mm: &Vector3<f64>) -> f64 {
-        let along = self.axes.tr_mul(&(p_w_mm - self.centroid_bench_mm));
+        let along = self.axes.tr_mul(&(p_w_mm - self.centre_bench));
         let spread2 = self.spread_mm.map(|spread| spread * spread);
         let ratios = [(1, 2), (0, 2), (0, 1)]
             .map(|(i, j)| (along[i] * along[i] + along[j] * along[j]) / (spread2[i] + spread2[j]));
@@ -192,35 +179,21 @@ fn refused<T>(reason: String) -> Result<T, CalibrationError> {
     Err(CalibrationError(format!("registration: {reason}")))
 }
 
-fn check_points(pairs: &[FiducialPair]) -> Result<(), CalibrationError> {
-    let points = pairs.len();
-    if points < 3 {
-        return refused(format!("too few points, {points} of at least 3; touch more fiducials"));
-    }
-    check_frame("tracker", pairs.iter().map(|pair| pair.tracker_mm))?;
-    check_frame("bench", pairs.iter().map(|pair| pair.bench_mm))
-}
-
-fn check_frame(
-    frame: &str,
-    positions_mm: impl Iterator<Item = Vector3<f64>> + Clone,
-) -> Result<(), CalibrationError> {
-    check_distances("registration: point", frame, positions_mm.clone())?;
-    match equal(positions_mm) {
-        Some((first, second)) => refused(format!(
-            "points {first} and {second} have the same {frame} position; remove the copy, or give \
-             the mean of repeated measurements as one pair"
-        )),
+/// Refuses positions that no bench reaches, and two that are the same.
+fn check_positions(frame: &str, positions_mm: &[Vector3<f64>]) -> Result<(), CalibrationError> {
+    check_distances("registration: point", frame, positions_mm)?;
+    let mut numbered: Vec<([f64; 3], usize)> =
+        positions_mm.iter().map(|position| (*position).into()).zip(1..).collect();
+    // All are finite by now. Zeros of either sign are the same position.
+    numbered.sort_by(|(a, _), (b, _)| a.partial_cmp(b).unwrap_or(Ordering::Equal));
+    match numbered.windows(2).find(|pair| pair[0].0 == pair[1].0) {
         None => Ok(()),
+        Some(pair) => refused(format!(
+            "points {} and {} have the same {frame} position; remove the copy, or give the mean of \
+             repeated measurements as one pair",
+            pair[0].1, pair[1].1
+        )),
     }
-}
-
-/// The numbers, from 1, of two positions that are the same.
-fn equal(positions: impl Iterator<Item = Vector3<f64>>) -> Option<(usize, usize)> {
-    let mut sorted: Vec<([f64; 3], usize)> = positions.map(Into::into).zip(1..).collect();
-    sorted.sort_by(|(a, _), (b, _)| a.partial_cmp(b).unwrap_or(Ordering::Equal));
-    let (first, second) = sorted.iter().zip(sorted.get(1..)?).find(|(a, b)| a.0 == b.0)?;
-    Some((first.1, second.1))
 }
 
 /// The rotation R that maximises tr(Rᵀ M), and whether a reflection would fit better.
@@ -231,11 +204,6 @@ fn nearest_rotation(m: &Matrix3<f64>) -> (Rotation3<f64>, bool) {
     let sign = (u * v_t).determinant().signum();
     let proper = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, sign));
     (Rotation3::from_matrix_unchecked(u * proper * v_t), sign < 0.0)
-}
-
-/// RMS distance from the centroid.
-fn size(spread_mm: &[f64; 3]) -> f64 {
-    Vector3::from(*spread_mm).norm()
 }
 
 #[cfg(test)]

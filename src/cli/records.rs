@@ -66,7 +66,7 @@ pub(super) fn earlier_run(
     let run = runs.find(|run| run.manifest().bus == bus && is_wanted(run.manifest()))?;
     let before = keys(&run.text(file::CONFIG).ok()?).ok()?;
     let now = keys(&config.to_toml().ok()?).ok()?;
-    let changed = differences(&before, &now).into_iter().map(|difference| difference.key);
+    let changed = differences(&before, &now).into_keys();
     Some(Earlier {
         started_utc: run.manifest().started_utc.clone(),
         proof: run.text(file::EVENTS).ok().and_then(|events| proof(&events)),

@@ -14,7 +14,7 @@ const ASIDE_MIN: f64 = 0.25;
 
 /// A smaller part of the bend has no direction worth aiming at: whole turns are made.
 const SHARE_MIN: f64 = 0.05;
-/// With so many times the length of a whole turn left, the bend that lies back counts no more.
+/// When less than this many whole turns are left, past bends are forgotten entirely.
 const FORGETTING: f64 = 2.0;
 
 /// The bend wanted over the next step.

@@ -1,7 +1,7 @@
 //! The paper's planar control law (Eq. 5 to 7), with its singularities guarded.
 
 use super::spin_guard::{SEARCHING_SPIN_RAD, SpinGuard};
-use super::{Command, ControlError, Controller};
+use super::{Command, ControlError, Controller, state_within};
 use crate::keys::{Rule, over, section, within};
 use crate::math;
 use crate::needle::{Needle, Reduced};
@@ -58,11 +58,7 @@ impl FeedbackLinearization {
         FeedbackLinearization { needle, config, past_guard_mm: 0.0, spin: SpinGuard::default() }
     }
 
-    fn check_domain(&mut self, state: &Reduced, step_mm: f64) -> Result<(), ControlError> {
-        if state.pitch_rad.abs() > PITCH_LIMIT_RAD {
-            let (pitch_rad, limit_rad) = (state.pitch_rad, PITCH_LIMIT_RAD);
-            return Err(ControlError::PitchOutOfDomain { pitch_rad, limit_rad });
-        }
+    fn check_roll(&mut self, state: &Reduced, step_mm: f64) -> Result<(), ControlError> {
         let past = math::cos(state.roll_rad).abs() < math::cos(ROLL_GUARD_RAD);
         self.past_guard_mm = if past { self.past_guard_mm + step_mm } else { 0.0 };
         if self.past_guard_mm > ROLL_GUARD_DEPTH_MM {
@@ -75,11 +71,8 @@ impl FeedbackLinearization {
 
 impl Controller for FeedbackLinearization {
     fn command(&mut self, estimate: &Estimate, step_mm: f64) -> Result<Command, ControlError> {
-        if !estimate.x_pb.is_finite() || !step_mm.is_finite() {
-            return Err(ControlError::NotFinite);
-        }
-        let (state, _) = Reduced::split(&estimate.x_pb);
-        self.check_domain(&state, step_mm)?;
+        let state = state_within(estimate, step_mm, PITCH_LIMIT_RAD)?;
+        self.check_roll(&state, step_mm)?;
 
         let k = self.needle.curvature_per_mm();
         let [a, b, c] = self.config.poles_per_mm;
@@ -94,15 +87,10 @@ impl Controller for FeedbackLinearization {
         let wanted =
             estimate.demand_gain(self.config.caution) * (u + k * k * sin_b) / (k * cos_b * divisor);
 
-        if !wanted.is_finite() {
-            return Err(ControlError::NotFinite);
-        }
         let limit = self.config.rotation_max_rad_per_mm;
-        let rotation_rad_per_mm = wanted.clamp(-limit, limit);
         let spin_limit_rad = if estimate.belief.is_some() { SEARCHING_SPIN_RAD } else { TAU };
-        self.spin.turn(rotation_rad_per_mm * step_mm, step_mm, spin_limit_rad)?;
-        let saturated = demand.abs() > most || wanted.abs() > limit;
-        Ok(Command { rotation_rad_per_mm, saturated })
+        let command = self.spin.command(wanted, limit, step_mm, spin_limit_rad)?;
+        Ok(Command { saturated: command.saturated || demand.abs() > most, ..command })
     }
 }
 

@@ -9,7 +9,7 @@ pub use bend::{Bend, BendLaw};
 pub use feedback_linearization::{FeedbackLinearization, FeedbackLinearizationConfig};
 pub use nested_saturation::{NestedSaturation, NestedSaturationConfig};
 
-use crate::needle::Needle;
+use crate::needle::{Needle, Reduced};
 use crate::observer::Estimate;
 use thiserror::Error;
 
@@ -63,6 +63,23 @@ pub enum ControlError {
         /// The limit, rad.
         limit_rad: f64,
     },
+}
+
+/// The reduced state of `estimate`, which must be finite and within the pitch that a law holds for.
+fn state_within(
+    estimate: &Estimate,
+    step_mm: f64,
+    limit_rad: f64,
+) -> Result<Reduced, ControlError> {
+    if !estimate.x_pb.is_finite() || !step_mm.is_finite() {
+        return Err(ControlError::NotFinite);
+    }
+    let (state, _) = Reduced::split(&estimate.x_pb);
+    let pitch_rad = state.pitch_rad;
+    match pitch_rad.abs() > limit_rad {
+        true => Err(ControlError::PitchOutOfDomain { pitch_rad, limit_rad }),
+        false => Ok(state),
+    }
 }
 
 /// A control law.

@@ -2,7 +2,7 @@
 //! shaft's torsion.
 
 use super::spin_guard::{SEARCHING_SPIN_RAD, SpinGuard};
-use super::{Command, ControlError, Controller};
+use super::{Command, ControlError, Controller, state_within};
 use crate::keys::{Rule, over, section, within};
 use crate::math;
 use crate::needle::{Needle, Reduced};
@@ -195,14 +195,7 @@ impl Transmission {
 
 impl Controller for NestedSaturation {
     fn command(&mut self, estimate: &Estimate, step_mm: f64) -> Result<Command, ControlError> {
-        if !estimate.x_pb.is_finite() || !step_mm.is_finite() {
-            return Err(ControlError::NotFinite);
-        }
-        let (state, _) = Reduced::split(&estimate.x_pb);
-        if state.pitch_rad.abs() > PITCH_LIMIT_RAD {
-            let (pitch_rad, limit_rad) = (state.pitch_rad, PITCH_LIMIT_RAD);
-            return Err(ControlError::PitchOutOfDomain { pitch_rad, limit_rad });
-        }
+        let state = state_within(estimate, step_mm, PITCH_LIMIT_RAD)?;
         let curvature = self.curvature_per_mm(estimate);
         let demand = self.demand(&state, curvature, step_mm);
         let hold = curvature * math::cos(state.roll_rad) * math::tan(state.pitch_rad) * step_mm;
@@ -210,16 +203,14 @@ impl Controller for NestedSaturation {
         let seen_rad = estimate.belief.map_or(0.5 * PI, |belief| belief.roll_seen_rad);
         let near_rad = math::asin(demand.clamp(-1.0, 1.0)).clamp(-seen_rad, seen_rad);
         let to = [near_rad, PI - near_rad].map(|goal| wrap_angle(goal - state.roll_rad));
-        let turn = self.base_turn(to, hold, &transmission);
-        let wanted = turn / step_mm;
-        if !wanted.is_finite() || !transmission.band_rad().is_finite() {
+        let wanted = self.base_turn(to, hold, &transmission) / step_mm;
+        let spin_limit_rad = SEARCHING_SPIN_RAD + transmission.band_rad();
+        if !spin_limit_rad.is_finite() {
             return Err(ControlError::NotFinite);
         }
         let limit = self.config.rotation_max_rad_per_mm;
-        let rotation_rad_per_mm = wanted.clamp(-limit, limit);
-        let limit_rad = SEARCHING_SPIN_RAD + transmission.band_rad();
-        self.spin.turn(rotation_rad_per_mm * step_mm, step_mm, limit_rad)?;
-        Ok(Command { rotation_rad_per_mm, saturated: demand.abs() > 1.0 || wanted.abs() > limit })
+        let command = self.spin.command(wanted, limit, step_mm, spin_limit_rad)?;
+        Ok(Command { saturated: command.saturated || demand.abs() > 1.0, ..command })
     }
 }
 

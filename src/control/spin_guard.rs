@@ -1,6 +1,6 @@
 //! A guard against a law that keeps turning the needle in one direction.
 
-use super::ControlError;
+use super::{Command, ControlError};
 use std::collections::VecDeque;
 use std::f64::consts::TAU;
 
@@ -19,26 +19,34 @@ pub(super) struct SpinGuard {
 }
 
 impl SpinGuard {
-    /// Records a rotation before it is commanded.
+    /// The command to turn the base by `wanted_rad_per_mm`, limited to ± `limit_rad_per_mm`.
     ///
     /// # Errors
-    /// [`ControlError::Spinning`] if the net rotation over the window is beyond `limit_rad`.
-    pub(super) fn turn(
+    /// [`ControlError::NotFinite`], and [`ControlError::Spinning`] if the net rotation over the window
+    /// is beyond `spin_limit_rad`.
+    pub(super) fn command(
         &mut self,
-        rotation_rad: f64,
+        wanted_rad_per_mm: f64,
+        limit_rad_per_mm: f64,
         step_mm: f64,
-        limit_rad: f64,
-    ) -> Result<(), ControlError> {
-        self.recent.push_back((rotation_rad, step_mm));
+        spin_limit_rad: f64,
+    ) -> Result<Command, ControlError> {
+        if !wanted_rad_per_mm.is_finite() {
+            return Err(ControlError::NotFinite);
+        }
+        let rotation_rad_per_mm = wanted_rad_per_mm.clamp(-limit_rad_per_mm, limit_rad_per_mm);
+        self.recent.push_back((rotation_rad_per_mm * step_mm, step_mm));
         let mut window_mm: f64 = self.recent.iter().map(|&(_, depth)| depth).sum();
         while window_mm > WINDOW_MM {
             let Some((_, depth)) = self.recent.pop_front() else { break };
             window_mm -= depth;
         }
         let turned_rad = self.recent.iter().map(|&(turn, _)| turn).sum::<f64>();
-        if turned_rad.abs() > limit_rad {
+        if turned_rad.abs() > spin_limit_rad {
+            let limit_rad = spin_limit_rad;
             return Err(ControlError::Spinning { turned_rad, window_mm, limit_rad });
         }
-        Ok(())
+        let saturated = wanted_rad_per_mm.abs() > limit_rad_per_mm;
+        Ok(Command { rotation_rad_per_mm, saturated })
     }
 }

@@ -8,46 +8,28 @@ use thiserror::Error;
 /// small that products of a few arguments do not overflow.
 pub(crate) const MAGNITUDE_MAX: f64 = 1e6;
 
-/// Why an argument was refused.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-pub enum NeedleError {
-    /// A number is NaN or infinite.
-    #[error("{quantity} is {value}: not a finite number")]
-    NotFinite {
-        /// The quantity.
-        quantity: &'static str,
-        /// Its value.
-        value: f64,
-    },
-    /// A number is far beyond any needle.
-    #[error("{quantity} is {value:e}, allowed is up to {limit:e} in magnitude")]
-    TooLarge {
-        /// The quantity.
-        quantity: &'static str,
-        /// Its value.
-        value: f64,
-        /// The largest magnitude.
-        limit: f64,
-    },
-    /// The curvature is negative: turn the bevel zero by half a turn instead.
-    #[error(
-        "needle curvature is {0}/mm, the least is 0; turn the bevel zero by 180 deg for a needle that bends the other way"
-    )]
-    NegativeCurvature(f64),
-    /// The insertion increment is negative: the model holds only while the needle cuts tissue.
-    #[error("insertion increment is {0} mm, the least is 0; withdrawal retraces the inserted path")]
-    Withdrawal(f64),
+/// Why an argument was refused, with its value and the limit.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("{0}")]
+pub struct NeedleError(pub(super) String);
+
+impl NeedleError {
+    /// `quantity` is far beyond any needle.
+    pub fn too_large(quantity: &str, value: f64) -> Self {
+        let max = MAGNITUDE_MAX;
+        NeedleError(format!("{quantity} is {value:e}, allowed is up to {max:e} in magnitude"))
+    }
 }
 
 /// Refuses a value that is not finite or over [`MAGNITUDE_MAX`] in magnitude.
-pub(super) fn bounded(quantity: &'static str, value: f64) -> Result<(), NeedleError> {
+pub(super) fn bounded(quantity: &str, value: f64) -> Result<(), NeedleError> {
     if !value.is_finite() {
-        return Err(NeedleError::NotFinite { quantity, value });
+        return Err(NeedleError(format!("{quantity} is {value}: not a finite number")));
     }
-    if value.abs() > MAGNITUDE_MAX {
-        return Err(NeedleError::TooLarge { quantity, value, limit: MAGNITUDE_MAX });
+    match value.abs() <= MAGNITUDE_MAX {
+        true => Ok(()),
+        false => Err(NeedleError::too_large(quantity, value)),
     }
-    Ok(())
 }
 
 /// An increment of insertion and rotation, both within ±1e6; the insertion is never negative.
@@ -61,13 +43,16 @@ impl Increment {
     /// An increment of `insertion_mm` ≥ 0 and `rotation_rad`.
     ///
     /// # Errors
-    /// [`NeedleError::NotFinite`], [`NeedleError::TooLarge`] over 1e6, and
-    /// [`NeedleError::Withdrawal`] below zero.
+    /// A value that is not finite or over 1e6, and an insertion below zero: the model holds only while
+    /// the needle cuts tissue.
     pub fn new(insertion_mm: f64, rotation_rad: f64) -> Result<Self, NeedleError> {
         bounded("insertion increment in mm", insertion_mm)?;
         bounded("rotation increment in rad", rotation_rad)?;
         if insertion_mm < 0.0 {
-            return Err(NeedleError::Withdrawal(insertion_mm));
+            return Err(NeedleError(format!(
+                "insertion increment is {insertion_mm} mm, the least is 0; withdrawal retraces the \
+                 inserted path"
+            )));
         }
         Ok(Increment { insertion_mm, rotation_rad })
     }
@@ -111,12 +96,14 @@ impl Needle {
     /// A needle of curvature κ ≥ 0, per mm.
     ///
     /// # Errors
-    /// [`NeedleError::NotFinite`], [`NeedleError::TooLarge`] over 1e6 and
-    /// [`NeedleError::NegativeCurvature`].
+    /// A curvature that is not finite, over 1e6 or negative.
     pub fn new(curvature_per_mm: f64) -> Result<Self, NeedleError> {
         bounded("needle curvature per mm", curvature_per_mm)?;
         if curvature_per_mm < 0.0 {
-            return Err(NeedleError::NegativeCurvature(curvature_per_mm));
+            return Err(NeedleError(format!(
+                "needle curvature is {curvature_per_mm}/mm, the least is 0; turn the bevel zero by \
+                 180 deg for a needle that bends the other way"
+            )));
         }
         Ok(Needle { curvature_per_mm, tip_ahead_mm: 0.0 })
     }
@@ -124,7 +111,7 @@ impl Needle {
     /// The same needle with its tip `tip_ahead_mm` ahead of the rear wheel (negative: behind it).
     ///
     /// # Errors
-    /// [`NeedleError::NotFinite`] and [`NeedleError::TooLarge`].
+    /// A distance that is not finite or over 1e6.
     pub fn with_tip_ahead(self, tip_ahead_mm: f64) -> Result<Self, NeedleError> {
         bounded("needle tip_ahead in mm", tip_ahead_mm)?;
         Ok(Needle { tip_ahead_mm, ..self })
@@ -269,16 +256,21 @@ mod tests {
 
     #[test]
     fn refuses_by_name() {
+        let said = |error: NeedleError| error.to_string();
         let needle = Needle::new(0.01).unwrap();
-        assert!(matches!(needle.with_tip_ahead(f64::NAN), Err(NeedleError::NotFinite { .. })));
-        assert!(matches!(Needle::new(f64::NAN), Err(NeedleError::NotFinite { .. })));
-        assert!(matches!(Needle::new(-0.01), Err(NeedleError::NegativeCurvature(_))));
-        assert!(matches!(Increment::new(-1e-9, 0.0), Err(NeedleError::Withdrawal(_))));
-        assert!(matches!(Increment::new(0.0, f64::INFINITY), Err(NeedleError::NotFinite { .. })));
-        assert!(matches!(Increment::new(1e308, 0.0), Err(NeedleError::TooLarge { .. })));
-        assert!(matches!(Needle::new(1.1e6), Err(NeedleError::TooLarge { .. })));
+        for error in [
+            needle.with_tip_ahead(f64::NAN).unwrap_err(),
+            Needle::new(f64::NAN).unwrap_err(),
+            Increment::new(0.0, f64::INFINITY).unwrap_err(),
+        ] {
+            assert!(said(error).contains("not a finite number"));
+        }
+        assert!(said(Needle::new(-0.01).unwrap_err()).starts_with("needle curvature is -0.01/mm"));
+        assert!(said(Needle::new(1.1e6).unwrap_err()).contains("up to 1e6"));
+        assert!(said(Increment::new(1e308, 0.0).unwrap_err()).contains("up to 1e6"));
+        assert!(said(Increment::new(-1e-9, 0.0).unwrap_err()).contains("the least is 0"));
         assert_eq!(
-            Increment::new(0.0, -1e308).unwrap_err().to_string(),
+            said(Increment::new(0.0, -1e308).unwrap_err()),
             "rotation increment in rad is -1e308, allowed is up to 1e6 in magnitude"
         );
     }

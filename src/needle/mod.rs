@@ -16,5 +16,5 @@ pub use measurement::TipPosition;
 pub use path::InsertedPath;
 pub use reduction::{Fibre, Reduced};
 pub(crate) use torsion::{HALF_WIDTH, HALF_WIDTH_PER_MM, OFFSET};
-pub use torsion::{Play, Torsion, TorsionConfig, TorsionError};
+pub use torsion::{Play, Torsion, TorsionConfig};
 pub use two_arc::shortest_into_plane_mm;

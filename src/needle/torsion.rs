@@ -4,7 +4,6 @@ use super::Increment;
 use super::kinematics::{NeedleError, bounded};
 use crate::keys::{Rule, section, within};
 use crate::math;
-use thiserror::Error;
 
 /// Below this ratio of inserted depth to creep length the creep is linear to rounding.
 const CREEP_RATIO_MIN: f64 = 1e-9;
@@ -35,37 +34,6 @@ section! {
     }
 }
 
-/// Why a torsion was refused.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-pub enum TorsionError {
-    /// A number is not finite, or far beyond any needle.
-    #[error(transparent)]
-    Unphysical(#[from] NeedleError),
-    /// A width or a length is negative.
-    #[error("{quantity} is {value}, the least is 0")]
-    Negative {
-        /// The quantity.
-        quantity: &'static str,
-        /// Its value.
-        value: f64,
-    },
-    /// The lag starts at 0, which must lie within the band of a shaft that does not creep.
-    #[error(
-        "torsion offset is {:.3} deg, allowed is up to the half-width at the start, {:.3} deg, in \
-         magnitude: the tip would start outside its own band",
-        .offset_rad.to_degrees(), .half_width_rad.to_degrees()
-    )]
-    OffsetOutsideBand {
-        /// The offset c, rad.
-        offset_rad: f64,
-        /// The half-width w₀, rad.
-        half_width_rad: f64,
-    },
-    /// A creep length that starts at 0 cannot grow: the creep at the start is not defined.
-    #[error("torsion creep grows by {0} mm per mm from 0 mm: give its length at the start")]
-    CreepFromNothing(f64),
-}
-
 /// The play between base and tip. The lag λ is tip roll minus base rotation, both counted from the
 /// start. The play keeps it within the band `c ± w(ℓ)` with `w(ℓ) = w₀ + w₁ ℓ`.
 ///
@@ -81,9 +49,10 @@ impl Torsion {
     /// A torsion of these parameters.
     ///
     /// # Errors
-    /// [`TorsionError`] for a value that is not finite, over 1e6 or negative, and for a start outside the
-    /// band.
-    pub fn new(config: TorsionConfig) -> Result<Self, TorsionError> {
+    /// A value that is not finite, over 1e6 or negative; a creep length that grows from zero, for which
+    /// the creep at the start is not defined; without creep a start outside the band, as the lag starts
+    /// at 0.
+    pub fn new(config: TorsionConfig) -> Result<Self, NeedleError> {
         let TorsionConfig { half_width_rad, offset_rad, creep_mm, creep_mm_per_mm, .. } = config;
         bounded("torsion offset in rad", offset_rad)?;
         for (quantity, value) in [
@@ -94,14 +63,21 @@ impl Torsion {
         ] {
             bounded(quantity, value)?;
             if value < 0.0 {
-                return Err(TorsionError::Negative { quantity, value });
+                return Err(NeedleError(format!("{quantity} is {value}, the least is 0")));
             }
         }
         if creep_mm == 0.0 && creep_mm_per_mm > 0.0 {
-            return Err(TorsionError::CreepFromNothing(creep_mm_per_mm));
+            return Err(NeedleError(format!(
+                "torsion creep grows by {creep_mm_per_mm} mm per mm from 0 mm: give its length at the \
+                 start"
+            )));
         }
         if creep_mm == 0.0 && offset_rad.abs() > half_width_rad {
-            return Err(TorsionError::OffsetOutsideBand { offset_rad, half_width_rad });
+            let (offset_deg, limit_deg) = (offset_rad.to_degrees(), half_width_rad.to_degrees());
+            return Err(NeedleError(format!(
+                "torsion offset is {offset_deg:.3} deg, allowed is up to the half-width at the start, \
+                 {limit_deg:.3} deg, in magnitude: the tip would start outside its own band"
+            )));
         }
         Ok(Torsion { config })
     }

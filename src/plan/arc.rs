@@ -34,6 +34,26 @@ impl Arc {
     }
 }
 
+/// Where a bent arc ends, seen from its start: forward and aside, mm; sine and cosine of its turn.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Chord {
+    ahead_mm: f64,
+    aside_mm: f64,
+    sin: f64,
+    pub(super) cos: f64,
+}
+
+impl Chord {
+    /// Of an arc of this curvature, over 0, and length.
+    pub(super) fn of(curvature_per_mm: f64, length_mm: f64) -> Self {
+        let angle_rad = curvature_per_mm * length_mm;
+        let (sin, cos) = math::sin_cos(angle_rad);
+        let half = math::sin(0.5 * angle_rad);
+        let (ahead_mm, aside_mm) = (sin / curvature_per_mm, 2.0 * half * half / curvature_per_mm);
+        Chord { ahead_mm, aside_mm, sin, cos }
+    }
+}
+
 /// A point as the tip sees it.
 pub(super) struct Seen {
     /// Distance from the tip's axis, ρ, mm.
@@ -51,10 +71,12 @@ impl Tip {
         if curvature_per_mm == 0.0 {
             return Tip { position_mm: self.position_mm + self.heading * length_mm, ..*self };
         }
-        let angle_rad = curvature_per_mm * length_mm;
-        let (sin, cos) = math::sin_cos(angle_rad);
-        let half = math::sin(0.5 * angle_rad);
-        let (ahead_mm, aside_mm) = (sin / curvature_per_mm, 2.0 * half * half / curvature_per_mm);
+        self.at_end_of(&Chord::of(curvature_per_mm, length_mm), &bend)
+    }
+
+    /// The tip at the end of the arc with this chord.
+    pub(super) fn at_end_of(&self, chord: &Chord, bend: &Vector3<f64>) -> Tip {
+        let Chord { ahead_mm, aside_mm, sin, cos } = *chord;
         Tip {
             position_mm: self.position_mm + self.heading * ahead_mm + bend * aside_mm,
             heading: self.heading * cos + bend * sin,

@@ -1,4 +1,4 @@
-//! The distance to the obstacles on a grid, as far as it was asked for.
+//! The distance to the obstacles on a grid, computed on demand.
 
 use super::arc::{Arc, Tip};
 use super::lattice::Visited;
@@ -12,7 +12,7 @@ const TEST_STEP_MM: f64 = 0.1;
 /// An arc longer than this is tested at these parts of it before all along it, mm.
 const FEW_MM: f64 = 5.0;
 const PARTS: [f64; 7] = [0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875];
-/// With this much slack a lower bound of it will do, mm.
+/// Above this slack a lower bound of the slack is enough, mm.
 const AMPLE_MM: f64 = 0.5;
 /// Distance between two nodes in the plane and in space, mm, and the most nodes along a coordinate.
 const SPACING_MM: [f64; 2] = [1.0, 4.0];
@@ -82,7 +82,7 @@ pub struct Field<'a> {
     pub(super) clearance_mm: f64,
     pub(super) grid: Grid,
     pub(super) in_plane: bool,
-    /// Distance of each node to the nearest obstacle, mm; NaN until it is asked for.
+    /// Distance of each node to the nearest obstacle, mm; NaN until it is computed.
     distances_mm: Vec<f32>,
     /// The memory of the last search.
     pub(super) visited: Visited,
@@ -141,7 +141,7 @@ impl<'a> Field<'a> {
             && self.is_clear_between(tip, arc, slacks_mm)
     }
 
-    /// The first part of `arc` from `tip` that is clear; none of it where the tip must not be.
+    /// The first part of `arc` from `tip` that is clear; of length 0 if the tip must not be where it is.
     pub(super) fn clear_part(&mut self, tip: &Tip, arc: Arc) -> Arc {
         let mut along_mm = 0.0;
         let mut clear_mm = 0.0;

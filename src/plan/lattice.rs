@@ -1,6 +1,6 @@
 //! The lattice that a search expands: short arcs, and cells that are visited once.
 
-use super::arc::{Arc, Tip};
+use super::arc::{Arc, Chord, Tip};
 use super::obstacle::Workspace;
 use crate::math;
 use nalgebra::Vector3;
@@ -15,7 +15,7 @@ const CELL_MM: f64 = 0.5;
 /// Memory for the visited cells, bits: 128 MB.
 const BITS_MAX: f64 = (1u64 << 30) as f64;
 
-/// What a search tells apart: cells and headings, and how long its arcs are.
+/// The resolution of a search: its cells and headings, and the length of its arcs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Resolution {
     /// Length of an arc, mm.
@@ -32,11 +32,8 @@ pub(super) struct Lattice {
     pub(super) resolution: Resolution,
     pub(super) in_plane: bool,
     curvature_per_mm: f64,
-    /// Forward and aside on an arc of full curvature, mm; sine and cosine of its turn.
-    ahead_mm: f64,
-    aside_mm: f64,
-    sin: f64,
-    cos: f64,
+    /// Of an arc of full curvature.
+    chord: Chord,
     first_mm: Vector3<f64>,
     counts: [usize; 3],
     /// In the plane on a circle; in space along an edge of the cube around the directions.
@@ -129,16 +126,11 @@ impl Lattice {
         }
         let counts: [usize; 3] = counts(cell_mm).map(|count| count as usize).into();
         let cells = counts.iter().product::<usize>() * all_headings;
-        let (sin, cos) = math::sin_cos(curvature_per_mm * step_mm);
-        let half = math::sin(0.5 * curvature_per_mm * step_mm);
         Lattice {
             resolution: Resolution { step_mm, cell_mm, heading_rad },
             in_plane,
             curvature_per_mm,
-            ahead_mm: sin / curvature_per_mm,
-            aside_mm: 2.0 * half * half / curvature_per_mm,
-            sin,
-            cos,
+            chord: Chord::of(curvature_per_mm, step_mm),
             first_mm,
             counts,
             headings,
@@ -168,10 +160,7 @@ impl Lattice {
             return Place { tip: Tip { position_mm, heading }, ..*from };
         }
         let bend = self.bend(&from.tip, before, by);
-        let tip = Tip {
-            position_mm: position_mm + heading * self.ahead_mm + bend * self.aside_mm,
-            heading: heading * self.cos + bend * self.sin,
-        };
+        let tip = from.tip.at_end_of(&self.chord, &bend);
         Place { tip, turns: from.turns + if by == 1 { 1 } else { -1 } }
     }
 
@@ -190,7 +179,7 @@ impl Lattice {
             return if by == 2 { -left } else { left };
         }
         // The first direction continues the bend of the arc that led here.
-        let first = before.map(|before| heading * self.cos - before);
+        let first = before.map(|before| heading * self.chord.cos - before);
         let first = first.and_then(|bend| bend.try_normalize(1e-6));
         let first = first.unwrap_or_else(|| tip.across()[0]);
         let (sin, cos) = math::sin_cos(TAU * f64::from(by.max(1) - 1) / f64::from(BENDS));

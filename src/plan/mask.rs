@@ -123,61 +123,42 @@ fn distances_mm(size: [usize; 3], spacing_mm: [f64; 3], is_in: impl Fn(usize) ->
         (0..voxels).map(|voxel| if is_in(voxel) { 0.0 } else { FAR_MM2 }).collect();
     let mut stride = 1;
     for (count, spacing_mm) in size.into_iter().zip(spacing_mm) {
-        let mut pass = Pass::new(count, spacing_mm);
         for first in (0..voxels).filter(|voxel| voxel / stride % count == 0) {
-            pass.along(&mut squared_mm2, first, stride);
+            let line_mm2: Vec<f64> =
+                (0..count).map(|i| f64::from(squared_mm2[first + i * stride])).collect();
+            for (i, mm2) in lowest_mm2(&line_mm2, spacing_mm).into_iter().enumerate() {
+                squared_mm2[first + i * stride] = mm2 as f32;
+            }
         }
         stride *= count;
     }
     squared_mm2.into_iter().map(f32::sqrt).collect()
 }
 
-/// The lower envelope of the parabolas over one line of voxels.
-struct Pass {
-    spacing_mm: f64,
-    line_mm2: Vec<f64>,
-    /// The voxels whose parabolas are in the envelope, each with where it begins to be lowest, mm.
-    envelope: Vec<(usize, f64)>,
-}
-
-impl Pass {
-    fn new(count: usize, spacing_mm: f64) -> Self {
-        Pass { spacing_mm, line_mm2: vec![0.0; count], envelope: Vec::with_capacity(count) }
-    }
-
-    fn along(&mut self, squared_mm2: &mut [f32], first: usize, stride: usize) {
-        let place_mm = |voxel: usize| voxel as f64 * self.spacing_mm;
-        for (i, value) in self.line_mm2.iter_mut().enumerate() {
-            *value = f64::from(squared_mm2[first + i * stride]);
-        }
-        let height = |voxel: usize| self.line_mm2[voxel] + place_mm(voxel) * place_mm(voxel);
-        self.envelope.clear();
-        for voxel in 0..self.line_mm2.len() {
-            let mut begin_mm = f64::NEG_INFINITY;
-            while let Some(&(last, last_begin_mm)) = self.envelope.last() {
-                begin_mm =
-                    0.5 * (height(voxel) - height(last)) / (place_mm(voxel) - place_mm(last));
-                if begin_mm > last_begin_mm {
-                    break;
-                }
-                self.envelope.pop();
-                begin_mm = f64::NEG_INFINITY;
+/// At each voxel of a line the lowest of the parabolas `line_mm2[k] + (x − x_k)²`, mm².
+fn lowest_mm2(line_mm2: &[f64], spacing_mm: f64) -> Vec<f64> {
+    let place_mm = |voxel: usize| voxel as f64 * spacing_mm;
+    let height = |voxel: usize| line_mm2[voxel] + place_mm(voxel) * place_mm(voxel);
+    // The voxels whose parabolas are in the lower envelope, each with where it begins to be lowest, mm.
+    let mut envelope: Vec<(usize, f64)> = Vec::with_capacity(line_mm2.len());
+    for voxel in 0..line_mm2.len() {
+        let mut begin_mm = f64::NEG_INFINITY;
+        while let Some(&(last, last_begin_mm)) = envelope.last() {
+            begin_mm = 0.5 * (height(voxel) - height(last)) / (place_mm(voxel) - place_mm(last));
+            if begin_mm > last_begin_mm {
+                break;
             }
-            self.envelope.push((voxel, begin_mm));
+            envelope.pop();
+            begin_mm = f64::NEG_INFINITY;
         }
-        let mut lowest = 0;
-        for i in 0..self.line_mm2.len() {
-            let is_next = |lowest: usize| {
-                self.envelope.get(lowest + 1).is_some_and(|(_, begin)| *begin < place_mm(i))
-            };
-            while is_next(lowest) {
-                lowest += 1;
-            }
-            let (voxel, _) = self.envelope[lowest];
-            let away_mm = place_mm(i) - place_mm(voxel);
-            squared_mm2[first + i * stride] = (self.line_mm2[voxel] + away_mm * away_mm) as f32;
-        }
+        envelope.push((voxel, begin_mm));
     }
+    let lowest = |voxel: usize| {
+        let begun = envelope.partition_point(|(_, begin_mm)| *begin_mm < place_mm(voxel));
+        let (at, _) = envelope[begun.saturating_sub(1)];
+        line_mm2[at] + (place_mm(voxel) - place_mm(at)).powi(2)
+    };
+    (0..line_mm2.len()).map(lowest).collect()
 }
 
 #[cfg(test)]

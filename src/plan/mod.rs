@@ -11,7 +11,6 @@ mod nearest;
 mod obstacle;
 mod path;
 mod reach;
-mod rejoin;
 mod replanner;
 mod reserve;
 mod route;

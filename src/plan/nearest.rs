@@ -15,9 +15,9 @@ use std::f64::consts::TAU;
 const EXPANSIONS_MAX: u32 = 20_000;
 /// Nodes are ordered by how near they can come, plus this share of how far they are.
 const DISTANCE_SHARE: f64 = 0.1;
-/// Points that are nearer by less are not looked for, mm.
+/// The least gain in distance that counts, mm.
 const GAIN_MIN_MM: f64 = 0.05;
-/// A path is changed so often at most.
+/// The largest number of changes of a path.
 const ROUNDS_MAX: u32 = 10;
 /// Points at which an arc may leave a path or end, mm apart, and its largest length, mm.
 const LEAVE_MM: f64 = 2.0;
@@ -28,10 +28,10 @@ const BENDS: u32 = 8;
 #[derive(Clone, Copy)]
 struct Node {
     place: Place,
-    /// The heading at the start of the arc that led here; none of a straight.
+    /// The heading at the start of the arc that led here; `None` after a straight.
     before: Option<Vector3<f64>>,
     length_mm: f64,
-    /// The node before, and the arc from it; none of the start.
+    /// The node before, and the arc from it; `None` at the start.
     from: Option<(usize, Arc)>,
 }
 

@@ -39,7 +39,8 @@ impl Obstacle {
         match self {
             Obstacle::Sphere { centre_mm, radius_mm } => (point_mm - centre_mm).norm() - radius_mm,
             Obstacle::Cylinder { from_mm, to_mm, radius_mm } => {
-                let (axis, length_mm) = axis(from_mm, to_mm);
+                let length_mm = (to_mm - from_mm).norm();
+                let axis = (to_mm - from_mm) / length_mm;
                 let to_point = point_mm - from_mm;
                 let along_mm = to_point.dot(&axis);
                 let off_axis_mm = (to_point - axis * along_mm).norm();
@@ -56,13 +57,6 @@ impl Obstacle {
             Obstacle::Mask(mask) => mask.distance_mm(point_mm),
         }
     }
-}
-
-/// The unit vector from one point to another, and their distance, mm.
-fn axis(from_mm: &Vector3<f64>, to_mm: &Vector3<f64>) -> (Vector3<f64>, f64) {
-    let along = to_mm - from_mm;
-    let length_mm = along.norm();
-    (along / length_mm, length_mm)
 }
 
 /// Distance to the product of intervals that a point is outside of by `over` in each coordinate;

@@ -18,24 +18,24 @@ mod known;
 const SDS: f64 = 2.0;
 /// The same a step ahead: there the next estimate may be nearer than this one.
 const AHEAD_SDS: f64 = 1.0;
-/// A path that was found from a tip that is known no better is not kept to come back to, mm.
+/// A path is kept to come back to only if the tip's position is known better than this, mm.
 const KNOWN_SD_MM: f64 = 0.3;
-/// With a heading that is known no better, rad, the tip may be on the last path,
+/// If the heading is known no better than this, rad, the tip may still be on the last path, …
 const UNKNOWN_RAD: f64 = 0.01;
-/// even if it is so much farther off it than the position is known, mm: the needle bends by turns.
+/// … even if it is farther off than the position's deviation by this much, mm: whole turns shake the path.
 const ON_PATH_MM: f64 = 0.1;
-/// The lengths around the obstacles are computed anew once the target has moved so far, mm.
+/// When the target has moved this far, the lengths around the obstacles are computed again, mm.
 const ROUTE_MOVED_MM: f64 = 1.0;
-/// A tip that is no farther before the target than this has arrived, mm.
+/// A tip nearer than this before the target has arrived, mm.
 const ARRIVED_MM: f64 = 0.02;
-/// Without a path the needle is bent at the target for so long, mm: the estimate may find one again.
+/// Without a path the needle is bent toward the target for this depth, mm: a later estimate may give a path.
 const PATIENCE_MM: f64 = 5.0;
-/// A path after a whole turn of the base may end so much farther from the target, mm.
+/// A path after a whole turn of the base may end farther from the target by this much, mm.
 const MORE_MM: f64 = 0.05;
-/// How much of the way ahead is clear of obstacles meanwhile, mm.
+/// Meanwhile this much of the way ahead must be clear of obstacles, mm.
 const AHEAD_MM: f64 = 3.0;
 
-/// What is known of the tip.
+/// The estimate of the tip.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
     /// Position and heading.
@@ -105,13 +105,13 @@ pub struct Replanner {
     path: Option<Path>,
     /// The last path that was found, where it was found, and how far along it the tip has come, mm.
     found: Option<(Path, f64)>,
-    /// What known paths keep beside the clearance where they can: as much as the path at the start, mm.
+    /// The reserve that known paths keep where they can: as much as the path at the start, mm.
     reserve_mm: f64,
     /// The part of the curvature that is left unused where there is a way without it.
     curvature_margin: f64,
     /// Inserted since there was a path, mm.
     without_path_mm: f64,
-    /// What the searches of a step may still expand.
+    /// Nodes that the searches of this step may still expand.
     expansions_left: u32,
 }
 
@@ -320,8 +320,9 @@ impl Replanner {
         (self.miss_mm(&path) <= tolerance_mm).then_some(path)
     }
 
-    /// That arc, where there has been a path lately and its next millimetres are clear; or where it is
-    /// all clear and, with the heading as little known as it is, may end within the tolerance.
+    /// The sharpest arc toward the target, where there has been a path lately and its next millimetres are
+    /// clear; or where it is all clear and, with the heading as little known as it is, may end within the
+    /// tolerance.
     fn toward_target(&mut self, heading_sd_rad: f64) -> Option<Path> {
         let path = self.sharpest();
         let was_lately = self.without_path_mm < PATIENCE_MM && self.begins_clear(&path, AHEAD_MM);

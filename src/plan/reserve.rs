@@ -1,12 +1,12 @@
-//! What a run keeps in hand of the clearance.
+//! The reserve: extra distance from obstacles beyond the clearance.
 
 use super::obstacle::World;
 use super::path::Path;
 use super::search::{Answer, Problem, Status, plan};
 
-/// Obstacles are kept so much farther away where that leaves a path, in the plane and in space, mm: the
-/// shortest path passes them as near as it may, and noise would push the needle past the last point from
-/// which it can. In the plane there is no way past an obstacle but to its two sides.
+/// The extra distance from obstacles, in the plane and in space, mm, wherever a path exists with it. The
+/// shortest path passes obstacles as near as it may, and noise would push the needle past the last point
+/// from which it can pass them. In the plane there is no way past an obstacle but to its two sides.
 const RESERVE_MM: [f64; 2] = [2.0, 0.5];
 
 /// The reserve, mm.
@@ -14,7 +14,7 @@ pub(super) fn reserve_mm(in_plane: bool) -> f64 {
     RESERVE_MM[usize::from(!in_plane)]
 }
 
-/// The parts of it that are tried, the largest first.
+/// The parts of the reserve that are tried, the largest first.
 const PARTS: [f64; 3] = [1.0, 0.5, 0.25];
 
 /// The path with which a run begins.
@@ -22,7 +22,7 @@ const PARTS: [f64; 3] = [1.0, 0.5, 0.25];
 pub struct RoomyPath {
     /// The path.
     pub path: Path,
-    /// What it keeps from every obstacle beside the clearance, at least, mm.
+    /// The least distance that the path keeps from every obstacle beyond the clearance, mm.
     pub reserve_mm: f64,
 }
 

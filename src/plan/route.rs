@@ -62,7 +62,7 @@ impl Route {
         Route { grid, lengths_mm, longer, target_mm: *target_mm }
     }
 
-    /// How far `target_mm` is from the target of this route, mm: ways to it may be so much shorter.
+    /// How far `target_mm` is from the target of this route, mm: ways to it may be shorter by this much.
     pub fn moved_mm(&self, target_mm: &Vector3<f64>) -> f64 {
         (target_mm - self.target_mm).norm()
     }

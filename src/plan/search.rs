@@ -13,7 +13,7 @@ use std::borrow::Cow;
 
 /// A plan is accepted once nothing can be shorter by more than this share.
 const SLACK: f64 = 0.01;
-/// What a change of curvature costs, mm: of paths of one length the one with fewer arcs is taken.
+/// Cost of a change of curvature, mm: of two paths of the same length the one with fewer arcs is taken.
 const CHANGE_MM: f64 = 0.02;
 /// Width of a bucket of the queue, mm.
 const BUCKET_MM: f64 = 0.25;
@@ -44,7 +44,7 @@ pub struct Problem {
 /// What a search found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
 pub enum Status {
-    /// A path, of which none at this resolution can be shorter by more than 1%, or the only one that was found.
+    /// A path. At this resolution no path is shorter by more than 1%, or no other path was found.
     #[display("plan")]
     Plan,
     /// There is none at this resolution: the search came to its end.
@@ -64,7 +64,7 @@ pub struct Answer {
     pub path: Option<Path>,
     /// Nodes expanded.
     pub expansions: u32,
-    /// What was told apart.
+    /// The resolution of the search.
     pub resolution: Resolution,
     /// Why there is no path.
     pub reason: Option<String>,
@@ -126,7 +126,18 @@ pub fn plan_along(field: &mut Field<'_>, problem: &Problem, route: &Route) -> An
         let visited = std::mem::take(&mut field.visited);
         let workspace = &field.world.workspace;
         let lattice = Lattice::new(workspace, curvature_per_mm, problem.in_plane, level, visited);
-        let answer = Search::new(field, problem, route, lattice).run(budget);
+        let search = Search {
+            field,
+            problem,
+            route,
+            lattice,
+            nodes: Vec::new(),
+            buckets: Vec::new(),
+            first_mm: 0.0,
+            best: None,
+            nearest: (f64::INFINITY, problem.start.position_mm),
+        };
+        let answer = search.run(budget);
         expansions += answer.expansions;
         level += 1;
         if level == levels || answer.path.is_some() || answer.nearest_mm.is_none() {
@@ -175,28 +186,7 @@ struct Search<'a, 'w> {
     nearest: (f64, Vector3<f64>),
 }
 
-impl<'a, 'w> Search<'a, 'w> {
-    fn new(
-        field: &'a mut Field<'w>,
-        problem: &'a Problem,
-        route: &'a Route,
-        lattice: Lattice,
-    ) -> Self {
-        let nearest = (f64::INFINITY, problem.start.position_mm);
-        let (nodes, buckets) = (Vec::new(), Vec::new());
-        Search {
-            field,
-            problem,
-            route,
-            lattice,
-            nodes,
-            buckets,
-            first_mm: 0.0,
-            best: None,
-            nearest,
-        }
-    }
-
+impl Search<'_, '_> {
     fn run(mut self, budget: u32) -> Answer {
         let start = self.lattice.start(self.problem.start);
         let mut answer = Answer {
@@ -233,10 +223,8 @@ impl<'a, 'w> Search<'a, 'w> {
         }
         answer.nearest_mm = Some(self.nearest.1);
         answer.path = self.best.take().map(|found| self.path(found));
-        match (answer.status, &answer.path) {
-            (Status::Budget, _) => {}
-            (_, Some(_)) => answer.status = Status::Plan,
-            (_, None) => {}
+        if answer.status == Status::None && answer.path.is_some() {
+            answer.status = Status::Plan;
         }
         answer.reason = answer.path.is_none().then(|| self.why_none(answer.status));
         self.field.visited = self.lattice.into_visited();

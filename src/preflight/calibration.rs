@@ -1,12 +1,13 @@
-//! What earlier work is worth now: calibrations, the last proof, the last run.
+//! Judges earlier work: calibrations, the last proof, the last run.
 
-use super::{Check, Verdict};
+use super::Check;
+use super::Verdict::{Fail, Warn};
 use crate::archive::unix_us_of;
 use crate::calibration::Provenance;
 use crate::config::{Config, RegistrationConfig};
 
 const DAY_US: f64 = 86_400e6;
-/// Two clocks may differ by an hour; what is dated further ahead has no date.
+/// Two clocks may differ by an hour; a date further ahead is not believed.
 const AHEAD_MAX_DAYS: f64 = 1.0 / 24.0;
 
 /// A run before this one.
@@ -39,97 +40,69 @@ fn ago(days: Option<f64>) -> String {
     }
 }
 
-/// The registration, the tip and the needle: how good and how old. On hardware one that was typed in is
-/// no PASS: nothing shows when and how it was measured.
+/// The registration, the tip and the needle: their quality and age. On hardware a value that was typed in
+/// does not pass: nothing shows when and how it was measured.
 pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
+    let (tracker, is_emulated) = (&config.tracker, !config.stage.hardware);
     let days_max = config.calibration.max_age_days;
-    let days_limit = format!("up to {days_max:.0} days");
-    let aged = |check: Check, fit: Option<&Provenance>, next: &str| {
-        let days = fit.map(|fit| age_days(&fit.date_utc, now_unix_us));
-        let age = days.map_or_else(|| "typed in, no date".to_owned(), ago);
-        let found = [check.found.as_str(), &age].into_iter().filter(|part| !part.is_empty());
-        let found = found.collect::<Vec<_>>().join(", ");
-        Check { found, ..check }
-            .unless(
-                fit.is_some() || !config.stage.hardware,
-                Verdict::Warn,
-                format!("nothing shows when and how it was measured: {next}"),
-            )
-            .unless(
-                days.is_none_or(|days| is_young(days, days_max)),
-                Verdict::Warn,
-                format!("measure it again: {next}"),
-            )
+    let aged =
+        |name: &str, found: String, limit: &str, fit: Option<&Provenance>, next: &str| {
+            let days = fit.map(|fit| age_days(&fit.date_utc, now_unix_us));
+            let age = days.map_or_else(|| "typed in, no date".to_owned(), ago);
+            let found = if found.is_empty() { age } else { format!("{found}, {age}") };
+            let is_young = days.is_none_or(|days| is_young(days, days_max));
+            let unknown = format!("nothing shows when and how it was measured: {next}");
+            Check::new(name, found, limit)
+                .unless(fit.is_some() || is_emulated, Warn, unknown)
+                .unless(is_young, Warn, format!("measure it again: {next}"))
+        };
+    let register = "needle-bench calibrate registration";
+    let collect = format!("{register} --collect");
+    let rms_max_mm = RegistrationConfig::rms_max_mm();
+    let limit = format!("up to {rms_max_mm} mm RMS and {days_max:.0} days");
+    let registration = match &tracker.registration {
+        None => {
+            let next = format!("{register}, then name its file in tracker.registration_file");
+            Check::new("registration", "missing", limit).unless(false, Fail, next)
+        }
+        Some(RegistrationConfig::Given(given)) => {
+            let fit = given.fit.as_ref();
+            let found = fit.map(|fit| format!("{:.2} mm RMS", fit.rms_mm)).unwrap_or_default();
+            let provenance = fit.map(|fit| &fit.provenance);
+            let is_close = fit.is_none_or(|fit| fit.rms_mm <= rms_max_mm);
+            let next = format!("over {rms_max_mm} mm RMS: {register}");
+            aged("registration", found, &limit, provenance, &collect).unless(is_close, Fail, next)
+        }
+        Some(RegistrationConfig::Fiducials(fiducials)) => match fiducials.fit() {
+            Ok(fit) => {
+                let found = format!("{} points, {:.2} mm RMS", fit.points, fit.rms_mm);
+                aged("registration", found, &limit, None, &collect)
+            }
+            Err(error) => {
+                let check = Check::new("registration", error.to_string(), limit);
+                check.unless(false, Fail, collect)
+            }
+        },
     };
-    let tracker = &config.tracker;
-    let tip = tracker.tip_fit.as_ref();
-    // The default, which stands for a sensor in the tip itself.
-    let is_placeholder = tip.is_none() && tracker.tip_offset_mm == [0.0; 3];
-    let tip_found = match tip {
+    let days_limit = format!("up to {days_max:.0} days");
+    let fit = tracker.tip_fit.as_ref();
+    // The default stands for a sensor in the tip itself.
+    let is_placeholder = fit.is_none() && tracker.tip_offset_mm == [0.0; 3];
+    let found = match fit {
         Some(fit) => format!("{:.2} mm RMS", fit.rms_mm),
         None if is_placeholder => "0 mm from the sensor".to_owned(),
         None => String::new(),
     };
-    let calibrate_tip = "needle-bench calibrate tip";
-    let needle = config.needle.fit.as_ref();
-    let needle_found = needle.map(|fit| format!("{} insertions", fit.insertions));
-    let needle_found = needle_found.unwrap_or_default();
-    vec![
-        registration(config, aged),
-        aged(
-            Check::new("tip", tip_found, &days_limit),
-            tip.map(|fit| &fit.provenance),
-            calibrate_tip,
-        )
-        .unless(
-            !is_placeholder || !config.stage.hardware,
-            Verdict::Warn,
-            format!("is the sensor in the tip itself? Else: {calibrate_tip}"),
-        ),
-        aged(
-            Check::new("needle", needle_found, &days_limit),
-            needle.map(|fit| &fit.provenance),
-            "needle-bench calibrate needle",
-        ),
-    ]
-}
+    let next = "needle-bench calibrate tip";
+    let tip = aged("tip", found, &days_limit, fit.map(|fit| &fit.provenance), next);
+    let next = format!("is the sensor in the tip itself? Else: {next}");
+    let tip = tip.unless(!is_placeholder || is_emulated, Warn, next);
 
-/// The registration: its residual, and its age by `aged`.
-fn registration(
-    config: &Config,
-    aged: impl Fn(Check, Option<&Provenance>, &str) -> Check,
-) -> Check {
-    let register = "needle-bench calibrate registration";
-    let collect = format!("{register} --collect");
-    let rms_max_mm = RegistrationConfig::rms_max_mm();
-    let days_max = config.calibration.max_age_days;
-    let limit = format!("up to {rms_max_mm} mm RMS and {days_max:.0} days");
-    let check = |found: String| Check::new("registration", found, &limit);
-    match &config.tracker.registration {
-        None => check("missing".to_owned()).unless(
-            false,
-            Verdict::Fail,
-            format!("{register}, then name its file in tracker.registration_file"),
-        ),
-        Some(RegistrationConfig::Given(given)) => {
-            let rms_mm = given.fit.as_ref().map(|fit| fit.rms_mm);
-            let found = rms_mm.map(|rms_mm| format!("{rms_mm:.2} mm RMS")).unwrap_or_default();
-            let fit = given.fit.as_ref().map(|fit| &fit.provenance);
-            aged(check(found), fit, &collect).unless(
-                rms_mm.is_none_or(|rms_mm| rms_mm <= rms_max_mm),
-                Verdict::Fail,
-                format!("over {rms_max_mm} mm RMS: {register}"),
-            )
-        }
-        Some(RegistrationConfig::Fiducials(fiducials)) => match fiducials.fit() {
-            Ok(fit) => {
-                let points = fiducials.fiducials.len();
-                let found = format!("{points} points, {:.2} mm RMS", fit.rms_mm);
-                aged(check(found), None, &collect)
-            }
-            Err(error) => check(error.to_string()).unless(false, Verdict::Fail, collect),
-        },
-    }
+    let fit = config.needle.fit.as_ref();
+    let found = fit.map(|fit| format!("{} insertions", fit.insertions)).unwrap_or_default();
+    let next = "needle-bench calibrate needle";
+    let needle = aged("needle", found, &days_limit, fit.map(|fit| &fit.provenance), next);
+    vec![registration, tip, needle]
 }
 
 /// The last completed `stage prove` on this bus, and the keys of stage and bus that changed since.
@@ -138,13 +111,13 @@ pub fn proof(config: &Config, last: Option<&Earlier>, now_unix_us: i64) -> Check
     let days_max = config.calibration.max_age_days;
     let limit = format!("this configuration, up to {days_max:.0} days");
     let Some(Earlier { started_utc, changed, proof }) = last else {
-        return Check::new("stage prove", "never", limit).unless(false, Verdict::Warn, next);
+        return Check::new("stage prove", "never", limit).unless(false, Warn, next);
     };
     let days = age_days(started_utc, now_unix_us);
     let proof = proof.as_ref().map(|proof| format!("{proof}, ")).unwrap_or_default();
     let found = format!("{proof}{}{}", ago(days), listed(changed, ", changed since: "));
     let is_valid = changed.is_empty() && is_young(days, days_max);
-    Check::new("stage prove", found, limit).unless(is_valid, Verdict::Warn, next)
+    Check::new("stage prove", found, limit).unless(is_valid, Warn, next)
 }
 
 /// What changed since the last run on this bus.
@@ -163,7 +136,7 @@ pub fn changes(last: Option<&Earlier>, now_unix_us: i64) -> Check {
         }
     };
     let next = format!("compare: the last run was {since}");
-    check(found).unless(changed.is_empty(), Verdict::Warn, next)
+    check(found).unless(changed.is_empty(), Warn, next)
 }
 
 /// The first of `keys` after `lead`; nothing where there are none.

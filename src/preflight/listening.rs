@@ -5,11 +5,11 @@ use crate::units::Time;
 use nalgebra::Vector3;
 use serde::Serialize;
 
-/// Fewer positions have no noise.
+/// The fewest positions from which noise is measured.
 pub(super) const POSITIONS_MIN: usize = 10;
 /// Two tools that take turns jump by more than this, mm, …
 const TURNS_MIN_MM: f64 = 3.0;
-/// … and by so many times more than every second position.
+/// … and by this factor more than every second position.
 const TURNS_RATIO: f64 = 4.0;
 
 /// What came from the tracker in a while.
@@ -30,7 +30,7 @@ pub struct TrackerReport {
     pub noise_sd_mm: Option<f64>,
     /// Receipt less stamp of the quickest sample, by the two clocks, s.
     pub stamp_skew_s: Option<f64>,
-    /// Positions jump to and fro, as those of two tools of one name do.
+    /// Positions jump to and fro, as they do when two tools have the same name.
     pub has_two_tools: bool,
     /// What to do about it, where no position was measured.
     pub trouble: Option<String>,

@@ -1,7 +1,6 @@
-//! What speaks for and against a run before anything has power, as one list.
+//! The checks before a run, while nothing has power, as one list.
 //!
-//! Everything here is computed from what others have found: the bus, the drives, the tracker, earlier
-//! runs, the disk. A [`Verdict::Fail`] never moves.
+//! The caller looks at the bus, the drives, the tracker, earlier runs and the disk; this folder judges. A [`Verdict::Fail`] never moves.
 
 mod calibration;
 mod equipment;
@@ -17,7 +16,7 @@ use serde::Serialize;
 /// The longest name of a check.
 const NAME_WIDTH: usize = 23;
 
-/// What a check came to.
+/// The result of a check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Display, Serialize)]
 #[display(rename_all = "UPPERCASE")]
 #[serde(rename_all = "UPPERCASE")]
@@ -35,18 +34,18 @@ pub enum Verdict {
 pub struct Check {
     /// What was checked.
     pub name: String,
-    /// What it came to.
+    /// Its result.
     pub verdict: Verdict,
     /// What was found, a number with its unit.
     pub found: String,
     /// What is allowed.
     pub limit: String,
-    /// What to do, of a check that did not pass.
+    /// What to do, if the check did not pass.
     pub next_step: Option<String>,
 }
 
 impl Check {
-    /// A check that passes so far: what was `found`, of what is allowed.
+    /// A check that passes so far: what was `found`, and what is allowed.
     pub fn new(
         name: impl Into<String>,
         found: impl Into<String>,
@@ -56,7 +55,7 @@ impl Check {
         Check { name, verdict: Verdict::Pass, found, limit, next_step: None }
     }
 
-    /// A check of what has no limit, such as an emulated bus.
+    /// A check without a limit, such as that of an emulated bus.
     pub fn unlimited(name: impl Into<String>, found: impl Into<String>) -> Self {
         Check::new(name, found, "no limit")
     }

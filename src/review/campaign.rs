@@ -1,13 +1,13 @@
 //! Many runs: a line for each, their totals, and which runs are left out and why.
 
-use super::configuration::Keys;
+use super::compare::Keys;
 use super::group::{Group, group};
-use super::run::{Condition, Folder};
-use super::text::{count, plain, utc};
+use super::run::{Condition, Folder, utc};
 use crate::archive::{VerdictKind, file};
 use crate::config::nearest_key;
-use crate::text::{fixed, screen};
+use crate::text::{escaped, fixed, screen};
 use minijinja::context;
+use minijinja::value::Serde;
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
@@ -133,8 +133,8 @@ impl Campaign {
         let rows = self.lines.iter().filter_map(|line| Some(row(line.run.as_deref()?)));
         let more = context! {
             rows => rows.collect::<Vec<_>>(),
-            totals => self.groups.iter().map(Group::to_text).collect::<Vec<_>>(),
-            folders => count(self.lines.len(), "folder"),
+            // In JSON infinite medians are null.
+            groups => minijinja::Value::from(Serde(&self.groups)),
             left_out => self.lines.len() - self.counted(),
         };
         screen(include_str!("campaign.txt"), &self.to_json(), more)
@@ -226,7 +226,7 @@ fn exclusion(folder: &Folder) -> Option<(Exclusion, String)> {
         Condition::Changed(_) => return Some((Exclusion::Edited, caution)),
     }
     if let Some(verdict) = manifest.verdict().filter(|v| v.verdict == VerdictKind::Invalid) {
-        return Some((Exclusion::Invalid, plain(&verdict.reason)));
+        return Some((Exclusion::Invalid, escaped(&verdict.reason).into_owned()));
     }
     let operation = manifest.operation.as_ref()?;
     Some((Exclusion::Operation, format!("the stage's {operation}")))
@@ -253,28 +253,28 @@ fn row(folder: &Folder) -> [String; 7] {
 
 impl Line {
     fn to_json(&self) -> Value {
-        let mut line = json!({ "dir": self.dir });
-        if let Some(run) = &self.run {
-            let (manifest, figures) = (&run.manifest, run.figures());
-            line["name"] = json!(manifest.name);
-            line["started_utc"] = json!(manifest.started_utc);
-            line["outcome"] = json!(manifest.outcome);
-            line["stop_reason"] = json!(manifest.stop_reason);
-            line["verdict"] = json!(manifest.verdict());
-            line["condition"] = json!(run.condition_name());
-            line["insertion_mm"] = json!(figures.as_ref().map(|figures| figures.insertion_mm));
-            let figures = figures.unwrap_or_default();
-            line["off_plane_rms_mm"] = json!(figures.off_plane_rms_mm);
-            line["settling_mm"] = json!(figures.settling_mm);
-        }
-        line["excluded"] = json!(self.excluded.as_ref().map(|(why, _)| why));
-        line
+        let excluded = self.excluded.as_ref().map(|(why, _)| why);
+        let Some(run) = &self.run else { return json!({ "dir": self.dir, "excluded": excluded }) };
+        let (manifest, figures) = (&run.manifest, run.figures());
+        json!({
+            "dir": self.dir,
+            "name": manifest.name,
+            "started_utc": manifest.started_utc,
+            "outcome": manifest.outcome,
+            "stop_reason": manifest.stop_reason,
+            "verdict": manifest.verdict(),
+            "condition": run.condition_name(),
+            "insertion_mm": figures.as_ref().map(|figures| figures.insertion_mm),
+            "off_plane_rms_mm": figures.as_ref().and_then(|figures| figures.off_plane_rms_mm),
+            "settling_mm": figures.as_ref().and_then(|figures| figures.settling_mm),
+            "excluded": excluded,
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::interval::Proportion;
+    use super::super::group::Proportion;
     use super::super::run::tests::run;
     use super::*;
     use crate::archive::{Counts, FileSeal, Verdict};

@@ -1,13 +1,27 @@
 //! Two runs side by side: differences in their settings, then their figures.
 
-use super::configuration::{Difference, Keys, differences};
-use super::figures::{Figure, errors};
+use super::figures::Figure;
 use super::run::Run;
-use super::text::plain;
 use crate::archive::{DriveIdentity, Manifest};
-use crate::text::screen;
+use crate::text::{escaped, screen};
 use minijinja::context;
+use serde::Serialize;
 use serde_json::{Map, Value, json};
+use std::collections::BTreeMap;
+use toml::Table;
+
+/// What a manifest says of bench, rig and people, beside the drives.
+const SETTING: [&str; 9] = [
+    "version",
+    "git",
+    "calibration_sha256",
+    "bus",
+    "tracker",
+    "operator",
+    "phantom",
+    "note",
+    "operation",
+];
 
 /// The differences between two runs, and their figures.
 #[derive(Debug, Clone, PartialEq)]
@@ -15,9 +29,9 @@ pub struct Comparison {
     /// The folders, and how their runs ended.
     runs: [(String, String); 2],
     /// Configuration keys that differ.
-    configuration: Vec<Difference>,
+    configuration: Differences,
     /// Differences in bench, rig and people, from the manifests.
-    setting: Vec<Difference>,
+    setting: Differences,
     /// The figures of both runs, in pairs.
     figures: Vec<[Figure; 2]>,
     /// Reasons to doubt the comparison.
@@ -31,8 +45,6 @@ impl Comparison {
         let mut keys = Vec::new();
         for Run { folder, .. } in [a, b] {
             warnings.extend(folder.caution().map(|caution| format!("{}: {caution}", folder.dir)));
-        }
-        for Run { folder, .. } in [a, b] {
             keys.push(folder.keys().unwrap_or_else(|error| {
                 warnings.push(format!("{}: configuration: {error}", folder.dir));
                 Keys::new()
@@ -53,10 +65,10 @@ impl Comparison {
     /// A fault in the template `compare.txt`.
     pub fn to_text(&self) -> Result<String, minijinja::Error> {
         let side = |value: &Option<String>| value.clone().unwrap_or_else(|| "-".to_owned());
-        let row = |Difference { key, a, b }: &Difference| {
-            vec![format!("  {key}"), plain(&format!("{} → {}", side(a), side(b)))]
+        let row = |(key, Difference { a, b }): (&String, &Difference)| {
+            [format!("  {key}"), escaped(&format!("{} → {}", side(a), side(b))).into_owned()]
         };
-        let rows = |all: &[Difference]| all.iter().map(row).collect::<Vec<_>>();
+        let rows = |all: &Differences| all.iter().map(row).collect::<Vec<_>>();
         let figures = self.figures.iter().map(|[a, b]| {
             let difference = difference(a, b).map(|by| format!("{by:+.*}", a.decimals));
             let label = match a.label == b.label {
@@ -74,11 +86,6 @@ impl Comparison {
 
     /// One JSON object, units in its keys.
     pub fn to_json(&self) -> Value {
-        let differ = |all: &[Difference]| -> Map<String, Value> {
-            let each =
-                |Difference { key, a, b }: &Difference| (key.clone(), json!({ "a": a, "b": b }));
-            all.iter().map(each).collect()
-        };
         let figure = |[a, b]: &[Figure; 2]| {
             let values = json!({ "a": a.value, "b": b.value, "b_minus_a": difference(a, b) });
             (a.key.clone(), values)
@@ -87,8 +94,8 @@ impl Comparison {
         json!({
             "a": { "run_dir": a.0, "ending": a.1 },
             "b": { "run_dir": b.0, "ending": b.1 },
-            "configuration": differ(&self.configuration),
-            "setting": differ(&self.setting),
+            "configuration": self.configuration,
+            "setting": self.setting,
             "figures": self.figures.iter().map(figure).collect::<Map<_, _>>(),
             "warnings": self.warnings,
         })
@@ -103,12 +110,7 @@ fn difference(a: &Figure, b: &Figure) -> Option<f64> {
 
 /// The figures of both runs, in the order of the first; unknown figures are left out.
 fn figures(a: &Run, b: &Run) -> Vec<[Figure; 2]> {
-    let all = |run: &Run| {
-        let mut all = run.limited_figures();
-        all.extend(errors(&run.folder, &run.figures()));
-        all
-    };
-    let (a, b) = (all(a), all(b));
+    let (a, b) = (a.all_figures(), b.all_figures());
     let unknown = |figure: &Figure| Figure { value: None, ..figure.clone() };
     let only_b = b.iter().filter(|figure| a.iter().all(|other| other.key != figure.key));
     let pairs = a.iter().map(|figure| {
@@ -121,18 +123,9 @@ fn figures(a: &Run, b: &Run) -> Vec<[Figure; 2]> {
 
 /// What a manifest says of bench, rig and people, other than the configuration.
 fn setting(manifest: &Manifest) -> Keys {
-    let said = [
-        ("version", Some(&manifest.version)),
-        ("git", manifest.git.as_ref()),
-        ("calibration_sha256", manifest.calibration_sha256.as_ref()),
-        ("bus", Some(&manifest.bus)),
-        ("tracker", Some(&manifest.tracker)),
-        ("operator", manifest.operator.as_ref()),
-        ("phantom", manifest.phantom.as_ref()),
-        ("note", manifest.note.as_ref()),
-        ("operation", manifest.operation.as_ref()),
-    ];
-    let said = said.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?.clone())));
+    let all = serde_json::to_value(manifest).unwrap_or_default();
+    let said = SETTING.into_iter().filter_map(|key| Some((key, all[key].as_str()?)));
+    let said = said.map(|(key, value)| (key.to_owned(), value.to_owned()));
     let drives = manifest.drives.iter().map(|d| (format!("{} drive", d.axis), drive(d)));
     said.chain(drives).collect()
 }
@@ -144,6 +137,60 @@ pub(super) fn drive(drive: &DriveIdentity) -> String {
     text.extend(drive.revision.map(|revision| format!(", revision {revision:#010x}")));
     text.extend(drive.serial.map(|serial| format!(", serial {serial}")));
     text
+}
+
+/// Every key of a configuration with its value in TOML. Tables in arrays are numbered:
+/// `emulator.fault[0].kind`.
+pub type Keys = BTreeMap<String, String>;
+
+/// The two values of a key; `None` if missing.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Difference {
+    /// In the first configuration.
+    pub a: Option<String>,
+    /// In the second.
+    pub b: Option<String>,
+}
+
+/// The keys with different values in two configurations.
+pub type Differences = BTreeMap<String, Difference>;
+
+/// The keys of `toml`.
+///
+/// # Errors
+/// Invalid TOML, with its line.
+pub fn keys(toml: &str) -> Result<Keys, toml::de::Error> {
+    let mut keys = Keys::new();
+    flatten("", &toml.parse::<Table>()?, &mut keys);
+    Ok(keys)
+}
+
+fn flatten(path: &str, table: &Table, keys: &mut Keys) {
+    for (name, value) in table {
+        let key = if path.is_empty() { name.clone() } else { format!("{path}.{name}") };
+        match value {
+            toml::Value::Table(table) => flatten(&key, table, keys),
+            toml::Value::Array(values) if values.iter().any(toml::Value::is_table) => {
+                for (n, value) in values.iter().enumerate() {
+                    let at = format!("{key}[{n}]");
+                    match value {
+                        toml::Value::Table(table) => flatten(&at, table, keys),
+                        other => drop(keys.insert(at, other.to_string())),
+                    }
+                }
+            }
+            other => drop(keys.insert(key, other.to_string())),
+        }
+    }
+}
+
+/// The keys whose values differ between `a` and `b`.
+pub fn differences(a: &Keys, b: &Keys) -> Differences {
+    let sides = a
+        .keys()
+        .chain(b.keys())
+        .map(|key| (key.clone(), Difference { a: a.get(key).cloned(), b: b.get(key).cloned() }));
+    sides.filter(|(_, difference)| difference.a != difference.b).collect()
 }
 
 #[cfg(test)]
@@ -190,5 +237,30 @@ mod tests {
             json["warnings"][0],
             "runs/b: the record is not closed; if its bench has ended, close it: needle-bench review runs/b --repair"
         );
+    }
+
+    #[test]
+    fn differences_are_told_key_by_key() {
+        let a = "name = \"a\"\n[needle]\nradius_mm = 122.0\n[needle.torsion]\noffset_deg = 0.0\n";
+        let b = "name = \"a\"\n[needle]\nradius_mm = 121.5\n[needle.torsion]\noffset_deg = 0.0\n\
+                 [[emulator.fault]]\nkind = \"silent\"\nat_mm = 10.0\n";
+        let said = differences(&keys(a).unwrap(), &keys(b).unwrap()).into_iter();
+        let said: Vec<_> = said.map(|(key, Difference { a, b })| (key, a, b)).collect();
+        let some = |text: &str| Some(text.to_owned());
+        assert_eq!(
+            said,
+            [
+                ("emulator.fault[0].at_mm".to_owned(), None, some("10.0")),
+                ("emulator.fault[0].kind".to_owned(), None, some("\"silent\"")),
+                ("needle.radius_mm".to_owned(), some("122.0"), some("121.5")),
+            ]
+        );
+    }
+
+    #[test]
+    fn a_configuration_agrees_with_itself() {
+        let keys = keys(crate::config::DEFAULT_TOML).unwrap();
+        assert!(keys.len() > 100);
+        assert!(differences(&keys, &keys).is_empty());
     }
 }

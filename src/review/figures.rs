@@ -157,7 +157,7 @@ pub(super) fn last_third(folder: &Folder, report: &FigureReport) -> String {
 }
 
 /// The estimate's errors, a figure for each coordinate.
-pub(super) fn errors(folder: &Folder, report: &FigureReport) -> Vec<Figure> {
+fn errors(folder: &Folder, report: &FigureReport) -> Vec<Figure> {
     let rms = format!("estimate's error, RMS over {},", last_third(folder, report));
     let sets = [
         ("estimate_rms", rms.as_str(), report.estimate_rms),
@@ -181,13 +181,10 @@ pub(super) fn errors(folder: &Folder, report: &FigureReport) -> Vec<Figure> {
     all
 }
 
-/// The figures that `steps.csv` alone gives; `None` if the text is not such a file.
+/// The figures that `steps.csv` alone gives, for a run that was not closed; `None` if the text is not
+/// such a file.
 pub fn figures_of_steps(steps_csv: &str) -> Option<FigureReport> {
-    StepsTable::parse(steps_csv).ok().map(|steps| report_of(&steps))
-}
-
-/// The figures that `steps.csv` alone gives: those of a run that was not closed.
-pub(super) fn report_of(steps: &StepsTable) -> FigureReport {
+    let steps = StepsTable::parse(steps_csv).ok()?;
     let six = |provenance: &str| {
         TipError::COORDINATES.map(|name| {
             let (coordinate, unit) = name.split_once('_').unwrap_or((name, ""));
@@ -210,7 +207,7 @@ pub(super) fn report_of(steps: &StepsTable) -> FigureReport {
         let error = est.zip(truth).map(|(est, truth)| TipError::between(est, truth));
         figures.take_scored(depth_mm, truth.or(est).map(|coordinates| coordinates[0]), error);
     }
-    FigureReport { steps_saturated: None, ..figures.report() }
+    Some(FigureReport { steps_saturated: None, ..figures.report() })
 }
 
 impl Run {
@@ -218,12 +215,19 @@ impl Run {
     pub(super) fn limited_figures(&self) -> Vec<Figure> {
         figures(&self.folder, &self.figures(), &self.folder.limits().unwrap_or_default())
     }
+
+    /// These, and the errors of the estimate.
+    pub(super) fn all_figures(&self) -> Vec<Figure> {
+        let mut all = self.limited_figures();
+        all.extend(errors(&self.folder, &self.figures()));
+        all
+    }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::run::tests::run;
-    use super::limits;
+    use super::super::run::tests::{run, steps_csv};
+    use super::{figures_of_steps, limits};
     use crate::session::Outcome;
 
     #[test]
@@ -241,6 +245,7 @@ mod tests {
         let mut run = run();
         let kept = run.figures();
         run.folder.manifest.figures.clear();
+        run.folder.figures_of_steps = figures_of_steps(&steps_csv());
         let told = run.figures();
         assert_eq!((told.insertion_mm, told.steps), (kept.insertion_mm, kept.steps));
         assert_eq!((told.off_plane_rms_mm, told.steps_saturated), (Some(0.5), None));

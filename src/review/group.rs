@@ -1,16 +1,14 @@
-//! The totals of runs of one kind.
+//! The totals of runs of one kind, with confidence intervals of 95 %.
 
-use super::configuration::Keys;
-use super::interval::{MedianInterval, Proportion};
+use super::compare::Keys;
 use super::run::Folder;
-use super::text::count;
 use crate::archive::RunOutcome;
-use crate::study::{FigureReport, OFF_PLANE_LIMIT_MM};
-use crate::text::fixed;
+use crate::math::{exp, ln};
+use crate::study::{FigureReport, OFF_PLANE_LIMIT_MM, quantile};
 use serde::Serialize;
 use std::collections::BTreeSet;
 
-/// Runs of one name, or of one value of a key, and their totals.
+/// Runs with the same name, or with the same value of a key, and their totals.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Group {
     /// The name or the value.
@@ -67,44 +65,125 @@ fn varied(runs: &[(&Folder, Keys)]) -> Vec<String> {
     all.into_iter().filter(differs).cloned().collect()
 }
 
-impl Group {
-    /// At most this many varied keys are listed in the text.
-    const VARIED_MAX: usize = 6;
+/// The 0.975 quantile of the normal distribution.
+const Z: f64 = 1.959_963_984_540_054;
+/// The probability that an interval leaves out at each side.
+const TAIL: f64 = 0.025;
 
-    pub(super) fn to_text(&self) -> String {
-        let mut text = format!("{}: {}", self.label, count(self.completed.of, "run"));
-        if self.configurations > 1 {
-            let shown: Vec<&str> =
-                self.varied.iter().take(Self::VARIED_MAX).map(String::as_str).collect();
-            let more = self.varied.len() - shown.len();
-            text += &format!(" of {} configurations, which differ in ", self.configurations);
-            text += &shown.join(", ");
-            text.extend((more > 0).then(|| format!(" and {more} more")));
+/// A share of runs, with its interval.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Proportion {
+    /// Number of runs that did.
+    pub count: usize,
+    /// Number of all runs.
+    pub of: usize,
+    /// The share; `None` without runs.
+    pub fraction: Option<f64>,
+    /// Wilson's score interval of 95 % (Wilson 1927; Newcombe 1998, method 3). It stays within 0 to
+    /// 1, and still says something when every run succeeded.
+    pub wilson_95: Option<[f64; 2]>,
+}
+
+impl Proportion {
+    /// `count` of `of` runs.
+    pub fn new(count: usize, of: usize) -> Self {
+        let n = of as f64;
+        let fraction = (of > 0).then(|| count as f64 / n);
+        let wilson_95 = fraction.map(|p| {
+            let middle = p + Z * Z / (2.0 * n);
+            let half = Z * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
+            let scale = 1.0 + Z * Z / n;
+            [((middle - half) / scale).max(0.0), ((middle + half) / scale).min(1.0)]
+        });
+        Proportion { count, of, fraction, wilson_95 }
+    }
+}
+
+/// A median, with its interval. Infinite values are null in JSON.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct MedianInterval {
+    /// Half of the runs are better; infinite if half of the runs never got there.
+    #[serde(rename = "median")]
+    pub value: f64,
+    /// An interval of at least 95 % between two of the values, for any distribution; `None` with
+    /// fewer than six runs.
+    #[serde(rename = "order_statistics_95")]
+    pub interval: Option<[f64; 2]>,
+}
+
+impl MedianInterval {
+    /// The median of `values`; `None` without values.
+    ///
+    /// The interval goes from the k-th smallest to the k-th largest value. k is the largest number
+    /// with P(B < k) ≤ 2.5 %, for B binomial with n and 1/2 (David and Nagaraja, Order Statistics,
+    /// 7.1).
+    pub fn of(values: &[f64]) -> Option<Self> {
+        let mut sorted = values.to_vec();
+        sorted.sort_by(f64::total_cmp);
+        let rank = median_rank(sorted.len());
+        let interval =
+            rank.and_then(|k| Some([*sorted.get(k - 1)?, *sorted.get(sorted.len() - k)?]));
+        Some(MedianInterval { value: quantile(&sorted, 0.5)?, interval })
+    }
+}
+
+/// The rank k of the interval's lower end among `n`, from 1.
+fn median_rank(n: usize) -> Option<usize> {
+    // P(B = i) by its logarithm: for some thousand runs 2^-n underflows.
+    let mut log_mass = -(n as f64) * std::f64::consts::LN_2;
+    let mut below = 0.0;
+    for i in 0..n {
+        below += exp(log_mass);
+        if below > TAIL {
+            return (i > 0).then_some(i);
         }
-        let share = |proportion: &Proportion| {
-            let percent = |share: f64| format!("{:.0}", share * 100.0);
-            let interval = proportion.wilson_95.map(|[low, high]| {
-                format!(" ({} to {} %, Wilson 95 %)", percent(low), percent(high))
-            });
-            let share = proportion.fraction.map(percent).unwrap_or_default();
-            let interval = interval.unwrap_or_default();
-            format!("{} of {}, {share} %{interval}", proportion.count, proportion.of)
-        };
-        let median = |median: &MedianInterval, decimals: usize| {
-            let interval = match median.interval {
-                Some(interval) => {
-                    let [low, high] = interval.map(|value| fixed(Some(value), decimals));
-                    format!("({low} to {high}, order statistics, 95 % or more)")
-                }
-                None => "(a 95 % interval needs six runs)".to_owned(),
-            };
-            let unit = if median.value.is_finite() { " mm" } else { "" };
-            format!("median {}{unit} {interval}", fixed(Some(median.value), decimals))
-        };
-        text += &format!("\n  completed   {}", share(&self.completed));
-        text += &format!("\n  settled     {}: completed, under 1 mm RMS", share(&self.settled));
-        text.extend(self.off_plane_rms_mm.map(|m| format!("\n  off plane   {}", median(&m, 3))));
-        text.extend(self.settling_mm.map(|m| format!("\n  settled at  {}", median(&m, 1))));
-        text
+        log_mass += ln((n - i) as f64 / (i + 1) as f64);
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Newcombe 1998, table I: 81 of 263, 15 of 148, 0 of 20, 1 of 29.
+    #[test]
+    fn wilsons_interval_has_its_published_values() {
+        for (count, of, low, high) in [
+            (81, 263, 0.2553, 0.3662),
+            (15, 148, 0.0624, 0.1605),
+            (0, 20, 0.0000, 0.1611),
+            (1, 29, 0.0061, 0.1718),
+        ] {
+            let [l, h] = Proportion::new(count, of).wilson_95.unwrap();
+            assert!((l - low).abs() < 5e-5 && (h - high).abs() < 5e-5, "{count} of {of}: {l} {h}");
+        }
+        assert_eq!(Proportion::new(0, 0).wilson_95, None);
+        assert_eq!(Proportion::new(7, 7).wilson_95.unwrap()[1], 1.0);
+    }
+
+    /// Ranks from tables of the sign test at 5 %, two-sided.
+    #[test]
+    fn the_medians_interval_has_the_ranks_of_the_sign_test() {
+        for (n, rank) in
+            [(6, 1), (8, 1), (9, 2), (10, 2), (12, 3), (15, 4), (20, 6), (25, 8), (100, 40)]
+        {
+            assert_eq!(median_rank(n), Some(rank), "{n}");
+        }
+        assert_eq!((0..6).map(median_rank).collect::<Vec<_>>(), [None; 6]);
+        assert!(median_rank(5000).is_some());
+    }
+
+    #[test]
+    fn a_median_may_be_never() {
+        let values: Vec<f64> = (0..9).map(f64::from).chain([f64::INFINITY]).collect();
+        let median = MedianInterval::of(&values).unwrap();
+        assert_eq!((median.value, median.interval), (4.5, Some([1.0, 8.0])));
+        assert_eq!(
+            MedianInterval::of(&[f64::INFINITY; 6]).unwrap().interval,
+            Some([f64::INFINITY; 2])
+        );
+        assert_eq!(MedianInterval::of(&[]), None);
+        assert_eq!(MedianInterval::of(&[3.0]).unwrap().interval, None);
     }
 }

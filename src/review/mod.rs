@@ -5,26 +5,18 @@
 
 mod campaign;
 mod compare;
-mod configuration;
 mod figures;
 mod group;
-mod interval;
 mod motion;
 mod report;
 mod run;
 mod summary;
-mod text;
-mod warnings;
 
 pub use campaign::{Campaign, Exclusion, Line, NoSuchKey};
-pub use compare::Comparison;
-pub use configuration::{Difference, Keys, differences, keys};
+pub use compare::{Comparison, Difference, Differences, Keys, differences, keys};
 pub use figures::{Figure, Limits, figures, figures_of_steps};
-pub use group::Group;
-pub use interval::{MedianInterval, Proportion};
+pub use group::{Group, MedianInterval, Proportion};
 pub use motion::{Motion, Stamped, stamped};
 pub use report::{GENERATOR, html};
 pub use run::{Condition, Folder, Run, StateChange, event};
-pub use summary::{to_json, to_text};
-pub use text::plain;
-pub use warnings::warnings;
+pub use summary::{to_json, to_text, warnings};

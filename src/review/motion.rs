@@ -15,7 +15,7 @@ pub type Stamped = (i64, Frame);
 /// Times, s since the start of the run, with positions in mm or degrees.
 type Course = Vec<(f64, f64)>;
 
-/// Where the axes were told to be, and where they were.
+/// The commanded and the measured positions of the axes.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Motion {
     /// The targets (RPDO1).
@@ -24,7 +24,7 @@ pub struct Motion {
     pub(super) measured: PerAxis<Course>,
 }
 
-/// The frame in a `line` of `can.log`; `None` of any other text.
+/// The frame in a `line` of `can.log`; `None` for any other text.
 pub fn stamped(line: &str) -> Option<Stamped> {
     LoggedFrame::parse(line).map(|logged| (logged.unix_us, logged.frame))
 }

@@ -1,13 +1,13 @@
 //! A run as recorded in its folder.
 
-use super::configuration::{Keys, keys};
-use super::figures::{Limits, limits, report_of};
+use super::compare::{Keys, keys};
+use super::figures::{Limits, limits};
 use super::motion::Motion;
-use super::text::ending;
 use crate::archive::{EventKind, EventLine, Manifest, RunOutcome, StepsTable, TrackerTimes};
 use crate::config::CanInterface;
 use crate::session::{Lane, Severity, State};
 use crate::study::FigureReport;
+use crate::text::escaped;
 use serde::Serialize;
 use std::borrow::Cow;
 use std::fmt::Display;
@@ -23,17 +23,6 @@ pub enum Condition {
     Open,
     /// Changed after it was closed; the text names the files.
     Changed(String),
-}
-
-impl Condition {
-    fn name(&self) -> &'static str {
-        match self {
-            Condition::Whole => "whole",
-            Condition::BeingWritten => "being written",
-            Condition::Open => "open",
-            Condition::Changed(_) => "edited",
-        }
-    }
 }
 
 /// The part of a run folder that every review needs.
@@ -72,7 +61,7 @@ pub struct Run {
     pub steps: StepsTable,
     /// The times in `tracker.ndjson`.
     pub samples: Vec<TrackerTimes>,
-    /// How the axes moved, of an operation.
+    /// How the axes moved, for an operation.
     pub motion: Motion,
     /// `events.log`.
     pub events: Vec<EventLine<'static>>,
@@ -81,9 +70,9 @@ pub struct Run {
 }
 
 impl Run {
-    /// The figures that the manifest keeps; of a run that was not closed, those that its steps tell.
+    /// The figures of its folder.
     pub fn figures(&self) -> FigureReport {
-        self.folder.figures().unwrap_or_else(|| report_of(&self.steps))
+        self.folder.figures().unwrap_or_default()
     }
 
     /// Depth at `time_s`, mm, linear between two steps; after the last as fast as before it, up to the
@@ -125,7 +114,7 @@ impl Run {
         self.events.iter().filter(is_state).map(change).collect()
     }
 
-    /// When the run was stopped, s; `None` of one that was not, or whose record does not tell.
+    /// When the run was stopped, s; `None` if it was not stopped, or if the record lacks the time.
     pub(super) fn stopped_at_s(&self) -> Option<f64> {
         let is_stopped = self.folder.manifest.outcome == Some(RunOutcome::Stopped);
         let stopping = State::Stopping.as_str();
@@ -133,7 +122,7 @@ impl Run {
         change.filter(|_| is_stopped).map(|change| change.time_s)
     }
 
-    /// The events that matter at least so much.
+    /// The events of at least this severity.
     pub fn events_from(&self, least: Severity) -> impl Iterator<Item = &EventLine<'static>> {
         self.events.iter().filter(
             move |line| matches!(line.kind, EventKind::Event(severity) if severity >= least),
@@ -147,6 +136,14 @@ pub fn event(line: &str) -> Option<EventLine<'static>> {
     Some(EventLine { text: Cow::Owned(line.text.into_owned()), ..line })
 }
 
+/// `2026-03-01 14:30:00 UTC` from `2026-03-01T14:30:00.123456Z`; other text is unchanged.
+pub(super) fn utc(rfc3339: &str) -> String {
+    match (rfc3339.get(..10), rfc3339.get(10..11), rfc3339.get(11..19)) {
+        (Some(date), Some("T"), Some(time)) => format!("{date} {time} UTC"),
+        _ => rfc3339.to_owned(),
+    }
+}
+
 fn gone<T>() -> Result<T, String> {
     Err("config.toml is missing".to_owned())
 }
@@ -156,11 +153,14 @@ fn first_line(error: impl Display) -> String {
 }
 
 impl Folder {
-    /// One word for what became of it: `whole` is said of what holds all of its run alone.
+    /// What became of it; `whole` is a record that holds all of its run.
     pub fn condition_name(&self) -> &'static str {
-        match &self.condition {
+        match self.condition {
             Condition::Whole if self.is_incomplete() => "incomplete",
-            condition => condition.name(),
+            Condition::Whole => "whole",
+            Condition::BeingWritten => "being written",
+            Condition::Open => "open",
+            Condition::Changed(_) => "edited",
         }
     }
 
@@ -177,7 +177,7 @@ impl Folder {
         is_repaired || !manifest.faults.is_empty() || lost.text_files + lost.recording > 0
     }
 
-    /// What to know of the record before it is believed; none of a whole one.
+    /// A reason for caution with the record; `None` for a whole one.
     pub fn caution(&self) -> Option<String> {
         let dir = &self.dir;
         match &self.condition {
@@ -194,9 +194,13 @@ impl Folder {
 
     /// How its run ended, with the reason where it was stopped.
     pub fn ending(&self) -> String {
-        match self.condition {
-            Condition::BeingWritten => "going on".to_owned(),
-            _ => ending(&self.manifest),
+        let Manifest { outcome, stop_reason, .. } = &self.manifest;
+        match (outcome, stop_reason) {
+            _ if self.condition == Condition::BeingWritten => "going on".to_owned(),
+            (None, _) => "not closed: the bench ended before the run did".to_owned(),
+            (Some(RunOutcome::Completed), _) => "completed".to_owned(),
+            (Some(RunOutcome::Stopped), Some(reason)) => format!("stopped: {}", escaped(reason)),
+            (Some(RunOutcome::Stopped), None) => "stopped".to_owned(),
         }
     }
 
@@ -239,6 +243,19 @@ pub(super) mod tests {
     use crate::session::Outcome;
     use serde_json::json;
 
+    pub(in crate::review) fn steps_csv() -> String {
+        let mut steps = "step,time_s,insertion_mm,rotation_rad,rotation_cmd_rad_per_mm,\
+                         x_meas_mm,x_est_mm,y_est_mm,z_est_mm,yaw_est_rad,pitch_est_rad,roll_est_rad,\
+                         x_sd_mm,roll_sd_rad,\
+                         x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad\n"
+            .to_owned();
+        for n in 0..4 {
+            steps += &format!("{n},{}.0,{n}.0,0,0.1,0.6,0.75,0,{n},0,0,3.1,0.2,0.1,", n + 2);
+            steps += &format!("0.5,0,{n},0,0,-3.1\n");
+        }
+        steps
+    }
+
     /// Four steps a second apart from 2 s on, 0.5 mm off the plane, the estimate 0.25 mm beside it.
     pub(in crate::review) fn run() -> Run {
         let mut manifest = Manifest::new("virtual", "2023-11-14T22:13:20.000000Z".to_owned());
@@ -254,15 +271,6 @@ pub(super) mod tests {
         });
         manifest.figures = figures.as_object().unwrap().clone();
         manifest.timing = timing.as_object().unwrap().clone();
-        let mut steps = "step,time_s,insertion_mm,rotation_rad,rotation_cmd_rad_per_mm,\
-                         x_meas_mm,x_est_mm,y_est_mm,z_est_mm,yaw_est_rad,pitch_est_rad,roll_est_rad,\
-                         x_sd_mm,roll_sd_rad,\
-                         x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad\n"
-            .to_owned();
-        for n in 0..4 {
-            steps += &format!("{n},{}.0,{n}.0,0,0.1,0.6,0.75,0,{n},0,0,3.1,0.2,0.1,", n + 2);
-            steps += &format!("0.5,0,{n},0,0,-3.1\n");
-        }
         let events = [
             "    0.000 s  session   state    preparing",
             "    0.500 s  tracker   info     connected",
@@ -280,12 +288,18 @@ pub(super) mod tests {
                 figures_of_steps: None,
                 config_toml: Some(DEFAULT_TOML.replace("depth_mm = 250.0", "depth_mm = 3.0")),
             },
-            steps: StepsTable::parse(&steps).unwrap(),
+            steps: StepsTable::parse(&steps_csv()).unwrap(),
             samples: Vec::new(),
             motion: Motion::default(),
             events: events.iter().filter_map(|line| event(line)).collect(),
             unreadable: Vec::new(),
         }
+    }
+
+    #[test]
+    fn times_are_shown_to_the_second() {
+        assert_eq!(utc("2026-03-01T14:30:00.123456Z"), "2026-03-01 14:30:00 UTC");
+        assert_eq!(utc("yesterday"), "yesterday");
     }
 
     #[test]

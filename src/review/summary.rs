@@ -1,76 +1,46 @@
 //! One run on one screen.
 
-use super::figures::{Figure, errors, last_third};
-use super::run::{Run, StateChange};
-use super::text::{count, plain, utc};
-use super::warnings::{shortened, warnings};
-use crate::archive::Manifest;
+use super::figures::{Figure, last_third};
+use super::run::{Run, utc};
+use crate::archive::{Dropped, VerdictKind};
 use crate::session::{PROVED, Severity};
-use crate::text::table;
+use crate::text::{escaped, screen};
+use minijinja::context;
+use minijinja::value::Serde;
 use serde_json::{Map, Value, json};
-
-/// Largest numbers of warnings and states on the screen.
-const WARNINGS_MAX: usize = 10;
-const STATES_MAX: usize = 8;
 
 /// The course of `run`, its figures with their limits, its warnings, and last how it ended.
 /// `report` is the path of its page.
-pub fn to_text(run: &Run, report: Option<&str>) -> String {
-    let manifest = &run.folder.manifest;
-    let mut lines = heading(manifest);
-    lines.extend(manifest.rehearsal.as_ref().map(|bus| {
-        format!("rehearsal   emulated drives and tracker; {} was not opened", plain(bus))
-    }));
-    lines.push(format!("record      {}: {}", run.folder.dir, run.folder.condition_name()));
-    lines.extend(report.map(|report| format!("report      {report}")));
-    lines.extend(tracker(&manifest.gates).map(|said| format!("tracker     {said}")));
-    let states = run.states();
-    if !states.is_empty() {
-        lines.push(format!("states      {}", course(&states)));
-    }
-    lines.push(String::new());
-    let shown = run.limited_figures().into_iter().filter(|figure| figure.value.is_some());
-    lines.extend(table(&shown.map(|figure| row(&figure)).collect::<Vec<_>>()));
-    let report = run.figures();
-    if let Some(rms) = report.estimate_rms {
-        let third = last_third(&run.folder, &report);
-        lines.push(format!("estimate    {rms} RMS over {third}"));
-    }
-    if let Some(error) = report.final_error {
-        lines.push(format!("at the end  {error}"));
-    }
-    lines.push(String::new());
-    let warnings = warnings(run);
-    lines.extend(
-        shortened(&warnings, WARNINGS_MAX).iter().map(|line| format!("warning     {line}")),
-    );
-    if warnings.is_empty() {
-        lines.push("no warnings".to_owned());
-    }
+///
+/// # Errors
+/// A fault in the template `run.txt`.
+pub fn to_text(run: &Run, report: Option<&str>) -> Result<String, minijinja::Error> {
+    let folder = &run.folder;
+    let manifest = &folder.manifest;
+    let figures = run.figures();
+    let known = run.limited_figures().into_iter().filter(|figure| figure.value.is_some());
     let proofs = run.events_from(Severity::Info).filter(|line| line.text.starts_with(PROVED));
-    lines.extend(proofs.map(|line| line.text.to_string()));
-    if let Some(verdict) = manifest.verdict() {
-        let (given, reason) = (utc(&verdict.given_utc), plain(&verdict.reason));
-        lines.push(format!("verdict     {}, {reason} ({given})", verdict.verdict));
-    }
-    lines.push(run.folder.ending());
-    lines.join("\n")
-}
-
-/// Name, time, people and equipment of the run.
-fn heading(manifest: &Manifest) -> Vec<String> {
-    let Manifest { name, started_utc, operator, phantom, note, version, bus, tracker, .. } =
-        manifest;
-    let mut first = format!("{name:<11} {}", utc(started_utc));
-    first.extend(manifest.duration_s.map(|s| format!(", {s:.1} s")));
-    first.extend(operator.iter().map(|operator| format!(", by {}", plain(operator))));
-    first.extend(phantom.iter().map(|phantom| format!(", into {}", plain(phantom))));
-    let git = manifest.git.as_deref().unwrap_or("git state unknown");
-    let seed = manifest.seed.map(|seed| format!(", seed {seed}")).unwrap_or_default();
-    let mut lines = vec![first];
-    lines.extend(note.iter().map(|note| format!("note        {}", plain(note))));
-    lines.push(format!("bench       {version} ({git}), bus {bus}, tracker {tracker}{seed}"));
-    lines
+    let verdict = manifest.verdict().map(|verdict| {
+        let (reason, given) = (escaped(&verdict.reason), utc(&verdict.given_utc));
+        format!("{}, {reason} ({given})", verdict.verdict)
+    });
+    let more = context! {
+        rehearsal => manifest.rehearsal.as_deref(),
+        started => utc(&manifest.started_utc),
+        record => format!("{}: {}", folder.dir, folder.condition_name()),
+        report,
+        positions => tracker(&manifest.gates),
+        states => minijinja::Value::from(Serde(run.states())),
+        rows => known.map(row).collect::<Vec<_>>(),
+        third => last_third(folder, &figures),
+        rms => figures.estimate_rms.map(|error| error.to_string()),
+        final_error => figures.final_error.map(|error| error.to_string()),
+        warnings => warnings(run),
+        proofs => proofs.map(|line| line.text.to_string()).collect::<Vec<_>>(),
+        verdict,
+        ending => folder.ending(),
+    };
+    screen(include_str!("run.txt"), manifest, more)
 }
 
 /// `5015 accepted, 12 refused (8 innovation, 4 status)`.
@@ -83,24 +53,10 @@ pub(super) fn tracker(gates: &Map<String, Value>) -> Option<String> {
     Some(format!("{accepted} accepted, {all} refused{gates}"))
 }
 
-/// `0.0 s preparing, 2.0 s inserting, 3.5 s holding at 1.5 mm`.
-fn course(states: &[StateChange]) -> String {
-    let one = |StateChange { time_s, insertion_mm, state }: &StateChange| {
-        let depth = insertion_mm.map(|mm| format!(" at {mm:.1} mm")).unwrap_or_default();
-        format!("{time_s:.1} s {state}{depth}")
-    };
-    let mut shown: Vec<String> = states.iter().take(STATES_MAX).map(one).collect();
-    let more = states.len().saturating_sub(STATES_MAX);
-    if more > 0 {
-        shown.push(format!("and {} more", count(more, "change")));
-    }
-    shown.join(", ")
-}
-
-fn row(figure: &Figure) -> Vec<String> {
+fn row(figure: Figure) -> [String; 4] {
     let mark = if figure.is_outside() { "  OUTSIDE" } else { "" };
     let limit = figure.limit_text() + mark;
-    vec![figure.label.clone(), figure.value_text(), format!("{:<3}", figure.unit), limit]
+    [figure.label.clone(), figure.value_text(), format!("{:<3}", figure.unit), limit]
 }
 
 /// The run as one JSON object, units in its keys.
@@ -110,8 +66,7 @@ pub fn to_json(run: &Run) -> Value {
     let limit = |figure: &Figure| Some((figure.key.clone(), json!(figure.limit?)));
     let limits: Map<String, Value> = figures.iter().filter_map(limit).collect();
     let outside = figures.iter().filter(|figure| figure.is_outside()).map(|figure| &figure.key);
-    let errors = errors(&run.folder, &run.figures());
-    let all: Map<String, Value> = figures.iter().chain(&errors).map(key_value).collect();
+    let all: Map<String, Value> = run.all_figures().iter().map(key_value).collect();
     json!({
         "run_dir": run.folder.dir,
         "name": manifest.name,
@@ -143,11 +98,68 @@ fn key_value(figure: &Figure) -> (String, Value) {
     (figure.key.clone(), value)
 }
 
+/// The warnings of `run`, the most serious first; its events with their times come last.
+pub fn warnings(run: &Run) -> Vec<String> {
+    let mut all = doubts(run);
+    all.extend(run.events_from(Severity::Warning).map(|line| {
+        let time_s = line.time.as_secs_f64();
+        let depth = run.insertion_mm_at(time_s).map(|mm| format!(" at {mm:.1} mm"));
+        format!("{time_s:.3} s{}, {}: {}", depth.unwrap_or_default(), line.lane, line.text)
+    }));
+    all
+}
+
+/// The doubts about `run` other than its events, the most serious first.
+pub(super) fn doubts(run: &Run) -> Vec<String> {
+    let manifest = &run.folder.manifest;
+    let mut all = Vec::new();
+    all.extend(run.folder.caution());
+    if let Some(verdict) = manifest.verdict().filter(|v| v.verdict == VerdictKind::Invalid) {
+        all.push(format!("invalid: {}", escaped(&verdict.reason)));
+    }
+    if let Some(repaired) = &manifest.repaired_utc {
+        all.push(format!("closed by a repair on {}, after the bench had ended", utc(repaired)));
+    }
+    all.extend(run.unreadable.iter().cloned());
+    if let Err(error) = run.folder.limits() {
+        all.push(format!(
+            "the limits are unknown, because the configuration cannot be read: {error}"
+        ));
+    }
+    if let Some(Dropped { text_files, recording, .. }) = manifest.dropped
+        && text_files + recording > 0
+    {
+        all.push(format!(
+            "not recorded: {text_files} records of the text files, {recording} of run.rrd"
+        ));
+    }
+    all.extend(manifest.faults.iter().map(|fault| format!("record: {fault}")));
+    for figure in run.limited_figures().iter().filter(|figure| figure.is_outside()) {
+        let Figure { label, unit, .. } = figure;
+        all.push(format!("{label}: {} {unit}, to be {}", figure.value_text(), figure.limit_text()));
+    }
+    for (key, what) in [
+        ("syncs_late", "SYNC was sent late"),
+        ("syncs_skipped", "SYNC was skipped"),
+        ("feedback_missed", "SYNC was not answered by both drives"),
+        ("frames_dropped", "frame was lost before the bench took it"),
+    ] {
+        if let Some(times) = manifest.timing.get(key).and_then(Value::as_u64).filter(|n| *n > 0) {
+            all.push(format!("{what}: {times} times"));
+        }
+    }
+    if manifest.git.as_deref().is_some_and(|git| git.ends_with("-dirty")) {
+        all.push("the bench was built from uncommitted changes".to_owned());
+    }
+    all
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::run::tests::run;
     use super::*;
-    use crate::archive::{Verdict, VerdictKind};
+    use crate::archive::Verdict;
+    use crate::review::run::Condition;
 
     #[test]
     fn a_run_on_one_screen() {
@@ -163,7 +175,7 @@ mod tests {
             reason: "wrong gain".to_owned(),
             given_utc: "2023-11-15T08:00:00.000000Z".to_owned(),
         });
-        insta::assert_snapshot!(to_text(&run, Some("runs/a/report.html")));
+        insta::assert_snapshot!(to_text(&run, Some("runs/a/report.html")).unwrap());
     }
 
     #[test]
@@ -175,5 +187,50 @@ mod tests {
         assert_eq!(json["outside"], json!(["sync_late_us_max"]));
         assert_eq!(json["states"][2]["insertion_mm"], 1.5);
         assert_eq!(json["verdict"], Value::Null);
+    }
+
+    #[test]
+    fn a_good_run_has_its_events_alone() {
+        let mut run = run();
+        run.folder.manifest.timing.clear();
+        assert_eq!(
+            warnings(&run),
+            ["3.500 s at 1.5 mm, tracker: last tip 0.51 s old (limit 0.50)"]
+        );
+    }
+
+    #[test]
+    fn what_makes_a_run_doubtful_is_said() {
+        let mut run = run();
+        run.folder.condition = Condition::Open;
+        run.folder.manifest.git = Some("abc-dirty".to_owned());
+        run.folder.manifest.dropped = Some(Dropped { text_files: 3, ..Dropped::default() });
+        run.folder.config_toml = Some("depth = 1".to_owned());
+        let said = warnings(&run);
+        assert!(
+            said[0]
+                .ends_with("if its bench has ended, close it: needle-bench review runs/a --repair")
+        );
+        assert!(
+            said[1]
+                .starts_with("the limits are unknown, because the configuration cannot be read: ")
+        );
+        assert!(said[2].starts_with("not recorded: 3 records of the text files"));
+        assert!(said.contains(&"SYNC was skipped: 2 times".to_owned()), "{said:?}");
+        assert!(said.contains(&"the bench was built from uncommitted changes".to_owned()));
+    }
+
+    /// The defaults have limits, but these need not be the run's limits.
+    #[test]
+    fn without_its_configuration_a_run_has_no_limits() {
+        let mut run = run();
+        assert!(run.limited_figures().iter().any(|figure| figure.limit.is_some()));
+        run.folder.config_toml = None;
+        let of_configuration = ["off_plane_rms_mm", "following_error_mm_max", "insertion_mm"];
+        let figures = run.limited_figures();
+        let mut figures = figures.iter().filter(|f| of_configuration.contains(&f.key.as_str()));
+        assert!(figures.all(|figure| figure.limit.is_none()));
+        let said = "the limits are unknown, because the configuration cannot be read: config.toml is missing";
+        assert!(warnings(&run).contains(&said.to_owned()), "{:?}", warnings(&run));
     }
 }

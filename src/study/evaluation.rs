@@ -142,11 +142,8 @@ fn steps(recording: &Recording, mount: &Mount) -> Result<Vec<Step>, EvaluationEr
         (depth_mm, rotation_rad) = (depth_mm + deeper_mm, row.rotation_meas_rad);
         let position_mm = r_ps * (row.position_meas_mm - first.position_meas_mm);
         let tip_meas = TipPosition::new(position_mm).ok_or_else(|| {
-            refused(NeedleError::TooLarge {
-                quantity: "way from the first position in mm",
-                value: position_mm.amax(),
-                limit: TipPosition::COORDINATE_MAX_MM,
-            })
+            let way = "way from the first position in mm";
+            refused(NeedleError::too_large(way, position_mm.amax()))
         })?;
         let rotation_true = row.rotation_true.filter(|_| !is_constant);
         let rotation_true = rotation_true.map(|rotation| r_ps * rotation * mount.r_sb);

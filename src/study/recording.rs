@@ -50,7 +50,10 @@ impl Recording {
                 rotation_true,
             })
             .collect();
-        if rows.is_empty() { Err(TableError::Empty) } else { Ok(Recording { rows }) }
+        match rows.is_empty() {
+            true => Err(TableError("no rows below the header".to_owned())),
+            false => Ok(Recording { rows }),
+        }
     }
 
     /// True if every row has the orientation of the first: a sensor in a needle that bends never does, so a
@@ -103,7 +106,8 @@ mod tests {
             message(&format!("{HEADER}\n0,0,0,0\n")),
             "line 2: z_mm is \"\", expected a finite number"
         );
-        assert_eq!(Recording::parse(HEADER), Err(TableError::Empty));
+        let empty = TableError("no rows below the header".to_owned());
+        assert_eq!(Recording::parse(HEADER), Err(empty));
         assert_eq!(
             message(&format!("{HEADER},qw,qx,qy,qz\n0,0,0,0,0,0,0,0,0\n")),
             "line 2: qw,qx,qy,qz have the norm 0: no orientation"

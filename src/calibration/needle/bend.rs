@@ -7,8 +7,7 @@
 //! all insertions is summed, and the nearest bicycle model is fitted to it: `S = a (K_y, −K_x)`.
 
 use super::insertion::Insertion;
-use super::scatter;
-use super::{CalibrationError, refused};
+use super::{CalibrationError, covariance, refused};
 use crate::geometry::{Pose, Twist};
 use crate::math;
 use nalgebra::{Matrix3, Matrix4, Rotation3, SMatrix, SVector, Vector2, Vector3, Vector4, Vector6};
@@ -149,28 +148,15 @@ impl BendFit {
         r_sa: &Rotation3<f64>,
         noise: &PathNoise,
     ) -> Result<Self, CalibrationError> {
-        let mut bend = Vector4::zeros();
-        let mut told = Vec::new();
+        let (mut bend, mut told) = (Vector4::zeros(), Vec::new());
+        let (mut weight, mut weighted) = (Matrix4::zeros(), Vector4::zeros());
         for _ in 0..PASSES {
-            told = insertions
-                .iter()
-                .map(|insertion| follow(insertion, &bend, noise))
-                .collect::<Option<Vec<_>>>()
-                .ok_or_else(no_bend)?;
-            let weight: Matrix4<f64> = told.iter().map(|t| t.weight).sum();
-            let weighted: Vector4<f64> = told.iter().map(|t| t.weighted).sum();
+            let follow = |insertion| follow(insertion, &bend, noise);
+            told = insertions.iter().map(follow).collect::<Option<Vec<_>>>().ok_or_else(no_bend)?;
+            weight = told.iter().map(|t| t.weight).sum();
+            weighted = told.iter().map(|t| t.weighted).sum();
             bend = weight.try_inverse().ok_or_else(no_bend)? * weighted;
         }
-        Self::nearest(&told, &bend, r_sa)
-    }
-
-    fn nearest(
-        told: &[Information],
-        bend: &Vector4<f64>,
-        r_sa: &Rotation3<f64>,
-    ) -> Result<Self, CalibrationError> {
-        let weight: Matrix4<f64> = told.iter().map(|t| t.weight).sum();
-        let weighted: Vector4<f64> = told.iter().map(|t| t.weighted).sum();
         let mut p = Vector3::new(bend[0], bend[1], 0.0);
         for _ in 0..ITERATIONS {
             let (model, by) = bicycle(&p);
@@ -182,7 +168,7 @@ impl BendFit {
         let gradients: Vec<Vector3<f64>> =
             told.iter().map(|t| by.transpose() * (t.weighted - t.weight * model)).collect();
         let covariance =
-            scatter::covariance(&(by.transpose() * weight * by), &gradients).ok_or_else(no_bend)?;
+            covariance(&(by.transpose() * weight * by), &gradients).ok_or_else(no_bend)?;
         let curvature_per_mm = math::hypot(p.x, p.y);
         let along = Vector2::new(p.x, p.y) / curvature_per_mm;
         let across = Vector2::new(-along.y, along.x);

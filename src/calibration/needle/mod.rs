@@ -2,7 +2,6 @@
 
 mod bend;
 mod insertion;
-mod scatter;
 mod torsion;
 
 pub use bend::{BendFit, PathNoise};
@@ -11,11 +10,14 @@ pub use torsion::TorsionFit;
 
 use super::CalibrationError;
 use insertion::Insertion;
-use nalgebra::Vector3;
+use nalgebra::{SMatrix, SVector, Vector3};
 use std::fmt::Display;
 
 /// Fewer insertions than this do not show how insertions differ.
 const INSERTIONS_MIN: usize = 3;
+
+/// Above this the data do not separate the parameters.
+const CONDITION_MAX: f64 = 1e8;
 
 /// A needle with its standard errors, which come from how the insertions differ.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -62,6 +64,36 @@ impl NeedleFit {
             torsion: TorsionFit::of(&tracks)?,
         })
     }
+}
+
+/// Covariance of the parameters of a least-squares fit with residuals that are correlated within
+/// each insertion and independent between insertions: `H⁻¹ (Σᵢ gᵢ gᵢᵀ) H⁻¹ n / (n − 1)`, the
+/// sandwich estimator (Liang and Zeger 1986).
+///
+/// `hessian` is `H = JᵀJ` over all n insertions, `gradients` holds `gᵢ = Jᵢᵀ rᵢ` of each insertion
+/// at the fit. `None` if H has no inverse: the insertions do not determine the parameters.
+fn covariance<const N: usize>(
+    hessian: &SMatrix<f64, N, N>,
+    gradients: &[SVector<f64, N>],
+) -> Option<SMatrix<f64, N, N>> {
+    // Scaled to a unit diagonal first, so that the test for singularity does not depend on units.
+    let scale = SVector::<f64, N>::from_fn(|i, _| hessian[(i, i)].sqrt());
+    if !scale.iter().all(|s| s.is_finite() && *s > 0.0) {
+        return None;
+    }
+    let scaled = SMatrix::<f64, N, N>::from_fn(|i, j| hessian[(i, j)] / (scale[i] * scale[j]));
+    let inverse = scaled.try_inverse()?;
+    if inverse.amax() > CONDITION_MAX {
+        return None;
+    }
+    let n = gradients.len() as f64;
+    let mut meat = SMatrix::<f64, N, N>::zeros();
+    for gradient in gradients {
+        let gradient = gradient.component_div(&scale);
+        meat += gradient * gradient.transpose();
+    }
+    let covariance = inverse * meat * inverse * (n / (n - 1.0));
+    Some(SMatrix::from_fn(|i, j| covariance[(i, j)] / (scale[i] * scale[j])))
 }
 
 #[cfg(test)]

@@ -1,9 +1,8 @@
 //! Fits the torsion from the recorded rotations of base and tip.
 
 use super::insertion::Insertion;
-use super::scatter;
-use super::{CalibrationError, refused};
-use crate::needle::{Play, Torsion, TorsionConfig, TorsionError};
+use super::{CalibrationError, covariance, refused};
+use crate::needle::{NeedleError, Play, Torsion, TorsionConfig};
 use nalgebra::{SMatrix, SVector};
 
 /// w₀, w₁, c, L₀, L₁: band, offset, creep.
@@ -54,7 +53,7 @@ fn config(p: &Parameters) -> TorsionConfig {
 }
 
 /// Roll predicted by the torsion `p` minus the recorded roll, at each row of `insertion`.
-fn residuals(insertion: &Insertion, p: &Parameters) -> Result<Vec<f64>, TorsionError> {
+fn residuals(insertion: &Insertion, p: &Parameters) -> Result<Vec<f64>, NeedleError> {
     let torsion = Torsion::new(config(p))?;
     let (mut play, mut base_rad, mut tip_rad) = (Play::default(), 0.0, 0.0);
     let mut residuals = Vec::with_capacity(insertion.steps.len());
@@ -73,7 +72,7 @@ fn residuals(insertion: &Insertion, p: &Parameters) -> Result<Vec<f64>, TorsionE
 fn normal(
     insertion: &Insertion,
     p: &Parameters,
-) -> Result<(Hessian, Parameters, f64), TorsionError> {
+) -> Result<(Hessian, Parameters, f64), NeedleError> {
     let at = residuals(insertion, p)?;
     let mut columns = Vec::with_capacity(PARAMETERS);
     for (k, &difference) in DIFFERENCE.iter().enumerate() {
@@ -89,6 +88,13 @@ fn normal(
         Parameters::from_fn(|i, _| dot(&columns[i], &at)),
         dot(&at, &at),
     ))
+}
+
+/// Leaves parameter number `k` out of a fit.
+fn hold(hessian: &mut Hessian, k: usize) {
+    hessian.row_mut(k).fill(0.0);
+    hessian.column_mut(k).fill(0.0);
+    hessian[(k, k)] = 1.0;
 }
 
 impl TorsionFit {
@@ -126,9 +132,7 @@ impl TorsionFit {
                 if !held && (banded || k >= OFFSET) {
                     continue;
                 }
-                hessian.row_mut(k).fill(0.0);
-                hessian.column_mut(k).fill(0.0);
-                hessian[(k, k)] = 1.0;
+                hold(&mut hessian, k);
                 gradient[k] = 0.0;
             }
             let inverse = hessian.try_inverse().ok_or_else(undetermined)?;
@@ -150,35 +154,24 @@ impl TorsionFit {
         if !settled {
             return Err(undetermined());
         }
-        Self::at(&p, &parts, insertions, banded)
-    }
-
-    fn at(
-        p: &Parameters,
-        parts: &[(Hessian, Parameters, f64)],
-        insertions: &[Insertion],
-        banded: bool,
-    ) -> Result<Self, CalibrationError> {
         let mut hessian: Hessian = parts.iter().map(|part| part.0).sum();
         let mut gradients: Vec<Parameters> = parts.iter().map(|part| part.1).collect();
         if !banded {
-            let others = hessian.fixed_view::<3, 3>(OFFSET, OFFSET).into_owned();
-            hessian = Hessian::identity();
-            hessian.fixed_view_mut::<3, 3>(OFFSET, OFFSET).copy_from(&others);
+            (0..OFFSET).for_each(|k| hold(&mut hessian, k));
             gradients.iter_mut().for_each(|g| g.fixed_rows_mut::<OFFSET>(0).fill(0.0));
         }
-        let covariance = scatter::covariance(&hessian, &gradients).ok_or_else(undetermined)?;
+        let covariance = covariance(&hessian, &gradients).ok_or_else(undetermined)?;
         // Each insertion's own offset, by one Newton step with the other parameters kept.
         let offsets = parts.iter().map(|part| part.1[OFFSET] / part.0[(OFFSET, OFFSET)]);
         let n = insertions.len() as f64;
         let spread = (offsets.map(|off| off * off).sum::<f64>() / (n - 1.0)).sqrt();
         let mut count = 0;
         for insertion in insertions {
-            count += residuals(insertion, p).map_err(refused)?.len();
+            count += residuals(insertion, &p).map_err(refused)?.len();
         }
         let squares: f64 = parts.iter().map(|part| part.2).sum();
         Ok(TorsionFit {
-            torsion: config(p),
+            torsion: config(&p),
             sd: config(&covariance.diagonal().map(|variance| variance.max(0.0).sqrt())),
             offset_spread_rad: spread,
             roll_rms_rad: (squares / count.max(1) as f64).sqrt(),

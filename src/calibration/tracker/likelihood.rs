@@ -57,32 +57,18 @@ pub(super) struct Residuals<'a> {
     pub(super) time_min_s: f64,
 }
 
-/// A maximum of the likelihood.
-#[derive(Clone, Copy)]
-struct Best {
-    share: f64,
-    ln_time: f64,
-    ln_likelihood: f64,
-}
-
 impl Residuals<'_> {
     /// The likeliest noise, the same in every series.
     pub(super) fn fit(&self) -> NoiseFit {
-        let white = self.ln_likelihood(0.0, 0.0);
-        let best = self.search();
-        let n = self.count();
-        if 2.0 * (best.ln_likelihood - white) < GAIN_MIN {
-            let sd = self.scale_mm2(0.0, 0.0).sqrt();
-            let sd_mm = Measured { value: sd, error: sd / (2.0 * n).sqrt() };
-            let none = Measured::default();
-            return NoiseFit {
-                sd_mm,
-                white_sd_mm: sd_mm,
-                correlated_sd_mm: none,
-                correlation_time_s: none,
-            };
+        let [share, ln_time] = self.search();
+        let gain = self.ln_likelihood(share, ln_time) - self.ln_likelihood(0.0, 0.0);
+        if 2.0 * gain >= GAIN_MIN {
+            return self.with_errors(share, ln_time);
         }
-        self.with_errors(best)
+        let sd = self.scale_mm2(0.0, 0.0).sqrt();
+        let sd_mm = Measured { value: sd, error: sd / (2.0 * self.count()).sqrt() };
+        let none = Measured::default();
+        NoiseFit { sd_mm, white_sd_mm: sd_mm, correlated_sd_mm: none, correlation_time_s: none }
     }
 
     fn count(&self) -> f64 {
@@ -126,10 +112,11 @@ impl Residuals<'_> {
         -0.5 * (self.count() * math::ln(scale_mm2) + logarithms)
     }
 
-    /// The maximum over the correlated share and the time, by grids that close in on it.
-    fn search(&self) -> Best {
+    /// The correlated share and the logarithm of the time at the maximum of the likelihood, by grids
+    /// that close in on it.
+    fn search(&self) -> [f64; 2] {
         let limits = [(0.0, 1.0), (math::ln(self.time_min_s), math::ln(self.time_max_s))];
-        let mut best = Best { share: 0.0, ln_time: limits[1].0, ln_likelihood: f64::NEG_INFINITY };
+        let mut best = (f64::NEG_INFINITY, [0.0, limits[1].0]);
         let mut half = limits.map(|(low, high)| 0.5 * (high - low));
         let mut centre = limits.map(|(low, high)| 0.5 * (low + high));
         let mut points = POINTS_FIRST;
@@ -144,23 +131,22 @@ impl Residuals<'_> {
                     // All white has no time.
                     let share = share.max(1e-6);
                     let ln_likelihood = self.ln_likelihood(share, ln_time);
-                    if ln_likelihood > best.ln_likelihood {
-                        best = Best { share, ln_time, ln_likelihood };
+                    if ln_likelihood > best.0 {
+                        best = (ln_likelihood, [share, ln_time]);
                     }
                 }
             }
-            centre = [best.share, best.ln_time];
+            centre = best.1;
             half = half.map(|half| 0.5 * half);
             points = POINTS;
         }
-        best
+        best.1
     }
 
     /// Standard errors from the curvature of the likelihood at its maximum.
-    fn with_errors(&self, best: Best) -> NoiseFit {
-        let Best { ln_time, .. } = best;
+    fn with_errors(&self, best_share: f64, ln_time: f64) -> NoiseFit {
         let [h, g] = STEPS;
-        let share = best.share.clamp(2.0 * h, 1.0 - 2.0 * h);
+        let share = best_share.clamp(2.0 * h, 1.0 - 2.0 * h);
         let l = |i: f64, j: f64| self.ln_likelihood(share + i * h, ln_time + j * g);
         let centre = l(0.0, 0.0);
         let a = -(l(1.0, 0.0) - 2.0 * centre + l(-1.0, 0.0)) / (h * h);
@@ -186,7 +172,7 @@ impl Residuals<'_> {
             0.5 * variance.max(0.0).sqrt()
         };
         let scale = |share, ln_time| math::ln(self.scale_mm2(share, ln_time));
-        let variance_mm2 = self.scale_mm2(best.share, ln_time);
+        let variance_mm2 = self.scale_mm2(best_share, ln_time);
         let sd = |part: f64, error: f64| {
             let value = (variance_mm2 * part).sqrt();
             Measured { value, error: value * error }
@@ -196,8 +182,8 @@ impl Residuals<'_> {
         let time_s = math::exp(ln_time);
         NoiseFit {
             sd_mm: sd(1.0, error(&scale)),
-            white_sd_mm: sd(1.0 - best.share, error(&white)),
-            correlated_sd_mm: sd(best.share, error(&correlated)),
+            white_sd_mm: sd(1.0 - best_share, error(&white)),
+            correlated_sd_mm: sd(best_share, error(&correlated)),
             correlation_time_s: Measured { value: time_s, error: time_s * time2.max(0.0).sqrt() },
         }
     }

@@ -7,7 +7,7 @@ mod tests;
 pub use likelihood::{Measured, NoiseFit};
 
 use self::likelihood::Residuals;
-use super::error::{CalibrationError, check_distances};
+use super::{CalibrationError, check_distances};
 use crate::units::Time;
 use nalgebra::Vector3;
 
@@ -96,22 +96,26 @@ impl TrackerFit {
     /// # Errors
     /// A recording that is too short, that moves, or that has positions no bench reaches.
     pub fn of(samples: &[RestSample]) -> Result<Self, CalibrationError> {
-        let valid: Vec<(RestSample, Vector3<f64>)> =
-            samples.iter().filter_map(|sample| Some((*sample, sample.position_mm?))).collect();
-        check_distances("position", "tracker", valid.iter().map(|(_, position)| *position))?;
-        let stamped = valid.iter().all(|(sample, _)| sample.source_unix_ns.is_some());
-        let is_new = |k: &usize| *k == 0 || valid[*k].1 != valid[*k - 1].1;
+        let mut valid: Vec<(&RestSample, Vector3<f64>)> =
+            samples.iter().filter_map(|sample| Some((sample, sample.position_mm?))).collect();
+        let positions_mm: Vec<Vector3<f64>> = valid.iter().map(|(_, position)| *position).collect();
+        check_distances("position", "tracker", &positions_mm)?;
+        valid.dedup_by_key(|(_, position)| *position);
+        let repeats = positions_mm.len() - valid.len();
+        let is_stamped = valid.iter().all(|(sample, _)| sample.source_unix_ns.is_some());
+        let time_ns = |sample: &RestSample| match sample.source_unix_ns.filter(|_| is_stamped) {
+            Some(stamp_ns) => stamp_ns,
+            None => sample.receive_time.as_nanos(),
+        };
+        let first_ns = valid.first().map_or(0, |(sample, _)| time_ns(sample));
         let mut points: Vec<(f64, Vector3<f64>)> = Vec::new();
-        let first_ns = valid.first().map_or(0, |(sample, _)| time_ns(sample, stamped));
-        for k in (0..valid.len()).filter(is_new) {
-            let (sample, position_mm) = valid[k];
-            let time_s = time_ns(&sample, stamped).saturating_sub(first_ns) as f64 * 1e-9;
+        for (sample, position_mm) in valid {
+            let time_s = time_ns(sample).saturating_sub(first_ns) as f64 * 1e-9;
             // A stamp that goes back dates nothing.
             if points.last().is_none_or(|(last_s, _)| time_s >= *last_s) {
                 points.push((time_s, position_mm));
             }
         }
-        let repeats = valid.len() - (0..valid.len()).filter(is_new).count();
         let duration_s = points.last().map_or(0.0, |(time_s, _)| *time_s);
         if points.len() < POSITIONS_MIN || duration_s < DURATION_MIN_S {
             let repeated =
@@ -123,7 +127,7 @@ impl TrackerFit {
             )));
         }
         let mut gaps_s: Vec<f64> = points.windows(2).map(|pair| pair[1].0 - pair[0].0).collect();
-        let rate_hz = rate(&gaps_s, duration_s);
+        let rate_hz = rate(&gaps_s);
         let interval_s = median(&mut gaps_s);
         let dropouts = gaps_s.iter().filter(|gap| **gap > DROPOUT_INTERVALS * interval_s);
         let dropouts = dropouts.map(|gap| (gap / interval_s).round() as usize - 1).sum();
@@ -187,7 +191,7 @@ impl TrackerFit {
             rate_hz,
             outliers,
             dropouts,
-            invalid: samples.len() - valid.len(),
+            invalid: samples.len() - positions_mm.len(),
             repeats,
             latency_jitter_ms,
             latency_p99_ms,
@@ -199,10 +203,6 @@ fn refused(message: String) -> CalibrationError {
     CalibrationError(message)
 }
 
-fn time_ns(sample: &RestSample, stamped: bool) -> i64 {
-    sample.source_unix_ns.filter(|_| stamped).unwrap_or(sample.receive_time.as_nanos())
-}
-
 /// The middle one; 0 of none.
 fn median(values: &mut [f64]) -> f64 {
     let middle = values.len() / 2;
@@ -212,11 +212,18 @@ fn median(values: &mut [f64]) -> f64 {
     }
 }
 
+/// Mean and variance of `values`.
+fn moments(values: &[f64]) -> (f64, f64) {
+    let count = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / count;
+    (mean, values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / count)
+}
+
 /// New positions a second; its error from how the intervals differ.
-fn rate(gaps_s: &[f64], duration_s: f64) -> Measured {
-    let (count, mean_s) = (gaps_s.len() as f64, duration_s / gaps_s.len() as f64);
-    let variance = gaps_s.iter().map(|gap| (gap - mean_s).powi(2)).sum::<f64>() / count;
-    Measured { value: mean_s.recip(), error: (variance / count).sqrt() / (mean_s * mean_s) }
+fn rate(gaps_s: &[f64]) -> Measured {
+    let (mean_s, variance) = moments(gaps_s);
+    let error = (variance / gaps_s.len() as f64).sqrt() / (mean_s * mean_s);
+    Measured { value: mean_s.recip(), error }
 }
 
 /// The points without the outliers.
@@ -231,11 +238,11 @@ fn without_outliers(
         let middle = median(&mut values);
         values.iter_mut().for_each(|value| *value = (*value - middle).abs());
         let mad = median(&mut values);
-        let mean_square =
-            values.iter().map(|value| value * value).sum::<f64>() / values.len() as f64;
+        let squares = values.iter().map(|value| value * value).sum::<f64>();
         // A tracker of coarse steps may give one value most of the time.
-        let sd = if mad > 0.0 { SD_PER_MAD * mad } else { mean_square.sqrt() };
-        (middle, OUTLIER_SDS * sd)
+        let sd_mm =
+            if mad > 0.0 { SD_PER_MAD * mad } else { (squares / values.len() as f64).sqrt() };
+        (middle, OUTLIER_SDS * sd_mm)
     });
     let total = points.len();
     let is_near = |(_, position): &(f64, Vector3<f64>)| {
@@ -328,11 +335,8 @@ fn latency(samples: &[RestSample]) -> Option<(Measured, f64)> {
     let least_ns = *late_ns.iter().min()?;
     let mut late_ms: Vec<f64> =
         late_ns.iter().map(|late| late.saturating_sub(least_ns) as f64 * 1e-6).collect();
-    let count = late_ms.len() as f64;
-    let mean_ms = late_ms.iter().sum::<f64>() / count;
-    let variance = late_ms.iter().map(|late| (late - mean_ms).powi(2)).sum::<f64>() / count;
+    let value = moments(&late_ms).1.sqrt();
+    let jitter = Measured { value, error: value / (2.0 * late_ms.len() as f64).sqrt() };
     let rank = (late_ms.len() - 1) * 99 / 100;
-    let p99_ms = *late_ms.select_nth_unstable_by(rank, f64::total_cmp).1;
-    let value = variance.sqrt();
-    Some((Measured { value, error: value / (2.0 * count).sqrt() }, p99_ms))
+    Some((jitter, *late_ms.select_nth_unstable_by(rank, f64::total_cmp).1))
 }

@@ -7,12 +7,13 @@ use super::records::{RUNS, describe, newest_first, open};
 use super::{BAD_CONFIGURATION, Failure};
 use crate::archive::{Verdict, VerdictKind, file};
 use crate::review::{
-    Campaign, Comparison, Condition, Folder, GENERATOR, Run, html, plain, to_json, to_text,
+    Campaign, Comparison, Condition, Folder, GENERATOR, Run, html, to_json, to_text,
 };
 use crate::runtime::make_recording;
 use crate::telemetry::{
     Repaired, RunFolder, is_being_written, lock, note_recording, repair, utc_text, write_manifest,
 };
+use crate::text::escaped;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use serde_json::json;
@@ -115,7 +116,7 @@ fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
     let report = written.as_ref().and_then(|written| written.as_deref().ok());
     let mut object = to_json(&run);
     object["report"] = json!(report);
-    give(arguments.json, &object, || Ok(to_text(&run, report)))?;
+    give(arguments.json, &object, || to_text(&run, report))?;
     match written {
         // The summary was printed already; the error follows it.
         Some(Err(error)) => {
@@ -283,5 +284,5 @@ fn judge(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<
     manifest.verdicts.push(Verdict { verdict, reason: reason.to_owned(), given_utc });
     write_manifest(path, &manifest).map_err(Failure::environment)?;
     let object = json!({ "run_dir": dir, "verdicts": manifest.verdicts });
-    give(json, &object, || Ok(format!("{dir}: {verdict}, {}", plain(reason))))
+    give(json, &object, || Ok(format!("{dir}: {verdict}, {}", escaped(reason))))
 }

@@ -1,45 +1,69 @@
 //! A chart, laid out in the pixels of the template `chart.svg`.
 
 use crate::math::log10;
+use derive_more::Display;
 use minijinja::{Value, context};
+
+// Colours by meaning: those of the viewer (`telemetry::recording`), adapted to white paper.
+/// The observer's estimate.
+pub(super) const ESTIMATE: &str = "#56B4E9";
+/// The emulator's truth.
+pub(super) const TRUTH: &str = "#009E73";
+/// Measurements.
+pub(super) const MEASURED: &str = "#E69F00";
+/// Commands.
+pub(super) const COMMANDED: &str = "#CC79A7";
+/// The first, second and third coordinate; black replaces the viewer's yellow.
+pub(super) const COORDINATES: [&str; 3] = ["#D55E00", "#000000", "#0072B2"];
+/// Faults.
+pub(super) const FAULT: &str = "#D55E00";
+/// Limits and holds: neither good nor bad.
+const NEUTRAL: &str = "#8A8A8A";
 
 /// The plot area within the picture of 560 × 280 pixels; `chart.svg` has the same numbers.
 const LEFT: f64 = 60.0;
 const RIGHT: f64 = 546.0;
 const TOP: f64 = 8.0;
 const BOTTOM: f64 = 234.0;
-/// About so many labels on the axes.
+/// The approximate number of labels on each axis.
 const X_LABELS: f64 = 10.0;
 const Y_LABELS: f64 = 6.0;
 /// Margin above and below the curves, relative to their span.
-const ROOM: f64 = 0.08;
+const MARGIN: f64 = 0.08;
 /// How far a band may widen the axis, relative to the span of the curves.
-const BAND_ROOM: f64 = 0.5;
+const BAND_MARGIN: f64 = 0.5;
+/// Larger values come from a damaged file and are left out of the charts.
+pub(super) const VALUE_MAX: f64 = 1e12;
 
-/// Connected points of a curve.
+/// Points of a curve; an infinite coordinate is at the end of its axis.
 pub(super) type Points = Vec<(f64, f64)>;
 
-/// A layer of a chart.
-pub(super) enum Layer {
+/// How a layer is drawn, in the chart and in its legend.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
+#[display(rename_all = "lowercase")]
+pub(super) enum Shape {
     /// Lines through the points of each piece.
-    Line(Vec<Points>),
+    Line,
     /// The same, but broad enough to be visible under another line.
-    Broad(Vec<Points>),
+    Broad,
     /// The points alone.
-    Points(Points),
-    /// Areas between a lower and an upper curve, as `(x, low, high)`.
-    Band(Vec<Vec<(f64, f64, f64)>>),
-    /// A dashed horizontal line.
-    Level(f64),
-    /// Intervals of the x axis.
-    Stretches(Points),
+    Points,
+    /// A dashed line.
+    Level,
+    /// Areas with the pieces as their outlines.
+    Area,
 }
 
-/// A layer with its name in the legend.
-pub(super) struct Named {
-    pub(super) name: &'static str,
-    pub(super) colour: &'static str,
-    pub(super) layer: Layer,
+/// The shapes of what a run has measured, estimated or commanded.
+const CURVES: [Shape; 3] = [Shape::Line, Shape::Broad, Shape::Points];
+
+/// A layer of a chart, with its name in the legend.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Layer {
+    name: &'static str,
+    colour: &'static str,
+    shape: Shape,
+    pub(super) pieces: Vec<Points>,
 }
 
 /// A chart: its axes with units, and its layers.
@@ -47,80 +71,51 @@ pub(super) struct Chart {
     pub(super) title: &'static str,
     pub(super) x: &'static str,
     pub(super) y: &'static str,
-    pub(super) layers: Vec<Named>,
+    pub(super) layers: Vec<Layer>,
     /// The range of the y axis; if `None`, it spans the curves.
     pub(super) span: Option<(f64, f64)>,
 }
 
 impl Layer {
+    pub(super) fn new(
+        name: &'static str,
+        colour: &'static str,
+        shape: Shape,
+        pieces: Vec<Points>,
+    ) -> Self {
+        Layer { name, colour, shape, pieces }
+    }
+
+    /// A dashed line across the chart.
+    pub(super) fn level(name: &'static str, y: f64) -> Self {
+        let across = vec![(f64::NEG_INFINITY, y), (f64::INFINITY, y)];
+        Layer::new(name, NEUTRAL, Shape::Level, vec![across])
+    }
+
+    /// Intervals of the x axis.
+    pub(super) fn intervals(name: &'static str, intervals: Points) -> Self {
+        let (low, high) = (f64::NEG_INFINITY, f64::INFINITY);
+        let outline = |(from, to)| vec![(from, low), (from, high), (to, high), (to, low)];
+        Layer::new(name, NEUTRAL, Shape::Area, intervals.into_iter().map(outline).collect())
+    }
+
     fn is_empty(&self) -> bool {
-        match self {
-            Layer::Line(pieces) | Layer::Broad(pieces) => pieces.iter().all(Vec::is_empty),
-            Layer::Points(points) | Layer::Stretches(points) => points.is_empty(),
-            Layer::Band(pieces) => pieces.iter().all(Vec::is_empty),
-            Layer::Level(level) => !level.is_finite(),
-        }
-    }
-
-    /// The points of a curve; a band, a level or a stretch has none.
-    fn points(&self) -> impl Iterator<Item = &(f64, f64)> {
-        let (pieces, points) = match self {
-            Layer::Line(pieces) | Layer::Broad(pieces) => (pieces.as_slice(), [].as_slice()),
-            Layer::Points(points) => ([].as_slice(), points.as_slice()),
-            Layer::Band(_) | Layer::Level(_) | Layer::Stretches(_) => {
-                ([].as_slice(), [].as_slice())
-            }
-        };
-        pieces.iter().flatten().chain(points)
-    }
-
-    /// How it is drawn, here and in a legend.
-    fn shape(&self) -> &'static str {
-        match self {
-            Layer::Line(_) => "line",
-            Layer::Broad(_) => "broad",
-            Layer::Points(_) => "points",
-            Layer::Level(_) => "level",
-            Layer::Band(_) | Layer::Stretches(_) => "area",
-        }
+        self.pieces.iter().all(Vec::is_empty)
     }
 
     /// Its SVG path.
     fn path(&self, x: &Axis, y: &Axis) -> String {
-        let at = |(x_value, y_value)| format!("{:.1} {:.1}", x.at(x_value), y.at(y_value));
-        let line = |points: &[(f64, f64)]| {
-            let finite = points.iter().filter(|(x, y)| x.is_finite() && y.is_finite());
-            let points: Vec<String> = finite.map(|point| at(*point)).collect();
-            if points.is_empty() { String::new() } else { format!("M{}", points.join("L")) }
+        let at = |point: &(f64, f64)| format!("{:.1} {:.1}", x.at(point.0), y.at(point.1));
+        let path = |piece: &Points| {
+            let points: Vec<String> = piece.iter().map(at).collect();
+            match self.shape {
+                // Lines without a length: their round ends are dots.
+                Shape::Points => format!("M{}h0", points.join("h0M")),
+                Shape::Area => format!("M{}Z", points.join("L")),
+                _ => format!("M{}", points.join("L")),
+            }
         };
-        let area = |outline: Points| line(&outline) + "Z";
-        match self {
-            Layer::Line(pieces) | Layer::Broad(pieces) => {
-                pieces.iter().map(|piece| line(piece)).collect()
-            }
-            // Lines without a length: their round ends are dots.
-            Layer::Points(points) => {
-                let dots = points.iter().map(|point| line(&[*point])).filter(|dot| !dot.is_empty());
-                dots.map(|dot| dot + "h0").collect()
-            }
-            Layer::Band(pieces) => {
-                let pieces = pieces.iter().filter(|piece| !piece.is_empty()).map(|piece| {
-                    let low = piece.iter().map(|&(x, low, _)| (x, low));
-                    let high = piece.iter().rev().map(|&(x, _, high)| (x, high));
-                    area(low.chain(high).collect())
-                });
-                pieces.collect()
-            }
-            Layer::Level(level) => line(&[(x.range.0, *level), (x.range.1, *level)]),
-            Layer::Stretches(stretches) => {
-                let stretches = stretches.iter().map(|&(from, to)| {
-                    let (from, to) = (from.max(x.range.0), to.min(x.range.1));
-                    let (low, high) = y.range;
-                    area(vec![(from, low), (from, high), (to, high), (to, low)])
-                });
-                stretches.collect()
-            }
-        }
+        self.pieces.iter().filter(|piece| !piece.is_empty()).map(path).collect()
     }
 }
 
@@ -132,7 +127,9 @@ struct Axis {
 
 impl Axis {
     fn at(&self, value: f64) -> f64 {
-        let part = (value - self.range.0) / (self.range.1 - self.range.0);
+        let (low, high) = self.range;
+        let value = if value.is_infinite() { value.clamp(low, high) } else { value };
+        let part = (value - low) / (high - low);
         self.ends.0 + part * (self.ends.1 - self.ends.0)
     }
 
@@ -155,14 +152,18 @@ impl Axis {
 }
 
 impl Chart {
-    /// The layers that are not empty.
-    pub(super) fn shown(&self) -> impl Iterator<Item = &Named> {
-        self.layers.iter().filter(|named| !named.layer.is_empty())
+    pub(super) fn new(
+        title: &'static str,
+        x: &'static str,
+        y: &'static str,
+        layers: Vec<Layer>,
+    ) -> Self {
+        Chart { title, x, y, layers, span: None }
     }
 
     /// Whether there is a curve and not only limits.
     pub(super) fn has_curve(&self) -> bool {
-        self.layers.iter().any(|named| named.layer.points().next().is_some())
+        self.points(&CURVES).next().is_some()
     }
 
     /// What the template `chart.svg` draws.
@@ -170,8 +171,9 @@ impl Chart {
         let x = Axis { range: self.x_range(), ends: (LEFT, RIGHT) };
         let y_range = self.span.unwrap_or_else(|| self.y_range());
         let y = Axis { range: y_range, ends: (BOTTOM, TOP) };
-        let layers = self.shown().map(|&Named { name, colour, ref layer }| {
-            context! { name, colour, shape => layer.shape(), path => layer.path(&x, &y) }
+        let layers = self.layers.iter().filter(|layer| !layer.is_empty()).map(|layer| {
+            let (name, colour, shape) = (layer.name, layer.colour, layer.shape.to_string());
+            context! { name, colour, shape, path => layer.path(&x, &y) }
         });
         context! {
             title => self.title,
@@ -183,102 +185,77 @@ impl Chart {
         }
     }
 
-    fn points(&self) -> impl Iterator<Item = &(f64, f64)> {
-        self.layers.iter().flat_map(|named| named.layer.points())
+    /// The points of the layers of these shapes.
+    fn points(&self, shapes: &[Shape]) -> impl Iterator<Item = (f64, f64)> {
+        let layers = self.layers.iter().filter(|layer| shapes.contains(&layer.shape));
+        layers.flat_map(|layer| layer.pieces.iter().flatten().copied())
     }
 
     fn x_range(&self) -> (f64, f64) {
-        padded(range(self.points().map(|(x, _)| *x)), 0.0)
+        padded(range(self.points(&CURVES).map(|(x, _)| x)), 0.0)
     }
 
-    /// The range of the curves from `x_from` on, with some room: a y axis that earlier values do not
+    /// The range of the curves from `x_from` on, with a margin: a y axis that earlier values do not
     /// stretch.
     pub(super) fn span_from(&self, x_from: f64) -> Option<(f64, f64)> {
-        let late = self.points().filter(|(x, _)| *x >= x_from);
-        let late = range(late.map(|(_, y)| *y));
-        late.map(|range| padded(Some(range), ROOM))
+        let late = self.points(&CURVES).filter(|(x, _)| *x >= x_from);
+        range(late.map(|(_, y)| y)).map(|range| padded(Some(range), MARGIN))
     }
 
     /// The range of the curves and levels, widened for the bands, which may be far wider.
     fn y_range(&self) -> (f64, f64) {
-        let layers = || self.layers.iter().map(|named| &named.layer);
-        let level =
-            |layer: &Layer| if let Layer::Level(level) = layer { Some(*level) } else { None };
-        let curves = self.points().map(|(_, y)| *y).chain(layers().filter_map(level));
-        let (low, high) = padded(range(curves), ROOM);
-        let room = (high - low) * BAND_ROOM;
-        let bands = layers().filter_map(|layer| match layer {
-            Layer::Band(pieces) => Some(pieces.iter().flatten()),
-            _ => None,
-        });
-        let bands = range(bands.flatten().flat_map(|(_, low, high)| [*low, *high]));
+        let levels = self.points(&[Shape::Level]);
+        let (low, high) = padded(range(self.points(&CURVES).chain(levels).map(|(_, y)| y)), MARGIN);
+        let margin = (high - low) * BAND_MARGIN;
+        let bands = range(self.points(&[Shape::Area]).map(|(_, y)| y));
         let (band_low, band_high) = bands.unwrap_or((low, high));
-        (low.min(band_low.max(low - room)), high.max(band_high.min(high + room)))
+        (low.min(band_low.max(low - margin)), high.max(band_high.min(high + margin)))
     }
 }
 
-/// Larger values come from a damaged file and are left out of the charts.
-pub(super) const VALUE_MAX: f64 = 1e12;
-
-/// The smallest and the largest of `values`; `None` without values.
+/// The smallest and the largest of the finite `values`; `None` without one.
 fn range(values: impl Iterator<Item = f64>) -> Option<(f64, f64)> {
-    let valid = values.filter(|value| value.abs() < VALUE_MAX);
-    valid.fold(None, |range, value| {
+    values.filter(|value| value.is_finite()).fold(None, |range, value| {
         let (low, high) = range.unwrap_or((value, value));
         Some((value.min(low), value.max(high)))
     })
 }
 
-/// `range` with a margin of `room` times its span on both sides; never empty.
-fn padded(range: Option<(f64, f64)>, room: f64) -> (f64, f64) {
+/// `range` with a `margin`, relative to its span, on both sides; never empty.
+fn padded(range: Option<(f64, f64)>, margin: f64) -> (f64, f64) {
     let (low, high) = range.unwrap_or((0.0, 1.0));
     let span = high - low;
-    let room = if span > 0.0 { span * room } else { low.abs().max(1.0) * 0.5 };
-    (low - room, high + room)
+    let margin = if span > 0.0 { span * margin } else { low.abs().max(1.0) * 0.5 };
+    (low - margin, high + margin)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    fn layer(shape: Shape, pieces: Vec<Points>) -> Layer {
+        Layer::new("a", "#000000", shape, pieces)
+    }
+
     fn chart(layers: Vec<Layer>) -> Chart {
-        let named = |layer| Named { name: "a", colour: "#000000", layer };
-        Chart {
-            title: "t",
-            x: "x (mm)",
-            y: "y (mm)",
-            layers: layers.into_iter().map(named).collect(),
-            span: None,
-        }
+        Chart::new("t", "x (mm)", "y (mm)", layers)
     }
 
     #[test]
     fn axes_span_what_is_drawn_and_bands_widen_them_by_half_at_most() {
-        let line = || Layer::Line(vec![vec![(0.0, -1.0), (10.0, 1.0)]]);
+        let line = || layer(Shape::Line, vec![vec![(0.0, -1.0), (10.0, 1.0)]]);
         let close =
             |(a, b): (f64, f64), (c, d): (f64, f64)| (a - c).abs() < 1e-9 && (b - d).abs() < 1e-9;
-        let lone = chart(vec![line()]);
+        let held = Layer::intervals("held", vec![(2.0, f64::INFINITY)]);
+        let lone = chart(vec![line(), held]);
         assert_eq!(lone.x_range(), (0.0, 10.0));
         assert!(close(lone.y_range(), (-1.16, 1.16)), "{:?}", lone.y_range());
-        let wide = chart(vec![line(), Layer::Band(vec![vec![(0.0, -1.2, 180.0)]])]);
+        let band = layer(Shape::Area, vec![vec![(0.0, -1.2), (0.0, 180.0)]]);
+        let wide = chart(vec![line(), band]);
         assert!(close(wide.y_range(), (-1.2, 1.16 + 1.16)), "{:?}", wide.y_range());
-        let limited = chart(vec![line(), Layer::Level(9.0)]);
+        let limited = chart(vec![line(), Layer::level("limit", 9.0)]);
         assert!(close(limited.y_range(), (-1.8, 9.8)), "{:?}", limited.y_range());
-    }
-
-    #[test]
-    fn values_that_are_no_numbers_do_no_harm() {
-        let nan = chart(vec![
-            Layer::Points(vec![(f64::NAN, 0.0), (1.0, f64::INFINITY)]),
-            Layer::Line(vec![vec![(0.0, 1.0)], Vec::new()]),
-            Layer::Level(f64::NAN),
-        ]);
-        assert_eq!(nan.shown().count(), 2);
-        assert_eq!(
-            nan.shown().map(|named| named.layer.path(&UNIT, &UNIT)).collect::<Vec<_>>(),
-            ["", "M0.0 1.0"]
-        );
-        assert!(!chart(vec![Layer::Level(1.0)]).has_curve());
+        assert!(!chart(vec![Layer::level("limit", 1.0)]).has_curve());
     }
 
     /// A pixel a unit.
@@ -288,15 +265,13 @@ mod tests {
     fn each_layer_is_a_path() {
         let path = |layer: Layer| layer.path(&UNIT, &UNIT);
         let piece = vec![(0.0, 0.0), (1.0, 4.0)];
-        assert_eq!(
-            path(Layer::Line(vec![piece.clone(), piece.clone()])),
-            "M0.0 0.0L1.0 4.0".repeat(2)
-        );
-        assert_eq!(path(Layer::Points(piece)), "M0.0 0.0h0M1.0 4.0h0");
-        let band = Layer::Band(vec![vec![(0.0, 1.0, 2.0), (1.0, 3.0, 4.0)]]);
+        let twice = vec![piece.clone(), Vec::new(), piece.clone()];
+        assert_eq!(path(layer(Shape::Line, twice)), "M0.0 0.0L1.0 4.0".repeat(2));
+        assert_eq!(path(layer(Shape::Points, vec![piece])), "M0.0 0.0h0M1.0 4.0h0");
+        let band = layer(Shape::Area, vec![vec![(0.0, 1.0), (1.0, 3.0), (1.0, 4.0), (0.0, 2.0)]]);
         assert_eq!(path(band), "M0.0 1.0L1.0 3.0L1.0 4.0L0.0 2.0Z");
-        assert_eq!(path(Layer::Level(0.5)), "M0.0 0.5L1.0 0.5");
-        let held = Layer::Stretches(vec![(0.5, f64::INFINITY)]);
+        assert_eq!(path(Layer::level("limit", 0.5)), "M0.0 0.5L1.0 0.5");
+        let held = Layer::intervals("held", vec![(0.5, f64::INFINITY)]);
         assert_eq!(path(held), "M0.5 0.0L0.5 1.0L1.0 1.0L1.0 0.0Z");
     }
 

@@ -1,7 +1,9 @@
 //! The curves of a run.
 
-use super::chart::{Chart, Layer, Named, Points, VALUE_MAX};
-use super::colour::{COMMANDED, COORDINATES, ESTIMATE, FAULT, MEASURED, NEUTRAL, TRUTH};
+use super::chart::{
+    COMMANDED, COORDINATES, Chart, ESTIMATE, FAULT, Layer, MEASURED, Points, Shape, TRUTH,
+    VALUE_MAX,
+};
 use crate::archive::RunOutcome;
 use crate::review::figures::{BLIND_DEPTH, GOAL, Limits, OFF_PLANE, TIP_AGE};
 use crate::review::run::Run;
@@ -17,21 +19,25 @@ type Column = Vec<Option<f64>>;
 
 /// The charts of `run` that have a curve.
 pub(super) fn curves(run: &Run, limits: &Limits) -> Vec<Chart> {
+    let roll = tip(run, "roll", "Roll: where the bevel looks", "roll (deg)");
+    let (position, angles) = (["x", "y", "z"], ["yaw", "pitch", "roll"]);
+    let turning = ("rotation_cmd_rad_per_mm", "commanded for the next step", COMMANDED);
+    let rotation = ("rotation_rad", "stage, measured", MEASURED);
     let mut charts = vec![
         off_plane(run, limits),
         tip(run, "y", "Tip in the plane, across the start", "y (mm)"),
         tip(run, "pitch", "Pitch: the heading out of the plane", "pitch (deg)"),
-        roll(run),
-        errors(run, "position", "estimate − truth (mm)", ["x", "y", "z"]),
-        errors(run, "angles", "estimate − truth (deg)", ["yaw", "pitch", "roll"]),
+        Chart { span: Some((-180.0, 180.0)), ..roll },
+        errors(run, "Errors of the estimated position", "estimate − truth (mm)", position),
+        errors(run, "Errors of the estimated angles", "estimate − truth (deg)", angles),
         residuals(run),
-        turning(run),
-        rotation(run),
+        base(run, "Turning of the base", "turning (deg/mm)", turning),
+        base(run, "Rotation of the base", "rotation (deg)", rotation),
         insertion(run, limits),
         tip_age(run, limits),
         blind_depth(run, limits),
-        motion(run, Axis::Insertion),
-        motion(run, Axis::Rotation),
+        motion(run, Axis::Insertion, "Motion of the insertion", "position (mm)"),
+        motion(run, Axis::Rotation, "Motion of the rotation", "position (deg)"),
     ];
     charts.retain(Chart::has_curve);
     charts
@@ -43,45 +49,40 @@ fn tip(run: &Run, name: &str, title: &'static str, y: &'static str) -> Chart {
     let of = |provenance| coordinate(run, name, provenance);
     let (estimate, jump) = (of("est"), jump(name));
     let layers = vec![
-        named("estimate ± 2 σ", ESTIMATE, Layer::Band(band(&depth, &estimate, &of("sd"), jump))),
-        named("measured", MEASURED, Layer::Points(points(&depth, &of("meas")))),
-        named("estimate", ESTIMATE, Layer::Broad(pieces(&depth, &estimate, jump))),
-        named("truth", TRUTH, Layer::Line(pieces(&depth, &of("true"), jump))),
+        Layer::new(
+            "estimate ± 2 σ",
+            ESTIMATE,
+            Shape::Area,
+            band(&depth, &estimate, &of("sd"), jump),
+        ),
+        dots("measured", MEASURED, points(&depth, &of("meas"))),
+        Layer::new("estimate", ESTIMATE, Shape::Broad, pieces(&depth, &estimate, jump)),
+        Layer::new("truth", TRUTH, Shape::Line, pieces(&depth, &of("true"), jump)),
     ];
-    Chart { title, x: DEPTH, y, layers, span: None }
+    Chart::new(title, DEPTH, y, layers)
 }
 
 fn off_plane(run: &Run, limits: &Limits) -> Chart {
     let mut chart = tip(run, "x", "Distance from the plane", "x (mm)");
     if let Some(off_plane_mm) = limits.get(OFF_PLANE) {
-        chart.layers.push(named("1 mm off the plane", NEUTRAL, Layer::Level(*off_plane_mm)));
-        chart.layers.push(named("", NEUTRAL, Layer::Level(-off_plane_mm)));
+        chart.layers.push(Layer::level("1 mm off the plane", *off_plane_mm));
+        chart.layers.push(Layer::level("", -off_plane_mm));
     }
     chart
 }
 
-fn roll(run: &Run) -> Chart {
-    let chart = tip(run, "roll", "Roll: where the bevel looks", "roll (deg)");
-    Chart { span: Some((-180.0, 180.0)), ..chart }
-}
-
 /// Errors of the estimate over depth. The errors at the start, which are large, do not stretch the
 /// y axis.
-fn errors(run: &Run, what: &str, y: &'static str, names: [&'static str; 3]) -> Chart {
+fn errors(run: &Run, title: &'static str, y: &'static str, names: [&'static str; 3]) -> Chart {
     let depth = depth(run);
     let layers = names.into_iter().zip(COORDINATES).map(|(name, colour)| {
         let mut error = difference(&coordinate(run, name, "est"), &coordinate(run, name, "true"));
         if is_angle(name) {
-            let wrapped = |deg: f64| wrap_angle(deg.to_radians()).to_degrees();
-            error = scaled(error, wrapped);
+            error = scaled(error, |deg| wrap_angle(deg.to_radians()).to_degrees());
         }
-        named(name, colour, Layer::Line(pieces(&depth, &error, jump(name))))
+        Layer::new(name, colour, Shape::Line, pieces(&depth, &error, jump(name)))
     });
-    let title = match what {
-        "position" => "Errors of the estimated position",
-        _ => "Errors of the estimated angles",
-    };
-    let mut chart = Chart { title, x: DEPTH, y, layers: layers.collect(), span: None };
+    let mut chart = Chart::new(title, DEPTH, y, layers.collect());
     chart.span = chart.span_from(depth.iter().flatten().fold(0.0, |a, b| b.max(a)) / 3.0);
     if chart.span.is_some() {
         chart.x = "depth (mm); the axis spans the errors from a third of it on";
@@ -91,97 +92,80 @@ fn errors(run: &Run, what: &str, y: &'static str, names: [&'static str; 3]) -> C
 
 /// The residuals after the correction; the innovations are in `run.rrd`.
 fn residuals(run: &Run) -> Chart {
-    let depth = depth(run);
     let layers = ["x", "y", "z"].into_iter().zip(COORDINATES).map(|(name, colour)| {
         let left = difference(&coordinate(run, name, "meas"), &coordinate(run, name, "est"));
-        named(name, colour, Layer::Points(points(&depth, &left)))
+        dots(name, colour, points(&depth(run), &left))
     });
     let (title, y) = ("Measured tip less the estimate", "measured − estimate (mm)");
-    Chart { title, x: DEPTH, y, layers: layers.collect(), span: None }
+    Chart::new(title, DEPTH, y, layers.collect())
 }
 
-fn turning(run: &Run) -> Chart {
-    let per_mm = scaled(column(run, "rotation_cmd_rad_per_mm"), f64::to_degrees);
-    let line = Layer::Line(pieces(&depth(run), &per_mm, f64::INFINITY));
-    let layers = vec![named("commanded for the next step", COMMANDED, line)];
-    Chart { title: "Turning of the base", x: DEPTH, y: "turning (deg/mm)", layers, span: None }
-}
-
-fn rotation(run: &Run) -> Chart {
-    let turned = scaled(column(run, "rotation_rad"), f64::to_degrees);
-    let line = Layer::Line(pieces(&depth(run), &turned, f64::INFINITY));
-    let layers = vec![named("stage, measured", MEASURED, line)];
-    Chart { title: "Rotation of the base", x: DEPTH, y: "rotation (deg)", layers, span: None }
+/// A column of the base's rotation over depth, with its name in the legend and its colour.
+fn base(
+    run: &Run,
+    title: &'static str,
+    y: &'static str,
+    (name, label, colour): (&str, &'static str, &'static str),
+) -> Chart {
+    let values = scaled(run.steps.column(name), f64::to_degrees);
+    Chart::new(title, DEPTH, y, vec![line(label, colour, points(&depth(run), &values))])
 }
 
 /// Depth over time, with the holds.
 fn insertion(run: &Run, limits: &Limits) -> Chart {
-    let time = column(run, "time_s");
-    let depth = column(run, "insertion_mm");
+    let steps = points(&column(run, "time_s"), &depth(run));
     let states = run.states();
     let ends = states.iter().skip(1).map(|next| next.time_s).chain([f64::INFINITY]);
     let is_held = |name: &str| State::named(Lane::Session, name).is_some_and(State::is_held);
     let held = states.iter().zip(ends).filter(|(change, _)| is_held(&change.state));
-    let held: Points = held.map(|(change, end)| (change.time_s, end)).collect();
-    let mut line = pieces(&time, &depth, f64::INFINITY);
+    let held = held.map(|(change, end)| (change.time_s, end)).collect();
+    let (last, mut course) = (steps.last().copied(), steps);
     // From the last step to the point where the run was stopped.
-    if let (Some(stop_s), Some(piece)) = (run.stopped_at_s(), line.last_mut())
-        && let Some((last_s, depth_mm)) = piece.last().copied()
+    if let (Some(stop_s), Some((last_s, depth_mm))) = (run.stopped_at_s(), last)
         && stop_s > last_s
     {
-        piece.push((stop_s, run.figures().insertion_mm.max(depth_mm)));
+        course.push((stop_s, run.figures().insertion_mm.max(depth_mm)));
     }
-    let line = Layer::Line(line);
-    let mut layers = vec![
-        named("held", NEUTRAL, Layer::Stretches(held)),
-        named("stage, measured", MEASURED, line),
-    ];
+    let mut layers =
+        vec![Layer::intervals("held", held), line("stage, measured", MEASURED, course)];
     if run.folder.manifest.outcome == Some(RunOutcome::Stopped) {
-        let last = points(&time, &depth).last().copied();
-        layers.push(named("last step", FAULT, Layer::Points(last.into_iter().collect())));
+        layers.push(dots("last step", FAULT, last.into_iter().collect()));
     }
-    let goal = limits.get(GOAL);
-    layers.extend(goal.map(|mm| named("depth to reach", NEUTRAL, Layer::Level(*mm))));
-    Chart { title: "Insertion", x: TIME, y: "depth (mm)", layers, span: None }
+    layers.extend(limits.get(GOAL).map(|mm| Layer::level("depth to reach", *mm)));
+    Chart::new("Insertion", TIME, "depth (mm)", layers)
 }
 
-/// Where an axis of an operation was told to be, and where it was.
-fn motion(run: &Run, axis: Axis) -> Chart {
-    let (title, y) = match axis {
-        Axis::Insertion => ("Motion of the insertion", "position (mm)"),
-        Axis::Rotation => ("Motion of the rotation", "position (deg)"),
-    };
+/// The commanded and the measured position of an axis in an operation.
+fn motion(run: &Run, axis: Axis, title: &'static str, y: &'static str) -> Chart {
     let (commanded, measured) = (&run.motion.commanded[axis], &run.motion.measured[axis]);
-    let line = |course: &Points| Layer::Line(vec![course.clone()]);
     let mut layers = vec![
-        named("stage, commanded", COMMANDED, line(commanded)),
-        named("stage, measured", MEASURED, line(measured)),
+        line("stage, commanded", COMMANDED, commanded.clone()),
+        line("stage, measured", MEASURED, measured.clone()),
     ];
     if let Some(stop_s) = run.stopped_at_s() {
-        let at = measured.partition_point(|(time_s, _)| *time_s <= stop_s).checked_sub(1);
-        let stopped = at.and_then(|at| measured.get(at)).copied().into_iter().collect();
-        layers.push(named("stopped", FAULT, Layer::Points(stopped)));
+        let stopped = measured.iter().rfind(|(time_s, _)| *time_s <= stop_s).copied();
+        layers.push(dots("stopped", FAULT, stopped.into_iter().collect()));
     }
-    Chart { title, x: TIME, y, layers, span: None }
+    Chart::new(title, TIME, y, layers)
 }
 
 /// When the next accepted tip position came, or the run was stopped, and when the newest before that was
 /// acquired, s. The hold that ended a run has no next position.
 fn sights(run: &Run) -> Points {
     let s = |ns: i64| ns as f64 * 1e-9;
-    let accepted = run
-        .samples
-        .iter()
-        .filter_map(|sample| Some((s(sample.receive_time_ns), s(sample.acquisition_time_ns?))));
-    let (mut sights, mut newest) = (Points::new(), None::<f64>);
-    let mut stop_s = run.stopped_at_s();
-    for (received_s, acquired_s) in accepted.chain([(f64::INFINITY, f64::INFINITY)]) {
-        let times = stop_s.take_if(|stop_s| *stop_s < received_s).into_iter().chain([received_s]);
-        sights.extend(times.filter_map(|time_s| Some((time_s, newest?))));
-        newest = Some(newest.map_or(acquired_s, |before| before.max(acquired_s)));
-    }
-    sights.retain(|(time_s, _)| time_s.is_finite());
-    sights
+    let accepted = run.samples.iter().filter_map(|sample| {
+        Some((s(sample.receive_time_ns), Some(s(sample.acquisition_time_ns?))))
+    });
+    let stop = run.stopped_at_s().map(|stop_s| (stop_s, None));
+    let mut times: Vec<(f64, Option<f64>)> = accepted.chain(stop).collect();
+    times.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+    let mut newest = None::<f64>;
+    let sights = times.into_iter().filter_map(|(time_s, acquired_s)| {
+        let seen_s = newest;
+        newest = newest.into_iter().chain(acquired_s).reduce(f64::max);
+        Some((time_s, seen_s?))
+    });
+    sights.collect()
 }
 
 /// The age of the newest accepted tip position when the next one came; a large age causes a hold.
@@ -189,46 +173,47 @@ fn tip_age(run: &Run, limits: &Limits) -> Chart {
     let refused = run.samples.iter().filter(|sample| sample.refused.is_some());
     let refused = refused.map(|sample| (sample.receive_time_ns as f64 * 1e-9, 0.0)).collect();
     let ages = sights(run).into_iter().map(|(time_s, seen_s)| (time_s, time_s - seen_s)).collect();
-    let mut layers = vec![
-        named("age when the next came", MEASURED, Layer::Line(vec![ages])),
-        named("refused", FAULT, Layer::Points(refused)),
-    ];
-    let hold = limits.get(TIP_AGE);
-    layers.extend(hold.map(|age_s| named("held when older", NEUTRAL, Layer::Level(*age_s))));
-    Chart { title: "Age of the newest tip position", x: TIME, y: "age (s)", layers, span: None }
+    let mut layers =
+        vec![line("age when the next came", MEASURED, ages), dots("refused", FAULT, refused)];
+    layers.extend(limits.get(TIP_AGE).map(|age_s| Layer::level("held when older", *age_s)));
+    Chart::new("Age of the newest tip position", TIME, "age (s)", layers)
 }
 
 /// The depth inserted since the newest accepted tip position, when the next one came.
 fn blind_depth(run: &Run, limits: &Limits) -> Chart {
     let depth_mm = run.depth_over_time();
+    let blind_mm = |time_s, seen_s| Some(depth_mm(time_s)? - depth_mm(seen_s)?);
     let blind = sights(run)
         .into_iter()
-        .filter_map(|(time_s, seen_s)| Some((time_s, depth_mm(time_s)? - depth_mm(seen_s)?)));
-    let line = Layer::Line(vec![blind.collect()]);
-    let mut layers = vec![named("inserted when the next came", MEASURED, line)];
-    let hold = limits.get(BLIND_DEPTH);
-    layers.extend(hold.map(|mm| named("held before", NEUTRAL, Layer::Level(*mm))));
+        .filter_map(|(time_s, seen_s)| Some((time_s, blind_mm(time_s, seen_s)?)))
+        .filter(|(_, mm)| mm.abs() < VALUE_MAX);
+    let mut layers = vec![line("inserted when the next came", MEASURED, blind.collect())];
+    layers.extend(limits.get(BLIND_DEPTH).map(|mm| Layer::level("held before", *mm)));
     let title = "Inserted since the newest tip position";
-    Chart { title, x: TIME, y: "blind depth (mm)", layers, span: None }
+    Chart::new(title, TIME, "blind depth (mm)", layers)
 }
 
-/// The band of ± 2 standard deviations around the estimate, in the same pieces as its line.
-fn band(depth: &Column, est: &Column, sd: &Column, jump: f64) -> Vec<Vec<(f64, f64, f64)>> {
-    // The pieces hold each known row once and in order, so the deviations are read along with them.
+fn line(name: &'static str, colour: &'static str, points: Points) -> Layer {
+    Layer::new(name, colour, Shape::Line, vec![points])
+}
+
+fn dots(name: &'static str, colour: &'static str, points: Points) -> Layer {
+    Layer::new(name, colour, Shape::Points, vec![points])
+}
+
+/// Outlines of the band of ± 2 standard deviations around the estimate, in the same pieces as its line.
+fn band(depth: &Column, est: &Column, sd: &Column, jump: f64) -> Vec<Points> {
     let known = depth.iter().zip(est).zip(sd);
-    let mut sds = known.filter(|((x, y), _)| x.is_some() && y.is_some()).map(|(_, sd)| *sd);
-    let band = pieces(depth, est, jump).into_iter().map(|piece| {
-        let bounded = piece.into_iter().filter_map(|(x, y)| {
-            let half = 2.0 * sds.next().flatten()?;
-            half.is_finite().then_some((x, y - half, y + half))
-        });
-        bounded.collect()
-    });
-    band.collect()
-}
-
-fn named(name: &'static str, colour: &'static str, layer: Layer) -> Named {
-    Named { name, colour, layer }
+    let known = known.filter_map(|((x, y), sd)| Some(((*x)?, (*y)?, *sd)));
+    let known: Vec<(f64, f64, Option<f64>)> = known.collect();
+    let outline = |piece: &[(f64, f64, Option<f64>)]| {
+        let edge = |sign: f64| {
+            let edge = piece.iter().filter_map(|(x, y, sd)| Some((*x, y + sign * 2.0 * (*sd)?)));
+            edge.collect::<Points>()
+        };
+        edge(-1.0).into_iter().chain(edge(1.0).into_iter().rev()).collect()
+    };
+    known.chunk_by(|(_, a, _), (_, b, _)| (b - a).abs() <= jump).map(outline).collect()
 }
 
 fn depth(run: &Run) -> Column {
@@ -274,16 +259,9 @@ fn points(xs: &Column, ys: &Column) -> Points {
 /// The points that are known, in pieces that end where a step exceeds `jump` (an angle passed
 /// ±180°).
 fn pieces(xs: &Column, ys: &Column, jump: f64) -> Vec<Points> {
-    let mut pieces = vec![Points::new()];
-    for point in points(xs, ys) {
-        let last = pieces.last().and_then(|piece| piece.last().copied());
-        let is_apart = last.is_some_and(|(_, y)| (point.1 - y).abs() > jump);
-        match pieces.last_mut() {
-            Some(piece) if !is_apart => piece.push(point),
-            _ => pieces.push(vec![point]),
-        }
-    }
-    pieces
+    let points = points(xs, ys);
+    let is_joined = |a: &(f64, f64), b: &(f64, f64)| (b.1 - a.1).abs() <= jump;
+    points.chunk_by(is_joined).map(<[_]>::to_vec).collect()
 }
 
 #[cfg(test)]
@@ -315,10 +293,11 @@ mod tests {
     #[test]
     fn a_band_is_two_deviations_to_each_side() {
         let chart = tip(&run(), "x", "Distance from the plane", "x (mm)");
-        let Layer::Band(band) = &chart.layers[0].layer else { panic!("no band") };
-        assert_eq!(band[0].len(), 4);
-        let (x, low, high) = band[0][1];
-        assert!(x == 1.0 && (low - 0.35).abs() < 1e-12 && (high - 1.15).abs() < 1e-12);
+        let [outline] = &chart.layers[0].pieces[..] else { panic!("one band") };
+        assert_eq!(outline.len(), 8);
+        let (low, high) = (outline[1], outline[6]);
+        assert_eq!((low.0, high.0), (1.0, 1.0));
+        assert!((low.1 - 0.35).abs() < 1e-12 && (high.1 - 1.15).abs() < 1e-12, "{outline:?}");
     }
 
     /// Samples are acquired at 0, 1 and 2 s and received 0.1 s later; the one in between is
@@ -333,13 +312,8 @@ mod tests {
         };
         run.samples = vec![at(0, false), at(1000, true), at(2000, false)];
         let chart = tip_age(&run, &Limits::new());
-        let (Layer::Line(ages), Layer::Points(refused)) =
-            (&chart.layers[0].layer, &chart.layers[1].layer)
-        else {
-            panic!("other layers")
-        };
-        assert_eq!(ages[0], [(2.1, 2.1)]);
-        assert_eq!(refused, &[(1.1, 0.0)]);
+        assert_eq!(chart.layers[0].pieces, [[(2.1, 2.1)]]);
+        assert_eq!(chart.layers[1].pieces, [[(1.1, 0.0)]]);
     }
 
     #[test]
@@ -350,9 +324,8 @@ mod tests {
         let titles: Vec<_> = curves(&run, &Limits::new()).iter().map(|c| c.title).collect();
         assert!(titles.contains(&"Motion of the insertion"), "{titles:?}");
         assert!(!titles.contains(&"Motion of the rotation"), "{titles:?}");
-        let chart = motion(&run, Axis::Insertion);
-        let Layer::Points(stopped) = &chart.layers[2].layer else { panic!("another layer") };
-        assert_eq!(stopped, &[(8.9, 1.4)]);
+        let chart = motion(&run, Axis::Insertion, "title", "position (mm)");
+        assert_eq!(chart.layers[2].pieces, [[(8.9, 1.4)]]);
     }
 
     /// The run is stopped at 9 s at 3.5 mm depth; the last accepted position came at 2 s.
@@ -369,13 +342,11 @@ mod tests {
         run.samples = vec![at(1000, None), at(2000, None), at(8000, Some("step".to_owned()))];
         run.samples.push(at(10_000, None));
         let chart = tip_age(&run, &Limits::new());
-        let Layer::Line(ages) = &chart.layers[0].layer else { panic!("another layer") };
-        assert_eq!(ages[0], [(2.0, 1.0), (9.0, 7.0), (10.0, 8.0)]);
+        assert_eq!(chart.layers[0].pieces, [[(2.0, 1.0), (9.0, 7.0), (10.0, 8.0)]]);
         let chart = blind_depth(&run, &Limits::new());
-        let Layer::Line(blind) = &chart.layers[0].layer else { panic!("another layer") };
-        assert_eq!(blind[0], [(9.0, 3.5), (10.0, 3.5)], "seen at 0 mm, stopped at 3.5");
+        let blind = &chart.layers[0].pieces;
+        assert_eq!(blind, &[[(9.0, 3.5), (10.0, 3.5)]], "seen at 0 mm, stopped at 3.5");
         let chart = insertion(&run, &Limits::new());
-        let Layer::Line(depths) = &chart.layers[1].layer else { panic!("another layer") };
-        assert_eq!(depths[0].last(), Some(&(9.0, 3.5)));
+        assert_eq!(chart.layers[1].pieces[0].last(), Some(&(9.0, 3.5)));
     }
 }

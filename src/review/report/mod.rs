@@ -1,22 +1,21 @@
 //! `report.html`: one run on one page that stands alone. It loads no script, font or picture.
 
 mod chart;
-mod colour;
 mod curves;
 
 use self::chart::Chart;
 use super::compare::drive;
 use super::figures::{Figure, last_third};
-use super::run::Run;
-use super::summary::tracker;
-use super::text::utc;
-use super::warnings::doubts;
+use super::run::{Run, utc};
+use super::summary::{doubts, tracker};
 use crate::archive::{EventKind, RunOutcome, is_unprintable};
 use crate::session::Severity;
 use crate::study::TipError;
 use crate::text::fixed;
-use minijinja::value::{Serde, ValueKind};
-use minijinja::{Environment, Error, UndefinedBehavior, Value, context};
+use minijinja::value::Serde;
+use minijinja::{
+    AutoEscape, Environment, Error, UndefinedBehavior, Value, context, escape_formatter,
+};
 
 const PAGE: &str = include_str!("page.html");
 const CSS: &str = include_str!("page.css");
@@ -34,10 +33,10 @@ pub fn html(run: &Run) -> Result<String, Error> {
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
     environment.add_filter("fixed", fixed);
     environment.add_template("chart.svg", CHART)?;
-    environment.set_formatter(|out, _, value| match value.as_str() {
-        Some(text) if !value.is_safe() => out.write_str(&escaped(text)).map_err(Error::from),
-        _ if value.kind() == ValueKind::None => Ok(()),
-        _ => write!(out, "{value}").map_err(Error::from),
+    environment.set_auto_escape_callback(|_| AutoEscape::Html);
+    environment.set_formatter(|out, state, value| match value.is_none() {
+        true => Ok(()),
+        false => escape_formatter(out, state, value),
     });
     let Run { folder, .. } = run;
     let manifest = &folder.manifest;
@@ -46,7 +45,7 @@ pub fn html(run: &Run) -> Result<String, Error> {
     let report = run.figures();
     let rms = format!("RMS over {}", last_third(folder, &report));
     let errors = [(rms.as_str(), report.estimate_rms), ("at the end", report.final_error)];
-    environment.template_from_str(PAGE)?.render(context! {
+    let page = environment.template_from_str(PAGE)?.render(context! {
         generator => Value::from_safe_string(GENERATOR.to_owned()),
         css => Value::from_safe_string(CSS.to_owned()),
         title => format!("{} {}", manifest.name, utc(&manifest.started_utc)),
@@ -63,25 +62,10 @@ pub fn html(run: &Run) -> Result<String, Error> {
         drives => manifest.drives.iter().map(|d| (d.axis.to_string(), drive(d))).collect::<Vec<_>>(),
         positions => tracker(&manifest.gates),
         config_toml => folder.config_toml.as_deref().unwrap_or_default(),
-    })
-}
-
-/// `text` escaped for HTML, also within attributes.
-fn escaped(text: &str) -> String {
-    let mut safe = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            '&' => safe.push_str("&amp;"),
-            '<' => safe.push_str("&lt;"),
-            '>' => safe.push_str("&gt;"),
-            '"' => safe.push_str("&quot;"),
-            '\'' => safe.push_str("&#39;"),
-            // HTML does not allow control characters; the others change how text reads.
-            c if is_unprintable(c) && c != '\n' && c != '\t' => safe.push('\u{FFFD}'),
-            c => safe.push(c),
-        }
-    }
-    safe
+    })?;
+    // HTML does not allow control characters; the others change how text reads.
+    let is_bad = |c: char| is_unprintable(c) && c != '\n' && c != '\t';
+    Ok(page.replace(is_bad, "\u{FFFD}"))
 }
 
 fn figure(figure: Figure) -> Value {
@@ -142,7 +126,9 @@ mod tests {
         assert!(!page.contains("<script"), "{page}");
         assert!(!page.contains('\u{1b}'));
         assert_eq!(page.matches("</style>").count(), 1);
-        assert!(page.contains("&lt;script src=&quot;http://x&quot;&gt;alert(&#39;1&#39;)"));
+        assert!(
+            page.contains("&lt;script src=&quot;http:&#x2f;&#x2f;x&quot;&gt;alert(&#x27;1&#x27;)")
+        );
     }
 
     #[test]

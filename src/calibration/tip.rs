@@ -1,15 +1,12 @@
 //! The tip's pose on the sensor, from a recording in which only the base turns. The sensor then
 //! moves on a circle about the needle's axis.
 
-mod circle;
-
-use self::circle::{Circle, arc_rad};
-use super::error::{CalibrationError, check_distances};
+use super::{CalibrationError, check_distances, mean, principal};
 use crate::geometry::{FixedAngles, Pose};
 use crate::math;
 use crate::table::{Table, TableError};
-use nalgebra::{Complex, Rotation3, Vector3};
-use std::f64::consts::{FRAC_PI_2, PI};
+use nalgebra::{Complex, Rotation3, SMatrix, SVector, Vector2, Vector3};
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 const POSITION: [&str; 4] = ["rotation_rad", "x_mm", "y_mm", "z_mm"];
 
@@ -100,7 +97,7 @@ impl TipFit {
         }
         let positions_mm: Vec<Vector3<f64>> =
             samples.iter().map(|sample| sample.position_meas_mm).collect();
-        check_distances("tip: position", "tracker", positions_mm.iter().copied())?;
+        check_distances("tip: position", "tracker", &positions_mm)?;
         let rotations = samples.iter().map(|sample| sample.rotation_meas_rad);
         let turn_rad = rotations.clone().fold(f64::NEG_INFINITY, f64::max)
             - rotations.fold(f64::INFINITY, f64::min);
@@ -123,7 +120,7 @@ impl TipFit {
             ));
         }
         let angles = circle.angles(&positions_mm);
-        let arc_rad = arc_rad(&angles);
+        let arc_rad = arc_of(&angles);
         if arc_rad < ARC_MIN_RAD || turn_rad < ARC_MIN_RAD || turn_rad.is_nan() {
             return short(arc_rad);
         }
@@ -216,6 +213,104 @@ impl SensorMount {
         (axis_length >= COHERENCE_MIN && is_seen)
             .then_some(SensorMount { to_axis_mm: across_mm, axis })
     }
+}
+
+/// Gauss-Newton steps; from the algebraic fit a few are enough.
+const STEPS: usize = 20;
+
+/// A circle in space.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Circle {
+    centre_mm: Vector3<f64>,
+    /// Unit vector.
+    normal: Vector3<f64>,
+    radius_mm: f64,
+    /// RMS distance of the points from the circle within its plane, and from its plane, mm.
+    rms_mm: (f64, f64),
+}
+
+impl Circle {
+    /// The least-squares circle within the least-squares plane of the points; `None` if the points
+    /// are on a line.
+    fn fit(points_mm: &[Vector3<f64>]) -> Option<Circle> {
+        let n = points_mm.len() as f64;
+        let centroid_mm = mean(points_mm);
+        let centred: Vec<Vector3<f64>> = points_mm.iter().map(|p| p - centroid_mm).collect();
+        let (spread_mm, axes) = principal(&centred);
+        let flat: Vec<Vector2<f64>> = centred.iter().map(|d| axes.tr_mul(d).xy()).collect();
+        let centre_mm = refine(algebraic(&flat)?, &flat);
+        let distances_mm: Vec<f64> = flat.iter().map(|p| (p - centre_mm).norm()).collect();
+        let radius_mm = distances_mm.iter().sum::<f64>() / n;
+        let squares = distances_mm.iter().map(|d| (d - radius_mm).powi(2)).sum::<f64>();
+        Some(Circle {
+            centre_mm: centroid_mm + axes * centre_mm.push(0.0),
+            normal: axes.column(2).into(),
+            radius_mm,
+            rms_mm: ((squares / n).sqrt(), spread_mm[2]),
+        })
+    }
+
+    /// RMS distance of the points from the circle, mm.
+    fn rms_mm(&self) -> f64 {
+        math::hypot(self.rms_mm.0, self.rms_mm.1)
+    }
+
+    /// The angle of each point about the normal, from a direction of its own, rad.
+    fn angles(&self, points_mm: &[Vector3<f64>]) -> Vec<f64> {
+        // Any direction that is not close to the normal.
+        let aside = Vector3::ith(self.normal.iamin(), 1.0);
+        let u = self.normal.cross(&aside).normalize();
+        let v = self.normal.cross(&u);
+        let radial = points_mm.iter().map(|p| p - self.centre_mm);
+        radial.map(|d| math::atan2(d.dot(&v), d.dot(&u))).collect()
+    }
+}
+
+/// The least-squares solution of `row · x = value` for all rows; `None` if the rows do not determine it.
+fn solve<const N: usize>(
+    rows: impl Iterator<Item = (SVector<f64, N>, f64)>,
+) -> Option<SVector<f64, N>> {
+    let (mut normal, mut right) = (SMatrix::<f64, N, N>::zeros(), SVector::zeros());
+    for (row, value) in rows {
+        normal += row * row.transpose();
+        right += row * value;
+    }
+    let solution = normal.try_inverse()? * right;
+    solution.iter().all(|x| x.is_finite()).then_some(solution)
+}
+
+/// The centre by the linear least squares of `|p|² − 2 c·p + k = 0` (Kåsa 1976).
+fn algebraic(points_mm: &[Vector2<f64>]) -> Option<Vector2<f64>> {
+    let rows = points_mm.iter().map(|p| (Vector3::new(p.x, p.y, 1.0), p.norm_squared()));
+    Some(solve(rows)?.xy() * 0.5)
+}
+
+/// The centre with the smallest sum of squared distances, by Gauss-Newton; the radius is the mean
+/// distance. Noise biases algebraic fits inwards, and this fit much less.
+fn refine(mut centre_mm: Vector2<f64>, points_mm: &[Vector2<f64>]) -> Vector2<f64> {
+    let n = points_mm.len() as f64;
+    for _ in 0..STEPS {
+        let radial = points_mm.iter().map(|p| p - centre_mm);
+        let towards: Vec<(Vector2<f64>, f64)> =
+            radial.map(|d| (d / d.norm().max(f64::MIN_POSITIVE), d.norm())).collect();
+        let mean = towards.iter().map(|(u, _)| u).sum::<Vector2<f64>>() / n;
+        let radius_mm = towards.iter().map(|(_, d)| d).sum::<f64>() / n;
+        let Some(step) = solve(towards.iter().map(|(u, d)| (u - mean, d - radius_mm))) else {
+            break;
+        };
+        centre_mm += step;
+    }
+    centre_mm
+}
+
+/// The part of a turn that `angles` cover: all except the widest gap between neighbours, rad.
+fn arc_of(angles: &[f64]) -> f64 {
+    let mut sorted: Vec<f64> = angles.iter().map(|angle| angle.rem_euclid(TAU)).collect();
+    sorted.sort_by(f64::total_cmp);
+    let ends = sorted.first().zip(sorted.last());
+    let around = ends.map_or(TAU, |(first, last)| first + TAU - last);
+    let gaps = sorted.windows(2).map(|pair| pair[1] - pair[0]);
+    TAU - gaps.fold(around, f64::max)
 }
 
 #[cfg(test)]
