@@ -50,7 +50,7 @@ impl SessionConfig {
         for observer in std::iter::once(&self.observer).chain(&self.shadows) {
             observer.build(self.needle, self.needle_torsion)?;
         }
-        Ok(self.stage.validate()?)
+        self.stage.validate().map_err(SessionError::Stage)
     }
 
     /// Whether the depth suffices to reach the plane from a tip at `tip_mm` in the plane frame, and a path

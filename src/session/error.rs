@@ -1,7 +1,6 @@
 //! Why a session cannot start.
 
 use crate::observer::ObserverError;
-use crate::stage::StageConfigError;
 use thiserror::Error;
 
 /// A configuration that a session cannot start with.
@@ -12,5 +11,5 @@ pub enum SessionError {
     Observer(#[from] ObserverError),
     /// The stage refuses it.
     #[error("stage: {0}")]
-    Stage(#[from] StageConfigError),
+    Stage(String),
 }

@@ -4,8 +4,7 @@ use std::time::Duration;
 
 use super::standstill::Standstill;
 use super::{
-    Axis, AxisConfig, Commanded, DriveFlag, FoundFault, LimitCheck, LimitError, StageConfig,
-    StageFault, Unwrapper,
+    Axis, AxisConfig, Commanded, DriveFlag, FoundFault, LimitCheck, StageConfig, Unwrapper,
 };
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
 use crate::canopen::emcy::{Emcy, EmcyCode};
@@ -47,11 +46,12 @@ pub(super) struct Drive {
     /// Scale and limits, known once the axis's zero is.
     armed: Option<LimitCheck>,
     commanded: Commanded,
-    next_counts: Option<i64>,
+    /// The target for the next SYNC; without one the axis is held.
+    pub(super) next_counts: Option<i64>,
     /// RPDO1 as it was sent since the last SYNC.
     sent_ahead: Option<Frame>,
     position: Unwrapper,
-    statusword: Option<Statusword>,
+    pub(super) statusword: Option<Statusword>,
     /// Its TPDO1 of the last SYNC has come.
     pub(super) fresh: bool,
     /// SYNCs in a row without its TPDO1.
@@ -281,14 +281,14 @@ impl Drive {
         let word = self.statusword?;
         self.flags().find(|flag| {
             let held = *flag == DriveFlag::FollowsCommand && word.has(Statusword::INTERNAL_LIMIT);
-            self.shown & !word.0 & flag.bit() != 0 && !held
+            self.shown & !word.0 & *flag as u16 != 0 && !held
         })
     }
 
     /// The bits that the enabled drive has not set yet: their loss could not be noticed.
     pub(super) fn flags_not_shown(&self) -> impl Iterator<Item = DriveFlag> + use<> {
         let shown = self.shown;
-        self.flags().filter(move |flag| shown & flag.bit() == 0)
+        self.flags().filter(move |flag| shown & *flag as u16 == 0)
     }
 
     /// How often bit 7 (warning) was set, if it has just been set for the 1st, 2nd, 4th, 8th … time.
@@ -309,11 +309,11 @@ impl Drive {
     /// Fixes zero, scale and target: from here on the drive follows its target.
     ///
     /// # Errors
-    /// When the axis stands out of its limits.
-    pub(super) fn arm(&mut self) -> Result<(), LimitError> {
+    /// The limit outside which the axis stands.
+    pub(super) fn arm(&mut self) -> Result<(), String> {
         let armed = self.armed_here();
         if !self.homes {
-            armed.check_standing(self.commanded.counts)?;
+            armed.check_position(armed.scale.value(self.commanded.counts))?;
         }
         self.armed = Some(armed);
         Ok(())
@@ -324,7 +324,7 @@ impl Drive {
     }
 
     /// Scale and limits; before the drive is armed, as they would be if it were armed now.
-    fn limits(&self) -> LimitCheck {
+    pub(super) fn limits(&self) -> LimitCheck {
         self.armed.unwrap_or_else(|| self.armed_here())
     }
 
@@ -343,21 +343,9 @@ impl Drive {
         self.measured()
     }
 
-    /// Whether the axis may be sent to `goal` (mm or rad) in time.
-    ///
-    /// # Errors
-    /// The position limit that `goal` breaks.
-    pub(super) fn check_goal(&self, goal: f64) -> Result<(), LimitError> {
-        self.limits().check_goal(goal)
-    }
-
     /// The counts of `target` (mm or rad), if the axis may go there next.
-    pub(super) fn check(&self, target: f64) -> Result<i64, LimitError> {
+    pub(super) fn check(&self, target: f64) -> Result<i64, String> {
         self.limits().check(target, self.commanded)
-    }
-
-    pub(super) fn set_next(&mut self, counts: Option<i64>) {
-        self.next_counts = counts;
     }
 
     /// Makes the next target the present one; without a next one the axis is held. After as many held
@@ -392,15 +380,17 @@ impl Drive {
 
     /// The fault of a measured position too far from the target, whatever the drive makes of it. More is
     /// a blocked axis or a wrong position: steering by it would be blind.
-    pub(super) fn not_following(&self) -> Option<StageFault> {
+    pub(super) fn not_following(&self) -> Option<String> {
         let (axis, following_error) = (self.axis, self.following_error());
         let limit = self.config.following_error_limit(self.sync_period);
         let follows = following_error.abs() <= limit;
-        (!follows).then_some(StageFault::NotFollowing { axis, following_error, limit })
-    }
-
-    pub(super) fn statusword(&self) -> Option<Statusword> {
-        self.statusword
+        (!follows).then(|| {
+            let (off, limit) = (axis.shown(following_error), axis.in_unit(limit).0);
+            format!(
+                "{axis}: following error of {off} (limit {limit:.3}); is the axis blocked, or the \
+                 encoder lost?"
+            )
+        })
     }
 
     pub(super) fn state(&self) -> Option<DriveState> {
