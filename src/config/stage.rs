@@ -62,7 +62,7 @@ impl StageConfig {
             boot_timeout: seconds(can.boot_timeout_s),
             boot_attempts: can.boot_attempts.into(),
             enable_timeout: seconds(self.enable_timeout_s),
-            let_on: seconds(self.let_on_s),
+            state_transition_timeout: seconds(self.let_on_s),
             stop_timeout: seconds(self.stop_timeout_s),
             missed_feedback_max: can.missed_feedback_max.into(),
             fault_reset_on_start: self.fault_reset_on_start,

@@ -18,7 +18,7 @@ use serde_json::{Map, Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// The operator's eyes and hands: told of progress and events as they happen, asked for commands.
+/// The operator's screen and keys: shows progress and events as they happen, gives commands.
 /// Nothing here may wait: the control thread calls it.
 pub trait Operator {
     /// The run has come this far.
@@ -42,7 +42,7 @@ pub trait Operator {
 pub enum OnRecordFailure {
     /// It is stopped, safely.
     Stop,
-    /// It goes on; what is lost is told and counted.
+    /// It goes on; what is lost is reported and counted.
     GoOn,
 }
 
@@ -123,9 +123,8 @@ impl<'a> Sink<'a> {
         self.recorder.identify_drives(self.drives.clone());
     }
 
-    /// Looks after the record: what has changed of it is told and recorded, as far as it can be.
-    /// Gives the reason to end the run, where it is not worth its while without a record, unless it
-    /// `is_ending` anyway.
+    /// Reports what has changed about the record, and records it as far as possible. Returns the reason to
+    /// end the run if recording failed, unless the run goes on without a record or `is_ending` anyway.
     fn look_after_record(&mut self, now: Time, is_ending: bool) -> Option<String> {
         let mut reason = None;
         while let Some(news) = self.recorder.news() {

@@ -89,9 +89,9 @@ impl TipServer {
     }
 }
 
-/// Says which fault of the script strikes. A bus that goes off is an error frame, which every
-/// listener hears; an interface is taken down by hand, `ip link set … down`.
-fn strike(fault: &Fault, bus: &mut dyn CanBus) {
+/// Reports a fault of the script that begins. Bus off is an error frame, which every program on the bus
+/// receives. An interface is taken down by hand, `ip link set … down`.
+fn begin_fault(fault: &Fault, bus: &mut dyn CanBus) {
     tracing::warn!("emulated fault: {fault}");
     if fault.kind == FaultKind::Bus(BusFault::Off)
         && let Err(error) = bus.report(&BusError::bus_off())
@@ -128,7 +128,7 @@ pub fn serve_stage(
                 StageOutput::Target(target) => {
                     tips.target.iter().for_each(|tool| tips.send(tool, &target));
                 }
-                StageOutput::FaultBegan(fault) => strike(&fault, bus),
+                StageOutput::FaultBegan(fault) => begin_fault(&fault, bus),
             }
         }
         let (now, deadline) = (clock.now(), stage.deadline());

@@ -14,11 +14,11 @@ const TIMETABLE_NOISE: Noise = Noise::Gaussian(1e-6);
 
 /// Insertions to be made again and again.
 pub struct Study<'a> {
-    /// What the bench is told.
+    /// The configuration of the bench.
     pub session: SessionConfig,
     /// The name of the tracked tip.
     pub tool: &'a str,
-    /// What nobody knows before a trial.
+    /// The random draws.
     pub prior: Prior,
     /// The emulated stage, needle and tracker of the trial with the seed given, or why there can be
     /// none.

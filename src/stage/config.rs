@@ -1,4 +1,4 @@
-//! What the stage has to be told about its axes and their drives.
+//! The axes, and the configuration of the stage and its drives.
 
 use std::fmt;
 use std::ops::{Index, IndexMut};
@@ -214,7 +214,7 @@ pub struct StageConfig {
     /// Longest way from Operational to both drives in Operation Enabled; brakes take their time.
     pub enable_timeout: Duration,
     /// For a drive to leave Switch On Disabled, and Ready To Switch On, once it is told to.
-    pub let_on: Duration,
+    pub state_transition_timeout: Duration,
     /// Longest wait for standstill, and for power to be off.
     pub stop_timeout: Duration,
     /// SYNCs in a row without both positions that are tolerated; the next is a fault.
@@ -331,7 +331,7 @@ impl StageConfig {
     }
 }
 
-/// An axis that is to be homed without being told how.
+/// An axis is to be homed, and no homing is configured.
 pub(super) fn no_homing(axis: Axis) -> String {
     format!("{axis}: its position is to come from homing, and no homing is configured")
 }

@@ -187,7 +187,9 @@ impl Stage {
             return self.fail_enabling(now, is_late);
         }
         for axis in Axis::BOTH {
-            if let Some(statusword) = self.drives[axis].is_not_let_on(self.config.let_on) {
+            if let Some(statusword) =
+                self.drives[axis].refuses_to_switch_on(self.config.state_transition_timeout)
+            {
                 return self.fail_switch_on(now, axis, statusword);
             }
         }
@@ -324,7 +326,7 @@ impl Stage {
         else {
             return;
         };
-        // An answer that nobody asked for may be another node's.
+        // An answer without a request may be another node's.
         if self.drives[axis].asked.take_if(|asked| *asked == object).is_none() {
             return;
         }

@@ -1,4 +1,4 @@
-//! One drive under SYNC: what it was told, what it said.
+//! One drive under SYNC: what it was commanded, and what it reported.
 
 use std::time::Duration;
 
@@ -20,7 +20,7 @@ const BEFORE_POWER: u16 = Statusword::REMOTE | Statusword::VOLTAGE_ENABLED;
 pub struct DriveReport {
     /// Its state; `None` where it has said none, or none that is defined.
     pub state: Option<DriveState>,
-    /// The last error of which it has told, and not that it is over.
+    /// The last error that it reported, if it has not reported the end of it.
     pub error: Option<EmcyCode>,
 }
 
@@ -58,7 +58,7 @@ pub(super) struct Drive {
     pub(super) missed_in_a_row: u32,
     sequence: EnableSequence,
     reset: Reset,
-    /// SYNCs in a state that it is told to leave.
+    /// SYNCs in a state that it is commanded to leave.
     held_back: u32,
     /// The payload of the TPDO1 taken for this SYNC, and a second one that differs.
     taken: [u8; 6],
@@ -133,7 +133,7 @@ impl Drive {
         self.take_statusword(Statusword(u16::from_le_bytes([s0, s1])));
         let counts = self.position.unwrap(i32::from_le_bytes([p0, p1, p2, p3]));
         self.fresh = true;
-        // Until the drive is told to follow, the target follows it.
+        // Until the drive is commanded to follow, the target follows it.
         if self.armed.is_none() || self.homes {
             self.commanded = Commanded { counts, step_counts: 0 };
         }
@@ -236,7 +236,7 @@ impl Drive {
 
     /// Its statusword, once the drive has been told for longer than `within` to leave a state on the
     /// way to Switched On, and has not.
-    pub(super) fn is_not_let_on(&mut self, within: Duration) -> Option<Statusword> {
+    pub(super) fn refuses_to_switch_on(&mut self, within: Duration) -> Option<Statusword> {
         let held = matches!(
             (self.state(), self.controlword),
             (Some(DriveState::SwitchOnDisabled), Controlword::SHUTDOWN)
@@ -299,7 +299,7 @@ impl Drive {
         (warns && !warned && self.warnings.is_power_of_two()).then_some(self.warnings)
     }
 
-    /// Whether `emcy` is worth telling: not the same again, but at the 2nd, 4th, 8th … time.
+    /// Whether to report `emcy`: if it is the same again, only the 2nd, 4th, 8th … time.
     pub(super) fn is_news(&mut self, emcy: Emcy) -> bool {
         let count = if self.emcy.0 == Some(emcy) { self.emcy.1 + 1 } else { 1 };
         self.emcy = (Some(emcy), count);

@@ -1,4 +1,4 @@
-//! What the stage tells its owner.
+//! What the stage reports to its owner.
 
 use super::{Axis, Identity};
 use crate::canopen::cia402::Statusword;
@@ -100,8 +100,8 @@ pub enum Ignored {
     /// From a drive, but of the wrong length.
     #[display("frame of the wrong length")]
     WrongLength,
-    /// A position nobody asked for: before any SYNC, or the second after one. An answer to an SDO
-    /// that nobody sent.
+    /// A position without a SYNC: before any SYNC, or the second after one. An SDO answer without a
+    /// request.
     #[display("position without a SYNC, or answer without a question")]
     Unexpected,
 }

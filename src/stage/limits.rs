@@ -47,7 +47,7 @@ impl AxisLimits {
     }
 }
 
-/// Where an axis was last told to be, and how it got there.
+/// The last target of an axis, and the step to it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Commanded {
     /// The last target, counts.

@@ -34,7 +34,7 @@ pub(super) enum Phase {
     Standby {
         /// When both drives must have answered a SYNC.
         give_up: Time,
-        /// It was told where the axes stand.
+        /// Where the axes stand was reported.
         located: bool,
     },
     Enabling {
@@ -321,7 +321,7 @@ impl Stage {
         !matches!(self.phase, Phase::Listening { .. } | Phase::BringUp | Phase::Stopped)
     }
 
-    /// Stops for `fault`. The first is the reason; others that follow from it are not told.
+    /// Stops for `fault`. The first is the reason; those that follow from it are not reported.
     pub(super) fn fail(&mut self, now: Time, fault: String) {
         if self.faulted || self.phase == Phase::Stopped {
             return;

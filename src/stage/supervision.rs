@@ -10,14 +10,14 @@ use crate::canopen::{Frame, NodeId, cob};
 use crate::units::Time;
 
 impl Stage {
-    /// Before anything is sent, and while the drives are commanded, nobody else may.
+    /// Stops if another master commands the drives: while this stage listens, and until it stops them.
     pub(super) fn watch_for_another_master(&mut self, now: Time, frame: &Frame) {
         if matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped) {
             return;
         }
         let nodes = self.config.nodes();
         let drives = [nodes.insertion, nodes.rotation];
-        if let Some(word) = word_of_another_master(frame, self.config.bench_node, drives) {
+        if let Some(word) = command_of_another_master(frame, self.config.bench_node, drives) {
             let fault = format!(
                 "another master on the bus: {word} ({frame}); stop it, or give it other nodes: two \
                  masters cannot share an axis"
@@ -26,7 +26,7 @@ impl Stage {
         }
     }
 
-    /// True for an identifier under which nobody but the bench sends.
+    /// True for an identifier under which only the bench sends.
     pub(super) fn is_own(&self, cob_id: u16) -> bool {
         let of_drive = |axis: Axis| {
             let node = self.config.axis(axis).node;
@@ -75,7 +75,7 @@ impl Stage {
             }
             return;
         }
-        // Nobody has begun to watch.
+        // Supervision begins with bring-up.
         if matches!(self.phase, Phase::Listening { .. }) {
             return;
         }
@@ -218,9 +218,9 @@ fn lost_flag(flag: DriveFlag, statusword: Statusword) -> String {
 const INITIATE_DOWNLOAD: u8 = 1;
 const BLOCK_DOWNLOAD: u8 = 6;
 
-/// What `frame`, received, does as a master of `drives` would, or as the node `bench`; `None` where
-/// it does nothing to them. Reading an object of a drive is nobody's harm, nor is starting a node.
-fn word_of_another_master(
+/// The kind of command to `drives` in `frame`, which was received, or of heartbeat under the node number
+/// of `bench`; `None` for any other frame. Reading an object does no harm, nor does starting a node.
+fn command_of_another_master(
     frame: &Frame,
     bench: NodeId,
     drives: [NodeId; 2],
@@ -256,7 +256,7 @@ mod tests {
     fn what_moves_or_rewires_a_drive_is_a_masters_word() {
         let node = |n| NodeId::new(n).unwrap();
         let word = |id, data: &[u8]| {
-            word_of_another_master(&Frame::new(id, data), node(127), [node(1), node(2)])
+            command_of_another_master(&Frame::new(id, data), node(127), [node(1), node(2)])
         };
         let of_a_master: [(u16, &[u8]); 9] = [
             (0x080, &[]),

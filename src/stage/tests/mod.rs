@@ -37,7 +37,7 @@ impl StageConfig {
             boot_timeout: Duration::from_secs(5),
             boot_attempts: 3,
             enable_timeout: Duration::from_secs(3),
-            let_on: Duration::from_millis(500),
+            state_transition_timeout: Duration::from_millis(500),
             stop_timeout: Duration::from_secs(2),
             missed_feedback_max: 1,
             fault_reset_on_start: false,
