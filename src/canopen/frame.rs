@@ -111,11 +111,10 @@ impl fmt::Display for Frame {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}#", self.id)?;
         if self.remote {
-            return write!(
-                f,
-                "R{}",
-                if self.len == 0 { String::new() } else { self.len.to_string() }
-            );
+            return match self.len {
+                0 => f.write_str("R"),
+                len => write!(f, "R{len}"),
+            };
         }
         self.data().iter().try_for_each(|byte| write!(f, "{byte:02X}"))
     }

@@ -20,38 +20,30 @@ pub fn is_sync(frame: &Frame, cob_id: u16) -> bool {
 #[derive(Debug, Clone)]
 pub struct SyncProducer {
     period: Duration,
-    next: Time,
-    missed: u64,
+    /// When the next SYNC is due.
+    pub deadline: Time,
+    /// How many SYNCs were skipped because the caller was late.
+    pub missed: u64,
 }
 
 impl SyncProducer {
     /// A SYNC every `period`, the first at `first`; a period of zero is off.
     pub fn new(period: Duration, first: Time) -> Self {
-        let next = if period.is_zero() { Time::NEVER } else { first };
-        SyncProducer { period, next, missed: 0 }
+        let deadline = if period.is_zero() { Time::NEVER } else { first };
+        SyncProducer { period, deadline, missed: 0 }
     }
 
     /// The SYNC to send now, if one is due. SYNCs that were missed are skipped and counted: two SYNCs
     /// in a row would make the drives jump.
     pub fn handle_timeout(&mut self, now: Time) -> Option<Frame> {
-        if now < self.next {
+        if now < self.deadline {
             return None;
         }
-        let late = now.since(self.next).as_nanos() / self.period.as_nanos().max(1);
+        let late = now.since(self.deadline).as_nanos() / self.period.as_nanos().max(1);
         let missed = u32::try_from(late).unwrap_or(u32::MAX);
         self.missed += u64::from(missed);
-        self.next = self.next + self.period.saturating_mul(missed) + self.period;
+        self.deadline = self.deadline + self.period.saturating_mul(missed) + self.period;
         Some(sync_frame())
-    }
-
-    /// When the next SYNC is due.
-    pub fn deadline(&self) -> Time {
-        self.next
-    }
-
-    /// How many SYNCs were skipped because the caller was late.
-    pub fn missed(&self) -> u64 {
-        self.missed
     }
 }
 
@@ -76,9 +68,9 @@ mod tests {
     fn beats_are_absolute_and_missed_ones_are_skipped() {
         let mut sync = SyncProducer::new(Duration::from_millis(10), at(0));
         assert_eq!(sync.handle_timeout(at(4)), Some(sync_frame()));
-        assert_eq!((sync.deadline(), sync.missed()), (at(10), 0));
+        assert_eq!((sync.deadline, sync.missed), (at(10), 0));
         assert!(sync.handle_timeout(at(9)).is_none());
         assert!(sync.handle_timeout(at(35)).is_some());
-        assert_eq!((sync.deadline(), sync.missed()), (at(40), 2));
+        assert_eq!((sync.deadline, sync.missed), (at(40), 2));
     }
 }

@@ -139,10 +139,10 @@ impl<'a> Job<'a> {
                 self.records_tracker().then(|| replay(&config.tracker, Time::ZERO)).transpose()?;
             let tips = tips.map(|replay| replay.map_or(emulated, TipSource::Recorded));
             let (recorder, _) = self.record(SystemTime::now(), Backpressure::Block)?;
-            let sink = Sink::new(recorder, on_record_failure, operator);
+            let sink = Sink::new(recorder, on_record_failure, operator, interrupt);
             let mut session = begin(Time::ZERO)?;
             let pace = self.paced.then(Pace::begin);
-            let report = run_virtual(&mut session, stage, tips, pace, sink, interrupt);
+            let report = run_virtual(&mut session, stage, tips, pace, sink);
             return Ok(Performed {
                 report,
                 done: session.done().to_vec(),
@@ -154,11 +154,11 @@ impl<'a> Job<'a> {
         let clock = Clock::start();
         let mut tracker = self.open_tracker(runtime, clock)?;
         let (recorder, realtime) = self.record(clock.origin_utc(), Backpressure::DropAndCount)?;
-        let sink = Sink::new(recorder, on_record_failure, operator);
+        let sink = Sink::new(recorder, on_record_failure, operator, interrupt);
         // Last, since the session's deadlines begin to run.
         let mut session = begin(clock.now())?;
         let (bus, tips) = (bus.as_mut(), tracker.as_mut());
-        let report = run_live(&mut session, bus, tips, clock, realtime, sink, interrupt);
+        let report = run_live(&mut session, bus, tips, clock, realtime, sink);
         drop(tracker);
         Ok(Performed { report, done: session.done().to_vec(), wants_withdrawal: false })
     }

@@ -61,7 +61,7 @@ impl StageConfig {
             boot_timeout: can.boot_timeout,
             boot_attempts: can.boot_attempts.into(),
             enable_timeout: self.enable_timeout,
-            let_on: self.state_transition_timeout,
+            state_transition_timeout: self.state_transition_timeout,
             stop_timeout: self.stop_timeout,
             missed_feedback_max: can.missed_feedback_max.into(),
             fault_reset_on_start: self.fault_reset_on_start,

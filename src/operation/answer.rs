@@ -9,7 +9,7 @@ use std::time::Duration;
 use nalgebra::Vector3;
 
 use super::moving::{Move, Moving};
-use super::{AnswerSettings, Goal, record_feedback};
+use super::{AnswerSettings, Goal};
 use crate::math;
 use crate::session::{
     Lane, PROVED, Record, SampleRecord, Severity, Shell, State, Task, tracker_news,
@@ -252,7 +252,7 @@ impl Task for Answering {
                 Ok(())
             }
             StageEvent::Feedback(feedback) => {
-                record_feedback(shell, feedback);
+                shell.record(Record::Stage(*feedback));
                 match shell.is_running() {
                     true => self.go_on(shell, feedback),
                     false => Ok(()),

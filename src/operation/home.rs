@@ -1,7 +1,6 @@
 //! The drives find their home, one axis after the other.
 
-use super::record_feedback;
-use crate::session::{Done, Shell, State, Task};
+use crate::session::{Done, Record, Shell, State, Task};
 use crate::stage::{Axis, AxisLimits, PerAxis, StageConfig, StageEvent};
 use std::collections::VecDeque;
 
@@ -61,7 +60,7 @@ impl Task for Homing {
                 self.home_next(shell)
             }
             StageEvent::Feedback(feedback) => {
-                record_feedback(shell, &feedback);
+                shell.record(Record::Stage(feedback));
                 Ok(())
             }
             _ => Ok(()),

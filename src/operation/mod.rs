@@ -17,8 +17,8 @@ use self::answer::Answering;
 use self::home::Homing;
 use self::moving::MoveOneAxis;
 use self::prove::Prove;
-use crate::session::{Record, Session, SessionConfig, SessionError, Shell, Task};
-use crate::stage::{Axis, Feedback, PerAxis, Stage, StageConfig, StageConfigError};
+use crate::session::{Session, SessionConfig, SessionError, Task};
+use crate::stage::{Axis, PerAxis, Stage, StageConfig};
 use crate::tracker::Gate;
 use crate::units::Time;
 use nalgebra::Vector3;
@@ -76,7 +76,7 @@ impl OperationConfig {
     ///
     /// # Errors
     /// Where the stage refuses its configuration, or an axis is to be homed without being told how.
-    pub fn begin(self, now: Time) -> Result<Session, StageConfigError> {
+    pub fn begin(self, now: Time) -> Result<Session, String> {
         let OperationConfig { stage: config, operation } = self;
         let stage = match operation {
             Operation::Home(axes) => Stage::for_homing(config.clone(), axes, now)?,
@@ -109,7 +109,7 @@ impl Plan {
     pub fn begin(self, now: Time) -> Result<Session, SessionError> {
         match self {
             Plan::Insertion(config) => Session::new(*config, now),
-            Plan::Operation(config) => Ok(config.begin(now)?),
+            Plan::Operation(config) => config.begin(now).map_err(SessionError::Stage),
         }
     }
 }
@@ -124,9 +124,4 @@ impl From<OperationConfig> for Plan {
     fn from(config: OperationConfig) -> Self {
         Plan::Operation(Box::new(config))
     }
-}
-
-/// Records where both axes are at a SYNC.
-fn record_feedback(shell: &mut Shell, feedback: &Feedback) {
-    shell.record(Record::Stage(*feedback));
 }

@@ -2,8 +2,7 @@
 
 use std::time::Duration;
 
-use super::record_feedback;
-use crate::session::{Done, Profile, Shell, State, Task};
+use crate::session::{Done, Profile, Record, Shell, State, Task};
 use crate::stage::{Axis, Feedback, SetPoint, StageConfig, StageEvent};
 use crate::units::Time;
 
@@ -178,7 +177,7 @@ impl Task for MoveOneAxis {
             // Before the axes have power.
             StageEvent::Located(at) => self.from(shell, *at).map(drop),
             StageEvent::Feedback(feedback) => {
-                record_feedback(shell, feedback);
+                shell.record(Record::Stage(*feedback));
                 if let Some(done) = self.done.last_mut() {
                     done.to = feedback.measured.along(done.axis);
                 }

@@ -2,10 +2,9 @@
 
 use std::time::Duration;
 
-use super::record_feedback;
 use crate::canopen::Frame;
 use crate::canopen::emcy::EmcyCode;
-use crate::session::{Lane, PROVED, Severity, Shell, State, Task};
+use crate::session::{Lane, PROVED, Record, Severity, Shell, State, Task};
 use crate::stage::{Axis, Dialogue, Halt, PerAxis, StageConfig, StageEvent};
 use crate::units::Time;
 
@@ -112,7 +111,7 @@ impl Task for Prove {
                     shell.event(Lane::Session, Severity::Info, text);
                 }
             }
-            StageEvent::Feedback(feedback) => record_feedback(shell, feedback),
+            StageEvent::Feedback(feedback) => shell.record(Record::Stage(*feedback)),
             _ => {}
         }
         Ok(())

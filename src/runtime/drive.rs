@@ -1,7 +1,5 @@
 //! The one loop of every run, in real time and in virtual time.
 
-use super::interrupt::Interrupt;
-use super::sink::Sink;
 use crate::canopen::Frame;
 use crate::emulator::Truth;
 use crate::session::{
@@ -36,36 +34,13 @@ impl<F: FnMut(Record, Option<Truth>)> Witness for F {
     }
 }
 
-/// A run whose record is kept, and that the operator may interrupt.
-pub(super) struct Watched<'a> {
-    pub(super) sink: Sink<'a>,
-    pub(super) interrupt: Interrupt,
-}
-
-impl Witness for Watched<'_> {
-    fn take(&mut self, record: Record, truth: Option<Truth>) {
-        self.sink.take(record, truth);
-    }
-
-    fn progress(&mut self, progress: Progress) {
-        self.sink.progress(progress);
-    }
-
-    fn command(&mut self) -> Option<OperatorCommand> {
-        self.sink.command()
-    }
-
-    fn stop_reason(&mut self, now: Time, is_asked: bool) -> Option<String> {
-        let is_raised = self.interrupt.is_raised();
-        let record = self.sink.look_after_record(now, is_asked || is_raised);
-        let operator = is_raised.then(|| "operator: interrupted".to_owned());
-        operator.or(record).filter(|_| !is_asked)
-    }
-}
-
 /// What a machine is joined to: a bus, a tracker, a clock.
 pub(super) trait World {
     fn machine(&mut self) -> &mut dyn Machine;
+
+    fn witness(&mut self) -> &mut dyn Witness;
+
+    fn now(&self) -> Time;
 
     /// Gives `input` to the machine with the time of now.
     fn give(&mut self, input: Input);
@@ -80,12 +55,6 @@ pub(super) trait World {
 
     /// Gives the machine what has come since; true when there was anything that may not wait.
     fn take_arrived(&mut self) -> bool;
-
-    /// As [`Witness::command`].
-    fn command(&mut self) -> Option<OperatorCommand>;
-
-    /// As [`Witness::stop_reason`].
-    fn stop_reason(&mut self, is_asked: bool) -> Option<String>;
 
     /// Goes on to the next thing that is due or comes.
     fn go_on(&mut self);
@@ -102,14 +71,15 @@ pub(super) fn drive(world: &mut impl World) -> Outcome {
         if world.take_arrived() {
             continue;
         }
-        match world.stop_reason(stop_asked) {
+        let now = world.now();
+        match world.witness().stop_reason(now, stop_asked) {
             Some(reason) => {
                 stop_asked = true;
                 world.give(Input::Stop(reason));
             }
             None => {
                 // One at a time: however many there are, what is due is done in between.
-                if let Some(command) = world.command() {
+                if let Some(command) = world.witness().command() {
                     world.give(Input::Operator(command));
                     carry_out(world);
                 }

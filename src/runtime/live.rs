@@ -1,14 +1,13 @@
 //! A session on a CAN bus and a tracker, in real time.
 
-use super::drive::{Watched, Witness, World, carry_out, drive};
-use super::interrupt::Interrupt;
+use super::drive::{Witness, World, carry_out, drive};
 use super::realtime::{RealTime, wake_in_time};
 use super::sink::{RunReport, Sink};
 use super::timing::{Clock, TimingFigures, TimingReport};
 use crate::canopen::{Frame, cob};
-use crate::session::{HELD_UP, Input, Machine, OperatorCommand, Record};
+use crate::session::{HELD_UP, Input, Machine, Record};
 use crate::transport::can::{BusEvent, CanBus, CanError};
-use crate::transport::link::{Link, MessageCount};
+use crate::transport::link::Link;
 use crate::units::Time;
 use std::time::{Duration, SystemTime};
 
@@ -35,7 +34,9 @@ struct Live<'a, W> {
     timing: TimingFigures,
     /// How long before a deadline the thread stops sleeping.
     spin: Duration,
-    arrivals: Option<Arrivals>,
+    /// When the tracker's link was last looked at, and the count of its messages then.
+    looked: Time,
+    counted: u64,
     /// A frame that was made before this is stale.
     stale_before: Option<Time>,
     /// The time of the last input.
@@ -54,7 +55,7 @@ impl<'a, W: Witness> Live<'a, W> {
     ) -> Self {
         // What waits on the bus came before the session was made, and is given to it afterwards.
         let last = clock.now();
-        let messages = tracker.as_ref().map(|link| link.message_count());
+        let counted = tracker.as_ref().map_or(0, |link| link.messages());
         Live {
             session,
             bus,
@@ -63,7 +64,8 @@ impl<'a, W: Witness> Live<'a, W> {
             witness,
             timing: TimingFigures::default(),
             spin: Duration::ZERO,
-            arrivals: messages.map(|count| Arrivals { looked: last, counted: count.get(), count }),
+            looked: last,
+            counted,
             stale_before: None,
             last,
             met: None,
@@ -102,8 +104,8 @@ impl<'a, W: Witness> Live<'a, W> {
     /// Why a run ends that nothing was done for during `gap`; `None` where the drives bear that.
     fn held_up(&self, gap: Duration) -> Option<String> {
         let max = self.session.silence_max().filter(|max| gap >= *max)?;
-        let flood = self.arrivals.as_ref().and_then(|arrivals| arrivals.flood(self.clock.now()));
-        let cause = flood.unwrap_or_else(|| {
+        let messages = self.tracker.as_ref().map_or(0, |link| link.messages() - self.counted);
+        let cause = flood(messages, self.clock.now().since(self.looked)).unwrap_or_else(|| {
             "was the program suspended, or the machine busy? See --realtime".to_owned()
         });
         Some(format!(
@@ -136,21 +138,22 @@ impl<'a, W: Witness> Live<'a, W> {
 
     /// Takes a portion of what the tracker's link says, and none of it once a deadline is due.
     fn take_events(&mut self) {
-        let Some(link) = self.tracker.take() else { return };
+        let Some(link) = &mut self.tracker else { return };
         let now = self.clock.now();
-        if self.arrivals.as_mut().is_some_and(|arrivals| arrivals.is_due(now))
-            && let Some(event) = link.passed_over()
-        {
-            self.give(Input::Tracker(event));
+        if now.since(self.looked) >= LOOK_PERIOD {
+            (self.looked, self.counted) = (now, link.messages());
+            if let Some(event) = link.passed_over() {
+                self.give(Input::Tracker(event));
+            }
         }
         for _ in 0..Link::PORTION {
             if self.clock.now() >= self.session.deadline() {
                 break;
             }
-            let Some(event) = link.try_next() else { break };
+            let next = self.tracker.as_mut().and_then(|link| link.try_next());
+            let Some(event) = next else { break };
             self.give(Input::Tracker(event));
         }
-        self.tracker = Some(link);
     }
 
     /// Waits for one event of the bus; false when none came.
@@ -176,6 +179,14 @@ impl<'a, W: Witness> Live<'a, W> {
 impl<W: Witness> World for Live<'_, W> {
     fn machine(&mut self) -> &mut dyn Machine {
         self.session
+    }
+
+    fn witness(&mut self) -> &mut dyn Witness {
+        &mut self.witness
+    }
+
+    fn now(&self) -> Time {
+        self.clock.now()
     }
 
     fn give(&mut self, input: Input) {
@@ -206,14 +217,6 @@ impl<W: Witness> World for Live<'_, W> {
         any && self.clock.now() < self.session.deadline()
     }
 
-    fn command(&mut self) -> Option<OperatorCommand> {
-        self.witness.command()
-    }
-
-    fn stop_reason(&mut self, is_asked: bool) -> Option<String> {
-        self.witness.stop_reason(self.clock.now(), is_asked)
-    }
-
     fn go_on(&mut self) {
         if self.clock.now() >= self.session.deadline() {
             self.give(Input::Tick);
@@ -234,31 +237,11 @@ impl<W: Witness> World for Live<'_, W> {
     }
 }
 
-/// What comes from the tracker, counted since the last look.
-struct Arrivals {
-    count: MessageCount,
-    looked: Time,
-    counted: u64,
-}
-
-impl Arrivals {
-    /// True at the end of a [`LOOK_PERIOD`]; the next one begins.
-    fn is_due(&mut self, now: Time) -> bool {
-        let is_due = now.since(self.looked) >= LOOK_PERIOD;
-        if is_due {
-            (self.looked, self.counted) = (now, self.count.get());
-        }
-        is_due
-    }
-
-    /// The flood that goes on since the last look, in words.
-    fn flood(&self, now: Time) -> Option<String> {
-        let messages = self.count.get() - self.counted;
-        let per_s = messages as f64 / now.since(self.looked).max(LOOK_PERIOD).as_secs_f64();
-        (per_s > FLOOD_PER_S).then(|| {
-            format!("by a flood from the tracker? {messages} messages, {per_s:.0} a second")
-        })
-    }
+/// So many messages from the tracker in this time in words, where they are a flood.
+fn flood(messages: u64, time: Duration) -> Option<String> {
+    let per_s = messages as f64 / time.max(LOOK_PERIOD).as_secs_f64();
+    (per_s > FLOOD_PER_S)
+        .then(|| format!("by a flood from the tracker? {messages} messages, {per_s:.0} a second"))
 }
 
 /// Runs `session`, an insertion or an operation, until it ends, on the calling thread, which is the
@@ -275,18 +258,16 @@ pub fn run_live(
     clock: Clock,
     realtime: Option<RealTime>,
     sink: Sink<'_>,
-    interrupt: &Interrupt,
 ) -> RunReport {
     wake_in_time();
-    let mut run =
-        Live::new(session, bus, tracker, clock, Watched { sink, interrupt: interrupt.clone() });
+    let mut run = Live::new(session, bus, tracker, clock, sink);
     run.spin = if realtime.is_some() { SPIN } else { Duration::ZERO };
     let outcome = drive(&mut run);
     run.witness.progress(run.session.progress());
     let figures = run.timing.report(run.session.stage_counters());
     let timing = TimingReport { frames_dropped: run.bus.dropped().ok(), realtime, ..figures };
     let (gates, left) = (run.session.gate_counts(), run.session.left());
-    let report = run.witness.sink.finish(outcome, clock.now(), gates, Some(timing));
+    let report = run.witness.finish(outcome, clock.now(), gates, Some(timing));
     RunReport { left, ..report }
 }
 

@@ -6,10 +6,8 @@
 
 mod dialogue;
 mod drive;
-mod emulated;
 mod interrupt;
 mod live;
-mod pace;
 mod realtime;
 mod recording;
 mod sink;
@@ -19,14 +17,12 @@ mod timing;
 mod virtual_time;
 
 pub use dialogue::{BusTrouble, talk_despite_errors, talk_live, talk_virtual};
-pub use emulated::{DriveOutcome, EmulationReport, Moment};
 pub use interrupt::Interrupt;
 pub use live::run_live;
-pub use pace::Pace;
-pub use realtime::{RealTime, RealTimeError, enter_real_time};
+pub use realtime::{RealTime, enter_real_time};
 pub use recording::{Describe, RecordedRun, complete_record, make_recording};
 pub use sink::{Holds, OnRecordFailure, Operator, RunReport, Sink, gates_to_json};
 pub use stage_server::{TipServer, serve_stage};
-pub use study::{DrawnGoal, Study, StudyError};
+pub use study::{DrawnGoal, Study};
 pub use timing::{Clock, TimingFigures, TimingReport};
-pub use virtual_time::{TipSource, run_virtual};
+pub use virtual_time::{DriveOutcome, EmulationReport, Moment, Pace, TipSource, run_virtual};

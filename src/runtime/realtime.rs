@@ -28,55 +28,17 @@ pub struct RealTime {
     pub cpu: usize,
 }
 
-/// A right that real time needs and this process does not have, with what gives it.
-#[derive(Debug, thiserror::Error)]
-pub enum RealTimeError {
-    /// No such processor, or not for this process.
-    #[error(
-        "--realtime: cannot bind the SYNC thread to processor {cpu}: {reason}; this process may \
-         use {allowed}"
-    )]
-    Cpu {
-        /// The processor that was asked for.
-        cpu: usize,
-        /// What the system said.
-        reason: Errno,
-        /// Those it may use.
-        allowed: String,
-    },
-    /// No real-time priority.
-    #[error(
-        "--realtime: SCHED_FIFO with priority {PRIORITY} is refused: {reason}; run as root, or give \
-         the program the right: sudo setcap cap_sys_nice,cap_ipc_lock+ep $(which needle-bench), or \
-         give the user rtprio {PRIORITY} in /etc/security/limits.conf (ulimit -r is {limit} now)"
-    )]
-    Priority {
-        /// What the library said.
-        reason: String,
-        /// RLIMIT_RTPRIO.
-        limit: u64,
-    },
-    /// Memory cannot be locked, or not all that may yet be asked for.
-    #[error(
-        "--realtime: memory cannot be locked: {reason}; run as root, or give the program the right: \
-         sudo setcap cap_sys_nice,cap_ipc_lock+ep $(which needle-bench), or give the user memlock \
-         unlimited in /etc/security/limits.conf (ulimit -l is {limit_kb} kB now)"
-    )]
-    Memory {
-        /// What the system said.
-        reason: Errno,
-        /// RLIMIT_MEMLOCK, kB.
-        limit_kb: u64,
-    },
-}
+/// What gives the program the rights that real time needs.
+const RIGHTS: &str = "run as root, or give the program the right: sudo setcap \
+    cap_sys_nice,cap_ipc_lock+ep $(which needle-bench), or give the user";
 
 /// Puts the calling thread in real time, on processor `cpu`, or without one on the last that this
 /// process may use: the first serve most interrupts. Threads made later by this thread inherit
 /// all of it, so it is called when every other thread is there.
 ///
 /// # Errors
-/// [`RealTimeError`], each with what to do. What was given before the refusal stays.
-pub fn enter_real_time(cpu: Option<usize>) -> Result<RealTime, RealTimeError> {
+/// The right that this process does not have, with what gives it. What was given before the refusal stays.
+pub fn enter_real_time(cpu: Option<usize>) -> Result<RealTime, String> {
     let cpu = bind(cpu)?;
     lock_memory()?;
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
@@ -86,9 +48,12 @@ pub fn enter_real_time(cpu: Option<usize>) -> Result<RealTime, RealTimeError> {
             set_thread_priority_and_policy(thread_native_id(), priority, policy)
                 .map_err(|error| error.to_string())
         })
-        .map_err(|reason| RealTimeError::Priority {
-            reason,
-            limit: soft_limit(Resource::RLIMIT_RTPRIO),
+        .map_err(|reason| {
+            let limit = soft_limit(Resource::RLIMIT_RTPRIO);
+            format!(
+                "--realtime: SCHED_FIFO with priority {PRIORITY} is refused: {reason}; {RIGHTS} rtprio \
+                 {PRIORITY} in /etc/security/limits.conf (ulimit -r is {limit} now)"
+            )
         })?;
     Ok(RealTime { priority: PRIORITY, cpu })
 }
@@ -101,28 +66,39 @@ pub(super) fn wake_in_time() {
     }
 }
 
-fn bind(cpu: Option<usize>) -> Result<usize, RealTimeError> {
+fn bind(cpu: Option<usize>) -> Result<usize, String> {
     let this_thread = Pid::from_raw(0);
     let allowed = sched_getaffinity(this_thread).unwrap_or_default();
     let numbers: Vec<usize> =
         (0..CpuSet::count()).filter(|&cpu| allowed.is_set(cpu) == Ok(true)).collect();
     let cpu = cpu.or(numbers.last().copied()).unwrap_or(0);
     let mut one = CpuSet::new();
-    one.set(cpu)
-        .and_then(|()| sched_setaffinity(this_thread, &one))
-        .map_err(|reason| RealTimeError::Cpu { cpu, reason, allowed: format!("{numbers:?}") })?;
-    Ok(cpu)
+    let bound = one.set(cpu).and_then(|()| sched_setaffinity(this_thread, &one));
+    bound.map(|()| cpu).map_err(|reason| {
+        format!(
+            "--realtime: cannot bind the SYNC thread to processor {cpu}: {reason}; this process may use \
+             {numbers:?}"
+        )
+    })
 }
 
 /// Locks all memory there is and will be. Under a limit, what is asked for later would be refused
 /// in the middle of a run: so it is done without one, or not at all.
-fn lock_memory() -> Result<(), RealTimeError> {
+fn lock_memory() -> Result<(), String> {
     let limit = soft_limit(Resource::RLIMIT_MEMLOCK);
-    let refused = |reason| RealTimeError::Memory { reason, limit_kb: limit / 1024 };
+    let refused = |reason| memory_refused(reason, limit / 1024);
     if limit != RLIM_INFINITY && !may_lock_any_amount() {
         return Err(refused(Errno::EPERM));
     }
     mlockall(MlockAllFlags::MCL_CURRENT | MlockAllFlags::MCL_FUTURE).map_err(refused)
+}
+
+/// Memory cannot be locked, or not all that may yet be asked for.
+fn memory_refused(reason: Errno, limit_kb: u64) -> String {
+    format!(
+        "--realtime: memory cannot be locked: {reason}; {RIGHTS} memlock unlimited in \
+         /etc/security/limits.conf (ulimit -l is {limit_kb} kB now)"
+    )
 }
 
 fn soft_limit(resource: Resource) -> u64 {
@@ -144,16 +120,15 @@ mod tests {
     #[test]
     fn a_processor_that_is_not_there_is_refused_with_those_that_are() {
         let error = std::thread::spawn(|| enter_real_time(Some(CpuSet::count() - 1)));
-        let error = error.join().unwrap().unwrap_err().to_string();
+        let error = error.join().unwrap().unwrap_err();
         let expected = "--realtime: cannot bind the SYNC thread to processor 1023: EINVAL";
         assert!(error.starts_with(expected) && error.contains("this process may use ["), "{error}");
     }
 
     #[test]
     fn refusals_say_what_to_do() {
-        let memory = RealTimeError::Memory { reason: Errno::EPERM, limit_kb: 8192 };
         assert_eq!(
-            memory.to_string(),
+            memory_refused(Errno::EPERM, 8192),
             "--realtime: memory cannot be locked: EPERM: Operation not permitted; run as root, or \
              give the program the right: sudo setcap cap_sys_nice,cap_ipc_lock+ep $(which \
              needle-bench), or give the user memlock unlimited in /etc/security/limits.conf \

@@ -188,11 +188,7 @@ fn time_of(record: &Record) -> Option<Time> {
         Record::Stage(stage) => Some(stage.time),
         Record::Step(step) => Some(step.time),
         Record::Drive { time, .. } => Some(*time),
-        Record::Begun { .. }
-        | Record::Input { .. }
-        | Record::Can { .. }
-        | Record::State { .. }
-        | Record::Event { .. } => None,
+        _ => None,
     }
 }
 

@@ -1,7 +1,9 @@
 //! What the runtime does with a session's records: telemetry, figures, news for the operator.
 
-use super::emulated::EmulationReport;
+use super::drive::Witness;
+use super::interrupt::Interrupt;
 use super::timing::{DurationHistogram, TimingReport};
+use super::virtual_time::EmulationReport;
 use crate::archive::DriveIdentity;
 use crate::canopen::NodeId;
 use crate::emulator::Truth;
@@ -16,7 +18,7 @@ use serde_json::{Map, Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// The operator's eyes and hands: told of progress and events as they happen, asked for commands.
+/// The operator's screen and keys: shows progress and events as they happen, gives commands.
 /// Nothing here may wait: the control thread calls it.
 pub trait Operator {
     /// The run has come this far.
@@ -40,7 +42,7 @@ pub trait Operator {
 pub enum OnRecordFailure {
     /// It is stopped, safely.
     Stop,
-    /// It goes on; what is lost is told and counted.
+    /// It goes on; what is lost is reported and counted.
     GoOn,
 }
 
@@ -65,6 +67,7 @@ pub struct Sink<'a> {
     /// How long it took to hand each record to the recorder, ns.
     handed_over: DurationHistogram,
     operator: &'a mut dyn Operator,
+    interrupt: Interrupt,
 }
 
 /// What a run came to.
@@ -93,43 +96,19 @@ pub struct RunReport {
 }
 
 impl<'a> Sink<'a> {
-    /// Records go to `recorder`, news to `operator`; `on_failure` says what a run is worth whose
-    /// record fails.
+    /// Records go to `recorder`, news to `operator`, who may raise `interrupt`; `on_failure` says what to
+    /// do when recording fails.
     pub fn new(
         recorder: Recorder,
         on_failure: OnRecordFailure,
         operator: &'a mut dyn Operator,
+        interrupt: &Interrupt,
     ) -> Self {
         let (figures, handed_over) = (RunFigures::default(), DurationHistogram::default());
         operator.recorded_to(recorder.run_dir());
         let (holds, drives) = (Holds::default(), Vec::new());
-        Sink { recorder, figures, holds, drives, on_failure, handed_over, operator }
-    }
-
-    /// Takes one record, with the truth of its moment where the run is emulated.
-    pub(crate) fn take(&mut self, record: Record, truth: Option<Truth>) {
-        self.operator.record(&record);
-        match &record {
-            Record::Step(step) => self.figures.take(step, truth.as_ref()),
-            Record::Event { time, lane, severity, text } => {
-                self.operator.event(*time, *lane, *severity, text);
-            }
-            Record::Drive { axis, node, identity, .. } => self.identify(*axis, *node, identity),
-            Record::Stage(stage) => self.figures.follow(stage),
-            Record::Sample(sample) => self.figures.see(sample),
-            Record::State { state: State::Holding, .. } => self.holds.tracker += 1,
-            Record::State { state: State::HeldByOperator, .. } => self.holds.operator += 1,
-            Record::State { state: State::HeldAfterStep, .. } => self.holds.step += 1,
-            Record::Begun { .. }
-            | Record::Input { .. }
-            | Record::Can { .. }
-            | Record::Target(_)
-            | Record::State { .. } => {}
-        }
-        let truth = truth.filter(|_| matches!(record, Record::Step(_)));
-        let begun = Instant::now();
-        self.recorder.record(Entry { record, truth });
-        self.handed_over.add_ns(begun.elapsed());
+        let interrupt = interrupt.clone();
+        Sink { recorder, figures, holds, drives, on_failure, handed_over, operator, interrupt }
     }
 
     fn identify(&mut self, axis: Axis, node: NodeId, identity: &Identity) {
@@ -144,20 +123,9 @@ impl<'a> Sink<'a> {
         self.recorder.identify_drives(self.drives.clone());
     }
 
-    /// Tells the operator how far the run is.
-    pub(crate) fn progress(&mut self, progress: Progress) {
-        self.operator.progress(progress);
-    }
-
-    /// What the operator asks for next, if anything.
-    pub(crate) fn command(&mut self) -> Option<OperatorCommand> {
-        self.operator.command()
-    }
-
-    /// Looks after the record: what has changed of it is told and recorded, as far as it can be.
-    /// Gives the reason to end the run, where it is not worth its while without a record, unless it
-    /// `is_ending` anyway.
-    pub(crate) fn look_after_record(&mut self, now: Time, is_ending: bool) -> Option<String> {
+    /// Reports what has changed about the record, and records it as far as possible. Returns the reason to
+    /// end the run if recording failed, unless the run goes on without a record or `is_ending` anyway.
+    fn look_after_record(&mut self, now: Time, is_ending: bool) -> Option<String> {
         let mut reason = None;
         while let Some(news) = self.recorder.news() {
             let trouble = match (news, self.on_failure) {
@@ -202,6 +170,44 @@ impl<'a> Sink<'a> {
         let (figures, holds) = (self.figures, self.holds);
         let (left, emulated) = (Left::default(), None);
         RunReport { outcome, figures, left, holds, gates, end, timing, run_dir, record, emulated }
+    }
+}
+
+impl Witness for Sink<'_> {
+    fn take(&mut self, record: Record, truth: Option<Truth>) {
+        self.operator.record(&record);
+        match &record {
+            Record::Step(step) => self.figures.take(step, truth.as_ref()),
+            Record::Event { time, lane, severity, text } => {
+                self.operator.event(*time, *lane, *severity, text);
+            }
+            Record::Drive { axis, node, identity, .. } => self.identify(*axis, *node, identity),
+            Record::Stage(stage) => self.figures.follow(stage),
+            Record::Sample(sample) => self.figures.see(sample),
+            Record::State { state: State::Holding, .. } => self.holds.tracker += 1,
+            Record::State { state: State::HeldByOperator, .. } => self.holds.operator += 1,
+            Record::State { state: State::HeldAfterStep, .. } => self.holds.step += 1,
+            _ => {}
+        }
+        let truth = truth.filter(|_| matches!(record, Record::Step(_)));
+        let begun = Instant::now();
+        self.recorder.record(Entry { record, truth });
+        self.handed_over.add_ns(begun.elapsed());
+    }
+
+    fn progress(&mut self, progress: Progress) {
+        self.operator.progress(progress);
+    }
+
+    fn command(&mut self) -> Option<OperatorCommand> {
+        self.operator.command()
+    }
+
+    fn stop_reason(&mut self, now: Time, is_asked: bool) -> Option<String> {
+        let is_raised = self.interrupt.is_raised();
+        let record = self.look_after_record(now, is_asked || is_raised);
+        let operator = is_raised.then(|| "operator: interrupted".to_owned());
+        operator.or(record).filter(|_| !is_asked)
     }
 }
 

@@ -8,8 +8,7 @@ use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
 use crate::geometry::FixedAngles;
 use crate::session::Direction;
 use crate::tracker::openigtlink::{Body, IgtlStamp, Message};
-use crate::transport::bus_error::BusError;
-use crate::transport::can::{BusEvent, CanBus, CanError};
+use crate::transport::can::{BusError, BusEvent, CanBus, CanError};
 use crate::transport::tcp::TransformServer;
 use crate::units::Time;
 use std::fs::File;
@@ -66,37 +65,19 @@ impl TipServer {
     }
 
     /// Sends a tracked tip or target to every client, as a tool of this name.
-    fn send(&mut self, tool: &str, tip: &TrackedTip) {
-        let r = tip.x_ts.rotation.matrix().map(|element| element as f32);
-        let p = tip.x_ts.translation.map(|coordinate| coordinate as f32);
-        let body = Body::Transform([
-            r[(0, 0)],
-            r[(1, 0)],
-            r[(2, 0)],
-            r[(0, 1)],
-            r[(1, 1)],
-            r[(2, 1)],
-            r[(0, 2)],
-            r[(1, 2)],
-            r[(2, 2)],
-            p.x,
-            p.y,
-            p.z,
-        ]);
+    fn send(&self, tool: &str, tip: &TrackedTip) {
+        // Column by column: the rotation, then the translation.
+        let columns = tip.x_ts.rotation.matrix().iter().chain(&tip.x_ts.translation);
+        let mut elements = [0.0; 12];
+        elements.iter_mut().zip(columns).for_each(|(to, from)| *to = *from as f32);
         let origin = self.clock.origin_utc().duration_since(UNIX_EPOCH).unwrap_or_default();
         let origin_ns = i64::try_from(origin.as_nanos()).unwrap_or(0);
         let stamp = IgtlStamp::from_unix_ns(origin_ns + tip.acquisition_time.as_nanos());
-        self.server.send(&Message::new(tool, stamp, body));
-    }
-
-    fn send_target(&mut self, target: &TrackedTip) {
-        if let Some(tool) = self.target.clone() {
-            self.send(&tool, target);
-        }
+        self.server.send(&Message::new(tool, stamp, Body::Transform(elements)));
     }
 
     fn send_tip(&mut self, tip: &TrackedTip, truth: &Truth) -> io::Result<()> {
-        self.send(&self.tool.clone(), tip);
+        self.send(&self.tool, tip);
         if let Some(file) = &mut self.truth {
             let p = truth.x_pb().translation;
             let FixedAngles { yaw, pitch, roll } =
@@ -108,9 +89,9 @@ impl TipServer {
     }
 }
 
-/// Says which fault of the script strikes. A bus that goes off is an error frame, which every
-/// listener hears; an interface is taken down by hand, `ip link set … down`.
-fn strike(fault: &Fault, bus: &mut dyn CanBus) {
+/// Reports a fault of the script that begins. Bus off is an error frame, which every program on the bus
+/// receives. An interface is taken down by hand, `ip link set … down`.
+fn begin_fault(fault: &Fault, bus: &mut dyn CanBus) {
     tracing::warn!("emulated fault: {fault}");
     if fault.kind == FaultKind::BusOff
         && let Err(error) = bus.report(&BusError::bus_off())
@@ -144,8 +125,10 @@ pub fn serve_stage(
                 StageOutput::Tip { tip, truth } => {
                     tips.send_tip(&tip, &truth).map_err(|error| format!("truth file: {error}"))?
                 }
-                StageOutput::Target(target) => tips.send_target(&target),
-                StageOutput::FaultBegan(fault) => strike(&fault, bus),
+                StageOutput::Target(target) => {
+                    tips.target.iter().for_each(|tool| tips.send(tool, &target));
+                }
+                StageOutput::FaultBegan(fault) => begin_fault(&fault, bus),
             }
         }
         let (now, deadline) = (clock.now(), stage.deadline());

@@ -3,11 +3,10 @@
 use super::virtual_time::{TipSource, run_unwatched};
 use crate::emulator::{Noise, TrackerModel, Truth, VirtualStage, VirtualStageConfig};
 use crate::geometry::Pose;
-use crate::session::{Goal, Outcome, Record, Session, SessionConfig, SessionError};
+use crate::session::{Goal, Outcome, Record, Session, SessionConfig};
 use crate::study::{Prior, Timetable, TimetableBuilder, TrialResult, TrialScore, insert};
 use crate::units::Time;
 use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
-use thiserror::Error;
 
 /// Noise of the insertion that is the timetable's: as good as none, and no two positions alike,
 /// since a tracker that says the same over and over is not believed.
@@ -15,11 +14,11 @@ const TIMETABLE_NOISE: Noise = Noise::Gaussian(1e-6);
 
 /// Insertions to be made again and again.
 pub struct Study<'a> {
-    /// What the bench is told.
+    /// The configuration of the bench.
     pub session: SessionConfig,
     /// The name of the tracked tip.
     pub tool: &'a str,
-    /// What nobody knows before a trial.
+    /// The random draws.
     pub prior: Prior,
     /// The emulated stage, needle and tracker of the trial with the seed given, or why there can be
     /// none.
@@ -31,36 +30,13 @@ pub struct Study<'a> {
 /// A target with the path to it, or why there is none.
 pub type DrawnGoal = Result<Option<Goal>, String>;
 
-/// Why there is no study.
-#[derive(Debug, Clone, PartialEq, Error)]
-pub enum StudyError {
-    /// The session refuses what it is told.
-    #[error(transparent)]
-    Session(#[from] SessionError),
-    /// A trial cannot be drawn.
-    #[error("trial with seed {seed}: {reason}")]
-    Trial {
-        /// Its seed.
-        seed: u64,
-        /// Why.
-        reason: String,
-    },
-    /// The insertion that tells when steps are taken came to no end.
-    #[error("an insertion in the plane, without noise, was stopped: {0}")]
-    NoTimetable(String),
-}
-
 impl Study<'_> {
     /// Makes the trials with these seeds, in parallel; `done` is called after each. The results are
     /// in the order of the seeds, whatever thread made them.
     ///
     /// # Errors
-    /// [`StudyError`] where the session or the emulator refuses its configuration.
-    pub fn run(
-        &self,
-        seeds: &[u64],
-        done: &(dyn Fn() + Sync),
-    ) -> Result<Vec<TrialResult>, StudyError> {
+    /// Where the session or the emulator refuses its configuration.
+    pub fn run(&self, seeds: &[u64], done: &(dyn Fn() + Sync)) -> Result<Vec<TrialResult>, String> {
         let Some(&first) = seeds.first() else { return Ok(Vec::new()) };
         self.trials(seeds, &self.timetable(first)?, done)
     }
@@ -74,10 +50,10 @@ impl Study<'_> {
         seeds: &[u64],
         timetable: &Timetable,
         done: &(dyn Fn() + Sync),
-    ) -> Result<Vec<TrialResult>, StudyError> {
+    ) -> Result<Vec<TrialResult>, String> {
         self.each(seeds, done, |session, stage, score| {
             let take = |step: &_, truth: &_| score.take(step, truth);
-            Ok(insert(&session, &stage, timetable, take)?)
+            insert(&session, &stage, timetable, take).map_err(|error| error.to_string())
         })
     }
 
@@ -90,7 +66,7 @@ impl Study<'_> {
         &self,
         seeds: &[u64],
         done: &(dyn Fn() + Sync),
-    ) -> Result<Vec<TrialResult>, StudyError> {
+    ) -> Result<Vec<TrialResult>, String> {
         self.each(seeds, done, |session, stage, score| {
             self.whole_session(session, stage, |record, truth| {
                 if let (Record::Step(step), Some(truth)) = (record, truth) {
@@ -105,16 +81,12 @@ impl Study<'_> {
         &self,
         seeds: &[u64],
         done: &(dyn Fn() + Sync),
-        insert: impl Fn(
-            SessionConfig,
-            VirtualStageConfig,
-            &mut TrialScore,
-        ) -> Result<Outcome, SessionError>
+        insert: impl Fn(SessionConfig, VirtualStageConfig, &mut TrialScore) -> Result<Outcome, String>
         + Sync,
-    ) -> Result<Vec<TrialResult>, StudyError> {
+    ) -> Result<Vec<TrialResult>, String> {
         let trial = |&seed: &u64| {
             let stage = self.drawn(seed)?;
-            let goal = (self.goal)(seed).map_err(|reason| StudyError::Trial { seed, reason })?;
+            let goal = (self.goal)(seed).map_err(|reason| refused_trial(seed, &reason))?;
             let result = match goal {
                 Err(why) => TrialResult::refused(seed, stage, &self.prior, &why),
                 Ok(goal) => {
@@ -131,16 +103,16 @@ impl Study<'_> {
         seeds.par_iter().map(trial).collect()
     }
 
-    fn drawn(&self, seed: u64) -> Result<VirtualStageConfig, StudyError> {
-        (self.stage)(seed).map_err(|reason| StudyError::Trial { seed, reason })
+    fn drawn(&self, seed: u64) -> Result<VirtualStageConfig, String> {
+        (self.stage)(seed).map_err(|reason| refused_trial(seed, &reason))
     }
 
     /// The times of all trials, from a whole session with a needle that needs no steering, at the
     /// stage of the trial with this seed.
     ///
     /// # Errors
-    /// As [`Study::run`]; [`StudyError::NoTimetable`] where that session is stopped.
-    pub fn timetable(&self, seed: u64) -> Result<Timetable, StudyError> {
+    /// As [`Study::run`], and where that session is stopped.
+    pub fn timetable(&self, seed: u64) -> Result<Timetable, String> {
         let stage = self.drawn(seed)?;
         let tracker = TrackerModel { noise: TIMETABLE_NOISE, correlated: None, ..stage.tracker };
         // The needle that the bench believes in: no gate finds fault with it.
@@ -157,7 +129,9 @@ impl Study<'_> {
         let outcome = self.whole_session(self.session.clone(), stage, take)?;
         match outcome {
             Outcome::Completed => Ok(builder.finish()),
-            Outcome::Stopped(reason) => Err(StudyError::NoTimetable(reason)),
+            Outcome::Stopped(reason) => {
+                Err(format!("an insertion in the plane, without noise, was stopped: {reason}"))
+            }
         }
     }
 
@@ -166,13 +140,17 @@ impl Study<'_> {
         session: SessionConfig,
         stage: VirtualStageConfig,
         take: impl FnMut(Record, Option<Truth>),
-    ) -> Result<Outcome, SessionError> {
+    ) -> Result<Outcome, String> {
         let stage = VirtualStage::new(stage, Time::ZERO);
         let target = session_tool(&session);
-        let mut session = Session::new(session, Time::ZERO)?;
+        let mut session = Session::new(session, Time::ZERO).map_err(|error| error.to_string())?;
         let tips = TipSource::Emulated { tool: self.tool.to_owned(), target };
         Ok(run_unwatched(&mut session, stage, tips, take))
     }
+}
+
+fn refused_trial(seed: u64, reason: &str) -> String {
+    format!("trial with seed {seed}: {reason}")
 }
 
 /// The name of the tool that is the target, where that is one.

@@ -1,20 +1,20 @@
-//! A session and the virtual stage in one thread, in virtual time: no sleeps, no sockets.
+//! A session and the virtual stage in one thread, in virtual time: no sockets, and no sleeps unless an
+//! operator practises at the pace of real time.
 
-use super::drive::{Watched, Witness, World, drive};
-use super::emulated::EmulationReport;
-use super::interrupt::Interrupt;
-use super::pace::Pace;
+use super::drive::{Witness, World, drive};
 use super::sink::{RunReport, Sink};
 use crate::canopen::Frame;
+use crate::canopen::cia402::DriveState;
 use crate::emulator::fault::{Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
 use crate::geometry::so3;
-use crate::session::{Input, Lane, Machine, OperatorCommand, Outcome, Record, Severity, State};
+use crate::session::{Input, Lane, Machine, Outcome, Record, Severity, State};
 use crate::tracker::{Event, Replay, Sample, Validity};
-use crate::transport::bus_error::BusError;
-use crate::transport::can::CanError;
+use crate::transport::can::{BusError, CanError};
 use crate::transport::unconfirmed::Unconfirmed;
 use crate::units::Time;
+use std::thread;
+use std::time::{Duration, Instant};
 
 /// Where a run in virtual time gets its tip positions from.
 #[derive(Debug)]
@@ -71,15 +71,13 @@ pub fn run_virtual(
     tips: Option<TipSource>,
     pace: Option<Pace>,
     sink: Sink<'_>,
-    interrupt: &Interrupt,
 ) -> RunReport {
-    let watched = Watched { sink, interrupt: interrupt.clone() };
-    let mut run = VirtualRun { pace, ..VirtualRun::new(session, stage, tips, watched) };
+    let mut run = VirtualRun { pace, ..VirtualRun::new(session, stage, tips, sink) };
     let outcome = drive(&mut run);
     run.witness.progress(run.session.progress());
     run.emulated.update(&run.stage, run.now);
     let (gates, left) = (run.session.gate_counts(), run.session.left());
-    let report = run.witness.sink.finish(outcome, run.now, gates, None);
+    let report = run.witness.finish(outcome, run.now, gates, None);
     RunReport { emulated: Some(run.emulated), left, ..report }
 }
 
@@ -168,6 +166,14 @@ impl<W: Witness> World for VirtualRun<'_, W> {
         self.session
     }
 
+    fn witness(&mut self) -> &mut dyn Witness {
+        &mut self.witness
+    }
+
+    fn now(&self) -> Time {
+        self.now
+    }
+
     fn give(&mut self, input: Input) {
         self.session.handle(self.now, input);
     }
@@ -207,17 +213,9 @@ impl<W: Witness> World for VirtualRun<'_, W> {
         any
     }
 
-    fn command(&mut self) -> Option<OperatorCommand> {
-        self.witness.command()
-    }
-
-    fn stop_reason(&mut self, is_asked: bool) -> Option<String> {
-        self.witness.progress(self.session.progress());
-        self.witness.stop_reason(self.now, is_asked)
-    }
-
     /// Goes to the earliest deadline of session, stage and tip source.
     fn go_on(&mut self) {
+        self.witness.progress(self.session.progress());
         self.emulated.update(&self.stage, self.now);
         let tip_due = self.tips.as_ref().map_or(Time::NEVER, TipSource::deadline);
         let due = self.session.deadline().min(self.stage.deadline()).min(tip_due);
@@ -232,5 +230,138 @@ impl<W: Witness> World for VirtualRun<'_, W> {
         if self.session.deadline() <= self.now {
             self.give(Input::Tick);
         }
+    }
+}
+
+/// The true positions of both axes at one time of an emulated run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Moment {
+    /// When.
+    pub time: Time,
+    /// True depth, mm, from where the stage was switched on.
+    pub insertion_true_mm: f64,
+    /// True rotation, rad, from where the stage was switched on.
+    pub rotation_true_rad: f64,
+}
+
+impl Moment {
+    fn of(stage: &VirtualStage, time: Time) -> Self {
+        let (insertion_true_mm, rotation_true_rad) = stage.position_true(time);
+        Moment { time, insertion_true_mm, rotation_true_rad }
+    }
+}
+
+/// How one emulated drive ended.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DriveOutcome {
+    /// Its state at the end.
+    pub state: DriveState,
+    /// When it last left Operation Enabled.
+    pub left_operation_enabled: Option<Moment>,
+}
+
+/// What can be known only of an emulated run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EmulationReport {
+    /// The scripted faults that began, in order.
+    pub faults: Vec<(Fault, Moment)>,
+    /// When the run began to stop.
+    pub stopping: Option<Moment>,
+    /// The insertion drive and the rotation drive.
+    pub drives: [DriveOutcome; 2],
+    /// The end of the run.
+    pub end: Moment,
+}
+
+impl EmulationReport {
+    /// The report of a run that begins on `stage`.
+    pub(super) fn new(stage: &VirtualStage, now: Time) -> Self {
+        let drives = stage
+            .drives()
+            .map(|drive| DriveOutcome { state: drive.state(), left_operation_enabled: None });
+        EmulationReport { faults: Vec::new(), stopping: None, drives, end: Moment::of(stage, now) }
+    }
+
+    pub(super) fn add_fault(&mut self, fault: Fault, stage: &VirtualStage, now: Time) {
+        self.faults.push((fault, Moment::of(stage, now)));
+    }
+
+    pub(super) fn set_stopping(&mut self, stage: &VirtualStage, now: Time) {
+        self.stopping = Some(Moment::of(stage, now));
+    }
+
+    /// Updates the positions and the drive states. Call it after every change of the stage.
+    pub(super) fn update(&mut self, stage: &VirtualStage, now: Time) {
+        self.end = Moment::of(stage, now);
+        for (outcome, drive) in self.drives.iter_mut().zip(stage.drives()) {
+            let before = std::mem::replace(&mut outcome.state, drive.state());
+            if before == DriveState::OperationEnabled && outcome.state != before {
+                outcome.left_operation_enabled = Some(self.end);
+            }
+        }
+    }
+}
+
+/// Longest wait: a key is served at least this often.
+const STRIDE: Duration = Duration::from_millis(20);
+/// A delay up to this long is caught up on; after a longer one, such as a suspended program, virtual time
+/// goes on from where it was.
+const CATCH_UP_MAX: Duration = Duration::from_millis(100);
+
+/// Keeps virtual time from running ahead of the clock.
+#[derive(Debug)]
+pub struct Pace {
+    /// When virtual time was zero.
+    origin: Instant,
+}
+
+impl Pace {
+    /// Virtual time is zero now.
+    pub fn begin() -> Self {
+        Pace { origin: Instant::now() }
+    }
+
+    /// Waits at `now` for `due`, at most a stride. Returns the time that is reached.
+    pub(super) fn wait(&mut self, now: Time, due: Time) -> Time {
+        let reached = due.min(now + STRIDE);
+        let at = self.origin + reached.since(Time::ZERO);
+        let late = at.elapsed();
+        if late > CATCH_UP_MAX {
+            self.origin += late;
+        }
+        thread::sleep(at.saturating_duration_since(Instant::now()));
+        reached
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(ms: i64) -> Time {
+        Time::from_nanos(ms * 1_000_000)
+    }
+
+    #[test]
+    fn virtual_time_is_never_ahead_of_the_clock() {
+        let begun = Instant::now();
+        let mut pace = Pace::begin();
+        let mut now = Time::ZERO;
+        // A deadline may have passed already.
+        for due in [at(0), at(7), at(3), at(40), Time::NEVER, Time::NEVER] {
+            now = now.max(pace.wait(now, due));
+            assert!(begun.elapsed() >= now.since(Time::ZERO), "{now:?}");
+        }
+        assert_eq!(now, at(67), "in strides of 20 ms");
+    }
+
+    #[test]
+    fn a_suspended_program_does_not_hurry_afterwards() {
+        let mut pace = Pace::begin();
+        thread::sleep(CATCH_UP_MAX * 2);
+        pace.wait(at(0), at(1));
+        let resumed = Instant::now();
+        pace.wait(at(1), at(16));
+        assert!(resumed.elapsed() >= Duration::from_millis(14), "{:?}", resumed.elapsed());
     }
 }

@@ -7,7 +7,7 @@ use crate::geometry::Pose;
 use crate::keys::{choice, over, section, within};
 use crate::needle::{Needle, Torsion};
 use crate::observer::{InvariantConfig, ObserverConfig, ObserverError, PositionNoise};
-use crate::stage::{StageConfig, StageConfigError};
+use crate::stage::StageConfig;
 use crate::tracker::{AcquisitionClock, Gate, TrackSettings};
 use nalgebra::Vector3;
 use std::time::Duration;
@@ -21,7 +21,7 @@ pub enum SessionError {
     Observer(#[from] ObserverError),
     /// The stage refuses it.
     #[error("stage: {0}")]
-    Stage(#[from] StageConfigError),
+    Stage(String),
 }
 
 /// Everything a run needs to know, in internal units.
@@ -61,7 +61,7 @@ impl SessionConfig {
         for observer in std::iter::once(&self.observer).chain(&self.shadows) {
             observer.build(self.needle, self.needle_torsion)?;
         }
-        Ok(self.stage.validate()?)
+        self.stage.validate().map_err(SessionError::Stage)
     }
 
     /// Whether the depth suffices to reach the plane from a tip at `tip_mm` in the plane frame, and a path

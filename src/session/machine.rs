@@ -172,7 +172,7 @@ impl Session {
     pub fn new(config: SessionConfig, now: Time) -> Result<Self, SessionError> {
         let stage_config = config.stage.clone();
         let task = Insert::new(config, now)?;
-        let stage = Stage::new(stage_config.clone(), now)?;
+        let stage = Stage::new(stage_config.clone(), now).map_err(SessionError::Stage)?;
         Ok(Session::begin(stage, stage_config, Box::new(task), now))
     }
 

@@ -24,7 +24,7 @@ mod tests {
     use super::super::{InsertionConfig, InsertionMode, PlaneOutOfReach, Samples};
     use super::*;
     use crate::stage::{
-        Axis, AxisLimits, Commanded, CountsRatio, LimitCheck, LimitError, Scale, SetPoint, Sign,
+        Axis, AxisLimits, Commanded, CountsRatio, LimitCheck, Scale, SetPoint, Sign,
     };
     use proptest::prelude::*;
 
@@ -49,7 +49,7 @@ mod tests {
             Limited { check, last: Commanded { counts: 0, step_counts: 0 } }
         }
 
-        fn command(&mut self, target: f64) -> Result<(), LimitError> {
+        fn command(&mut self, target: f64) -> Result<(), String> {
             let counts = self.check.check(target, self.last)?;
             self.last = Commanded { counts, step_counts: counts - self.last.counts };
             Ok(())

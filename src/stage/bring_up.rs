@@ -2,15 +2,52 @@
 //! reads and writes. The steps are in [`plan`](super::plan).
 
 use std::cell::Cell;
+use std::fmt;
 use std::rc::Rc;
 use std::time::Duration;
 
-use super::bring_up_error::{BringUpError, FoundFault, is_absent};
 use super::dialogue::{Conversation, Sdo};
-use super::{Axis, AxisConfig, BringUpPart, Progress, StageConfig, StageEvent};
+use super::{Axis, AxisConfig, Progress, StageConfig, StageEvent};
 use crate::canopen::ObjectAddress;
-use crate::canopen::sdo::{SdoError, SdoReply, SdoRequest, SdoValue};
+use crate::canopen::cia402::Statusword;
+use crate::canopen::emcy::EmcyCode;
+use crate::canopen::sdo::{AbortCode, SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::units::Time;
+
+/// Who a drive says it is (object 0x1018).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Identity {
+    /// 0x1018:01.
+    pub vendor: u32,
+    /// 0x1018:02.
+    pub product: u32,
+    /// 0x1018:03, when the drive has it.
+    pub revision: Option<u32>,
+    /// 0x1018:04, when the drive has it.
+    pub serial: Option<u32>,
+}
+
+impl fmt::Display for Identity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "vendor 0x{:08X}, product 0x{:08X}", self.vendor, self.product)?;
+        if let Some(revision) = self.revision {
+            write!(f, ", revision 0x{revision:08X}")?;
+        }
+        if let Some(serial) = self.serial {
+            write!(f, ", serial 0x{serial:08X}")?;
+        }
+        Ok(())
+    }
+}
+
+/// A fault that a drive was found in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FoundFault {
+    /// 0x6041.
+    pub statusword: Statusword,
+    /// 0x603F, when the drive has it.
+    pub error_code: Option<EmcyCode>,
+}
 
 /// Bytes of an expedited answer that does not give its size.
 const UNSIZED: usize = 4;
@@ -22,18 +59,23 @@ const POLL_PERIOD: Duration = Duration::from_millis(10);
 pub(super) struct BringUp {
     script: Script,
     /// Gives where the axis stood (0x6064), or why the drive could not be brought up.
-    pub(super) conversation: Conversation<Result<i32, BringUpError>>,
+    pub(super) conversation: Conversation<Result<i32, String>>,
     restarts_left: u32,
 }
 
 /// How far a bring-up has come.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct SoFar {
-    pub(super) part: Option<BringUpPart>,
+    /// The part of the bring-up that goes on.
+    part: &'static str,
+    /// The drive has answered.
+    pub(super) found: bool,
     /// The drive is known to be the one of the configuration.
     pub(super) identified: bool,
     /// Its power is off, and its statusword was read: any fault from here on is a new one.
     pub(super) disarmed: bool,
+    /// The drive may have been told to watch the bench; its power was taken off before.
+    pub(super) may_be_supervised: bool,
     /// The fault that it was in when its statusword was read.
     pub(super) found_in_fault: Option<FoundFault>,
 }
@@ -54,26 +96,21 @@ impl BringUp {
     /// Takes a boot-up message. A drive that has not answered yet is expected to send one. Later it means
     /// that the drive has lost what was written: its bring-up starts again, a limited number of times.
     pub(super) fn handle_boot_up(&mut self, now: Time) {
-        match self.so_far().part {
-            Some(BringUpPart::Find) | None => {}
-            Some(_) if self.restarts_left > 0 => {
-                self.restarts_left -= 1;
-                self.script.so_far.take();
-                self.script.tell(Progress::Restarted(self.script.axis));
-                let script = self.script.clone();
-                self.conversation = Conversation::begin(&self.script.sdo, now, script.run());
-            }
-            Some(part) => self.conversation.end(Err(BringUpError::Rebooted(part))),
+        let SoFar { part, found, .. } = self.so_far();
+        if found && self.restarts_left > 0 {
+            self.restarts_left -= 1;
+            self.script.so_far.take();
+            self.script.tell(Progress::Restarted(self.script.axis));
+            let script = self.script.clone();
+            self.conversation = Conversation::begin(&self.script.sdo, now, script.run());
+        } else if found {
+            let error = format!("boot-up message while {part}, is its supply stable?");
+            self.conversation.end(Err(error));
         }
     }
 
     pub(super) fn so_far(&self) -> SoFar {
         self.script.so_far.get()
-    }
-
-    /// The drive may have been told to watch the bench; its power was taken off before.
-    pub(super) fn may_be_supervised(&self) -> bool {
-        self.so_far().part >= Some(BringUpPart::Supervise)
     }
 }
 
@@ -118,8 +155,9 @@ impl Script {
         self.so_far.set(so_far);
     }
 
-    pub(super) fn begin(&self, part: BringUpPart) {
-        self.note(|so_far| so_far.part = Some(part));
+    /// Begins a part of the bring-up.
+    pub(super) fn begin(&self, part: &'static str) {
+        self.note(|so_far| so_far.part = part);
         self.tell(Progress::BringUp(self.axis, part));
     }
 
@@ -133,40 +171,48 @@ impl Script {
         request: SdoRequest,
         is_optional: bool,
         answer: Result<SdoReply, SdoError>,
-    ) -> Result<Option<SdoReply>, BringUpError> {
+    ) -> Result<Option<SdoReply>, String> {
         let object = request.object();
         let may_lack = is_optional || self.drive().optional_objects.contains(&object);
-        let attempts = self.config.sdo_attempts;
-        match (answer, request) {
-            (Ok(reply), _) => Ok(Some(reply)),
-            (Err(SdoError::Aborted(code)), _) if may_lack && is_absent(code) => {
-                self.tell(Progress::Skipped(self.axis, object));
-                Ok(None)
-            }
-            (Err(SdoError::Aborted(code)), SdoRequest::Download(_, value)) => {
-                Err(BringUpError::WriteRefused(object, value, code))
-            }
-            (Err(SdoError::Aborted(code)), _) => Err(BringUpError::ReadRefused(object, code)),
-            (Err(SdoError::Timeout(timeout)), _) => {
-                Err(BringUpError::NoReply { object, timeout, attempts })
-            }
-            (Err(error), _) => Err(BringUpError::Sdo(object, error)),
+        let error = match answer {
+            Ok(reply) => return Ok(Some(reply)),
+            Err(error) => error,
+        };
+        let is_absent = matches!(
+            error,
+            SdoError::Aborted(AbortCode::NO_SUCH_OBJECT | AbortCode::NO_SUCH_SUBINDEX)
+        );
+        if is_absent && may_lack {
+            self.tell(Progress::Skipped(self.axis, object));
+            return Ok(None);
         }
+        let hint = if is_absent { "; list it as optional if the drive does without" } else { "" };
+        let attempts = self.config.sdo_attempts;
+        Err(match (error, request) {
+            (SdoError::Aborted(code), SdoRequest::Download(_, value)) => {
+                format!("{object}: writing {value} was refused with SDO abort {code}{hint}")
+            }
+            (SdoError::Aborted(code), SdoRequest::Upload(_)) => {
+                format!("{object}: reading was refused with SDO abort {code}{hint}")
+            }
+            (SdoError::Timeout(_), _) => format!(
+                "{object}: {error} (attempt {attempts} of {attempts}), check cable, termination and \
+                 bus load"
+            ),
+            _ => format!("{object}: {error}"),
+        })
     }
 
     async fn ask(
         &self,
         request: SdoRequest,
         is_optional: bool,
-    ) -> Result<Option<SdoReply>, BringUpError> {
+    ) -> Result<Option<SdoReply>, String> {
         self.judge(request, is_optional, self.sdo.ask(request).await)
     }
 
     /// Reads `object`; `None` if the drive lacks an object that it may lack.
-    pub(super) async fn read(
-        &self,
-        object: impl Into<Object>,
-    ) -> Result<Option<SdoValue>, BringUpError> {
+    pub(super) async fn read(&self, object: impl Into<Object>) -> Result<Option<SdoValue>, String> {
         let Object { address, is_optional } = object.into();
         match self.ask(SdoRequest::Upload(address), is_optional).await? {
             Some(SdoReply::Uploaded(value)) => Ok(Some(value)),
@@ -179,7 +225,7 @@ impl Script {
         &self,
         object: ObjectAddress,
         value: SdoValue,
-    ) -> Result<(), BringUpError> {
+    ) -> Result<(), String> {
         self.ask(SdoRequest::Download(object, value), false).await.map(drop)
     }
 
@@ -188,7 +234,7 @@ impl Script {
         &self,
         object: impl Into<Object>,
         value: impl Into<SdoValue>,
-    ) -> Result<(), BringUpError> {
+    ) -> Result<(), String> {
         let (object, value) = (object.into(), value.into());
         let request = SdoRequest::Download(object.address, value);
         if self.ask(request, object.is_optional).await?.is_none() {
@@ -205,7 +251,7 @@ impl Script {
         &self,
         object: ObjectAddress,
         value: SdoValue,
-    ) -> Result<(), BringUpError> {
+    ) -> Result<(), String> {
         let patience = self.config.sdo_timeout.saturating_mul(self.config.sdo_attempts);
         let give_up = self.sdo.now() + patience;
         while let Some(received) = self.read(object).await? {
@@ -222,11 +268,7 @@ impl Script {
 /// Checks that `received` is what `expected` reads as. An expedited answer may leave out how many of its
 /// four bytes are the object's (CiA 301, 7.2.4.3.6); the others are then zero. Bit 30 of a PDO's COB-ID
 /// (remote requests) is fixed in many drives and of no consequence here.
-fn check(
-    object: ObjectAddress,
-    expected: SdoValue,
-    received: SdoValue,
-) -> Result<(), BringUpError> {
+fn check(object: ObjectAddress, expected: SdoValue, received: SdoValue) -> Result<(), String> {
     let is_pdo_cob_id =
         matches!(object.index, 0x1400..=0x15ff | 0x1800..=0x19ff) && object.subindex == 1;
     let ignored = if is_pdo_cob_id { 1 << 30 } else { 0 };
@@ -234,6 +276,6 @@ fn check(
     let fits = length == expected.as_bytes().len() || length == UNSIZED;
     match fits && (expected.to_u32() ^ received.to_u32()) & !ignored == 0 {
         true => Ok(()),
-        false => Err(BringUpError::Mismatch { object, expected, received }),
+        false => Err(format!("{object}: expected {expected}, received {received}")),
     }
 }

@@ -1,11 +1,90 @@
-//! What the stage has to be told about its drives.
+//! The axes, and the configuration of the stage and its drives.
 
+use std::fmt;
+use std::ops::{Index, IndexMut};
 use std::time::Duration;
 
 use super::standstill::Standstill;
-use super::{Axis, AxisLimits, CountsRatio, HomingConfig, PerAxis, Reference, Scale, Sign};
+use super::{AxisLimits, CountsRatio, HomingConfig, Reference, Scale, Sign};
 use crate::canopen::sdo::SdoValue;
 use crate::canopen::{NodeId, ObjectAddress};
+
+/// One of the two axes of the stage.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Axis {
+    /// Pushes the needle; mm.
+    Insertion,
+    /// Turns the needle about its shaft; rad.
+    Rotation,
+}
+
+impl Axis {
+    /// Both, in the order in which they are served.
+    pub const BOTH: [Axis; 2] = [Axis::Insertion, Axis::Rotation];
+
+    /// `value`, mm or rad, in the unit of the configuration and the command line, with that unit.
+    pub fn in_unit(self, value: f64) -> (f64, &'static str) {
+        match self {
+            Axis::Insertion => (value, "mm"),
+            Axis::Rotation => (value.to_degrees(), "deg"),
+        }
+    }
+
+    /// `value`, mm or rad, as an operator reads it: `1.500 mm`, `90.000 deg`.
+    pub fn shown(self, value: f64) -> String {
+        let (value, unit) = self.in_unit(value);
+        format!("{value:.3} {unit}")
+    }
+}
+
+impl fmt::Display for Axis {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Axis::Insertion => "insertion",
+            Axis::Rotation => "rotation",
+        })
+    }
+}
+
+/// One value for each axis, indexed by [`Axis`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct PerAxis<T> {
+    /// The insertion axis's.
+    pub insertion: T,
+    /// The rotation axis's.
+    pub rotation: T,
+}
+
+impl<T> PerAxis<T> {
+    /// Makes one value for each axis.
+    pub fn from_fn(mut make: impl FnMut(Axis) -> T) -> Self {
+        PerAxis { insertion: make(Axis::Insertion), rotation: make(Axis::Rotation) }
+    }
+
+    /// True when both values pass.
+    pub fn all(&self, mut passes: impl FnMut(&T) -> bool) -> bool {
+        passes(&self.insertion) && passes(&self.rotation)
+    }
+}
+
+impl<T> Index<Axis> for PerAxis<T> {
+    type Output = T;
+    fn index(&self, axis: Axis) -> &T {
+        match axis {
+            Axis::Insertion => &self.insertion,
+            Axis::Rotation => &self.rotation,
+        }
+    }
+}
+
+impl<T> IndexMut<Axis> for PerAxis<T> {
+    fn index_mut(&mut self, axis: Axis) -> &mut T {
+        match axis {
+            Axis::Insertion => &mut self.insertion,
+            Axis::Rotation => &mut self.rotation,
+        }
+    }
+}
 
 /// An object that a particular drive needs written, before the stage's own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -135,7 +214,7 @@ pub struct StageConfig {
     /// Longest way from Operational to both drives in Operation Enabled; brakes take their time.
     pub enable_timeout: Duration,
     /// For a drive to leave Switch On Disabled, and Ready To Switch On, once it is told to.
-    pub let_on: Duration,
+    pub state_transition_timeout: Duration,
     /// Longest wait for standstill, and for power to be off.
     pub stop_timeout: Duration,
     /// SYNCs in a row without both positions that are tolerated; the next is a fault.
@@ -149,69 +228,6 @@ pub struct StageConfig {
     pub insertion: AxisConfig,
     /// The rotation axis.
     pub rotation: AxisConfig,
-}
-
-/// A configuration the stage cannot work with.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum StageConfigError {
-    /// Two of the bench and the drives have one node number.
-    #[error("node {0} is used twice among the bench, insertion and rotation")]
-    NodeUsedTwice(NodeId),
-    /// The SYNC period cannot be told to a drive.
-    #[error(
-        "a SYNC period of {} µs does not fit object 0x60C2: 1 to 255 times 1, 0.1, 0.01 or 0.001 ms",
-        .0.as_micros()
-    )]
-    SyncPeriod(Duration),
-    /// Heartbeat times that cannot be told to a drive, or that lose every heartbeat.
-    #[error(
-        "heartbeat every {} ms, lost after {} ms: 1 to 65535 ms, and the second must be the longer",
-        .0.producer_period.as_millis(), .0.consumer_time.as_millis()
-    )]
-    Heartbeat(HeartbeatConfig),
-    /// Limits that allow nothing, or no number.
-    #[error(
-        "{axis}: limits {} to {}, {}/s: the range and the speed must be finite and over zero",
-        axis.shown(.limits.min), axis.shown(.limits.max), axis.shown(.limits.speed_max)
-    )]
-    Limits {
-        /// Whose limits.
-        axis: Axis,
-        /// As configured.
-        limits: AxisLimits,
-    },
-    /// A value for the drive that is no number, or that its object cannot hold.
-    #[error(
-        "{axis}: {what} of {} {}{per}: it must be over zero and fit 32 bits in counts",
-        axis.in_unit(*value).0, axis.in_unit(*value).1
-    )]
-    DriveValue {
-        /// Whose drive.
-        axis: Axis,
-        /// Of what.
-        what: &'static str,
-        /// As configured, mm or rad.
-        value: f64,
-        /// What follows the unit: nothing, `/s` or `/s²`.
-        per: &'static str,
-    },
-    /// An axis whose counts take so long to show that it stands that every stop would time out.
-    #[error(
-        "{axis}: {:.0} ms of its counts are needed to see it stand, and stop_timeout_s is {:.3}: set a \
-         longer one",
-        .window.as_secs_f64() * 1e3, .stop_timeout.as_secs_f64()
-    )]
-    TooCoarse {
-        /// Whose drive.
-        axis: Axis,
-        /// The time over which standstill is seen.
-        window: Duration,
-        /// As configured.
-        stop_timeout: Duration,
-    },
-    /// An axis that is to be homed without being told how.
-    #[error("{0}: its position is to come from homing, and no homing is configured")]
-    NoHoming(Axis),
 }
 
 impl StageConfig {
@@ -237,65 +253,87 @@ impl StageConfig {
     /// Checks what the types do not.
     ///
     /// # Errors
-    /// The first thing the stage cannot work with.
-    pub fn validate(&self) -> Result<(), StageConfigError> {
+    /// The first thing that the stage cannot work with.
+    pub fn validate(&self) -> Result<(), String> {
         let PerAxis { insertion, rotation } = self.nodes();
-        if insertion == rotation || insertion == self.bench_node {
-            return Err(StageConfigError::NodeUsedTwice(insertion));
-        }
-        if rotation == self.bench_node {
-            return Err(StageConfigError::NodeUsedTwice(rotation));
+        let nodes = [insertion, rotation, self.bench_node];
+        let is_used_twice = |node: &&NodeId| nodes.iter().filter(|other| other == node).count() > 1;
+        if let Some(node) = nodes.iter().find(is_used_twice) {
+            return Err(format!(
+                "node {node} is used twice among the bench, insertion and rotation"
+            ));
         }
         if interpolation_period(self.sync_period).is_none() {
-            return Err(StageConfigError::SyncPeriod(self.sync_period));
+            return Err(format!(
+                "a SYNC period of {} µs does not fit object 0x60C2: 1 to 255 times 1, 0.1, 0.01 or \
+                 0.001 ms",
+                self.sync_period.as_micros()
+            ));
         }
         let HeartbeatConfig { producer_period, consumer_time } = self.heartbeat;
         let (producer, consumer) = (millis(producer_period), millis(consumer_time));
         if !matches!((producer, consumer), (Some(1..), Some(1..))) || consumer <= producer {
-            return Err(StageConfigError::Heartbeat(self.heartbeat));
+            return Err(format!(
+                "heartbeat every {} ms, lost after {} ms: 1 to 65535 ms, and the second must be the \
+                 longer",
+                producer_period.as_millis(),
+                consumer_time.as_millis()
+            ));
         }
-        for axis in Axis::BOTH {
-            let limits = self.axis(axis).limits;
-            let AxisLimits { min, max, speed_max, acceleration_max } = limits;
-            let rates = [speed_max, acceleration_max.unwrap_or(1.0)];
-            let range_ok = min.is_finite() && max.is_finite() && min < max;
-            if !range_ok || rates.iter().any(|rate| !rate.is_finite() || *rate <= 0.0) {
-                return Err(StageConfigError::Limits { axis, limits });
+        Axis::BOTH.into_iter().try_for_each(|axis| self.validate_axis(axis))
+    }
+
+    /// Checks the limits of `axis`, and what goes to its drive in counts.
+    fn validate_axis(&self, axis: Axis) -> Result<(), String> {
+        let config = self.axis(axis);
+        let AxisLimits { min, max, speed_max, acceleration_max } = config.limits;
+        let rates = [speed_max, acceleration_max.unwrap_or(1.0)];
+        let range_ok = min.is_finite() && max.is_finite() && min < max;
+        if !range_ok || rates.iter().any(|rate| !rate.is_finite() || *rate <= 0.0) {
+            let [min, max, speed] = [min, max, speed_max].map(|value| axis.shown(value));
+            return Err(format!(
+                "{axis}: limits {min} to {max}, {speed}/s: the range and the speed must be finite and \
+                 over zero"
+            ));
+        }
+        let homing = config.homing.as_ref();
+        if config.reference == Reference::Homing && homing.is_none() {
+            return Err(no_homing(axis));
+        }
+        let values = [
+            (config.following_error_max, "a following error", ""),
+            (config.quick_stop_deceleration, "a quick-stop deceleration", "/s²"),
+            (homing.and_then(|homing| homing.speed_switch), "a homing speed", "/s"),
+            (homing.and_then(|homing| homing.speed_zero), "a homing speed", "/s"),
+            (homing.and_then(|homing| homing.acceleration), "a homing acceleration", "/s²"),
+        ];
+        let scale = config.scale(axis, 0);
+        for (value, what, per) in values {
+            if let Some(value) = value.filter(|value| unsigned_counts(scale, *value).is_none()) {
+                let (value, unit) = axis.in_unit(value);
+                return Err(format!(
+                    "{axis}: {what} of {value} {unit}{per}: it must be over zero and fit 32 bits in \
+                     counts"
+                ));
             }
-            self.axis(axis).validate(axis)?;
-            let window = self.standstill_window(axis);
-            // It brakes first, and the last SYNC counts when the next is due.
-            let stop_timeout = self.stop_timeout;
-            if window + 2 * self.sync_period >= stop_timeout {
-                return Err(StageConfigError::TooCoarse { axis, window, stop_timeout });
-            }
+        }
+        let window = self.standstill_window(axis);
+        // It brakes first, and the last SYNC counts when the next is due.
+        if window + 2 * self.sync_period >= self.stop_timeout {
+            return Err(format!(
+                "{axis}: {:.0} ms of its counts are needed to see it stand, and stop_timeout_s is \
+                 {:.3}: set a longer one",
+                window.as_secs_f64() * 1e3,
+                self.stop_timeout.as_secs_f64()
+            ));
         }
         Ok(())
     }
 }
 
-impl AxisConfig {
-    /// Checks what goes to the drive in counts.
-    fn validate(&self, axis: Axis) -> Result<(), StageConfigError> {
-        if self.reference == Reference::Homing && self.homing.is_none() {
-            return Err(StageConfigError::NoHoming(axis));
-        }
-        let homing = self.homing.as_ref();
-        let values = [
-            (self.following_error_max, "a following error", ""),
-            (self.quick_stop_deceleration, "a quick-stop deceleration", "/s²"),
-            (homing.and_then(|homing| homing.speed_switch), "a homing speed", "/s"),
-            (homing.and_then(|homing| homing.speed_zero), "a homing speed", "/s"),
-            (homing.and_then(|homing| homing.acceleration), "a homing acceleration", "/s²"),
-        ];
-        let scale = self.scale(axis, 0);
-        for (value, what, per) in values {
-            if let Some(value) = value.filter(|value| unsigned_counts(scale, *value).is_none()) {
-                return Err(StageConfigError::DriveValue { axis, what, value, per });
-            }
-        }
-        Ok(())
-    }
+/// An axis is to be homed, and no homing is configured.
+pub(super) fn no_homing(axis: Axis) -> String {
+    format!("{axis}: its position is to come from homing, and no homing is configured")
 }
 
 /// `value`, in mm or rad (a second, a second squared), in the counts of an unsigned object; `None`

@@ -2,7 +2,7 @@
 
 use super::drive::Drive;
 use super::machine::Phase;
-use super::{Axis, Feedback, PerAxis, Progress, SetPoint, Stage, StageEvent, StageFault};
+use super::{Axis, Feedback, PerAxis, Progress, SetPoint, Stage, StageEvent};
 use crate::canopen::Frame;
 use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};
 use crate::canopen::nmt::NmtState;
@@ -34,7 +34,12 @@ impl Stage {
                     return self.finish(standing);
                 }
                 if now >= give_up {
-                    self.fail_orderly_end(now, |drive| !drive.is_off(), StageFault::KeepsPower);
+                    self.fail_orderly_end(
+                        now,
+                        |drive| !drive.is_off(),
+                        "the drive still has power",
+                        "shutdown",
+                    );
                 }
                 self.repeat_by_sdo(now, |drive| !drive.is_off());
             }
@@ -58,7 +63,7 @@ impl Stage {
         let enabled = |state| state == Some(DriveState::OperationEnabled);
         if matches!(self.phase, Phase::Enabling { .. })
             && self.drives.all(|drive| drive.is_armed() && enabled(drive.state()))
-            && self.monitors.all(|monitor| monitor.state() == Some(NmtState::Operational))
+            && self.monitors.all(|monitor| monitor.state == Some(NmtState::Operational))
         {
             self.phase = Phase::Ready;
             self.tell(StageEvent::Ready);
@@ -101,7 +106,11 @@ impl Stage {
             if let Some((syncs, frame)) = drive.conflicts_in_a_row()
                 && syncs > self.config.missed_feedback_max
             {
-                return self.fail(now, StageFault::TwoSenders { axis, syncs, frame });
+                let fault = format!(
+                    "{axis}: two TPDO1 that differ after each of {syncs} SYNCs in a row, the second \
+                     {frame}; does another node have the same ID, or does the drive answer late?"
+                );
+                return self.fail(now, fault);
             }
         }
         if self.drives.all(|drive| drive.fresh) {
@@ -118,19 +127,22 @@ impl Stage {
                 true => Axis::Rotation,
                 false => Axis::Insertion,
             };
-            self.fail(now, StageFault::FeedbackMissing(axis, syncs));
+            let fault = format!(
+                "{axis}: no TPDO1 for {syncs} SYNCs in a row, check bus load, cable and the drive"
+            );
+            self.fail(now, fault);
         }
     }
 
     pub(super) fn both_heard(&self) -> bool {
-        self.drives.all(|drive| drive.statusword().is_some())
+        self.drives.all(|drive| drive.statusword.is_some())
     }
 
     /// Tells where the axes stand, and begins to enable them once they may have power.
     fn stand_by(&mut self, now: Time, give_up: Time, located: bool) {
         if !self.both_heard() {
             if now >= give_up {
-                self.fail_enabling(now, |drive| drive.statusword().is_none());
+                self.fail_enabling(now, |drive| drive.statusword.is_none());
             }
             return;
         }
@@ -149,15 +161,23 @@ impl Stage {
     /// Enabling has timed out; the first drive that `is_late` is the reason.
     fn fail_enabling(&mut self, now: Time, is_late: impl Fn(&Drive) -> bool) {
         let (axis, statusword) = self.first(is_late);
-        let within = self.config.enable_timeout;
-        self.fail(now, StageFault::NotEnabled(axis, statusword, within));
+        let timeout_ms = self.config.enable_timeout.as_millis();
+        let heard = match statusword {
+            Some(word) => format!("statusword {word}"),
+            None => "no TPDO1 was heard".to_owned(),
+        };
+        let fault = format!(
+            "{axis}: not in operation enabled within {timeout_ms} ms ({heard}), check power stage, \
+             enable input and brake"
+        );
+        self.fail(now, fault);
     }
 
     /// The first axis whose drive `is_late`, and its statusword.
     fn first(&self, is_late: impl Fn(&Drive) -> bool) -> (Axis, Option<Statusword>) {
         let axis = Axis::BOTH.into_iter().find(|axis| is_late(&self.drives[*axis]));
         let axis = axis.unwrap_or(Axis::Insertion);
-        (axis, self.drives[axis].statusword())
+        (axis, self.drives[axis].statusword)
     }
 
     /// Leads both drives to Operation Enabled, the last step together.
@@ -167,8 +187,10 @@ impl Stage {
             return self.fail_enabling(now, is_late);
         }
         for axis in Axis::BOTH {
-            if let Some(statusword) = self.drives[axis].is_not_let_on(self.config.let_on) {
-                return self.fail(now, StageFault::SwitchOnRefused(axis, statusword));
+            if let Some(statusword) =
+                self.drives[axis].refuses_to_switch_on(self.config.state_transition_timeout)
+            {
+                return self.fail_switch_on(now, axis, statusword);
             }
         }
         let both_on = self.drives.all(|drive| {
@@ -177,11 +199,24 @@ impl Stage {
         if both_on && !self.drives.all(Drive::is_armed) {
             for axis in Axis::BOTH {
                 if let Err(limit) = self.drives[axis].arm() {
-                    return self.fail(now, StageFault::StandsOutside(limit));
+                    let fault = format!(
+                        "cannot start: the axis stands outside its limits: {limit}; move it back, or \
+                         correct its limits or zero"
+                    );
+                    return self.fail(now, fault);
                 }
             }
         }
         self.lead_to_enabled();
+    }
+
+    /// A drive on its way to Operation Enabled went back, or did not leave a state in time.
+    pub(super) fn fail_switch_on(&mut self, now: Time, axis: Axis, statusword: Statusword) {
+        let fault = format!(
+            "{axis}: the drive refused to switch on (statusword {statusword}); check safety input, \
+             emergency stop and supply, then start again"
+        );
+        self.fail(now, fault);
     }
 
     /// Sets the controlwords that lead both drives one step on.
@@ -200,7 +235,12 @@ impl Stage {
         let enabled = |drive: &Drive| drive.state() == Some(DriveState::OperationEnabled);
         let standing = self.drives.all(|drive| drive.stands() && !(quick && enabled(drive)));
         if !quick && !standing && now >= give_up {
-            self.fail_orderly_end(now, |drive| !drive.stands(), StageFault::NotStanding);
+            self.fail_orderly_end(
+                now,
+                |drive| !drive.stands(),
+                "not seen to stand",
+                "its last target",
+            );
         } else if standing || now >= give_up {
             let give_up = now + self.config.stop_timeout;
             self.phase = Phase::Disabling { quick, standing, give_up };
@@ -220,17 +260,24 @@ impl Stage {
         &mut self,
         now: Time,
         is_late: impl Fn(&Drive) -> bool,
-        fault: impl Fn(Axis, Statusword, Duration) -> StageFault,
+        what: &str,
+        since: &str,
     ) {
         let (axis, statusword) = self.first(is_late);
-        self.fail(now, fault(axis, statusword.unwrap_or_default(), self.config.stop_timeout));
+        let (statusword, ms) =
+            (statusword.unwrap_or_default(), self.config.stop_timeout.as_millis());
+        let fault = format!(
+            "{axis}: {what} {ms} ms after {since} (statusword {statusword}); if it does not stop now, \
+             press the emergency stop"
+        );
+        self.fail(now, fault);
     }
 
     pub(super) fn begin_stop(&mut self, now: Time, quick: bool) {
         self.phase = Phase::Stopping { quick, give_up: now + self.config.stop_timeout };
         self.tell(StageEvent::Progress(Progress::Stopping));
         for axis in Axis::BOTH {
-            self.drives[axis].set_next(None);
+            self.drives[axis].next_counts = None;
             self.drives[axis].watch_standstill();
         }
     }
@@ -279,7 +326,7 @@ impl Stage {
         else {
             return;
         };
-        // An answer that nobody asked for may be another node's.
+        // An answer without a request may be another node's.
         if self.drives[axis].asked.take_if(|asked| *asked == object).is_none() {
             return;
         }

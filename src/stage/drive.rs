@@ -1,11 +1,10 @@
-//! One drive under SYNC: what it was told, what it said.
+//! One drive under SYNC: what it was commanded, and what it reported.
 
 use std::time::Duration;
 
 use super::standstill::Standstill;
 use super::{
-    Axis, AxisConfig, Commanded, DriveFlag, FoundFault, LimitCheck, LimitError, StageConfig,
-    StageFault, Unwrapper,
+    Axis, AxisConfig, Commanded, DriveFlag, FoundFault, LimitCheck, StageConfig, Unwrapper,
 };
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
 use crate::canopen::emcy::{Emcy, EmcyCode};
@@ -21,7 +20,7 @@ const BEFORE_POWER: u16 = Statusword::REMOTE | Statusword::VOLTAGE_ENABLED;
 pub struct DriveReport {
     /// Its state; `None` where it has said none, or none that is defined.
     pub state: Option<DriveState>,
-    /// The last error of which it has told, and not that it is over.
+    /// The last error that it reported, if it has not reported the end of it.
     pub error: Option<EmcyCode>,
 }
 
@@ -47,18 +46,19 @@ pub(super) struct Drive {
     /// Scale and limits, known once the axis's zero is.
     armed: Option<LimitCheck>,
     commanded: Commanded,
-    next_counts: Option<i64>,
+    /// The target for the next SYNC; without one the axis is held.
+    pub(super) next_counts: Option<i64>,
     /// RPDO1 as it was sent since the last SYNC.
     sent_ahead: Option<Frame>,
     position: Unwrapper,
-    statusword: Option<Statusword>,
+    pub(super) statusword: Option<Statusword>,
     /// Its TPDO1 of the last SYNC has come.
     pub(super) fresh: bool,
     /// SYNCs in a row without its TPDO1.
     pub(super) missed_in_a_row: u32,
     sequence: EnableSequence,
     reset: Reset,
-    /// SYNCs in a state that it is told to leave.
+    /// SYNCs in a state that it is commanded to leave.
     held_back: u32,
     /// The payload of the TPDO1 taken for this SYNC, and a second one that differs.
     taken: [u8; 6],
@@ -133,7 +133,7 @@ impl Drive {
         self.take_statusword(Statusword(u16::from_le_bytes([s0, s1])));
         let counts = self.position.unwrap(i32::from_le_bytes([p0, p1, p2, p3]));
         self.fresh = true;
-        // Until the drive is told to follow, the target follows it.
+        // Until the drive is commanded to follow, the target follows it.
         if self.armed.is_none() || self.homes {
             self.commanded = Commanded { counts, step_counts: 0 };
         }
@@ -236,7 +236,7 @@ impl Drive {
 
     /// Its statusword, once the drive has been told for longer than `within` to leave a state on the
     /// way to Switched On, and has not.
-    pub(super) fn is_not_let_on(&mut self, within: Duration) -> Option<Statusword> {
+    pub(super) fn refuses_to_switch_on(&mut self, within: Duration) -> Option<Statusword> {
         let held = matches!(
             (self.state(), self.controlword),
             (Some(DriveState::SwitchOnDisabled), Controlword::SHUTDOWN)
@@ -281,14 +281,14 @@ impl Drive {
         let word = self.statusword?;
         self.flags().find(|flag| {
             let held = *flag == DriveFlag::FollowsCommand && word.has(Statusword::INTERNAL_LIMIT);
-            self.shown & !word.0 & flag.bit() != 0 && !held
+            self.shown & !word.0 & *flag as u16 != 0 && !held
         })
     }
 
     /// The bits that the enabled drive has not set yet: their loss could not be noticed.
     pub(super) fn flags_not_shown(&self) -> impl Iterator<Item = DriveFlag> + use<> {
         let shown = self.shown;
-        self.flags().filter(move |flag| shown & flag.bit() == 0)
+        self.flags().filter(move |flag| shown & *flag as u16 == 0)
     }
 
     /// How often bit 7 (warning) was set, if it has just been set for the 1st, 2nd, 4th, 8th … time.
@@ -299,7 +299,7 @@ impl Drive {
         (warns && !warned && self.warnings.is_power_of_two()).then_some(self.warnings)
     }
 
-    /// Whether `emcy` is worth telling: not the same again, but at the 2nd, 4th, 8th … time.
+    /// Whether to report `emcy`: if it is the same again, only the 2nd, 4th, 8th … time.
     pub(super) fn is_news(&mut self, emcy: Emcy) -> bool {
         let count = if self.emcy.0 == Some(emcy) { self.emcy.1 + 1 } else { 1 };
         self.emcy = (Some(emcy), count);
@@ -309,11 +309,11 @@ impl Drive {
     /// Fixes zero, scale and target: from here on the drive follows its target.
     ///
     /// # Errors
-    /// When the axis stands out of its limits.
-    pub(super) fn arm(&mut self) -> Result<(), LimitError> {
+    /// The limit outside which the axis stands.
+    pub(super) fn arm(&mut self) -> Result<(), String> {
         let armed = self.armed_here();
         if !self.homes {
-            armed.check_standing(self.commanded.counts)?;
+            armed.check_position(armed.scale.value(self.commanded.counts))?;
         }
         self.armed = Some(armed);
         Ok(())
@@ -324,7 +324,7 @@ impl Drive {
     }
 
     /// Scale and limits; before the drive is armed, as they would be if it were armed now.
-    fn limits(&self) -> LimitCheck {
+    pub(super) fn limits(&self) -> LimitCheck {
         self.armed.unwrap_or_else(|| self.armed_here())
     }
 
@@ -343,21 +343,9 @@ impl Drive {
         self.measured()
     }
 
-    /// Whether the axis may be sent to `goal` (mm or rad) in time.
-    ///
-    /// # Errors
-    /// The position limit that `goal` breaks.
-    pub(super) fn check_goal(&self, goal: f64) -> Result<(), LimitError> {
-        self.limits().check_goal(goal)
-    }
-
     /// The counts of `target` (mm or rad), if the axis may go there next.
-    pub(super) fn check(&self, target: f64) -> Result<i64, LimitError> {
+    pub(super) fn check(&self, target: f64) -> Result<i64, String> {
         self.limits().check(target, self.commanded)
-    }
-
-    pub(super) fn set_next(&mut self, counts: Option<i64>) {
-        self.next_counts = counts;
     }
 
     /// Makes the next target the present one; without a next one the axis is held. After as many held
@@ -392,15 +380,17 @@ impl Drive {
 
     /// The fault of a measured position too far from the target, whatever the drive makes of it. More is
     /// a blocked axis or a wrong position: steering by it would be blind.
-    pub(super) fn not_following(&self) -> Option<StageFault> {
+    pub(super) fn not_following(&self) -> Option<String> {
         let (axis, following_error) = (self.axis, self.following_error());
         let limit = self.config.following_error_limit(self.sync_period);
         let follows = following_error.abs() <= limit;
-        (!follows).then_some(StageFault::NotFollowing { axis, following_error, limit })
-    }
-
-    pub(super) fn statusword(&self) -> Option<Statusword> {
-        self.statusword
+        (!follows).then(|| {
+            let (off, limit) = (axis.shown(following_error), axis.in_unit(limit).0);
+            format!(
+                "{axis}: following error of {off} (limit {limit:.3}); is the axis blocked, or the \
+                 encoder lost?"
+            )
+        })
     }
 
     pub(super) fn state(&self) -> Option<DriveState> {

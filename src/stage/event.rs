@@ -1,6 +1,6 @@
-//! What the stage tells its owner.
+//! What the stage reports to its owner.
 
-use super::{Axis, BringUpPart, Identity, StageFault};
+use super::{Axis, Identity};
 use crate::canopen::cia402::Statusword;
 use crate::canopen::emcy::Emcy;
 use crate::canopen::{Frame, ObjectAddress};
@@ -46,7 +46,7 @@ pub enum Progress {
     Listening,
     /// A part of a drive's bring-up begins.
     #[display("{_0}: {_1}")]
-    BringUp(Axis, BringUpPart),
+    BringUp(Axis, &'static str),
     /// A drive lacks an optional object.
     #[display("{_0}: drive has no {_1}, skipped")]
     Skipped(Axis, ObjectAddress),
@@ -69,29 +69,22 @@ pub enum Progress {
 
 /// A bit of the statusword that an enabled drive is to show, and whose loss stops the run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, derive_more::Display)]
+#[repr(u16)]
 pub enum DriveFlag {
-    /// Bit 9: it obeys the controlword.
+    /// It obeys the controlword.
     #[display("bit 9 (remote)")]
-    Remote,
-    /// Bit 4: its power stage has its supply.
+    Remote = Statusword::REMOTE,
+    /// Its power stage has its supply.
     #[display("bit 4 (voltage enabled)")]
-    Voltage,
-    /// Bit 12 in cyclic synchronous position: it follows its targets.
+    Voltage = Statusword::VOLTAGE_ENABLED,
+    /// In cyclic synchronous position: it follows its targets.
     #[display("bit 12 (drive follows command)")]
-    FollowsCommand,
+    FollowsCommand = Statusword::FOLLOWS_COMMAND,
 }
 
 impl DriveFlag {
     pub(super) const ALL: [DriveFlag; 3] =
         [DriveFlag::Remote, DriveFlag::Voltage, DriveFlag::FollowsCommand];
-
-    pub(super) const fn bit(self) -> u16 {
-        match self {
-            DriveFlag::Remote => Statusword::REMOTE,
-            DriveFlag::Voltage => Statusword::VOLTAGE_ENABLED,
-            DriveFlag::FollowsCommand => Statusword::FOLLOWS_COMMAND,
-        }
-    }
 }
 
 /// Why a frame had no effect.
@@ -107,8 +100,8 @@ pub enum Ignored {
     /// From a drive, but of the wrong length.
     #[display("frame of the wrong length")]
     WrongLength,
-    /// A position nobody asked for: before any SYNC, or the second after one. An answer to an SDO
-    /// that nobody sent.
+    /// A position without a SYNC: before any SYNC, or the second after one. An SDO answer without a
+    /// request.
     #[display("position without a SYNC, or answer without a question")]
     Unexpected,
 }
@@ -116,14 +109,8 @@ pub enum Ignored {
 /// What did not go as it should and did no harm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counters {
-    /// Frames that are not from a drive of this stage.
-    pub foreign: u64,
-    /// Frames under an identifier of the bench's own.
-    pub own_identifier: u64,
-    /// Frames of the wrong length.
-    pub wrong_length: u64,
-    /// Positions without a SYNC, and SDO answers without a question.
-    pub unexpected: u64,
+    /// Frames without effect, for each [`Ignored`] in the order of its variants.
+    pub ignored: [u64; 4],
     /// SYNCs that went out without both positions coming back.
     pub feedback_missed: u64,
     /// SYNC periods skipped because the bench was late.
@@ -182,8 +169,8 @@ pub enum StageEvent {
     },
     /// The bench was late: this many SYNC periods were skipped.
     SyncSkipped(u64),
-    /// The stage stops for this reason.
-    Fault(StageFault),
+    /// The stage stops for this reason. It never moves again: a new run needs a new stage.
+    Fault(String),
     /// The nodes were told to take power off and to go to Pre-operational, SYNC has ended. The last
     /// event but for emergency messages.
     Stopped {

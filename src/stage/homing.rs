@@ -1,10 +1,56 @@
 //! Homing: a drive finds its home by itself (CiA 402-2, mode 6), and the stage watches.
 
 use super::machine::Phase;
-use super::{Axis, CommandError, Stage, StageEvent, StageFault};
+use super::{Axis, Stage, StageEvent};
 use crate::canopen::cia402::{Controlword, Statusword};
+use crate::keys::choice;
 use crate::units::Time;
 use std::time::Duration;
+
+/// Where the position of a drive (0x6064) comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Reference {
+    /// It is right from power-on: an absolute encoder, or an axis of which it does not matter.
+    #[default]
+    Absolute,
+    /// From homing: without it the axis is not enabled, but to be homed.
+    Homing,
+}
+
+choice! {
+    for Reference {
+        /// The drive's position is right from power-on.
+        Absolute = "absolute",
+        /// From homing: before `needle-bench stage home` nothing is moved.
+        Homing = "homing",
+    }
+}
+
+/// Homing by the drive (CiA 402-2, mode 6). What is `None` is left as the drive has it: some take
+/// speeds in units of their own.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HomingConfig {
+    /// 0x6098: how home is found.
+    pub method: i8,
+    /// 0x6099:01, but mm/s or rad/s: towards the switch.
+    pub speed_switch: Option<f64>,
+    /// 0x6099:02, but mm/s or rad/s: towards zero.
+    pub speed_zero: Option<f64>,
+    /// 0x609A, but mm/s² or rad/s².
+    pub acceleration: Option<f64>,
+    /// 0x607C, but mm or rad: from the home position to zero, as the drive counts it.
+    pub offset: Option<f64>,
+    /// Longest way home.
+    pub timeout: Duration,
+    /// The bit of the statusword that says that the axis was homed. 12 is the standard's and means
+    /// that in homing mode only; some drives have one of their own, such as 15, in every mode.
+    pub homed_bit: u8,
+}
+
+impl HomingConfig {
+    /// Bit 12 in homing mode: homing attained.
+    pub const ATTAINED_BIT: u8 = 12;
+}
 
 /// From then on the bits of the statusword are of this homing even where they were never seen to
 /// clear, if the axis stands: some methods take no time at all, and no drive takes this long to
@@ -29,11 +75,11 @@ impl Stage {
     ///
     /// # Errors
     /// When the stage is not ready, or `axis` not in homing mode.
-    pub fn home(&mut self, now: Time, axis: Axis) -> Result<(), CommandError> {
+    pub fn home(&mut self, now: Time, axis: Axis) -> Result<(), String> {
         let config = self.config.axis(axis).homing;
         let (Phase::Ready, Some(config), true) = (self.phase, config, self.drives[axis].homes)
         else {
-            return Err(CommandError::NotReadyToHome);
+            return Err("the stage is not ready to home".to_owned());
         };
         self.drives[axis].controlword = Controlword::START_HOMING;
         let began = self.sync_count + 1;
@@ -46,9 +92,13 @@ impl Stage {
     pub(super) fn check_home_in_time(&mut self, now: Time) {
         let Phase::Homing(Homing { axis, since, give_up, .. }) = self.phase else { return };
         if now >= give_up {
-            let within = give_up.since(since);
-            let statusword = self.drives[axis].statusword().unwrap_or_default();
-            self.fail(now, StageFault::HomingTimeout(axis, statusword, within));
+            let timeout_s = give_up.since(since).as_secs_f64();
+            let statusword = self.drives[axis].statusword.unwrap_or_default();
+            let fault = format!(
+                "{axis}: not home within {timeout_s:.1} s (statusword {statusword}); is the switch too \
+                 far, or the homing speed too low?"
+            );
+            self.fail(now, fault);
         }
     }
 
@@ -59,14 +109,18 @@ impl Stage {
         if self.sync_count <= began {
             return;
         }
-        let Some(statusword) = self.drives[axis].statusword() else { return };
+        let Some(statusword) = self.drives[axis].statusword else { return };
         let over =
             statusword.has(Statusword::HOMING_ATTAINED) || statusword.has(Statusword::HOMING_ERROR);
         let has_begun = now.since(since) >= BEGUN_AFTER && self.drives[axis].stands();
         homing.cleared |= !over || has_begun;
         self.phase = Phase::Homing(homing);
         if homing.cleared && statusword.has(Statusword::HOMING_ERROR) {
-            self.fail(now, StageFault::HomingFailed(axis, statusword));
+            let fault = format!(
+                "{axis}: homing failed (statusword {statusword}); check switches, method (0x6098) and \
+                 speeds"
+            );
+            self.fail(now, fault);
         } else if homing.cleared && is_home(statusword) {
             self.drives[axis].controlword = Controlword::ENABLE_OPERATION;
             let position = self.drives[axis].take_home();

@@ -20,85 +20,34 @@ pub struct AxisLimits {
     pub acceleration_max: Option<f64>,
 }
 
-/// Why a target was refused.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum LimitError {
-    /// The target is NaN or infinite.
-    #[error("{axis}: the target {target} is not a finite number")]
-    NotFinite {
-        /// Whose target.
+impl AxisLimits {
+    /// Refuses a `target` (mm or rad) outside the positions of `axis`.
+    ///
+    /// # Errors
+    /// The position limit that `target` breaks.
+    pub fn check_position(&self, axis: Axis, target: f64) -> Result<(), String> {
+        self.check_rounded(axis, target, |value| value)
+    }
+
+    /// The same, compared after rounding both target and limits.
+    fn check_rounded(
+        &self,
         axis: Axis,
-        /// As asked.
         target: f64,
-    },
-    /// Over the highest position.
-    #[error(
-        "{axis}: {} is over the limit of {} (stage.{axis}.max_{})",
-        axis.shown(*target), axis.shown(*max), axis.in_unit(0.0).1
-    )]
-    Over {
-        /// Whose target.
-        axis: Axis,
-        /// As asked, mm or rad.
-        target: f64,
-        /// The limit, mm or rad.
-        max: f64,
-    },
-    /// Under the lowest position.
-    #[error(
-        "{axis}: {} is under the limit of {} (stage.{axis}.min_{})",
-        axis.shown(*target), axis.shown(*min), axis.in_unit(0.0).1
-    )]
-    Under {
-        /// Whose target.
-        axis: Axis,
-        /// As asked, mm or rad.
-        target: f64,
-        /// The limit, mm or rad.
-        min: f64,
-    },
-    /// Too far from the last target for one SYNC period.
-    #[error(
-        "{axis}: a step of {} in one SYNC is {}/s, over the limit of {}/s (stage.{axis}.speed_max_{}_per_s)",
-        axis.shown(*step), axis.shown(*speed), axis.shown(*max), axis.in_unit(0.0).1
-    )]
-    TooFast {
-        /// Whose target.
-        axis: Axis,
-        /// From the last target to this one, mm or rad.
-        step: f64,
-        /// That step per SYNC period, per second.
-        speed: f64,
-        /// The limit, per second.
-        max: f64,
-    },
-    /// The step changes by too much from the step before.
-    #[error(
-        "{axis}: an acceleration of {}/s² is over the limit of {}/s² (stage.{axis}.acceleration_max_{}_per_s2)",
-        axis.shown(*acceleration), axis.shown(*max), axis.in_unit(0.0).1
-    )]
-    TooHard {
-        /// Whose target.
-        axis: Axis,
-        /// As asked, per second squared.
-        acceleration: f64,
-        /// The limit, per second squared.
-        max: f64,
-    },
-    /// The drive's 32-bit position cannot hold the target.
-    #[error(
-        "{axis}: {} does not fit the drive's 32-bit position; home it nearer to its zero",
-        axis.shown(*target)
-    )]
-    OutOfCounts {
-        /// Whose target.
-        axis: Axis,
-        /// As asked, mm or rad.
-        target: f64,
-    },
+        round: impl Fn(f64) -> f64,
+    ) -> Result<(), String> {
+        let (rounded, unit) = (round(target), axis.in_unit(0.0).1);
+        let (side, limit, key) = match self {
+            AxisLimits { max, .. } if rounded > round(*max) => ("over", *max, "max"),
+            AxisLimits { min, .. } if rounded < round(*min) => ("under", *min, "min"),
+            _ => return Ok(()),
+        };
+        let [target, limit] = [target, limit].map(|value| axis.shown(value));
+        Err(format!("{axis}: {target} is {side} the limit of {limit} (stage.{axis}.{key}_{unit})"))
+    }
 }
 
-/// Where an axis was last told to be, and how it got there.
+/// The last target of an axis, and the step to it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Commanded {
     /// The last target, counts.
@@ -136,68 +85,60 @@ impl LimitCheck {
     ///
     /// # Errors
     /// The first limit that `target` breaks.
-    pub fn check(&self, target: f64, last: Commanded) -> Result<i64, LimitError> {
-        let counts = self.counts_of(target)?;
-        self.check_position(counts, target)?;
+    pub fn check(&self, target: f64, last: Commanded) -> Result<i64, String> {
+        let counts = self.check_position(target)?;
         self.check_motion(target, counts, last)?;
         Ok(counts)
     }
 
-    /// Whether `goal` (mm or rad) is a place where the axis may be.
+    /// The counts of `target` (mm or rad) if the axis may be there.
     ///
     /// # Errors
-    /// The position limit that `goal` breaks.
-    pub fn check_goal(&self, goal: f64) -> Result<(), LimitError> {
-        self.counts_of(goal).and_then(|counts| self.check_position(counts, goal))
-    }
-
-    fn counts_of(&self, target: f64) -> Result<i64, LimitError> {
+    /// The position limit that `target` breaks.
+    pub fn check_position(&self, target: f64) -> Result<i64, String> {
         let axis = self.axis;
         if !target.is_finite() {
-            return Err(LimitError::NotFinite { axis, target });
+            return Err(format!("{axis}: the target {target} is not a finite number"));
         }
-        self.scale.counts(target).ok_or(LimitError::OutOfCounts { axis, target })
-    }
-
-    /// Whether the axis may be held at `counts`.
-    ///
-    /// # Errors
-    /// The position limit that `counts` breaks.
-    pub fn check_standing(&self, counts: i64) -> Result<(), LimitError> {
-        self.check_position(counts, self.scale.value(counts))
-    }
-
-    fn check_position(&self, counts: i64, target: f64) -> Result<(), LimitError> {
-        let (axis, AxisLimits { min, max, .. }) = (self.axis, self.limits);
+        let does_not_fit = || {
+            let target = axis.shown(target);
+            format!(
+                "{axis}: {target} does not fit the drive's 32-bit position; home it nearer to its zero"
+            )
+        };
+        let counts = self.scale.counts(target).ok_or_else(does_not_fit)?;
         // Compared on the grid of counts, along the axis.
-        let value = self.scale.value(counts);
-        let on_grid = |limit: f64| self.scale.counts(limit).map_or(limit, |c| self.scale.value(c));
-        if value > on_grid(max) {
-            return Err(LimitError::Over { axis, target, max });
-        }
-        if value < on_grid(min) {
-            return Err(LimitError::Under { axis, target, min });
-        }
+        let on_grid = |value| self.scale.counts(value).map_or(value, |c| self.scale.value(c));
+        self.limits.check_rounded(axis, target, on_grid)?;
         if !self.wraps && i32::try_from(counts).is_err() {
-            return Err(LimitError::OutOfCounts { axis, target });
+            return Err(does_not_fit());
         }
-        Ok(())
+        Ok(counts)
     }
 
-    fn check_motion(&self, target: f64, counts: i64, last: Commanded) -> Result<(), LimitError> {
+    fn check_motion(&self, target: f64, counts: i64, last: Commanded) -> Result<(), String> {
         let (axis, per_unit, period_s) = (self.axis, self.scale.counts_per_unit(), self.period_s);
+        let unit = axis.in_unit(0.0).1;
         let step_counts = counts.saturating_sub(last.counts);
         let speed_max = self.limits.speed_max;
         if step_counts.unsigned_abs() as f64 > speed_max * period_s * per_unit + 1.0 {
             let step = target - self.scale.value(last.counts);
             let speed = step.abs() / period_s;
-            return Err(LimitError::TooFast { axis, step, speed, max: speed_max });
+            let [step, speed, max] = [step, speed, speed_max].map(|value| axis.shown(value));
+            return Err(format!(
+                "{axis}: a step of {step} in one SYNC is {speed}/s, over the limit of {max}/s \
+                 (stage.{axis}.speed_max_{unit}_per_s)"
+            ));
         }
         let Some(max) = self.limits.acceleration_max else { return Ok(()) };
         let change_counts = step_counts.saturating_sub(last.step_counts).unsigned_abs() as f64;
         if change_counts > max * period_s * period_s * per_unit + 2.0 {
             let acceleration = change_counts / (per_unit * period_s * period_s);
-            return Err(LimitError::TooHard { axis, acceleration, max });
+            let [acceleration, max] = [acceleration, max].map(|value| axis.shown(value));
+            return Err(format!(
+                "{axis}: an acceleration of {acceleration}/s² is over the limit of {max}/s² \
+                 (stage.{axis}.acceleration_max_{unit}_per_s2)"
+            ));
         }
         Ok(())
     }
@@ -223,8 +164,8 @@ mod tests {
         Commanded { counts: (mm * 1000.0).round() as i64, step_counts: 0 }
     }
 
-    fn text(result: Result<i64, LimitError>) -> String {
-        result.expect_err("refused").to_string()
+    fn text(result: Result<i64, String>) -> String {
+        result.expect_err("refused")
     }
 
     #[test]
@@ -252,10 +193,9 @@ mod tests {
             text(check.check(f64::NAN, STANDING)),
             "insertion: the target NaN is not a finite number"
         );
-        let axis = Axis::Rotation;
-        let past = LimitError::Under { axis, target: -0.5, min: -20_f64.to_radians() };
+        let limits = AxisLimits { min: -20_f64.to_radians(), ..check.limits };
         assert_eq!(
-            past.to_string(),
+            limits.check_position(Axis::Rotation, -0.5).expect_err("refused"),
             "rotation: -28.648 deg is under the limit of -20.000 deg (stage.rotation.min_deg)"
         );
     }
@@ -278,12 +218,11 @@ mod tests {
             check.check(150.0, Commanded { counts: 5 - 149_950, step_counts: 0 }),
             Ok(-149_995)
         );
-        assert!(matches!(
-            check.check(-1.01, Commanded { counts: 1000, step_counts: 0 }),
-            Err(LimitError::Under { .. })
-        ));
-        assert!(check.check_standing(5 - 150_001).is_err());
-        assert!(check.check_standing(5 - 150_000).is_ok());
+        let under = text(check.check(-1.01, Commanded { counts: 1000, step_counts: 0 }));
+        assert!(under.contains("is under the limit"), "{under}");
+        let standing_at = |counts| check.check_position(check.scale.value(counts));
+        assert!(standing_at(5 - 150_001).is_err());
+        assert_eq!(standing_at(5 - 150_000), Ok(5 - 150_000));
     }
 
     #[test]
@@ -291,7 +230,8 @@ mod tests {
         let near_the_end = check(Sign::Positive, i64::from(i32::MAX) - 10);
         let last = Commanded { counts: i64::from(i32::MAX) - 10, step_counts: 0 };
         assert!(near_the_end.check(0.010, last).is_ok());
-        assert!(matches!(near_the_end.check(0.011, last), Err(LimitError::OutOfCounts { .. })));
+        let refused = text(near_the_end.check(0.011, last));
+        assert!(refused.contains("does not fit the drive's 32-bit position"), "{refused}");
         let wrapping = LimitCheck { wraps: true, ..near_the_end };
         assert_eq!(wrapping.check(0.011, last), Ok(i64::from(i32::MAX) + 1));
     }

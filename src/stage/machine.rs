@@ -4,12 +4,12 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use super::bring_up::BringUp;
+use super::config::no_homing;
 use super::drive::{Drive, DriveReport};
 use super::flood::FloodWatch;
 use super::homing::Homing;
 use super::{
-    Axis, CommandError, Counters, Ignored, LimitError, Output, PerAxis, Progress, SetPoint,
-    StageConfig, StageConfigError, StageEvent, StageFault,
+    Axis, Counters, Ignored, Output, PerAxis, Progress, SetPoint, StageConfig, StageEvent,
 };
 use crate::canopen::cia402::{Controlword, object};
 use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatProducer};
@@ -34,7 +34,7 @@ pub(super) enum Phase {
     Standby {
         /// When both drives must have answered a SYNC.
         give_up: Time,
-        /// It was told where the axes stand.
+        /// Where the axes stand was reported.
         located: bool,
     },
     Enabling {
@@ -85,7 +85,7 @@ impl Stage {
     ///
     /// # Errors
     /// When the configuration cannot work; nothing has been sent then.
-    pub fn new(config: StageConfig, now: Time) -> Result<Self, StageConfigError> {
+    pub fn new(config: StageConfig, now: Time) -> Result<Self, String> {
         Self::for_homing(config, PerAxis::default(), now)
     }
 
@@ -98,10 +98,10 @@ impl Stage {
         config: StageConfig,
         homes: PerAxis<bool>,
         now: Time,
-    ) -> Result<Self, StageConfigError> {
+    ) -> Result<Self, String> {
         let unknown = |axis: &Axis| homes[*axis] && config.axis(*axis).homing.is_none();
         if let Some(axis) = Axis::BOTH.into_iter().find(unknown) {
-            return Err(StageConfigError::NoHoming(axis));
+            return Err(no_homing(axis));
         }
         config.validate()?;
         let consumer_time = config.heartbeat.consumer_time;
@@ -175,13 +175,13 @@ impl Stage {
             }
         }
         self.drain_bring_ups(now);
-        let skipped_before = self.sync.missed();
+        let skipped_before = self.sync.missed;
         if self.sync_runs()
             && let Some(sync) = self.sync.handle_timeout(now)
         {
-            let skipped = self.sync.missed() - skipped_before;
+            let skipped = self.sync.missed - skipped_before;
             if skipped > 0 {
-                self.counters.syncs_skipped = self.sync.missed();
+                self.counters.syncs_skipped = self.sync.missed;
                 self.tell(StageEvent::SyncSkipped(skipped));
             }
             self.cycle(now, sync);
@@ -202,15 +202,15 @@ impl Stage {
 
     /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
     pub fn deadline(&self) -> Time {
-        let mut deadline = self.heartbeat.deadline();
+        let mut deadline = self.heartbeat.deadline;
         if let Phase::Listening { until } = self.phase {
             deadline = deadline.min(until);
         }
         if self.sync_runs() {
-            deadline = deadline.min(self.sync.deadline());
+            deadline = deadline.min(self.sync.deadline);
         }
         for axis in Axis::BOTH {
-            deadline = deadline.min(self.monitors[axis].deadline());
+            deadline = deadline.min(self.monitors[axis].deadline);
             if let Some(bring_up) = &self.bring_ups[axis] {
                 deadline = deadline.min(bring_up.conversation.deadline());
             }
@@ -224,30 +224,30 @@ impl Stage {
     /// between is sent before that SYNC.
     ///
     /// # Errors
-    /// When a limit is broken, the stage is not ready, or the positions at the last SYNC have not
-    /// come. The axes then keep the target they had.
-    pub fn command(&mut self, set_point: SetPoint) -> Result<(), CommandError> {
+    /// Why neither axis is sent anything: a limit is broken, the stage is not ready, or the positions at
+    /// the last SYNC have not come. The axes then keep the target they had.
+    pub fn command(&mut self, set_point: SetPoint) -> Result<(), String> {
         let not_ready = match self.phase {
             Phase::Ready if self.drives.all(|drive| !drive.homes) => None,
             Phase::Ready | Phase::Homing(_) => Some("in homing mode"),
-            Phase::Listening { .. }
-            | Phase::BringUp
-            | Phase::Standby { .. }
-            | Phase::Enabling { .. } => Some("before it is ready"),
             Phase::Stopping { .. } | Phase::Disabling { .. } => Some("while it stops"),
             Phase::Stopped => Some("after it has stopped"),
+            _ => Some("before it is ready"),
         };
         if let Some(why) = not_ready {
-            return Err(CommandError::NotReady(why));
+            return Err(format!("the stage takes no set-points {why}"));
         }
         if !self.drives.all(|drive| drive.fresh) {
-            return Err(CommandError::StaleFeedback(self.sync_count));
+            return Err(format!(
+                "the positions at SYNC {} have not arrived; older ones must not be used",
+                self.sync_count
+            ));
         }
         let PerAxis { insertion, rotation } = &mut self.drives;
         let insertion_counts = insertion.check(set_point.insertion_mm)?;
         let rotation_counts = rotation.check(set_point.rotation_rad)?;
-        insertion.set_next(Some(insertion_counts));
-        rotation.set_next(Some(rotation_counts));
+        insertion.next_counts = Some(insertion_counts);
+        rotation.next_counts = Some(rotation_counts);
         for axis in Axis::BOTH {
             let rpdo = self.drives[axis].rpdo_ahead();
             self.send(rpdo);
@@ -260,9 +260,9 @@ impl Stage {
     ///
     /// # Errors
     /// The position limit that `goal` breaks.
-    pub fn check_goal(&self, goal: SetPoint) -> Result<(), LimitError> {
-        self.drives.insertion.check_goal(goal.insertion_mm)?;
-        self.drives.rotation.check_goal(goal.rotation_rad)
+    pub fn check_goal(&self, goal: SetPoint) -> Result<(), String> {
+        let check = |axis| self.drives[axis].limits().check_position(goal.along(axis));
+        Axis::BOTH.into_iter().try_for_each(|axis| check(axis).map(drop))
     }
 
     /// Whether the axes may be given power; until this is called they may. While they may not, the
@@ -321,8 +321,8 @@ impl Stage {
         !matches!(self.phase, Phase::Listening { .. } | Phase::BringUp | Phase::Stopped)
     }
 
-    /// Stops for `fault`. The first is the reason; others that follow from it are not told.
-    pub(super) fn fail(&mut self, now: Time, fault: StageFault) {
+    /// Stops for `fault`. The first is the reason; those that follow from it are not reported.
+    pub(super) fn fail(&mut self, now: Time, fault: String) {
         if self.faulted || self.phase == Phase::Stopped {
             return;
         }
@@ -354,12 +354,7 @@ impl Stage {
     }
 
     pub(super) fn ignore(&mut self, why: Ignored, frame: &Frame) {
-        let counter = match why {
-            Ignored::Foreign => &mut self.counters.foreign,
-            Ignored::OwnIdentifier => &mut self.counters.own_identifier,
-            Ignored::WrongLength => &mut self.counters.wrong_length,
-            Ignored::Unexpected => &mut self.counters.unexpected,
-        };
+        let counter = &mut self.counters.ignored[why as usize];
         *counter += 1;
         let count = *counter;
         if count.is_power_of_two() {
@@ -375,7 +370,7 @@ impl Stage {
                 Some(Ok(position)) => self.drive_is_up(now, axis, position),
                 Some(Err(error)) => {
                     let node = self.config.axis(axis).node;
-                    self.fail(now, StageFault::BringUp(axis, node, error));
+                    self.fail(now, format!("node {node} ({axis}): {error}"));
                 }
                 None => {}
             }
@@ -388,7 +383,7 @@ impl Stage {
         if let Some(fault) = bring_up.and_then(|bring_up| bring_up.so_far().found_in_fault) {
             self.drives[axis].allow_reset(fault.error_code);
         }
-        self.monitors[axis].expect_by(now + self.config.heartbeat.consumer_time);
+        self.monitors[axis].deadline = now + self.config.heartbeat.consumer_time;
         if self.bring_ups.all(Option::is_none) {
             for axis in Axis::BOTH {
                 self.send_nmt(NmtCommand::StartRemoteNode, axis);
@@ -410,7 +405,7 @@ impl Stage {
                     let left = std::iter::from_fn(|| bring_up.conversation.poll());
                     self.outputs.extend(left);
                     self.drives[axis].found = bring_up.so_far().found_in_fault;
-                    (bring_up.so_far().identified, bring_up.may_be_supervised())
+                    (bring_up.so_far().identified, bring_up.so_far().may_be_supervised)
                 }
                 None => (true, true),
             };

@@ -7,9 +7,8 @@
 //! has come after it: a bench that was held up must not take frames it did not read for frames
 //! that did not come. The stage touches no clock and no socket.
 //!
-//! It listens first, for as long as a heartbeat may be late: where another master speaks to these
-//! drives it ends without a word of its own, and where one begins to later it stops
-//! ([`StageFault::AnotherMaster`]).
+//! It listens first, for as long as a heartbeat may be late. If another master commands these drives, it
+//! ends without sending anything; if one begins to do so later, it stops with a fault.
 //!
 //! It brings both drives up over SDO, every object read back; starts SYNC; enables both drives
 //! together with their targets where they stand; and says [`StageEvent::Ready`]. From then on,
@@ -22,38 +21,32 @@
 //! ready, only while the positions at the last SYNC are known, only within the soft limits.
 //! Without a command the axes are held.
 //!
-//! Any [`StageFault`] is told once and quick-stops both axes; SYNC goes on until they are seen to
+//! Any [`StageEvent::Fault`] is reported once and quick-stops both axes; SYNC goes on until they are seen to
 //! stand or a time-out, then power is taken off, the nodes are sent to Pre-operational and
-//! [`StageEvent::Stopped`] is told. A drive that does not obey is told again by SDO every 100 ms. An
+//! [`StageEvent::Stopped`] is reported. A drive that does not obey is commanded again by SDO every 100 ms. An
 //! orderly end ([`Stage::disable`]) whose time is over is such a fault, too. The stage never moves
 //! again: a new run needs a new stage.
 //! The bench's own heartbeat, which the drives watch, runs from the end of that silence to the last;
-//! drives known to be without power are told at the end to watch it no more.
+//! drives known to be without power are then configured to watch it no more.
 //!
 //! Frames of the wrong length, from elsewhere, or without a SYNC have no effect but a count. A
 //! TPDO carries no stamp, so one that comes late, after the next SYNC, is taken for that SYNC's; its
 //! successor is then the one that is counted, and one that says something else, SYNC after SYNC, is
-//! a second sender ([`StageFault::TwoSenders`]). A drive whose every answer is late by a whole
+//! a second sender, which is a fault. A drive whose every answer is late by a whole
 //! period from some SYNC on cannot be told from one that is on time.
 
-mod axis;
 mod bring_up;
-mod bring_up_error;
 mod config;
 mod cycle;
 mod dialogue;
 mod drive;
 mod event;
-mod fault;
 mod flood;
 mod halt;
 mod homing;
 mod limits;
 mod machine;
-mod other_master;
 mod plan;
-mod reference;
-mod reset;
 mod scale;
 mod standstill;
 mod status;
@@ -61,18 +54,14 @@ mod supervision;
 #[cfg(test)]
 mod tests;
 
-pub use axis::{Axis, PerAxis};
-pub use bring_up_error::{BringUpError, FoundFault, Identity};
-pub use config::{AxisConfig, HeartbeatConfig, RawSdo, StageConfig, StageConfigError, Zero};
+pub use bring_up::{FoundFault, Identity};
+pub use config::{Axis, AxisConfig, HeartbeatConfig, PerAxis, RawSdo, StageConfig, Zero};
 pub use dialogue::{Dialogue, WithBothDrives};
 pub use drive::DriveReport;
 pub use event::{Counters, DriveFlag, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};
-pub use fault::{CommandError, StageFault};
 pub use halt::Halt;
-pub use limits::{AxisLimits, Commanded, LimitCheck, LimitError};
+pub use homing::{HomingConfig, Reference};
+pub use limits::{AxisLimits, Commanded, LimitCheck};
 pub use machine::Stage;
-pub use plan::BringUpPart;
-pub use reference::{HomingConfig, Reference};
-pub use reset::Reset;
 pub use scale::{CountsRatio, Scale, Sign, Unwrapper};
-pub use status::{AxisStatus, StatusReader};
+pub use status::{AxisStatus, Reset, StatusReader};

@@ -1,7 +1,6 @@
 //! The steps of bring-up, in order: what is read from a drive, and what is written to it.
 
-use super::bring_up::{Object, Script, optional};
-use super::bring_up_error::{BringUpError, DRIVE_PROFILE, FoundFault, Identity};
+use super::bring_up::{FoundFault, Identity, Object, Script, optional};
 use super::config::{interpolation_period, millis, unsigned_counts};
 use super::{AxisConfig, HomingConfig, Reference, Sign, StageEvent};
 use crate::canopen::cia402::{Controlword, DriveState, Mode, Statusword, object as drive};
@@ -14,40 +13,6 @@ use crate::canopen::pdo::{EVERY_SYNC, MappedObject, PDOS, PdoCobId, PdoDirection
 use crate::canopen::sdo::{SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::canopen::{ObjectAddress, cob};
 
-/// The parts of bring-up, in order.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, derive_more::Display)]
-pub enum BringUpPart {
-    /// Does the drive answer?
-    #[display("looking for the drive")]
-    Find,
-    /// Is it the right one?
-    #[display("checking its identity")]
-    Identify,
-    /// Take power off, look for a fault.
-    #[display("taking power off, looking for faults")]
-    Disarm,
-    /// Objects of the configuration.
-    #[display("writing the configured objects")]
-    Configure,
-    /// Heartbeats, both ways.
-    #[display("setting heartbeats")]
-    Supervise,
-    /// PDOs.
-    #[display("mapping PDOs")]
-    MapPdos,
-    /// Does the drive know where it is?
-    #[display("checking that it is homed")]
-    CheckHomed,
-    /// Cyclic synchronous position on the SYNC period, or homing.
-    #[display("setting its mode of operation")]
-    SetMode,
-    /// The drive's own limits, and the target where the axis stands.
-    #[display("setting its limits and seeding the target")]
-    SeedTarget,
-}
-
-use BringUpPart as P;
-
 /// RPDO1: controlword and target in one frame, so that neither is older than the other.
 pub(super) const RPDO: [MappedObject; 2] =
     [MappedObject::new(0x6040, 0, 16), MappedObject::new(0x607a, 0, 32)];
@@ -55,6 +20,8 @@ pub(super) const RPDO: [MappedObject; 2] =
 pub(super) const TPDO: [MappedObject; 2] =
     [MappedObject::new(0x6041, 0, 16), MappedObject::new(0x6064, 0, 32)];
 
+/// CiA 402, the low word of 0x1000.
+const DRIVE_PROFILE: u16 = 402;
 /// SYNC is on the usual identifier, and made by the bench alone (bit 30: the node makes it).
 const SYNC_BITS: u32 = 0x4000_07ff;
 /// A PDO with this bit in its COB-ID is off.
@@ -63,7 +30,7 @@ const PDO_OFF: u32 = 1 << 31;
 impl Script {
     /// Brings the drive up, to be moved in cyclic synchronous position or to be homed. Gives where the
     /// axis stands (0x6064).
-    pub(super) async fn run(self) -> Result<i32, BringUpError> {
+    pub(super) async fn run(self) -> Result<i32, String> {
         self.find().await?;
         self.identify().await?;
         self.disarm().await?;
@@ -76,8 +43,8 @@ impl Script {
     }
 
     /// Reads until the drive answers: is it a CiA 402 drive?
-    async fn find(&self) -> Result<(), BringUpError> {
-        self.begin(P::Find);
+    async fn find(&self) -> Result<(), String> {
+        self.begin("looking for the drive");
         let boot_timeout = self.config.boot_timeout;
         let give_up = self.sdo.now() + boot_timeout;
         let look = SdoRequest::Upload(DEVICE_TYPE);
@@ -85,7 +52,11 @@ impl Script {
             match self.sdo.ask_once(look).await {
                 Err(SdoError::Timeout(_)) if self.sdo.now() >= give_up => {
                     let cob_id = cob::sdo_rx(self.sdo.node());
-                    return Err(BringUpError::NoAnswer(cob_id, boot_timeout));
+                    let timeout_s = boot_timeout.as_secs_f64();
+                    return Err(format!(
+                        "no answer on {cob_id:X}h within {timeout_s:.1} s, is the drive powered, \
+                         node-id and bitrate right?"
+                    ));
                 }
                 // It may have been left in NMT Stopped, where no node answers.
                 Err(SdoError::Timeout(_)) => self.sdo.leave_operational(),
@@ -94,16 +65,21 @@ impl Script {
                 answer => break answer,
             }
         };
+        self.note(|so_far| so_far.found = true);
         match self.judge(look, false, answer)? {
             Some(SdoReply::Uploaded(value)) if value.to_u32() as u16 != DRIVE_PROFILE => {
-                Err(BringUpError::Profile(value.to_u32() as u16))
+                let profile = value.to_u32() as u16;
+                Err(format!(
+                    "{DEVICE_TYPE}: device profile {profile} where {DRIVE_PROFILE} (drives) is needed, \
+                     is the node-id right?"
+                ))
             }
             _ => Ok(()),
         }
     }
 
-    async fn identify(&self) -> Result<(), BringUpError> {
-        self.begin(P::Identify);
+    async fn identify(&self) -> Result<(), String> {
+        self.begin("checking its identity");
         let vendor = self.read_identity(1, self.drive().vendor).await?;
         let product = self.read_identity(2, self.drive().product).await?;
         self.note(|so_far| so_far.identified = true);
@@ -116,30 +92,31 @@ impl Script {
         self.sdo.tell(StageEvent::Identity(self.axis, identity));
         let mode = if self.homed { Mode::HOMING } else { Mode::CSP };
         match supported.map(SdoValue::to_u32) {
-            Some(supported) if !mode.is_in(supported) => Err(BringUpError::NoMode(mode, supported)),
+            Some(supported) if !mode.is_in(supported) => Err(format!(
+                "{}: supported modes {supported:#010X} lack {mode} (bit {})",
+                drive::SUPPORTED_MODES,
+                mode.0 - 1
+            )),
             _ => Ok(()),
         }
     }
 
-    async fn read_identity(
-        &self,
-        subindex: u8,
-        expected: Option<u32>,
-    ) -> Result<u32, BringUpError> {
+    async fn read_identity(&self, subindex: u8, expected: Option<u32>) -> Result<u32, String> {
         let object = identity(subindex);
         let received = self.read(object).await?.map(SdoValue::to_u32);
         match (expected, received) {
-            (Some(expected), Some(received)) if expected != received => {
-                Err(BringUpError::Identity { object, expected, received })
-            }
+            (Some(expected), Some(received)) if expected != received => Err(format!(
+                "{object}: expected {expected:#010X}, received {received:#010X}, is this the drive of \
+                 the configuration?"
+            )),
             _ => Ok(received.unwrap_or(0)),
         }
     }
 
     /// Takes power off first: a drive that an earlier run left enabled is not reconfigured under power. If
     /// the drive is in Fault, the cause is read; unless it may be reset, bring-up ends there.
-    async fn disarm(&self) -> Result<(), BringUpError> {
-        self.begin(P::Disarm);
+    async fn disarm(&self) -> Result<(), String> {
+        self.begin("taking power off, looking for faults");
         self.command(drive::CONTROLWORD, Controlword::DISABLE_VOLTAGE.0.into()).await?;
         let statusword = self.read_statusword().await?;
         self.note(|so_far| so_far.disarmed = true);
@@ -147,7 +124,7 @@ impl Script {
         {
             return Ok(());
         }
-        let mut fault = FoundFault { statusword, error_code: None, history: None };
+        let mut fault = FoundFault { statusword, error_code: None };
         self.note(|so_far| so_far.found_in_fault = Some(fault));
         let error_code = self.read(optional(drive::ERROR_CODE)).await?;
         fault.error_code = error_code.map(|code| EmcyCode(code.to_u32() as u16));
@@ -155,18 +132,23 @@ impl Script {
         if self.config.fault_reset_on_start {
             return Ok(());
         }
-        fault.history = self.read(optional(error_history(1))).await?.map(SdoValue::to_u32);
-        Err(BringUpError::Fault(fault))
+        let history = self.read(optional(error_history(1))).await?.map(SdoValue::to_u32);
+        let error_code = fault.error_code.map_or("absent".to_owned(), |code| code.to_string());
+        let history = history.map_or("empty".to_owned(), |error| format!("{error:#010X}"));
+        Err(format!(
+            "drive found in fault (statusword {statusword}, 0x603F {error_code}, 0x1003:01 {history}); \
+             clear its cause, then: needle-bench stage reset"
+        ))
     }
 
-    async fn read_statusword(&self) -> Result<Statusword, BringUpError> {
+    async fn read_statusword(&self) -> Result<Statusword, String> {
         let value = self.read(drive::STATUSWORD).await?;
         Ok(Statusword(value.map_or(0, SdoValue::to_u32) as u16))
     }
 
     /// Writes the raw objects of the configuration, then what it gives in mm or rad.
-    async fn configure(&self) -> Result<(), BringUpError> {
-        self.begin(P::Configure);
+    async fn configure(&self) -> Result<(), String> {
+        self.begin("writing the configured objects");
         let config = self.drive();
         for raw in &config.raw_sdos {
             match raw.read_back {
@@ -184,11 +166,7 @@ impl Script {
     }
 
     /// Writes `value`, in mm or rad (per second, per second squared), in counts; nothing for `None`.
-    async fn write_counts(
-        &self,
-        object: ObjectAddress,
-        value: Option<f64>,
-    ) -> Result<(), BringUpError> {
+    async fn write_counts(&self, object: ObjectAddress, value: Option<f64>) -> Result<(), String> {
         let scale = self.drive().scale(self.axis, 0);
         match value.and_then(|value| unsigned_counts(scale, value)) {
             Some(counts) => self.write(object, counts).await,
@@ -196,11 +174,12 @@ impl Script {
         }
     }
 
-    async fn supervise(&self) -> Result<(), BringUpError> {
-        self.begin(P::Supervise);
+    async fn supervise(&self) -> Result<(), String> {
+        self.begin("setting heartbeats");
         let (config, heartbeat) = (self.drive(), self.config.heartbeat);
         let producer_ms = millis(heartbeat.producer_period).unwrap_or(u16::MAX);
         let consumer_ms = millis(heartbeat.consumer_time).unwrap_or(u16::MAX);
+        self.note(|so_far| so_far.may_be_supervised = true);
         let watched = u32::from(self.config.bench_node.get()) << 16 | u32::from(consumer_ms);
         self.write(PRODUCER_HEARTBEAT, producer_ms).await?;
         self.write(consumer_heartbeat(1), watched).await?;
@@ -216,13 +195,13 @@ impl Script {
 
     /// Switches every PDO off, then maps one in each direction in the order of CiA 301, 7.5.2.36: off by
     /// bit 31, number of entries 0, entries, number of entries, on.
-    async fn map_pdos(&self) -> Result<(), BringUpError> {
-        self.begin(P::MapPdos);
+    async fn map_pdos(&self) -> Result<(), String> {
+        self.begin("mapping PDOs");
         if let Some(received) = self.read(optional(SYNC_COB_ID)).await?
             && received.to_u32() & SYNC_BITS != u32::from(cob::SYNC)
         {
-            let (object, expected) = (SYNC_COB_ID, u32::from(cob::SYNC).into());
-            return Err(BringUpError::Mismatch { object, expected, received });
+            let (object, expected) = (SYNC_COB_ID, SdoValue::from(u32::from(cob::SYNC)));
+            return Err(format!("{object}: expected {expected}, received {received}"));
         }
         let node = self.drive().node;
         for direction in [PdoDirection::Receive, PdoDirection::Transmit] {
@@ -250,32 +229,36 @@ impl Script {
     }
 
     /// Sets bit 31 of a COB-ID and leaves the others, which may not change while it is clear.
-    async fn disable_pdo(&self, object: Object) -> Result<(), BringUpError> {
+    async fn disable_pdo(&self, object: Object) -> Result<(), String> {
         match self.read(object).await?.map(SdoValue::to_u32) {
             Some(cob_id) if cob_id & PDO_OFF == 0 => self.write(object, cob_id | PDO_OFF).await,
             _ => Ok(()),
         }
     }
 
-    async fn check_homed(&self) -> Result<(), BringUpError> {
+    async fn check_homed(&self) -> Result<(), String> {
         let AxisConfig { homing, reference, .. } = self.drive();
         let Some(homing) = homing.filter(|_| *reference == Reference::Homing && !self.homed) else {
             return Ok(());
         };
-        self.begin(P::CheckHomed);
+        self.begin("checking that it is homed");
         // Bit 12 says it in homing mode alone, and so the drive is asked in that mode, without power.
         if homing.homed_bit == HomingConfig::ATTAINED_BIT {
             self.set_mode(Mode::HOMING).await?;
         }
         let statusword = self.read_statusword().await?;
         match statusword.0.checked_shr(homing.homed_bit.into()).unwrap_or(0) & 1 {
-            0 => Err(BringUpError::NotHomed(statusword, homing.homed_bit)),
+            0 => Err(format!(
+                "not homed (statusword {statusword}, bit {} clear), home it first: needle-bench stage \
+                 home",
+                homing.homed_bit
+            )),
             _ => Ok(()),
         }
     }
 
-    async fn set_modes(&self) -> Result<(), BringUpError> {
-        self.begin(P::SetMode);
+    async fn set_modes(&self) -> Result<(), String> {
+        self.begin("setting its mode of operation");
         let period = interpolation_period(self.config.sync_period);
         let (count, exponent) = period.unwrap_or((u8::MAX, -3));
         self.write(drive::INTERPOLATION_PERIOD_EXPONENT, exponent).await?;
@@ -289,7 +272,7 @@ impl Script {
         }
     }
 
-    async fn configure_homing(&self, homing: HomingConfig) -> Result<(), BringUpError> {
+    async fn configure_homing(&self, homing: HomingConfig) -> Result<(), String> {
         self.write(drive::HOMING_METHOD, homing.method).await?;
         self.write_counts(drive::HOMING_SPEED_SWITCH, homing.speed_switch).await?;
         self.write_counts(drive::HOMING_SPEED_ZERO, homing.speed_zero).await?;
@@ -301,18 +284,18 @@ impl Script {
         }
     }
 
-    async fn set_mode(&self, mode: Mode) -> Result<(), BringUpError> {
+    async fn set_mode(&self, mode: Mode) -> Result<(), String> {
         self.write(drive::MODES_OF_OPERATION, mode.0).await?;
         self.wait_for(drive::MODES_OF_OPERATION_DISPLAY, mode.0.into()).await
     }
 
-    async fn seed_target(&self) -> Result<i32, BringUpError> {
-        self.begin(P::SeedTarget);
+    async fn seed_target(&self) -> Result<i32, String> {
+        self.begin("setting its limits and seeding the target");
         let object = drive::POSITION_ACTUAL;
         let position = self.read(object).await?.map_or(Ok(0), |value| {
             let bytes = value.as_bytes();
             let counts = bytes.try_into().map(i32::from_le_bytes);
-            counts.map_err(|_| BringUpError::Length(object, bytes.len()))
+            counts.map_err(|_| format!("{object}: expected 4 bytes, received {}", bytes.len()))
         })?;
         let (min, max) = (drive::SOFTWARE_LIMIT_MIN, drive::SOFTWARE_LIMIT_MAX);
         if self.drive().wraps {

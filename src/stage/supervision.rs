@@ -1,29 +1,32 @@
 //! What the drives and others say, and what of it ends a run.
 
 use super::machine::Phase;
-use super::other_master::word_of_another_master;
-use super::{Axis, Ignored, Stage, StageEvent, StageFault};
+use super::{Axis, DriveFlag, Ignored, Stage, StageEvent};
 use crate::canopen::cia402::{DriveState, Statusword};
 use crate::canopen::emcy::{EmcyCode, parse_emcy};
 use crate::canopen::heartbeat::HeartbeatEvent;
-use crate::canopen::nmt::NmtState;
-use crate::canopen::{Frame, cob};
+use crate::canopen::nmt::{NmtCommand, NmtState};
+use crate::canopen::{Frame, NodeId, cob};
 use crate::units::Time;
 
 impl Stage {
-    /// Before anything is sent, and while the drives are commanded, nobody else may.
+    /// Stops if another master commands the drives: while this stage listens, and until it stops them.
     pub(super) fn watch_for_another_master(&mut self, now: Time, frame: &Frame) {
         if matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped) {
             return;
         }
         let nodes = self.config.nodes();
         let drives = [nodes.insertion, nodes.rotation];
-        if let Some(word) = word_of_another_master(frame, self.config.bench_node, drives) {
-            self.fail(now, StageFault::AnotherMaster(word, *frame));
+        if let Some(word) = command_of_another_master(frame, self.config.bench_node, drives) {
+            let fault = format!(
+                "another master on the bus: {word} ({frame}); stop it, or give it other nodes: two \
+                 masters cannot share an axis"
+            );
+            self.fail(now, fault);
         }
     }
 
-    /// True for an identifier under which nobody but the bench sends.
+    /// True for an identifier under which only the bench sends.
     pub(super) fn is_own(&self, cob_id: u16) -> bool {
         let of_drive = |axis: Axis| {
             let node = self.config.axis(axis).node;
@@ -72,21 +75,27 @@ impl Stage {
             }
             return;
         }
-        // Nobody has begun to watch.
+        // Supervision begins with bring-up.
         if matches!(self.phase, Phase::Listening { .. }) {
             return;
         }
-        let within = self.config.heartbeat.consumer_time;
-        match event {
-            HeartbeatEvent::BootUp => self.fail(now, StageFault::Rebooted(axis)),
-            HeartbeatEvent::Lost => self.fail(now, StageFault::HeartbeatLost(axis, within)),
-            HeartbeatEvent::State(NmtState::Operational) => {}
-            HeartbeatEvent::State(state) => match self.phase {
-                // A heartbeat may still be from before the start command.
-                Phase::BringUp | Phase::Standby { .. } | Phase::Enabling { .. } => {}
-                _ => self.fail(now, StageFault::NotOperational(axis, state)),
-            },
-        }
+        // A heartbeat may still be from before the start command.
+        let may_be_old =
+            matches!(self.phase, Phase::BringUp | Phase::Standby { .. } | Phase::Enabling { .. });
+        let fault = match event {
+            HeartbeatEvent::BootUp => {
+                "boot-up message in mid-run, the drive restarted; is its supply stable?".to_owned()
+            }
+            HeartbeatEvent::Lost => {
+                let ms = self.config.heartbeat.consumer_time.as_millis();
+                format!("no heartbeat for {ms} ms, is the drive powered and on the bus?")
+            }
+            HeartbeatEvent::State(state) if state != NmtState::Operational && !may_be_old => {
+                format!("NMT state {state} instead of operational, is there another master?")
+            }
+            HeartbeatEvent::State(_) => return,
+        };
+        self.fail(now, format!("{axis}: {fault}"));
     }
 
     pub(super) fn handle_emcy(&mut self, now: Time, axis: Axis, frame: &Frame) {
@@ -101,7 +110,13 @@ impl Stage {
             && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped);
         let is_of_the_fault_found = self.drives[axis].excuses(emcy.code);
         if is_watched && !is_of_the_fault_found && emcy.code != EmcyCode::NO_ERROR {
-            self.fail(now, StageFault::Emergency(axis, emcy));
+            let hint = match emcy.code {
+                EmcyCode::HEARTBEAT => {
+                    ": the drive missed the bench's heartbeat; is the bench stalled or unplugged?"
+                }
+                _ => "",
+            };
+            self.fail(now, format!("{axis}: emergency {emcy}{hint}"));
         }
     }
 
@@ -123,7 +138,7 @@ impl Stage {
     }
 
     fn check_statusword(&mut self, now: Time, axis: Axis, was: Option<DriveState>) {
-        let Some(statusword) = self.drives[axis].statusword() else { return };
+        let Some(statusword) = self.drives[axis].statusword else { return };
         let state = statusword.state();
         let standby = matches!(self.phase, Phase::Standby { .. });
         let enabling = matches!(self.phase, Phase::Enabling { .. });
@@ -152,24 +167,124 @@ impl Stage {
             self.tell(StageEvent::Warns { axis, statusword, count });
         }
         if faulty && !((standby || enabling) && self.drives[axis].may_be_in_fault()) {
-            self.fail(now, StageFault::DriveFault(axis, statusword));
+            self.fail(now, format!("{axis}: drive in fault (statusword {statusword})"));
         } else if fell_back {
-            self.fail(now, StageFault::SwitchOnRefused(axis, statusword));
+            self.fail_switch_on(now, axis, statusword);
         } else if must_follow && state != Some(DriveState::OperationEnabled) {
-            self.fail(now, StageFault::LeftOperationEnabled(axis, statusword));
+            let fault = format!(
+                "{axis}: drive left operation enabled (statusword {statusword}), was an enable or limit \
+                 switch opened?"
+            );
+            self.fail(now, fault);
         } else if (must_follow || enabling)
             && let Some(flag) = self.drives[axis].lost_flag()
         {
-            self.fail(now, StageFault::FlagLost(axis, flag, statusword));
+            self.fail(now, format!("{axis}: {}", lost_flag(flag, statusword)));
         } else if self.drives[axis].homes {
             // It follows no target, and its bit 13 is of its homing.
         } else if state == Some(DriveState::OperationEnabled)
             && statusword.has(Statusword::FOLLOWING_ERROR)
         {
-            let following_error = self.drives[axis].following_error();
-            self.fail(now, StageFault::FollowingError(axis, following_error));
+            let off = axis.shown(self.drives[axis].following_error());
+            let fault = format!(
+                "{axis}: following error reported by the drive; target minus position is {off}"
+            );
+            self.fail(now, fault);
         } else if must_follow && let Some(fault) = self.drives[axis].not_following() {
             self.fail(now, fault);
+        }
+    }
+}
+
+/// Why a bit of the statusword that the drive cleared while it was enabled stops the run.
+fn lost_flag(flag: DriveFlag, statusword: Statusword) -> String {
+    match flag {
+        DriveFlag::Remote => format!(
+            "the drive no longer obeys the bus (statusword {statusword}, bit 9 clear): it will \
+             ignore a stop; press the emergency stop"
+        ),
+        DriveFlag::Voltage => format!(
+            "the drive has lost its supply (statusword {statusword}, bit 4 clear), is an emergency \
+             stop pressed, or a fuse blown?"
+        ),
+        DriveFlag::FollowsCommand => format!(
+            "the drive ignores its targets (statusword {statusword}, bit 12 clear), does an input or \
+             another tool hold it?"
+        ),
+    }
+}
+
+// Client command specifiers (CiA 301, 7.2.4.3).
+const INITIATE_DOWNLOAD: u8 = 1;
+const BLOCK_DOWNLOAD: u8 = 6;
+
+/// The kind of command to `drives` in `frame`, which was received, or of heartbeat under the node number
+/// of `bench`; `None` for any other frame. Reading an object does no harm, nor does starting a node.
+fn command_of_another_master(
+    frame: &Frame,
+    bench: NodeId,
+    drives: [NodeId; 2],
+) -> Option<&'static str> {
+    let cob_id = frame.cob_id()?;
+    let is_one_of = |of: fn(NodeId) -> u16| drives.into_iter().any(|node| of(node) == cob_id);
+    if cob_id == cob::SYNC {
+        Some("SYNC")
+    } else if cob_id == cob::NMT {
+        let &[command, node] = frame.data() else { return None };
+        let is_ours = node == 0 || drives.iter().any(|drive| drive.get() == node);
+        let is_harmless = command == NmtCommand::StartRemoteNode as u8;
+        (is_ours && !is_harmless).then_some("an NMT command")
+    } else if cob_id == cob::heartbeat(bench) {
+        // The drives would take it for the bench's, and not miss the bench.
+        Some("a heartbeat of the bench's own node number")
+    } else if is_one_of(cob::rpdo) {
+        Some("RPDO1 of a drive")
+    } else if is_one_of(cob::sdo_rx) {
+        let specifier = frame.data().first().map(|command| command >> 5);
+        let writes = matches!(specifier, Some(INITIATE_DOWNLOAD | BLOCK_DOWNLOAD));
+        writes.then_some("a write to a drive's object dictionary")
+    } else {
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_moves_or_rewires_a_drive_is_a_masters_word() {
+        let node = |n| NodeId::new(n).unwrap();
+        let word = |id, data: &[u8]| {
+            command_of_another_master(&Frame::new(id, data), node(127), [node(1), node(2)])
+        };
+        let of_a_master: [(u16, &[u8]); 9] = [
+            (0x080, &[]),
+            (0x000, &[0x80, 1]),
+            (0x000, &[0x02, 0]),
+            (0x000, &[0x81, 2]),
+            (0x201, &[0x0F, 0, 0, 0, 0, 0]),
+            (0x202, &[]),
+            (0x77F, &[5]),
+            (0x601, &[0x23, 0x16, 0x10, 1, 0, 0, 0, 0]),
+            (0x602, &[0xC2, 0x10, 0x10, 1, 0, 0, 0, 0]),
+        ];
+        for (id, data) in of_a_master {
+            assert!(word(id, data).is_some(), "{id:03X} {data:?}");
+        }
+        let of_nobody: [(u16, &[u8]); 9] = [
+            (0x000, &[0x01, 0]),
+            (0x000, &[0x80, 3]),
+            (0x000, &[]),
+            (0x181, &[0; 6]),
+            (0x203, &[0; 6]),
+            (0x601, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]),
+            (0x603, &[0x2B, 0x40, 0x60, 0, 0, 0, 0, 0]),
+            (0x77E, &[5]),
+            (0x601, &[]),
+        ];
+        for (id, data) in of_nobody {
+            assert_eq!(word(id, data), None, "{id:03X} {data:?}");
         }
     }
 }

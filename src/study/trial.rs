@@ -6,7 +6,7 @@ use crate::emulator::{TargetModel, Tissue, Truth, VirtualStageConfig};
 use crate::needle::TipPosition;
 use crate::observer::ObserverError;
 use crate::session::{Decision, MovingMean, Outcome, SessionConfig, Steering, StepRecord};
-use crate::stage::{Axis, AxisLimits, LimitError};
+use crate::stage::Axis;
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::ops::RangeInclusive;
@@ -85,7 +85,8 @@ pub fn insert(
             needle.insert_to(due.command_mm);
         }
         let rotation_rad = needle.base.rotation_at(due.command_mm);
-        if let Err(error) = within(&session.stage.rotation.limits, rotation_rad) {
+        let limits = &session.stage.rotation.limits;
+        if let Err(error) = limits.check_position(Axis::Rotation, rotation_rad) {
             return Ok(Outcome::Stopped(format!("stage: {error}")));
         }
         if command.is_none() {
@@ -202,16 +203,4 @@ fn record(step: usize, due: &StepDue, base: &BasePath, decision: Decision) -> St
         approach,
         ..StepRecord::default()
     }
-}
-
-/// The stage's error for a rotation beyond its soft limits.
-fn within(limits: &AxisLimits, rotation_rad: f64) -> Result<(), LimitError> {
-    let (axis, target) = (Axis::Rotation, rotation_rad);
-    if target > limits.max {
-        return Err(LimitError::Over { axis, target, max: limits.max });
-    }
-    if target < limits.min {
-        return Err(LimitError::Under { axis, target, min: limits.min });
-    }
-    Ok(())
 }

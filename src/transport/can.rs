@@ -3,8 +3,14 @@
 use std::io;
 use std::time::{Duration, SystemTime};
 
-use super::bus_error::BusError;
 use crate::canopen::Frame;
+use nix::errno::Errno;
+use nix::poll::{PollFd, PollFlags, ppoll};
+use nix::sys::time::TimeSpec;
+use socketcan::CanErrorFrame;
+use socketcan::errors::{self, CAN_ERR_BUSOFF, CAN_ERR_RESTARTED};
+use std::fmt;
+use std::os::fd::BorrowedFd;
 
 /// An event received from the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -13,6 +19,41 @@ pub enum BusEvent {
     Frame(Frame),
     /// A report of the controller about itself or the wires.
     Error(BusError),
+}
+
+/// A report of a CAN controller about itself and the wires, as the kernel gives it to programs: an error
+/// frame with the layout of `linux/can/error.h`, which was never on the bus. It may report several
+/// things at once.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct BusError(pub CanErrorFrame);
+
+impl BusError {
+    /// An error frame with these class bits and 8 data bytes.
+    pub fn new(classes: u32, data: [u8; 8]) -> Self {
+        BusError(CanErrorFrame::new_error(classes, &data).expect("8 bytes fit an error frame"))
+    }
+
+    /// The controller has left the bus: nothing more is sent or received.
+    pub fn bus_off() -> Self {
+        BusError::new(CAN_ERR_BUSOFF, [0; 8])
+    }
+
+    /// True when the controller has left the bus.
+    pub fn is_bus_off(&self) -> bool {
+        self.0.error_bits() & CAN_ERR_BUSOFF != 0
+    }
+
+    /// True when the controller came back after bus off. Frames queued before may be sent now.
+    pub fn is_restarted(&self) -> bool {
+        self.0.error_bits() & CAN_ERR_RESTARTED != 0
+    }
+}
+
+/// Names all that is reported: `bus off; error counters: tx=248, rx=0`.
+impl fmt::Display for BusError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        errors::CanError::from(self.0).fmt(f)
+    }
 }
 
 /// A CAN bus, used by one blocking thread.
@@ -136,9 +177,33 @@ fn bring_up(interface: &str) -> String {
     }
 }
 
+/// Waits up to `timeout` until `socket` has data or an error, by ppoll(2): poll(2) counts whole
+/// milliseconds. A signal ends the wait early; the caller
+/// waits again for the rest.
+pub(super) fn readable(socket: BorrowedFd<'_>, timeout: Duration) -> io::Result<()> {
+    let mut sockets = [PollFd::new(socket, PollFlags::POLLIN)];
+    match ppoll(&mut sockets, Some(TimeSpec::from_duration(timeout)), None) {
+        Ok(_) | Err(Errno::EINTR) => Ok(()),
+        Err(error) => Err(error.into()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_error_frame_names_all_that_it_reports() {
+        let passive = BusError::new(0x204, [0, 0x30, 0, 0, 0, 0, 136, 128]);
+        assert!(!passive.is_bus_off() && BusError::bus_off().is_bus_off());
+        assert!(BusError::new(0x100, [0; 8]).is_restarted());
+        assert_eq!(BusError::bus_off().to_string(), "bus off");
+        assert_eq!(
+            passive.to_string(),
+            "controller problem: rx passive, tx passive; error counters: tx=136, rx=128"
+        );
+        assert_eq!(BusError::new(0, [0; 8]).to_string(), "unknown error (0x0)");
+    }
 
     #[test]
     fn messages_give_the_next_step() {

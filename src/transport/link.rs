@@ -1,14 +1,17 @@
 //! A tracker's stream: a queue of events that a reader task or thread fills.
 
 use crate::tracker::openigtlink::ToolStream;
-use crate::tracker::{Event, Protocol, Reader, Sieve};
+use crate::tracker::{Event, Protocol, Reader, Replay, Sieve};
 use crate::units::Time;
 use rtrb::{Consumer, Producer, RingBuffer};
+use std::io::{ErrorKind, Read};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread;
 use std::time::Duration;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
+use tokio::time::sleep;
 
 /// The protocol of a [`Link`], its time limits and sizes.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -65,17 +68,6 @@ struct Shared {
     has_ended: AtomicBool,
     /// Notified when an event was queued or the stream has ended.
     filled: Notify,
-}
-
-/// The number of messages received over a link; it can be read from any thread.
-#[derive(Debug, Clone)]
-pub struct MessageCount(Arc<Shared>);
-
-impl MessageCount {
-    /// Samples, statuses and refused messages so far, including those passed over.
-    pub fn get(&self) -> u64 {
-        self.0.messages.load(Ordering::Relaxed)
-    }
 }
 
 impl Link {
@@ -138,9 +130,9 @@ impl Link {
             .then(|| Event::PassedOver { messages: now.0 - before.0, dropped: now.1 - before.1 })
     }
 
-    /// The count of received messages.
-    pub fn message_count(&self) -> MessageCount {
-        MessageCount(Arc::clone(&self.shared))
+    /// Samples, statuses and refused messages so far, including those passed over.
+    pub fn messages(&self) -> u64 {
+        self.shared.messages.load(Ordering::Relaxed)
     }
 
     /// Samples dropped so far.
@@ -182,7 +174,7 @@ impl Outlet {
     /// connecting, while no data is waiting in the socket.
     pub(super) async fn wait_for_room(&mut self) {
         while self.events.slots() < Self::RESERVE {
-            tokio::time::sleep(Self::ROOM_POLL).await;
+            sleep(Self::ROOM_POLL).await;
         }
     }
 
@@ -219,10 +211,78 @@ impl Drop for Outlet {
     }
 }
 
+/// Streams that are not over TCP: from standard input or another reader, and from a recording.
+impl Link {
+    /// Reads `input`, called `name` in messages, to its end. A thread of its own does so, because
+    /// reading a pipe may block for ever. `clock` gives the receive times.
+    pub fn read<R, C>(mut input: R, name: &str, settings: LinkSettings, clock: C) -> Self
+    where
+        R: Read + Send + 'static,
+        C: Fn() -> Time + Send + 'static,
+    {
+        let (link, mut outlet) = Link::new(&settings);
+        let mut reader = Reader::new(settings.protocol);
+        let name = name.to_owned();
+        thread::spawn(move || {
+            outlet.hand_on(clock(), Event::Connected { peer: name.clone() });
+            let why = read_to_end(&mut input, &mut reader, &mut outlet, &clock);
+            let reason = format!("tracker: {name} {why}");
+            outlet.hand_on(clock(), Event::Disconnected { reason });
+        });
+        link
+    }
+
+    /// Gives the events of `replay` when they are due by `clock`. Only the tool and the queue length of
+    /// `settings` matter.
+    ///
+    /// # Panics
+    /// Outside a tokio runtime.
+    pub fn replay<C>(mut replay: Replay, settings: &LinkSettings, clock: C) -> Self
+    where
+        C: Fn() -> Time + Send + 'static,
+    {
+        Link::filled_by(settings, async move |mut outlet| {
+            while replay.deadline() < Time::NEVER {
+                sleep(replay.deadline().since(clock())).await;
+                while let Some(event) = replay.poll(clock()) {
+                    outlet.hand_on(clock(), event);
+                }
+            }
+        })
+    }
+}
+
+/// Reads until the input ends or the link is dropped, and returns how it ended.
+fn read_to_end(
+    input: &mut impl Read,
+    reader: &mut Reader,
+    outlet: &mut Outlet,
+    clock: impl Fn() -> Time,
+) -> String {
+    let mut buffer = [0; 4096];
+    while !outlet.is_closed() {
+        let len = match input.read(&mut buffer) {
+            Ok(0) => {
+                let cut = reader.finish().err().map(|error| format!(": {error}"));
+                return format!("has ended{}", cut.unwrap_or_default());
+            }
+            Ok(len) => len,
+            Err(error) if error.kind() == ErrorKind::Interrupted => continue,
+            Err(error) => return format!("failed: {error}"),
+        };
+        let now = clock();
+        reader.push(now, buffer.get(..len).unwrap_or_default());
+        if let Err(reason) = outlet.hand_on_all(now, reader) {
+            return reason;
+        }
+    }
+    "is no longer read".to_owned()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tracker::{Sample, Validity};
+    use crate::tracker::{Sample, Validity, ndjson};
     use nalgebra::Vector3;
 
     fn sample(x_mm: usize) -> Event {
@@ -256,7 +316,7 @@ mod tests {
         assert_eq!(positions(&mut link), (500 - Link::PORTION..500).collect::<Vec<_>>());
         let dropped = (450 - Link::PORTION) as u64;
         assert_eq!(link.passed_over(), Some(Event::PassedOver { messages: 0, dropped }));
-        assert_eq!((link.passed_over(), link.message_count().get()), (None, 500));
+        assert_eq!((link.passed_over(), link.messages()), (None, 500));
     }
 
     /// However much comes, what changes the connection's state has room.
@@ -279,5 +339,61 @@ mod tests {
         let states = taken.iter().filter(|event| !event.is_message()).count();
         assert_eq!(states, Reader::NAMES_MAX + 2);
         assert!(matches!(taken.last(), Some(Event::Disconnected { .. })));
+    }
+
+    const NOW: Time = Time::from_nanos(42);
+
+    fn events_of(text: &'static str) -> Vec<String> {
+        let settings = LinkSettings { protocol: Protocol::Ndjson, ..LinkSettings::default() };
+        let mut link = Link::read(text.as_bytes(), "standard input", settings, || NOW);
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let next = || runtime.block_on(link.next());
+        std::iter::from_fn(next)
+            .map(|event| match event {
+                Event::Sample(sample) => {
+                    assert_eq!(sample.receive_time, NOW);
+                    format!("{} {}", sample.tool, sample.position_mm.x)
+                }
+                Event::Connected { peer } => format!("connected to {peer}"),
+                Event::Malformed(error) => error.to_string(),
+                Event::Disconnected { reason } => reason,
+                other => format!("{other:?}"),
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_pipe_is_read_to_its_end() {
+        assert_eq!(
+            events_of("{\"tool\":\"N\",\"position_tracker_mm\":[1,2,3]}\nnonsense\n{\"tool\""),
+            [
+                "connected to standard input",
+                "SawTool { tool: \"N\", message_type: \"NDJSON\" }",
+                "N 1",
+                "ndjson: line 2: expected ident (column 2)",
+                "tracker: standard input has ended: ndjson: line 3: 7 bytes and no end of line; it \
+                 was cut off",
+            ]
+        );
+    }
+
+    #[tokio::test]
+    async fn a_recording_is_given_to_its_end() {
+        let line = |ns: u32| {
+            format!(r#"{{"tool":"N","position_tracker_mm":[{ns},0,0],"receive_time_ns":{ns}}}"#)
+        };
+        let recording = ndjson::recording(&[line(1_000_000), line(3_000_000)].join("\n")).unwrap();
+        let start = std::time::Instant::now();
+        let clock = move || Time::ZERO + start.elapsed();
+        let replay = Replay::new("tip.ndjson", recording, Time::ZERO);
+        let mut link = Link::replay(replay, &LinkSettings::default(), clock);
+        let mut samples = Vec::new();
+        while let Some(event) = link.next().await {
+            if let Event::Sample(sample) = event {
+                assert!(sample.receive_time <= clock(), "none comes before its time");
+                samples.push(sample.receive_time.as_nanos());
+            }
+        }
+        assert_eq!(samples, [0, 2_000_000]);
     }
 }

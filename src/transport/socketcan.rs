@@ -5,26 +5,18 @@ use std::os::fd::AsFd;
 use std::path::Path;
 use std::time::{Duration, Instant, SystemTime};
 
+use nix::errno::Errno;
 use socketcan::timestamp::{
     SOF_TIMESTAMPING_OPT_CMSG, SOF_TIMESTAMPING_RX_SOFTWARE, SOF_TIMESTAMPING_SOFTWARE,
 };
 use socketcan::{
-    CanDataFrame, CanErrorFrame, CanFilter, CanFrame, CanRemoteFrame, CanSocket, EmbeddedFrame,
-    ExtendedId, Id, Socket, SocketOptions, StandardId,
+    CanDataFrame, CanFilter, CanFrame, CanRemoteFrame, CanSocket, EmbeddedFrame, ExtendedId, Id,
+    Socket, SocketOptions, StandardId,
 };
 
-use super::bus_error::BusError;
-use super::can::{BusEvent, CanBus, CanError};
+use super::can::{BusError, BusEvent, CanBus, CanError, readable};
 use super::unconfirmed::Unconfirmed;
-use super::wait::readable;
 use crate::canopen::{CanId, Frame, NodeId};
-
-// Linux error numbers that `ErrorKind` does not distinguish.
-const ENODEV: i32 = 19;
-const EPROTONOSUPPORT: i32 = 93;
-const EAFNOSUPPORT: i32 = 97;
-const ENETDOWN: i32 = 100;
-const ENOBUFS: i32 = 105;
 
 // getsockopt(2): SO_MEMINFO gives nine u32; the last is the number of frames dropped by a full buffer.
 const SOL_SOCKET: i32 = 1;
@@ -150,9 +142,9 @@ impl SocketCan {
     /// `error` as a [`CanError`].
     fn failed(&self, action: &'static str, error: io::Error) -> CanError {
         let interface = self.interface.clone();
-        match error.raw_os_error() {
-            Some(ENETDOWN) => CanError::Down(interface),
-            Some(ENODEV) => CanError::Gone(interface),
+        match errno(&error) {
+            Some(Errno::ENETDOWN) => CanError::Down(interface),
+            Some(Errno::ENODEV) => CanError::Gone(interface),
             _ => CanError::Io { interface, action, reason: error },
         }
     }
@@ -179,7 +171,7 @@ impl CanBus for SocketCan {
             }
             // ENOBUFS: the interface's queue is full. EAGAIN: the socket's queue is full.
             Err(error)
-                if error.raw_os_error() == Some(ENOBUFS)
+                if errno(&error) == Some(Errno::ENOBUFS)
                     || error.kind() == ErrorKind::WouldBlock =>
             {
                 let interface = self.interface.clone();
@@ -221,9 +213,7 @@ impl CanBus for SocketCan {
     }
 
     fn report(&mut self, error: &BusError) -> Result<(), CanError> {
-        let frame = CanErrorFrame::new_error(error.classes(), error.data());
-        let frame = frame.map_err(|_| self.failed("report", ErrorKind::InvalidInput.into()))?;
-        let sent = self.socket.write_frame(&CanFrame::Error(frame));
+        let sent = self.socket.write_frame(&CanFrame::Error(error.0));
         sent.map_err(|error| self.failed("put an error frame on the bus", error))
     }
 
@@ -242,6 +232,11 @@ impl CanBus for SocketCan {
     }
 }
 
+/// The error number of the operating system.
+fn errno(error: &io::Error) -> Option<Errno> {
+    error.raw_os_error().map(Errno::from_raw)
+}
+
 /// True when there is no frame yet, or a signal interrupted the call.
 fn nothing_there(error: &io::Error) -> bool {
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted)
@@ -250,14 +245,14 @@ fn nothing_there(error: &io::Error) -> bool {
 /// Why `interface` did not open. The kernel looks up the name before it checks for CAN, so ENODEV has
 /// three causes.
 fn cannot_open(interface: &str, error: io::Error) -> CanError {
-    let any = CanSocket::open_iface(0).err().and_then(|error| error.raw_os_error());
+    let any = CanSocket::open_iface(0).err().and_then(|error| errno(&error));
     let interface = interface.to_owned();
-    match (any, error.raw_os_error()) {
-        (Some(EAFNOSUPPORT | EPROTONOSUPPORT), _) => CanError::NoCan(interface),
-        (_, Some(ENODEV)) if Path::new("/sys/class/net").join(&interface).exists() => {
+    match (any, errno(&error)) {
+        (Some(Errno::EAFNOSUPPORT | Errno::EPROTONOSUPPORT), _) => CanError::NoCan(interface),
+        (_, Some(Errno::ENODEV)) if Path::new("/sys/class/net").join(&interface).exists() => {
             CanError::NotCan(interface)
         }
-        (_, Some(ENODEV)) => CanError::NoInterface(interface),
+        (_, Some(Errno::ENODEV)) => CanError::NoInterface(interface),
         _ => CanError::Io { interface, action: "open", reason: error },
     }
 }
@@ -277,9 +272,7 @@ fn to_socketcan(frame: &Frame) -> Option<CanFrame> {
 
 fn event(frame: &CanFrame) -> io::Result<BusEvent> {
     if let CanFrame::Error(error) = frame {
-        let mut data = [0; 8];
-        data.iter_mut().zip(error.data()).for_each(|(to, from)| *to = *from);
-        return Ok(BusEvent::Error(BusError::new(error.error_bits(), data)));
+        return Ok(BusEvent::Error(BusError(*error)));
     }
     let id = match frame.id() {
         Id::Standard(id) => CanId::Base(id.as_raw()),
@@ -296,6 +289,7 @@ fn event(frame: &CanFrame) -> io::Result<BusEvent> {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+    use socketcan::CanErrorFrame;
 
     fn frames() -> impl Strategy<Value = Frame> {
         let id = prop_oneof![

@@ -5,9 +5,7 @@
 
 mod message;
 
-use super::bus_error::BusError;
-use super::can::{BusEvent, CanBus, CanError};
-use super::wait::readable;
+use super::can::{BusError, BusEvent, CanBus, CanError, readable};
 use crate::canopen::Frame;
 use nix::cmsg_space;
 use nix::sys::socket::{

@@ -7,8 +7,7 @@ use std::time::{Duration, SystemTime};
 use crate::support::link::ip;
 use crate::support::vcan;
 use needle_bench::canopen::{CanId, Frame, NodeId};
-use needle_bench::transport::bus_error::BusError;
-use needle_bench::transport::can::{BusEvent, CanBus, CanError};
+use needle_bench::transport::can::{BusError, BusEvent, CanBus, CanError};
 use needle_bench::transport::socketcan::SocketCan;
 use socketcan::{CanErrorFrame, CanFrame, CanSocket, Socket};
 
@@ -68,7 +67,7 @@ fn error_frames_are_received_by_name() {
     let event = next(&mut bus, |event| matches!(event, BusEvent::Error(_)));
     let BusEvent::Error(error) = event else { unreachable!("filtered above") };
     assert_eq!(error, BusError::new(0x240, counters));
-    assert_eq!(error.to_string(), "bus off; error counters: transmit 248, receive 7");
+    assert_eq!(error.to_string(), "bus off; error counters: tx=248, rx=7");
 }
 
 #[test]

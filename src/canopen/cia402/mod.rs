@@ -34,7 +34,7 @@ pub enum DriveState {
 }
 
 /// Object 0x6041.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Statusword(pub u16);
 
 impl Statusword {
@@ -98,14 +98,8 @@ impl fmt::Display for Statusword {
     }
 }
 
-impl fmt::Debug for Statusword {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "Statusword({self})")
-    }
-}
-
 /// Object 0x6040: the commands and their bits.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Controlword(pub u16);
 
 impl Controlword {
@@ -142,12 +136,6 @@ impl Controlword {
     /// True when any of `bits` is set.
     pub const fn has(self, bits: u16) -> bool {
         self.0 & bits != 0
-    }
-}
-
-impl fmt::Debug for Controlword {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "Controlword(0x{:04X})", self.0)
     }
 }
 

@@ -1,7 +1,7 @@
 use super::*;
 use crate::archive::Manifest;
 use crate::config::Config;
-use crate::runtime::{OnRecordFailure, Operator};
+use crate::runtime::{Interrupt, OnRecordFailure, Operator};
 use crate::session::{Lane, Outcome, Output, Progress, Session, Severity};
 use crate::stage::Counters;
 use crate::telemetry::tests::{CONFIG_TOML, manifest};
@@ -148,9 +148,8 @@ fn a_bench_that_was_away_names_itself() {
     let mut drive = bus.endpoint();
     let mut bench = bus.endpoint();
     drive.send(&Frame::new(0x81, &[0x30, 0x81, 0x11, 0, 0, 0, 0, 0])).unwrap();
-    let sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody);
-    let interrupt = Interrupt::default();
-    let report = run_live(&mut late, &mut bench, None, clock, None, sink, &interrupt);
+    let sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody, &Interrupt::default());
+    let report = run_live(&mut late, &mut bench, None, clock, None, sink);
     let reason = report.outcome.stop_reason().expect("stopped");
     assert!(reason.starts_with("bench: was held up for "), "{reason}");
     assert!(reason.contains("ms (limit 100, the drives' heartbeat time"), "{reason}");
@@ -257,8 +256,8 @@ fn live(
     let bus = MemoryBus::new();
     let (mut drives, mut bench) = (bus.endpoint(), bus.endpoint());
     frames.iter().for_each(|frame| drives.send(frame).unwrap());
-    let sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody);
-    run_live(machine, &mut bench, tracker, clock, None, sink, &Interrupt::default());
+    let sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody, &Interrupt::default());
+    run_live(machine, &mut bench, tracker, clock, None, sink);
     std::fs::remove_dir_all(dir).unwrap();
     let sent = std::iter::from_fn(|| drives.receive(Duration::ZERO).unwrap());
     let frame = |event| match event {
@@ -302,7 +301,7 @@ fn a_flood_of_other_tools_does_not_reach_the_session() {
     });
     let told = counts.count();
     assert_eq!(events.len() - told, 3, "connected, saw Stylus, ended: {events:?}");
-    assert_eq!(link.message_count().get(), 60_000);
+    assert_eq!(link.messages(), 60_000);
 }
 
 /// A deadline that comes while events are waiting is met before the next of them is taken.
@@ -318,17 +317,9 @@ fn a_deadline_goes_before_the_tracker() {
 
 #[test]
 fn a_flood_is_named() {
-    let link = stream("Stylus", 20_000);
-    let count = link.message_count();
-    while count.get() < 20_000 {
-        std::thread::sleep(Duration::from_millis(1));
-    }
-    let arrivals = Arrivals { count, looked: Time::ZERO, counted: 0 };
-    assert_eq!(
-        arrivals.flood(Time::from_secs_f64(0.2)).as_deref(),
-        Some("by a flood from the tracker? 20000 messages, 100000 a second")
-    );
-    assert_eq!(arrivals.flood(Time::from_secs_f64(10.0)), None);
+    let text = "by a flood from the tracker? 20000 messages, 100000 a second";
+    assert_eq!(flood(20_000, Duration::from_millis(200)).as_deref(), Some(text));
+    assert_eq!(flood(20_000, Duration::from_secs(10)), None);
 }
 
 /// The kernel stamps frames by CLOCK_REALTIME, which may be set either way in a run.
@@ -376,8 +367,7 @@ fn run_ticking(
     clock: Clock,
     sink: Sink<'_>,
 ) -> RunReport {
-    let interrupt = Interrupt::default();
-    let mut run = Live::new(session, bus, None, clock, Watched { sink, interrupt });
+    let mut run = Live::new(session, bus, None, clock, sink);
     let outcome = loop {
         carry_out(&mut run);
         match run.session.outcome().cloned() {
@@ -386,7 +376,7 @@ fn run_ticking(
         }
     };
     let gates = run.session.gate_counts();
-    run.witness.sink.finish(outcome, clock.now(), gates, None)
+    run.witness.finish(outcome, clock.now(), gates, None)
 }
 
 /// What was queued behind a refused frame is stale and never sent; what the fault itself asks
@@ -400,7 +390,7 @@ fn behind_a_refused_frame_only_the_stop_is_sent() {
     let mut nobody = Nobody;
     let recorder =
         Recorder::create(&dir, manifest, CONFIG_TOML.to_owned(), Backpressure::Block).unwrap();
-    let sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody);
+    let sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody, &Interrupt::default());
     let mut session = Session::new(config.session().unwrap(), clock.now()).unwrap();
     let mut bus = Refusing::default();
     let report = run_ticking(&mut session, &mut bus, clock, sink);

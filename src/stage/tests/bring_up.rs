@@ -433,7 +433,10 @@ fn reboot(bench: &mut Bench, times: u32) {
         let identity = |event: &StageEvent| {
             matches!(
                 event,
-                StageEvent::Progress(Progress::BringUp(Axis::Insertion, BringUpPart::Disarm))
+                StageEvent::Progress(Progress::BringUp(
+                    Axis::Insertion,
+                    "taking power off, looking for faults"
+                ))
             )
         };
         bench.run_until(identity);

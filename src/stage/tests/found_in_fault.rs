@@ -38,7 +38,7 @@ fn a_fault_that_a_reset_does_not_end_is_not_reset_again() {
 fn a_fault_that_comes_later_is_never_reset() {
     let enabling = StageEvent::Progress(Progress::Enabling);
     let configuring =
-        StageEvent::Progress(Progress::BringUp(Axis::Rotation, BringUpPart::Configure));
+        StageEvent::Progress(Progress::BringUp(Axis::Rotation, "writing the configured objects"));
     for begun in [configuring, enabling] {
         let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
         bench.run_until(|event| *event == begun);

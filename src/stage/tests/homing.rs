@@ -149,7 +149,7 @@ fn only_an_axis_in_homing_mode_is_homed() {
     assert_eq!(refused.to_string(), "the stage is not ready to home");
     let both = PerAxis { insertion: true, rotation: true };
     let refused = Stage::for_homing(homing_config(), both, bench.now).expect_err("no homing");
-    assert_eq!(refused, StageConfigError::NoHoming(Axis::Rotation));
+    assert!(refused.starts_with("rotation: ") && refused.ends_with("no homing is configured"));
 }
 
 #[test]

@@ -37,7 +37,7 @@ impl StageConfig {
             boot_timeout: Duration::from_secs(5),
             boot_attempts: 3,
             enable_timeout: Duration::from_secs(3),
-            let_on: Duration::from_millis(500),
+            state_transition_timeout: Duration::from_millis(500),
             stop_timeout: Duration::from_secs(2),
             missed_feedback_max: 1,
             fault_reset_on_start: false,
@@ -179,7 +179,7 @@ impl Bench {
         panic!("never happened; events since: {:?}", self.events);
     }
 
-    fn until_fault(&mut self) -> StageFault {
+    fn until_fault(&mut self) -> String {
         match self.run_until(|event| matches!(event, StageEvent::Fault(_))) {
             StageEvent::Fault(fault) => fault,
             _ => unreachable!(),
@@ -200,7 +200,7 @@ impl Bench {
         }
     }
 
-    fn command(&mut self, insertion_mm: f64, rotation_rad: f64) -> Result<(), CommandError> {
+    fn command(&mut self, insertion_mm: f64, rotation_rad: f64) -> Result<(), String> {
         self.stage.command(SetPoint { insertion_mm, rotation_rad })
     }
 

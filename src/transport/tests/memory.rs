@@ -6,8 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use crate::canopen::Frame;
-use crate::transport::bus_error::BusError;
-use crate::transport::can::{BusEvent, CanBus, CanError};
+use crate::transport::can::{BusError, BusEvent, CanBus, CanError};
 
 /// Events an endpoint holds that nobody has received yet. What comes on top of them is dropped and
 /// counted, as by a kernel's socket (which holds some 280 frames by default).

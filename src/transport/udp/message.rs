@@ -2,15 +2,15 @@
 //! (`can.interfaces.udp_multicast.utils`, python-can 4.6).
 
 use crate::canopen::{CanId, Frame};
-use crate::transport::bus_error::BusError;
-use crate::transport::can::BusEvent;
+use crate::transport::can::{BusError, BusEvent};
 use serde::{Deserialize, Serialize, Serializer};
+use socketcan::EmbeddedFrame;
 
 /// Maximum nesting depth. A map of scalars needs less; deeper data is refused before it uses stack.
 const DEPTH_MAX: usize = 4;
 
 /// The map, in python-can's order. Other keys are ignored.
-#[derive(Serialize, Deserialize)]
+#[derive(Default, Serialize, Deserialize)]
 struct Fields<'a> {
     timestamp: f64,
     arbitration_id: u32,
@@ -40,19 +40,8 @@ pub(super) fn encode(
     timestamp_s: f64,
     event: &BusEvent,
 ) -> Result<Vec<u8>, rmp_serde::encode::Error> {
-    let mut fields = Fields {
-        timestamp: timestamp_s,
-        arbitration_id: 0,
-        is_extended_id: true,
-        is_remote_frame: false,
-        is_error_frame: false,
-        channel: (),
-        dlc: 8,
-        data: &[],
-        is_fd: false,
-        bitrate_switch: false,
-        error_state_indicator: false,
-    };
+    let mut fields =
+        Fields { timestamp: timestamp_s, is_extended_id: true, dlc: 8, ..Fields::default() };
     match event {
         BusEvent::Frame(frame) => {
             (fields.arbitration_id, fields.is_extended_id) = match frame.id() {
@@ -64,9 +53,9 @@ pub(super) fn encode(
             fields.data = if frame.is_remote() { &[] } else { frame.data() };
         }
         BusEvent::Error(error) => {
-            fields.arbitration_id = error.classes();
+            fields.arbitration_id = error.0.error_bits();
             fields.is_error_frame = true;
-            fields.data = error.data();
+            fields.data = error.0.data();
         }
     }
     rmp_serde::to_vec_named(&fields)
@@ -150,17 +139,11 @@ mod tests {
     fn only_classic_frames_are_taken() {
         let message = |arbitration_id, dlc, data, is_fd| {
             let datagram = rmp_serde::to_vec_named(&Fields {
-                timestamp: 0.0,
                 arbitration_id,
-                is_extended_id: false,
-                is_remote_frame: false,
-                is_error_frame: false,
-                channel: (),
                 dlc,
                 data,
                 is_fd,
-                bitrate_switch: false,
-                error_state_indicator: false,
+                ..Fields::default()
             });
             decode(&datagram.unwrap())
         };
