@@ -112,27 +112,24 @@ fn why_there_is_none() {
     insta::assert_snapshot!(reasons);
 }
 
+/// A search that is cut short says so, and what it found by then is a path.
 #[test]
-fn tmp_scan() {
-    for seed in 0..60 {
-        let f = seed as f64;
-        let world = world(vec![
-            sphere([0.0, 8.0 * (f * 1.7).sin(), 40.0 + 20.0 * (f * 0.9).sin()], 5.0),
-            sphere([0.0, 10.0 * (f * 2.3).sin(), 85.0 + 15.0 * (f * 1.3).cos()], 6.0),
-        ]);
-        let mut problem = problem([0.0, 10.0 * (f * 0.37).sin(), 130.0], true);
-        let whole = plan(&world, &problem);
-        let mut first = None;
-        for expansions_max in 1..whole.expansions.min(3000) {
-            problem.expansions_max = expansions_max;
-            let answer = plan(&world, &problem);
-            if answer.path.is_some() {
-                first = Some((expansions_max, answer.status));
-                break;
-            }
+fn a_budget_ends_the_search() {
+    let world = world(vec![sphere([0.0, 1.0, 70.0], 5.0)]);
+    let mut problem = problem([0.0, 0.0, 140.0], true);
+    let whole = plan(&world, &problem);
+    assert_eq!(whole.status, Status::Plan);
+    for expansions_max in [1, whole.expansions / 2, whole.expansions - 1] {
+        problem.expansions_max = expansions_max;
+        let answer = plan(&world, &problem);
+        assert_eq!((answer.status, answer.expansions), (Status::Budget, expansions_max));
+        match &answer.path {
+            Some(_) => drop(path(&world, &problem, &answer)),
+            None => assert!(answer.reason.is_some_and(|why| why.contains("was spent"))),
         }
-        println!("{seed}: {:?} {} first {first:?}", whole.status, whole.expansions);
     }
+    problem.expansions_max = whole.expansions;
+    assert_eq!(plan(&world, &problem).status, Status::Plan);
 }
 
 /// The first arc is as long as the way to this ball, and ends beyond it.
