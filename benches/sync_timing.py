@@ -30,11 +30,12 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 
 
 class Witness(threading.Thread):
-    """Notes when the kernel received each SYNC, s."""
+    """Notes when the kernel received each frame of these identifiers: pairs of s and identifier."""
 
-    def __init__(self, interface):
+    def __init__(self, interface, identifiers):
         super().__init__(daemon=True)
-        self.times, self.ended, self.is_udp = [], False, interface == "udp"
+        self.frames, self.ended, self.is_udp = [], False, interface == "udp"
+        self.identifiers = identifiers
         if self.is_udp:
             self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -44,8 +45,8 @@ class Witness(threading.Thread):
             self.socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
         else:
             self.socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-            only_sync = struct.pack("=II", 0x80, 0x7FF)
-            self.socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, only_sync)
+            filters = b"".join(struct.pack("=II", identifier, 0x7FF) for identifier in identifiers)
+            self.socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
             self.socket.bind((interface,))
         self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self.socket.settimeout(0.2)
@@ -62,23 +63,24 @@ class Witness(threading.Thread):
                 arbitration_id = msgpack.unpackb(data)["arbitration_id"]
             else:
                 arbitration_id = struct.unpack_from("=I", data)[0] & 0x7FF
-            if arbitration_id == 0x80 and control:
+            if arbitration_id in self.identifiers and control:
                 seconds, nanos = struct.unpack("qq", control[0][2])
-                self.times.append(seconds + nanos * 1e-9)
+                self.frames.append((seconds + nanos * 1e-9, arbitration_id))
 
     def finish(self):
         self.ended = True
         self.join()
         self.socket.close()
-        return self.times
+        return self.frames
 
 
 def quantile(sorted_values, q):
     return sorted_values[min(int(q * len(sorted_values)), len(sorted_values) - 1)]
 
 
-def figures(times):
+def figures(frames):
     """Of the SYNCs without the first and last half second, us."""
+    times = [at_s for at_s, _ in frames]
     times = times and [t for t in times if times[0] + 0.5 <= t <= times[-1] - 0.5]
     if len(times) < 100:
         sys.exit("hardly any SYNC was seen")
@@ -183,7 +185,7 @@ def main():
     found = {sender: [] for sender in senders}
     for number in range(args.rounds):
         for sender in senders:
-            witness = Witness(args.interface)
+            witness = Witness(args.interface, {0x80})
             witness.start()
             beside = cyclictest(args.seconds, args.realtime)
             if sender == "bench":

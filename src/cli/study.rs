@@ -36,7 +36,8 @@ pub(super) struct Arguments {
     /// Write a CSV row for each trial.
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Make each insertion through drives and CAN frames: much slower, with the same result.
+    /// Make each insertion through drives and CAN frames: slower, with the same result, but that a start is also
+    /// refused if no path leads to the target from where the tip is seen.
     #[arg(long)]
     through_session: bool,
     /// Number of threads, by default the number of processors.

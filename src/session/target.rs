@@ -37,8 +37,11 @@ impl MovingMean {
         MovingMean { over, newest: VecDeque::new() }
     }
 
-    /// Adds a position, mm.
+    /// Adds a position, mm, unless it is the newest that was added.
     pub fn take(&mut self, acquisition_time: Time, position_mm: Vector3<f64>) {
+        if self.newest.back() == Some(&(acquisition_time, position_mm)) {
+            return;
+        }
         self.newest.push_back((acquisition_time, position_mm));
         let oldest = acquisition_time - self.over;
         while self.newest.pop_front_if(|(time, _)| *time < oldest).is_some() {}

@@ -34,6 +34,8 @@ pitch_deg = [0.0, 0.0]
 roll_deg = [0.0, 0.0]
 ";
 
+const STUDY: &str = "bench-config/target-study.toml";
+
 fn run(scratch: &Scratch, sets: &[&str]) -> Said {
     scratch.write("goal.toml", GOAL);
     let sets = sets.iter().flat_map(|set| ["--set", *set]);
@@ -88,6 +90,30 @@ fn a_run_comes_to_its_target() {
         assert!(last[27].parse::<f64>().unwrap() < 0.5, "{last:?}");
         let replayed = needle_bench(&scratch, &["replay", dir]);
         assert_eq!(replayed.status, 0, "{}", replayed.stdout);
+        assert_eq!(needle_bench(&scratch, &["review", dir]).status, 0);
+        let page = std::fs::read_to_string(scratch.path().join(dir).join("report.html")).unwrap();
+        assert!(page.contains("Predicted error at the target"), "{in_plane}");
+    }
+}
+
+/// The lattice of the search finds no path from the first tips that are seen here, or the first position is
+/// off by its noise, and there is a path.
+#[test]
+fn a_start_with_a_path_is_not_refused() {
+    for seed in ["1108866274680416", "4320813557789487", "8171976210547261", "4390525250300538"] {
+        let scratch = Scratch::new();
+        scratch.write("study.toml", &std::fs::read_to_string(repository(STUDY)).unwrap());
+        let sets = [
+            "goal.in_plane=false",
+            "study.obstacles=5",
+            "study.target_share=[0,0.6]",
+            "goal.curvature_margin=0.1",
+        ];
+        let sets = sets.iter().flat_map(|set| ["--set", *set]);
+        let run = ["run", "study.toml", "--json", "--quiet", "--seed", seed];
+        let said = needle_bench(&scratch, &run.into_iter().chain(sets).collect::<Vec<_>>());
+        assert_eq!(said.status, 0, "{seed}: {} {}", said.stdout, said.stderr);
+        assert_eq!(said.json()["plan_status"], "arrived", "{seed}");
     }
 }
 

@@ -33,6 +33,7 @@ pub(super) fn curves(run: &Run, limits: &Limits) -> Vec<Chart> {
         residuals(run),
         base(run, "Turning of the base", "turning (deg/mm)", turning),
         base(run, "Rotation of the base", "rotation (deg)", rotation),
+        target_error(run, limits),
         insertion(run, limits),
         tip_age(run, limits),
         blind_depth(run, limits),
@@ -69,6 +70,33 @@ fn off_plane(run: &Run, limits: &Limits) -> Chart {
         chart.layers.push(Layer::level("", -off_plane_mm));
     }
     chart
+}
+
+/// The predicted distance from the target at the end of the path, with a band of twice its standard deviation:
+/// that of the position, and that of the heading over the rest of the path. What is corrected on the way is not
+/// in it.
+fn target_error(run: &Run, limits: &Limits) -> Chart {
+    let (depth, error) = (depth(run), column(run, "target_error_pred_mm"));
+    let largest = |names: &[&str]| {
+        let columns = names.iter().map(|name| column(run, name));
+        columns.reduce(|a, b| a.iter().zip(b).map(|(a, b)| Some(a.as_ref()?.max(b?))).collect())
+    };
+    let position = largest(&["x_sd_mm", "y_sd_mm", "z_sd_mm"]).unwrap_or_default();
+    let heading = largest(&["yaw_sd_rad", "pitch_sd_rad"]).unwrap_or_default();
+    let left = column(run, "path_left_mm");
+    let sd = position.iter().zip(&heading).zip(&left);
+    let sd: Column = sd.map(|((mm, rad), left)| Some((*mm)?.hypot((*rad)? * (*left)?))).collect();
+    let mut layers = vec![
+        Layer::new(
+            "prediction ± 2 σ",
+            ESTIMATE,
+            Shape::Area,
+            band(&depth, &error, &sd, f64::INFINITY),
+        ),
+        line("prediction", ESTIMATE, points(&depth, &error)),
+    ];
+    layers.extend(limits.get("target_error_mm").map(|mm| Layer::level("goal.tolerance_mm", *mm)));
+    Chart::new("Predicted error at the target", DEPTH, "error (mm)", layers)
 }
 
 /// Errors of the estimate over depth. The errors at the start, which are large, do not stretch the

@@ -11,7 +11,7 @@ use super::record::{Lane, Record, Severity, StepRecord};
 use super::shell::{Power, Shell};
 use super::state::State;
 use super::steering::Decision;
-use super::target::TargetTracking;
+use super::target::{MovingMean, TargetTracking};
 use super::task::Task;
 use super::tracking::Tracking;
 use super::{OperatorCommand, Progress, SessionError, tracker_news};
@@ -22,10 +22,13 @@ use crate::stage::{Feedback, SetPoint, StageEvent};
 use crate::text::clipped;
 use crate::tracker::{Event, GateCounts, StageHistory, StagePoint};
 use crate::units::Time;
+use nalgebra::Vector3;
 use std::time::Duration;
 
 /// Kept of the stage's past beyond what a measurement can come from.
 const HISTORY_MARGIN: Duration = Duration::from_secs(1);
+/// A start is refused by the mean of the positions over this long: one position has the noise of one.
+const START_AVERAGE: Duration = Duration::from_millis(500);
 
 /// An insertion and what it is steered by.
 ///
@@ -35,6 +38,8 @@ pub(super) struct Insert {
     begun: Time,
     /// The tip was believed when the last input had been taken.
     tip_believed: bool,
+    /// Since when the start is in doubt, and the mean of the positions since then.
+    start_in_doubt: Option<(Time, MovingMean)>,
     tracking: Tracking,
     /// The track of the target, if the target is a tool of its own.
     target: Option<TargetTracking>,
@@ -56,6 +61,7 @@ impl Insert {
         Ok(Insert {
             begun: now,
             tip_believed: false,
+            start_in_doubt: None,
             tracking: Tracking::new(&config),
             target: config
                 .goal
@@ -119,16 +125,13 @@ impl Insert {
         inserted
     }
 
-    fn check_reach(&mut self, shell: &mut Shell) -> Result<(), String> {
+    fn check_reach(&mut self, shell: &mut Shell, tip_mm: &Vector3<f64>) -> Result<(), String> {
         let target_mm = self.target.as_ref().and_then(TargetTracking::position_mm);
-        let tip_mm = self.tracking.track.last().map(|fix| fix.position_mm);
-        if let (Some(goal), Some(tip_mm)) = (&mut self.config.goal, &tip_mm) {
+        if let Some(goal) = &mut self.config.goal {
             target_mm.into_iter().for_each(|target_mm| goal.set_target(target_mm));
             goal.check_start(tip_mm).map_err(|why| format!("goal: {why}"))?;
         }
-        let Some(Err(why)) = tip_mm.map(|tip_mm| check_reach(&self.config, &tip_mm)) else {
-            return Ok(());
-        };
+        let Err(why) = check_reach(&self.config, tip_mm) else { return Ok(()) };
         match self.config.insertion.plane_out_of_reach {
             PlaneOutOfReach::Insert => {
                 shell.event(Lane::Session, Severity::Warning, why);
@@ -323,12 +326,27 @@ impl Task for Insert {
     /// The axes get power only while the tip is believed, from a start from which the plane can be
     /// reached.
     fn permits_power(&mut self, shell: &mut Shell) -> Result<bool, String> {
-        let was_believed = self.tip_believed;
-        self.tip_believed = self.is_seen(shell.now);
-        if self.tip_believed && !was_believed {
-            self.check_reach(shell)?;
+        let newest = self.tracking.track.last().copied().filter(|_| self.is_seen(shell.now));
+        let Some(newest) = newest else {
+            (self.tip_believed, self.start_in_doubt) = (false, None);
+            return Ok(false);
+        };
+        if self.tip_believed {
+            return Ok(true);
         }
-        Ok(self.tip_believed)
+        if let Some((since, mean)) = &mut self.start_in_doubt {
+            mean.take(newest.acquisition_time, newest.position_mm);
+            if shell.now.since(*since) < START_AVERAGE {
+                return Ok(false);
+            }
+            let tip_mm = mean.mean_mm().unwrap_or(newest.position_mm);
+            self.check_reach(shell, &tip_mm)?;
+        } else if self.check_reach(shell, &newest.position_mm).is_err() {
+            self.start_in_doubt = Some((shell.now, MovingMean::new(START_AVERAGE)));
+            return Ok(false);
+        }
+        self.tip_believed = true;
+        Ok(true)
     }
 
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
