@@ -100,17 +100,17 @@ fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, 
         image.get_f64(&at).map(|value| value != 0.0).map_err(|error| reason(&error))
     });
     let occupied: Vec<bool> = occupied.collect::<Result<_, _>>()?;
-    if !occupied.contains(&true) {
-        return Err(
-            "all of its voxels are 0, so it is no obstacle: is it the right label?".to_owned()
-        );
-    }
     let found = file_crc32(path).map_err(|error| error.to_string())?;
     if let Some(crc32) = crc32.filter(|crc32| *crc32 != found) {
         return Err(format!(
             "the mask has another content: its CRC-32 is {found:#010x}, crc32 says {crc32:#010x}; find \
              the file that was meant, or mend the key"
         ));
+    }
+    if !occupied.contains(&true) {
+        return Err(
+            "all of its voxels are 0, so it is no obstacle: is it the right label?".to_owned()
+        );
     }
     Mask::new(size, spacing_mm, &occupied, &pose.to_pose()).map(Obstacle::Mask)
 }

@@ -311,6 +311,9 @@ impl Replanner {
     /// A path that the searches missed: the one that ends nearest to the target, where that is within the
     /// tolerance. It spends what is left of the budget.
     fn to_nearest(&mut self, estimate: &Estimate) -> Option<Path> {
+        if self.expansions_left == 0 {
+            return None;
+        }
         let Problem { clearance_mm, tolerance_mm, .. } = self.problem;
         self.field.clearance_mm = clearance_mm;
         self.problem.curvature_per_mm = estimate.curvature_per_mm;

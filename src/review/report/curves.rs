@@ -5,6 +5,7 @@ use super::chart::{
     VALUE_MAX,
 };
 use crate::archive::RunOutcome;
+use crate::math;
 use crate::review::figures::{BLIND_DEPTH, GOAL, Limits, OFF_PLANE, TIP_AGE};
 use crate::review::run::Run;
 use crate::session::{Lane, State};
@@ -85,7 +86,8 @@ fn target_error(run: &Run, limits: &Limits) -> Chart {
     let heading = largest(&["yaw_sd_rad", "pitch_sd_rad"]).unwrap_or_default();
     let left = column(run, "path_left_mm");
     let sd = position.iter().zip(&heading).zip(&left);
-    let sd: Column = sd.map(|((mm, rad), left)| Some((*mm)?.hypot((*rad)? * (*left)?))).collect();
+    let sd: Column =
+        sd.map(|((mm, rad), left)| Some(math::hypot((*mm)?, (*rad)? * (*left)?))).collect();
     let mut layers = vec![
         Layer::new(
             "prediction ± 2 σ",
