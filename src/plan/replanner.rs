@@ -220,7 +220,7 @@ impl Replanner {
         }
         let path = path
             .or_else(|| self.blindly(last?, heading_sd_rad))
-            .or_else(|| self.to_nearest(estimate))
+            .or_else(|| self.nearest_path(estimate))
             .or_else(|| self.toward_target(heading_sd_rad));
         let Some(path) = path else { return Step::Hold(Hold::NoPath) };
         let first = path.arcs.iter().find(|arc| arc.length_mm > 0.0).copied();
@@ -310,7 +310,7 @@ impl Replanner {
 
     /// A path that the searches missed: the one that ends nearest to the target, where that is within the
     /// tolerance. It spends what is left of the budget.
-    fn to_nearest(&mut self, estimate: &Estimate) -> Option<Path> {
+    fn nearest_path(&mut self, estimate: &Estimate) -> Option<Path> {
         if self.expansions_left == 0 {
             return None;
         }
