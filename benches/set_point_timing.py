@@ -7,7 +7,7 @@ and python-canopen in turn, with the same drives and tracker (vcan-stage), as on
 The witness takes the times at which the kernel received the frames: from the second TPDO1 after a SYNC to the
 second RPDO1 after it, in each cycle. The bench steers a needle in that time: it estimates the pose with its
 default observer. The loop in Python takes the newest position of the tracker, sends the targets at which the
-drives stand, moved by less than a count, and estimates nothing. It needs the packages of
+drives stand, moved by less than a count, to drives without power, and estimates nothing. It needs the packages of
 tests/peers/requirements.txt and a build: cargo build (--profile release: cargo build --release).
 """
 
@@ -51,7 +51,7 @@ def bench(build, common, seconds, realtime):
 
 
 def python_loop(interface, seconds):
-    """Both drives enabled and held by python-canopen, with pyigtl's newest position in each cycle."""
+    """Both drives Operational, without power, with pyigtl's newest position in each cycle."""
     sys.path.insert(0, str(ROOT / "tests/peers"))
     import canopen
     import pyigtl
@@ -91,11 +91,7 @@ def python_loop(interface, seconds):
         for master in masters:
             master.drive.tpdo[1].add_callback(answer)
         network.sync.start(PERIOD_S)
-        for master in masters:
-            master.enable()
         time.sleep(seconds)
-        for master in masters:
-            master.disable()
         network.sync.stop()
 
 
