@@ -16,7 +16,8 @@ use nifti::{NiftiError, NiftiHeader, NiftiObject, RandomAccessNiftiVolume, Reade
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::fmt::Display;
-use std::io;
+use std::fs::File;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
@@ -115,9 +116,16 @@ fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, 
     Mask::new(size, spacing_mm, &occupied, &pose.to_pose()).map(Obstacle::Mask)
 }
 
-/// The CRC-32 of the file in `path`.
+/// The CRC-32 of the file in `path`, read in pieces: a file that is no mask may be of any size.
 pub(super) fn file_crc32(path: &Path) -> io::Result<u32> {
-    std::fs::read(path).map(|bytes| crc32fast::hash(&bytes))
+    let (mut file, mut hasher) = (File::open(path)?, crc32fast::Hasher::new());
+    let mut piece = vec![0; 1 << 16];
+    loop {
+        match file.read(&mut piece)? {
+            0 => return Ok(hasher.finalize()),
+            count => hasher.update(&piece[..count]),
+        }
+    }
 }
 
 /// Why an image cannot be read.
