@@ -8,7 +8,7 @@ use crate::config::{Config, OnFailure};
 use crate::runtime::RunReport;
 use crate::session::{Left, Outcome};
 use crate::stage::{Axis, DriveReport};
-use crate::study::OFF_PLANE_LIMIT_MM;
+use crate::study::{OFF_PLANE_LIMIT_MM, PlanStatus};
 use crate::telemetry::{Finished, TelemetryError};
 use std::fmt;
 use std::fs;
@@ -37,7 +37,7 @@ pub(super) fn record_error(record: &Result<Finished, TelemetryError>) -> Option<
 }
 
 /// The last lines of a summary: the record, and how the run ended.
-pub(super) fn ending(report: &RunReport) -> String {
+pub(super) fn ending(config: &Config, report: &RunReport) -> String {
     let dir = report.run_dir.display();
     let recording = report.run_dir.join(file::RECORDING);
     let mut lines = Vec::new();
@@ -57,6 +57,11 @@ pub(super) fn ending(report: &RunReport) -> String {
         }
     }
     lines.push(match (report.outcome.stop_reason(), plane_missed_by_mm(report)) {
+        (None, _) if plan_status(config, report) == Some(PlanStatus::Missed) => format!(
+            "completed, not at the target: farther from it than goal.tolerance_mm = {}; see \
+             target_error_pred_mm in steps.csv for where it was lost",
+            config.goal.tolerance_mm
+        ),
         (None, None) => "completed".to_owned(),
         (None, Some(off_mm)) => format!(
             "completed, not in the plane: {off_mm:.1} mm RMS off it over the last third by the estimate \
@@ -71,6 +76,12 @@ pub(super) fn ending(report: &RunReport) -> String {
 pub(super) fn folder_bytes(dir: &Path) -> u64 {
     let Ok(files) = fs::read_dir(dir) else { return 0 };
     files.flatten().filter_map(|file| file.metadata().ok()).map(|file| file.len()).sum()
+}
+
+/// What became of the plan; `None` without a target.
+pub(super) fn plan_status(config: &Config, report: &RunReport) -> Option<PlanStatus> {
+    let is_completed = report.outcome == Outcome::Completed;
+    report.figures.report().plan_status(is_completed, config.goal.tolerance_mm)
 }
 
 /// How far a completed run missed the plane, mm; `None` if it did not.
@@ -278,7 +289,7 @@ mod tests {
         let mut report = report(Outcome::Completed, &[]);
         let source = std::io::ErrorKind::NotFound.into();
         report.record = Err(TelemetryError::File { path: "runs/a/manifest.json".into(), source });
-        let said = ending(&report);
+        let said = ending(&Config::from_sources(&[], &[]).unwrap(), &report);
         let said: Vec<&str> = said.lines().collect();
         assert!(said[0].starts_with("record      runs/a, left open: "), "{said:?}");
         assert!(said[0].ends_with("; close it: needle-bench review runs/a --repair"), "{said:?}");

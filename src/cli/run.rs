@@ -3,7 +3,7 @@
 use super::arguments::{About, Configured, RealTimeArguments, seed};
 use super::console::Console;
 use super::ending::{
-    after_insertion, ending, plane_missed_by_mm, record_error, status, withdrawal,
+    after_insertion, ending, plan_status, plane_missed_by_mm, record_error, status, withdrawal,
 };
 use super::output::{give, tell, with};
 use super::perform::{Job, LIVE_ADDRESS, Performed, emulated_json};
@@ -139,17 +139,6 @@ fn to_json(config: &Config, report: &RunReport, preflight: &[Check]) -> Value {
     with(json!(report.figures.report()), &more)
 }
 
-/// What became of the plan: `"arrived"`; `"missed"` where the run completed and the estimated tip is not
-/// within the tolerance; `"lost"` where the run was stopped before. Null without a target.
-fn plan_status(config: &Config, report: &RunReport) -> Option<&'static str> {
-    let error_mm = report.figures.report().target_error_est_mm?;
-    Some(match report.outcome {
-        Outcome::Completed if error_mm <= config.goal.tolerance_mm => "arrived",
-        Outcome::Completed => "missed",
-        Outcome::Stopped(_) => "lost",
-    })
-}
-
 /// What the screen shows besides the object.
 fn more(config: &Config, path: Option<&Path>, report: &RunReport) -> Shown {
     let figures = report.figures.report();
@@ -163,6 +152,6 @@ fn more(config: &Config, path: Option<&Path>, report: &RunReport) -> Shown {
         error => figures.final_error.map(|error| error.to_string()),
         kept_time => report.timing.as_ref().map(ToString::to_string),
         after => after_insertion(config, path, report),
-        ending => ending(report),
+        ending => ending(config, report),
     }
 }

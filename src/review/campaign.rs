@@ -5,6 +5,7 @@ use super::group::{Group, group};
 use super::run::{Condition, Folder, utc};
 use crate::archive::{VerdictKind, file};
 use crate::config::nearest_key;
+use crate::study::FigureReport;
 use crate::text::{escaped, fixed, screen};
 use minijinja::context;
 use minijinja::value::Serde;
@@ -232,7 +233,7 @@ fn exclusion(folder: &Folder) -> Option<(Exclusion, String)> {
     Some((Exclusion::Operation, format!("the stage's {operation}")))
 }
 
-fn row(folder: &Folder) -> [String; 7] {
+fn row(folder: &Folder) -> [String; 8] {
     let manifest = &folder.manifest;
     let figures = folder.figures();
     let depth_mm = figures.as_ref().map(|figures| figures.insertion_mm);
@@ -245,6 +246,7 @@ fn row(folder: &Folder) -> [String; 7] {
         fixed(depth_mm, 1),
         fixed(figures.off_plane_rms_mm, 3),
         fixed(figures.settling_mm, 0),
+        fixed(figures.target_error(), 3),
         outcome + incomplete,
         verdict.unwrap_or_default(),
         utc(&manifest.started_utc),
@@ -267,6 +269,8 @@ impl Line {
             "insertion_mm": figures.as_ref().map(|figures| figures.insertion_mm),
             "off_plane_rms_mm": figures.as_ref().and_then(|figures| figures.off_plane_rms_mm),
             "settling_mm": figures.as_ref().and_then(|figures| figures.settling_mm),
+            "target_error_mm": figures.as_ref().and_then(FigureReport::target_error),
+            "plan_status": run.plan_status(),
             "excluded": excluded,
         })
     }
@@ -360,6 +364,34 @@ mod tests {
             "{}",
             campaign.to_text().unwrap()
         );
+    }
+
+    /// Of three runs to a target one ended beside it and one was stopped; the fourth run has no target.
+    #[test]
+    fn runs_to_a_target_are_judged_by_their_target() {
+        let to_target = |n, error_mm: f64| {
+            folder(n, |folder| {
+                let toml = folder.config_toml.as_mut().unwrap();
+                let goal = "kind = \"target\"\nposition_mm = [0.0, 10.0, 100.0]\ntool_range_mm";
+                *toml = toml.replace("kind = \"plane\"", "").replace("tool_range_mm", goal);
+                folder.manifest.figures.insert("target_error_mm".to_owned(), error_mm.into());
+                folder.manifest.figures.insert("target_error_est_mm".to_owned(), error_mm.into());
+            })
+        };
+        let mut stopped = to_target(3, 0.5);
+        let manifest = &mut stopped.run.as_mut().unwrap().manifest;
+        manifest.set_outcome(&Outcome::Stopped("no path to the target is left".to_owned()));
+        let entries = vec![to_target(1, 0.25), to_target(2, 1.5), stopped, folder(4, |_| ())];
+        let campaign = Campaign::of(entries, None).unwrap();
+        let [group] = campaign.groups.as_slice() else { panic!("{:?}", campaign.groups) };
+        assert_eq!(group.completed, Proportion::new(3, 4));
+        assert_eq!((group.reached, group.settled), (Proportion::new(1, 3), Proportion::new(1, 1)));
+        assert_eq!(group.target_error_mm.unwrap().value, 1.5);
+        let json = campaign.to_json();
+        let statuses = [0, 1, 2, 3].map(|n| json["runs"][n]["plan_status"].clone());
+        assert_eq!(json!(statuses), json!(["arrived", "missed", "lost", null]));
+        let text = campaign.to_text().unwrap();
+        assert!(text.contains("reached     1 of 3, 33 % "), "{text}");
     }
 
     /// Two runs without a step are two where their tip positions are.

@@ -20,27 +20,37 @@ pub struct Group {
     pub varied: Vec<String>,
     /// The runs that reached their depth.
     pub completed: Proportion,
-    /// The runs that reached it within 1 mm RMS of the plane over the last third.
+    /// The runs without a target that reached it within 1 mm RMS of the plane over the last third.
     pub settled: Proportion,
-    /// Distance from the plane over the last third, RMS, mm; infinite for a run that was stopped.
+    /// Their distance from the plane over the last third, RMS, mm; infinite for a run that was stopped.
     pub off_plane_rms_mm: Option<MedianInterval>,
     /// Depth after which the tip stays within 1 mm of the plane, mm; infinite where it does not.
     pub settling_mm: Option<MedianInterval>,
+    /// The runs to a target that ended within its tolerance.
+    pub reached: Proportion,
+    /// Distance of their tips from the target at the end, mm: the true one if known, else the
+    /// estimated one; infinite for a run that was stopped.
+    pub target_error_mm: Option<MedianInterval>,
 }
 
-/// The totals of one group. A run that was stopped counts as infinitely far off the plane.
+/// The totals of one group. A run that was stopped counts as infinitely far off the plane, and from
+/// its target.
 pub(super) fn group(label: String, runs: &[(&Folder, Keys)]) -> Group {
-    let figures = runs.iter().map(|(run, _)| {
-        let is_completed = run.manifest.outcome == Some(RunOutcome::Completed);
-        is_completed.then(|| run.figures().unwrap_or_default())
-    });
-    let figures: Vec<Option<FigureReport>> = figures.collect();
-    let completed = figures.iter().flatten().count();
-    let pick = |of: fn(&FigureReport) -> Option<f64>| -> Vec<f64> {
-        figures.iter().map(|f| f.as_ref().and_then(of).unwrap_or(f64::INFINITY)).collect()
+    let is_completed = |run: &Folder| run.manifest.outcome == Some(RunOutcome::Completed);
+    let completed = runs.iter().filter(|(run, _)| is_completed(run)).count();
+    let (to_target, in_plane): (Vec<&Folder>, Vec<&Folder>) =
+        runs.iter().map(|(run, _)| *run).partition(|run| run.tolerance_mm().is_some());
+    let figure = |run: &Folder, of: fn(&FigureReport) -> Option<f64>| {
+        let figures = run.figures().filter(|_| is_completed(run));
+        figures.as_ref().and_then(of).unwrap_or(f64::INFINITY)
     };
+    let pick = |of| in_plane.iter().map(|run| figure(run, of)).collect::<Vec<_>>();
     let off_plane = pick(|figures| figures.off_plane_rms_mm);
     let settled = off_plane.iter().filter(|rms_mm| **rms_mm < OFF_PLANE_LIMIT_MM).count();
+    let errors = to_target.iter().map(|run| figure(run, FigureReport::target_error));
+    let errors: Vec<f64> = errors.collect();
+    let tolerances = to_target.iter().filter_map(|run| run.tolerance_mm());
+    let reached = errors.iter().zip(tolerances).filter(|(error, limit)| *error <= limit).count();
     let hashes: BTreeSet<&str> =
         runs.iter().map(|(run, _)| run.manifest.config_sha256.as_str()).collect();
     Group {
@@ -48,9 +58,11 @@ pub(super) fn group(label: String, runs: &[(&Folder, Keys)]) -> Group {
         configurations: hashes.len(),
         varied: varied(runs),
         completed: Proportion::new(completed, runs.len()),
-        settled: Proportion::new(settled, runs.len()),
+        settled: Proportion::new(settled, in_plane.len()),
         off_plane_rms_mm: MedianInterval::of(&off_plane),
         settling_mm: MedianInterval::of(&pick(|figures| figures.settling_mm)),
+        reached: Proportion::new(reached, to_target.len()),
+        target_error_mm: MedianInterval::of(&errors),
     }
 }
 

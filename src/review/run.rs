@@ -6,7 +6,7 @@ use super::motion::Motion;
 use crate::archive::{EventKind, EventLine, Manifest, RunOutcome, StepsTable, TrackerTimes};
 use crate::config::CanInterface;
 use crate::session::{Lane, Severity, State};
-use crate::study::FigureReport;
+use crate::study::{FigureReport, PlanStatus};
 use crate::text::escaped;
 use serde::Serialize;
 use std::borrow::Cow;
@@ -198,7 +198,10 @@ impl Folder {
         match (outcome, stop_reason) {
             _ if self.condition == Condition::BeingWritten => "going on".to_owned(),
             (None, _) => "not closed: the bench ended before the run did".to_owned(),
-            (Some(RunOutcome::Completed), _) => "completed".to_owned(),
+            (Some(RunOutcome::Completed), _) => match self.plan_status() {
+                Some(PlanStatus::Missed) => "completed, not at the target".to_owned(),
+                _ => "completed".to_owned(),
+            },
             (Some(RunOutcome::Stopped), Some(reason)) => format!("stopped: {}", escaped(reason)),
             (Some(RunOutcome::Stopped), None) => "stopped".to_owned(),
         }
@@ -218,6 +221,17 @@ impl Folder {
     /// Why they are not known, in words.
     pub(super) fn limits(&self) -> Result<Limits, String> {
         self.config_toml.as_deref().map_or_else(gone, |toml| limits(toml).map_err(first_line))
+    }
+
+    /// `goal.tolerance_mm` of a run to a target; `None` for another run, and without its configuration.
+    pub(super) fn tolerance_mm(&self) -> Option<f64> {
+        self.limits().ok()?.get("target_error_mm").copied()
+    }
+
+    /// What became of the plan, where the run had a target and a step.
+    pub(super) fn plan_status(&self) -> Option<PlanStatus> {
+        let is_completed = self.manifest.outcome? == RunOutcome::Completed;
+        self.figures()?.plan_status(is_completed, self.tolerance_mm()?)
     }
 
     /// The figures that the manifest keeps, or else those that the steps tell.

@@ -76,6 +76,7 @@ pub fn to_json(run: &Run) -> Value {
         "duration_s": manifest.duration_s,
         "outcome": manifest.outcome,
         "stop_reason": manifest.stop_reason,
+        "plan_status": run.folder.plan_status(),
         "condition": run.folder.condition_name(),
         "verdict": manifest.verdict(),
         "operator": manifest.operator,

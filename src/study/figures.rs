@@ -6,6 +6,7 @@ use crate::geometry::coordinates;
 use crate::session::{SampleRecord, StepRecord};
 use crate::stage::Feedback;
 use crate::units::{Time, wrap_angle};
+use derive_more::Display;
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 use std::fmt;
@@ -174,6 +175,37 @@ pub struct FigureReport {
     pub target_error_est_mm: Option<f64>,
     /// The least distance of the tip from an obstacle, mm, as estimated; null without obstacles.
     pub clearance_mm_min: Option<f64>,
+}
+
+/// What became of the plan of a run to a target.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display, Serialize)]
+#[display(rename_all = "snake_case")]
+#[serde(rename_all = "snake_case")]
+pub enum PlanStatus {
+    /// The run completed, and the estimated tip is within the tolerance.
+    Arrived,
+    /// The run completed, and it is not.
+    Missed,
+    /// The run was stopped before.
+    Lost,
+}
+
+impl FigureReport {
+    /// Distance of the tip from the target at the last step, mm: the true one if known, else the
+    /// estimated one; `None` without a target.
+    pub fn target_error(&self) -> Option<f64> {
+        self.target_error_mm.or(self.target_error_est_mm)
+    }
+
+    /// What became of the plan, by the estimate; `None` without a target.
+    pub fn plan_status(&self, is_completed: bool, tolerance_mm: f64) -> Option<PlanStatus> {
+        let error_mm = self.target_error_est_mm?;
+        Some(match is_completed {
+            true if error_mm <= tolerance_mm => PlanStatus::Arrived,
+            true => PlanStatus::Missed,
+            false => PlanStatus::Lost,
+        })
+    }
 }
 
 impl RunFigures {

@@ -17,7 +17,7 @@ mod trial;
 pub use bound::{InformationBound, Prior};
 pub use consistency::{Consistency, Nees, TrialNees, Verdict};
 pub use evaluation::{Evaluation, EvaluationError, Quantiles, Score, Scoring, evaluate};
-pub use figures::{FigureReport, OFF_PLANE_LIMIT_MM, RunFigures, TipError};
+pub use figures::{FigureReport, OFF_PLANE_LIMIT_MM, PlanStatus, RunFigures, TipError};
 pub use mount::{Mount, MountError};
 pub use recording::{RecordedRow, Recording};
 pub use score::{TargetScore, TrialResult, TrialScore};

@@ -98,6 +98,7 @@ fn summary(
     };
     let rest = motion.remaining(done);
     let left = after_operation(config, path, rest.as_deref(), report);
-    let lines: Vec<String> = done.iter().map(line).chain(left).chain([ending(report)]).collect();
+    let lines: Vec<String> =
+        done.iter().map(line).chain(left).chain([ending(config, report)]).collect();
     lines.join("\n")
 }
