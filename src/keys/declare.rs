@@ -48,8 +48,7 @@ macro_rules! section {
 }
 pub(crate) use section;
 
-/// Declares an enumeration: the names that its variants have in TOML, and what they mean. After `for`,
-/// of one that is declared elsewhere.
+/// Declares an enumeration: the names that its variants have in TOML, and what they mean.
 macro_rules! choice {
     (
         $(#[$doc:meta])*
@@ -60,16 +59,11 @@ macro_rules! choice {
         pub enum $name {
             $($(#[doc = $text])* $variant,)+
         }
-        $crate::keys::choice! {
-            for $name { $($(#[doc = $text])* $variant = $word,)+ }
-        }
         impl std::fmt::Display for $name {
             fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
                 f.pad(match self { $($name::$variant => $word),+ })
             }
         }
-    };
-    (for $name:ident { $($(#[doc = $text:literal])* $variant:ident = $word:literal,)+ }) => {
         impl $crate::keys::Field for $name {
             const KIND: $crate::keys::Kind =
                 $crate::keys::Kind::OneOf(&[$(($word, concat!($($text, "\n"),*))),+]);

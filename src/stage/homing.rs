@@ -7,18 +7,10 @@ use crate::keys::choice;
 use crate::units::Time;
 use std::time::Duration;
 
-/// Where the position of a drive (0x6064) comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Reference {
-    /// It is right from power-on: an absolute encoder, or an axis of which it does not matter.
-    #[default]
-    Absolute,
-    /// From homing: without it the axis is not enabled, but to be homed.
-    Homing,
-}
-
 choice! {
-    for Reference {
+    /// Where the position of a drive (0x6064) comes from. It is right from power-on with an absolute encoder,
+    /// or where it does not matter. An axis that needs homing is not enabled without it, except to be homed.
+    pub enum Reference {
         /// The drive's position is right from power-on.
         Absolute = "absolute",
         /// From homing: before `needle-bench stage home` nothing is moved.

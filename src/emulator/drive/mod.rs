@@ -68,20 +68,14 @@ pub struct Identity {
     pub serial: u32,
 }
 
-/// The make that a drive imitates, where the profile leaves a choice.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum Model {
-    /// All objects of the data sheet. A limit switch causes a quick stop.
-    #[default]
-    Generic,
-    /// An EPOS4: TPDOs have no event timer; the unit is the increment (no 0x6091, 0x6092); 0x1006,
-    /// 0x1007, 0x1019 and 0x6066 are missing; a limit switch is a fault; bit 15 of the statusword says
-    /// that the axis was homed.
-    Epos4,
-}
-
 choice! {
-    for Model {
+    /// The make that a drive imitates, where the profile leaves a choice.
+    ///
+    /// The generic drive has all objects of the data sheet, and a limit switch causes a quick stop. Of an
+    /// EPOS4 TPDOs have no event timer; the unit is the increment (no 0x6091, 0x6092); 0x1006, 0x1007, 0x1019
+    /// and 0x6066 are missing; a limit switch is a fault; bit 15 of the statusword says that the axis was
+    /// homed.
+    pub enum Model {
         /// All that the emulator has.
         Generic = "generic",
         /// As an EPOS4.
