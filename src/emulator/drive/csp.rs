@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use super::axis::{Axis, whole};
+use super::device::Device;
 use crate::canopen::cia402::{Mode, object};
 use crate::canopen::emcy::{EmcyCode, error_register};
-use crate::canopen::node::Device;
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::units::Time;
 

@@ -1,13 +1,13 @@
 //! Homing (CiA 402-2, mode 6): its legs, and how the axis moves along them.
 
 use super::axis::{Axis, whole};
+use super::device::Device;
 use super::inputs::{End, Switches};
 use super::motion::Motion;
 use super::objects::MAX_ACCELERATION;
 use super::profile::Profile;
 use crate::canopen::cia402::{Controlword, Mode, object};
 use crate::canopen::emcy::{EmcyCode, error_register};
-use crate::canopen::node::Device;
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::units::Time;
 

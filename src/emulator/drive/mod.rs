@@ -8,25 +8,24 @@
 
 mod axis;
 mod csp;
+mod device;
 mod homing;
 mod inputs;
 mod motion;
+mod node;
 mod objects;
+mod parameters;
+mod pdo;
 mod profile;
 mod state_machine;
 #[cfg(test)]
 mod tests;
 
 pub use self::inputs::Switches;
+pub use self::node::Drive;
 
-use self::axis::Axis;
-use super::fault::{Fault, FaultKind};
-use crate::canopen::cia402::DriveState;
-use crate::canopen::nmt::{NmtCommand, nmt_frame};
-use crate::canopen::node::Node;
 use crate::canopen::{NodeId, ObjectAddress};
 use crate::keys::choice;
-use crate::units::Time;
 
 /// The configuration of an emulated drive.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -106,50 +105,5 @@ impl DriveConfig {
         let mut eds = objects::data_sheet(self);
         eds.set("FileInfo", "FileName", file_name);
         eds.to_string()
-    }
-}
-
-/// An emulated CiA 402 drive, sans-IO: [`Node`] says how it is driven.
-///
-/// In cyclic synchronous position the axis reaches the target received before a SYNC exactly, at
-/// constant speed, one interpolation period (0x60C2) after that SYNC. So the position reported at each
-/// SYNC is the target of the SYNC before.
-pub type Drive = Node<Axis>;
-
-impl Drive {
-    /// A drive that has just been switched on; its boot-up message waits to be sent.
-    pub fn new(config: DriveConfig) -> Self {
-        let node = config.node;
-        let objects = objects::data_sheet(&config).objects(node);
-        Node::switched_on(Time::ZERO, node, objects, Axis::new(config))
-    }
-
-    /// The state of the CiA 402 state machine.
-    pub fn state(&self) -> DriveState {
-        self.application().state()
-    }
-
-    /// A fault of the drive or its axis begins or ends; faults of frames and of the bus do nothing here.
-    pub fn apply_fault(&mut self, now: Time, fault: &Fault, begins: bool) {
-        match fault.kind {
-            // It restarts again at the end, so that its boot-up message is received.
-            FaultKind::Restart => {
-                self.handle_frame(now, &nmt_frame(NmtCommand::ResetNode, Some(self.id())));
-            }
-            FaultKind::Stall
-            | FaultKind::DriveFault
-            | FaultKind::NegativeSwitch
-            | FaultKind::PositiveSwitch
-            | FaultKind::EmergencyStop
-            | FaultKind::NoVoltage => {
-                self.apply(now, |axis, device| axis.apply_fault(now, fault, begins, device));
-            }
-            _ => {}
-        }
-    }
-
-    /// The true position of the axis in counts, not wrapped to 32 bits and not rounded.
-    pub fn position_counts_at(&self, now: Time) -> f64 {
-        self.application().position_at(now)
     }
 }

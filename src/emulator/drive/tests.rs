@@ -2,6 +2,7 @@
 
 mod homing;
 mod inputs;
+mod node;
 mod stops;
 
 use std::time::Duration;
@@ -9,13 +10,14 @@ use std::time::Duration;
 use proptest::prelude::*;
 
 use super::*;
-use crate::canopen::cia402::{EnableSequence, Statusword, object};
-use crate::canopen::nmt::NmtState;
-use crate::canopen::nmt::heartbeat_frame;
+use crate::canopen::cia402::{DriveState, EnableSequence, Statusword, object};
+use crate::canopen::nmt::{NmtCommand, NmtState, heartbeat_frame, nmt_frame};
 use crate::canopen::pdo::MappedObject;
 use crate::canopen::sdo::{AbortCode, SdoClient, SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::canopen::sync::sync_frame;
 use crate::canopen::{Frame, ObjectAddress, cob};
+use crate::emulator::fault::{Fault, FaultKind};
+use crate::units::Time;
 
 const NODE: NodeId = NodeId::new(5).unwrap();
 const MASTER: NodeId = NodeId::new(127).unwrap();
@@ -392,7 +394,7 @@ proptest! {
             let state = bench.state();
             let operational = bench.drive.nmt_state() == NmtState::Operational;
             let (then, before) = (bench.now, bench.position());
-            let speed_before = bench.drive.application().motion.velocity_at(bench.now).abs();
+            let speed_before = bench.drive.axis.motion.velocity_at(bench.now).abs();
             match input {
                 Input::Command(word, target) => bench.command(word, target.into()),
                 Input::Sync => { bench.give(sync_frame()); }
@@ -412,7 +414,7 @@ proptest! {
                     | DriveState::FaultReactionActive
             );
             prop_assert!(moved == 0.0 || powered, "{moved} counts in {state}");
-            let speed = bench.drive.application().motion.velocity_at(bench.now).abs();
+            let speed = bench.drive.axis.motion.velocity_at(bench.now).abs();
             if !operational {
                 prop_assert!(speed <= speed_before + 1e-6, "gains speed out of Operational");
             }
