@@ -1,12 +1,13 @@
 //! From sections of the configuration to settings of the pure parts of the bench, in mm, rad and per mm.
 
 use super::needle::torsion;
-use super::{AxisSection, CanInterface, Config, ConfigError, ReadMask, TrackerSource, rehearsal};
+use super::{CanInterface, Config, ConfigError, ReadMask, TrackerSource, rehearsal};
 use crate::canopen::ObjectAddress;
 use crate::emulator::fault::Fault;
 use crate::emulator::{TargetModel, VirtualStageConfig, drive};
 use crate::observer::InvariantConfig;
 use crate::session::{InsertionConfig, ObserverConfig, SessionConfig};
+use crate::stage::{AxisConfig, Sign};
 use std::f64::consts::TAU;
 
 /// Identity of an emulated drive if the configuration expects none: not a vendor's number.
@@ -91,8 +92,8 @@ impl Config {
             (emulator.insertion_switches_mm, emulator.rotation_switches_deg);
         let turns_per_s = self.number("stage.rotation.speed_max_deg_per_s") / 360.0;
         let (along, about) = (&self.stage.insertion, &self.stage.rotation);
-        let mut insertion = self.emulated_drive(along, along.speed_max)?;
-        let mut rotation = self.emulated_drive(about, turns_per_s)?;
+        let mut insertion = self.emulated_drive(along, along.limits.speed_max);
+        let mut rotation = self.emulated_drive(about, turns_per_s);
         let (per_mm, per_turn) = (insertion.1, rotation.1);
         let [zero, zero_turned] = [along.zero, about.zero].map(|zero| zero.unwrap_or(0).into());
         insertion.0.start_counts = zero + (emulator.insertion_start_mm * per_mm).round() as i64;
@@ -124,12 +125,8 @@ impl Config {
     }
 
     /// The drive of `axis`, which moves by so many mm or turns a second, and its counts per mm or turn.
-    fn emulated_drive<const AXIS: usize>(
-        &self,
-        axis: &AxisSection<AXIS>,
-        units_per_s: f64,
-    ) -> Result<(drive::DriveConfig, f64), ConfigError> {
-        let counts_per_unit = axis.ratio()?.to_f64();
+    fn emulated_drive(&self, axis: &AxisConfig, units_per_s: f64) -> (drive::DriveConfig, f64) {
+        let counts_per_unit = axis.ratio.to_f64();
         let identity = drive::Identity {
             vendor: axis.vendor_id.unwrap_or(EMULATED_VENDOR_ID),
             product: axis.product_code.unwrap_or(EMULATED_PRODUCT_CODE),
@@ -147,6 +144,7 @@ impl Config {
                 .collect(),
             ..drive::DriveConfig::new(axis.node, identity)
         };
-        Ok((drive, counts_per_unit * f64::from(axis.sign)))
+        let sign = if axis.sign == Sign::Negative { -1.0 } else { 1.0 };
+        (drive, counts_per_unit * sign)
     }
 }

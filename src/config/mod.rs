@@ -22,7 +22,6 @@
 //! rad. This module reads no files: the caller hands it their text.
 
 mod assemble;
-mod axis;
 mod axis_checks;
 mod can;
 mod checks;
@@ -47,7 +46,6 @@ mod tracker;
 mod value;
 mod warnings;
 
-pub use axis::{AxisSection, RawSdo};
 pub use can::{CanConfig, CanInterface, Listen};
 pub use control::{ControlConfig, ControlKind};
 pub use emulator::{EmulatorConfig, Noise, SEED_MAX, SwitchesConfig, TrackerPreset};

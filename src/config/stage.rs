@@ -2,12 +2,11 @@
 
 use std::time::Duration;
 
-use super::axis::{AxisSection, INSERTION, ROTATION};
 use super::can::CanConfig;
 use super::error::ConfigError;
 use crate::keys::{section, within};
 use crate::stage;
-use crate::stage::HeartbeatConfig;
+use crate::stage::{Axis, AxisConfig, HeartbeatConfig};
 
 section! {
     /// `[stage]`: the two drives.
@@ -26,9 +25,9 @@ section! {
         /// Longest wait for both axes to stand after a stop, s.
         stop_timeout as "stop_timeout_s": Duration [within(0.1, 60.0)] = 2.0;
         /// The axis that pushes the needle.
-        insertion: AxisSection<INSERTION>;
+        insertion: AxisConfig;
         /// The axis that turns the needle about its shaft.
-        rotation: AxisSection<ROTATION>;
+        rotation: AxisConfig, table(AxisConfig::keys_of::<{ Axis::Rotation as usize }>());
     }
 }
 
@@ -38,18 +37,15 @@ impl StageConfig {
     /// # Errors
     /// None for a configuration that was read; a program may have put in what no drive can do.
     pub fn to_stage(&self, can: &CanConfig) -> Result<stage::StageConfig, ConfigError> {
-        let config = self.to_unchecked_stage(can)?;
+        let config = self.to_unchecked_stage(can);
         config.validate().map_err(ConfigError::of)?;
         Ok(config)
     }
 
     /// The same, with whatever the stage cannot work with: a stop is sent all the same.
-    pub(super) fn to_unchecked_stage(
-        &self,
-        can: &CanConfig,
-    ) -> Result<stage::StageConfig, ConfigError> {
+    pub(super) fn to_unchecked_stage(&self, can: &CanConfig) -> stage::StageConfig {
         let millis = |ms: u16| Duration::from_millis(ms.into());
-        Ok(stage::StageConfig {
+        stage::StageConfig {
             sync_period: millis(can.sync_ms),
             bench_node: can.bench_node,
             heartbeat: HeartbeatConfig {
@@ -66,9 +62,9 @@ impl StageConfig {
             missed_feedback_max: can.missed_feedback_max.into(),
             fault_reset_on_start: self.fault_reset_on_start,
             listen_first: millis(can.heartbeat_timeout_ms),
-            insertion: self.insertion.to_axis()?,
-            rotation: self.rotation.to_axis()?,
-        })
+            insertion: self.insertion.clone(),
+            rotation: self.rotation.clone(),
+        }
     }
 }
 

@@ -106,7 +106,7 @@ impl StopConfig {
             }
         }
         let rest = Config::of(Reader::new(tree).read(Config::KEYS));
-        let mut stage = rest.stage.to_unchecked_stage(&rest.can)?;
+        let mut stage = rest.stage.to_unchecked_stage(&rest.can);
         (stage.insertion.node, stage.rotation.node) = (insertion, rotation);
         // A coarse axis is seen to stand all the same.
         let windows = stage::Axis::BOTH.map(|axis| 2 * stage.standstill_window(axis));

@@ -7,7 +7,7 @@ use crate::canopen::cia402::DriveState;
 use crate::config::{CanInterface, Config};
 use crate::math;
 use crate::session::PlaneOutOfReach;
-use crate::stage::{Axis, AxisLimits, AxisStatus, Reference, Zero};
+use crate::stage::{Axis, AxisLimits, AxisStatus, Reference};
 use crate::tracker::{StampPolicy, Workspace};
 use nalgebra::Vector3;
 
@@ -133,11 +133,11 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
     let AxisStatus { node, identity, statusword, .. } = status;
     let state = statusword.state();
     let is_faulty = matches!(state, Some(DriveState::Fault | DriveState::FaultReactionActive));
-    let is_named = drive.vendor.is_some() && drive.product.is_some();
-    let is_right = drive.vendor.is_none_or(|vendor| vendor == identity.vendor)
-        && drive.product.is_none_or(|product| product == identity.product);
+    let is_named = drive.vendor_id.is_some() && drive.product_code.is_some();
+    let is_right = drive.vendor_id.is_none_or(|vendor| vendor == identity.vendor)
+        && drive.product_code.is_none_or(|product| product == identity.product);
     let id = |expected: Option<u32>| expected.map_or("any".to_owned(), |id| format!("{id:#010X}"));
-    let (vendor, product) = (id(drive.vendor), id(drive.product));
+    let (vendor, product) = (id(drive.vendor_id), id(drive.product_code));
     let limit = format!("vendor {vendor}, product {product}; no fault, no power");
     let write = format!("write vendor_id and product_code into [stage.{axis}]");
     let other = format!("not the drive of [stage.{axis}]: is node right?");
@@ -165,7 +165,7 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
         checks.push(homing.unless(status.homed != Some(false), Fail, next));
     }
     let way = if axis == Axis::Insertion { config.insertion.depth_mm } else { 0.0 };
-    if let Some(position) = status.position.filter(|_| !drive.wraps && drive.zero != Zero::Here) {
+    if let Some(position) = status.position.filter(|_| !drive.wraps && drive.zero.is_some()) {
         checks.push(room(axis, position, way, &drive.limits));
     }
     checks

@@ -173,7 +173,7 @@ impl Script {
         answer: Result<SdoReply, SdoError>,
     ) -> Result<Option<SdoReply>, String> {
         let object = request.object();
-        let may_lack = is_optional || self.drive().optional_objects.contains(&object);
+        let may_lack = is_optional || self.drive().optional_objects.contains(&object.index);
         let error = match answer {
             Ok(reply) => return Ok(Some(reply)),
             Err(error) => error,

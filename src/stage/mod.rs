@@ -55,7 +55,7 @@ mod supervision;
 mod tests;
 
 pub use bring_up::{FoundFault, Identity};
-pub use config::{Axis, AxisConfig, HeartbeatConfig, PerAxis, RawSdo, StageConfig, Zero};
+pub use config::{Axis, AxisConfig, HeartbeatConfig, PerAxis, RawSdo, StageConfig};
 pub use dialogue::{Dialogue, WithBothDrives};
 pub use drive::DriveReport;
 pub use event::{Counters, DriveFlag, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};

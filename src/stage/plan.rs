@@ -80,8 +80,8 @@ impl Script {
 
     async fn identify(&self) -> Result<(), String> {
         self.begin("checking its identity");
-        let vendor = self.read_identity(1, self.drive().vendor).await?;
-        let product = self.read_identity(2, self.drive().product).await?;
+        let vendor = self.read_identity(1, self.drive().vendor_id).await?;
+        let product = self.read_identity(2, self.drive().product_code).await?;
         self.note(|so_far| so_far.identified = true);
         // Not a reset: the drive may hold a load.
         self.sdo.leave_operational();
@@ -150,15 +150,16 @@ impl Script {
     async fn configure(&self) -> Result<(), String> {
         self.begin("writing the configured objects");
         let config = self.drive();
-        for raw in &config.raw_sdos {
+        for raw in &config.sdo {
+            let (object, value) = raw.to_write()?;
             match raw.read_back {
-                true => self.write(raw.object, raw.value).await?,
-                false => self.command(raw.object, raw.value).await?,
+                true => self.write(object, value).await?,
+                false => self.command(object, value).await?,
             }
         }
-        if let Some(timeout) = config.following_error_timeout.and_then(millis) {
+        if let Some(timeout_ms) = config.following_error_timeout_ms {
             // A drive without it does not wait.
-            self.write(optional(drive::FOLLOWING_ERROR_TIMEOUT), timeout).await?;
+            self.write(optional(drive::FOLLOWING_ERROR_TIMEOUT), timeout_ms).await?;
         }
         let window = Some(config.following_error_window());
         self.write_counts(drive::FOLLOWING_ERROR_WINDOW, window).await?;

@@ -54,24 +54,27 @@ impl AxisConfig {
     pub(crate) fn new(node: NodeId, ratio: CountsRatio, limits: AxisLimits) -> Self {
         AxisConfig {
             node,
-            vendor: None,
-            product: None,
+            vendor_id: None,
+            product_code: None,
             ratio,
             sign: Sign::Positive,
-            zero: Zero::Here,
+            zero: None,
             reference: Reference::Absolute,
             homing: None,
             wraps: false,
             limits,
             following_error_max: None,
-            following_error_timeout: None,
+            following_error_timeout_ms: None,
             quick_stop_deceleration: None,
             quick_stop_option: 6,
             fault_reaction_option: 2,
             abort_connection_option: 3,
             communication_error_behaviour: 0,
             optional_objects: Vec::new(),
-            raw_sdos: Vec::new(),
+            sdo: Vec::new(),
+            jog_speed: 2.0,
+            jog_acceleration: 10.0,
+            withdraw_speed: None,
         }
     }
 }
