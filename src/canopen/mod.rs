@@ -20,5 +20,5 @@ pub mod pdo;
 pub mod sdo;
 pub mod sync;
 
-pub use frame::{CanId, Frame, NodeId, NotAFrame};
+pub use frame::{CanId, Frame, NodeId};
 pub use object::ObjectAddress;

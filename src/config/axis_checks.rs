@@ -1,10 +1,9 @@
 //! Contradictions within `[stage]`: settings of an axis, its drive and its operations.
 
-use std::time::Duration;
-
 use super::Config;
+use super::checks::ROTATION_ACCELERATION_MAX;
 use super::reader::Reader;
-use crate::session::{PROFILE_PEAK, rotation_peak};
+use crate::session::PROFILE_PEAK;
 use crate::stage::{Axis, AxisConfig, Reference};
 
 /// Objects that a drive of the bench must have, and why. Of the others that the bring-up writes, a
@@ -218,11 +217,10 @@ fn reserved(index: u16) -> Option<&'static str> {
 /// bound to break.
 fn accelerations(config: &Config, reader: &mut Reader) {
     let along = "stage.insertion.acceleration_max_mm_per_s2";
-    let about = "stage.rotation.acceleration_max_deg_per_s2";
     for (key, max_key) in [
         ("insertion.acceleration_mm_per_s2", along),
         ("stage.insertion.jog_acceleration_mm_per_s2", along),
-        ("stage.rotation.jog_acceleration_deg_per_s2", about),
+        ("stage.rotation.jog_acceleration_deg_per_s2", ROTATION_ACCELERATION_MAX),
     ] {
         let [acceleration, max] = [key, max_key].map(|key| config.number(key));
         reader.check(&[key, max_key], PROFILE_PEAK * acceleration > max, || {
@@ -233,15 +231,4 @@ fn accelerations(config: &Config, reader: &mut Reader) {
             )
         });
     }
-    let (_, key) = config.control.rotation_max_rad_per_mm();
-    let (per_mm, speed, max) =
-        (config.number(key), config.insertion.speed_mm_per_s, config.number(about));
-    let peak = rotation_peak(per_mm, speed, Duration::from_millis(config.can.sync_ms.into()));
-    let keys = [key, "insertion.speed_mm_per_s", "can.sync_ms", about];
-    reader.check(&keys, peak > max, || {
-        format!(
-            "{key} is {per_mm}: reversed within a SYNC at {speed} mm/s, that is {peak:.0} deg/s², \
-             over {about} = {max}; raise it, or turn or insert more slowly"
-        )
-    });
 }

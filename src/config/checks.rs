@@ -11,7 +11,10 @@ use super::{CanInterface, Config, GoalKind};
 use crate::emulator::fault::Fault;
 use crate::keys::{Key, expanded};
 use crate::needle::{Torsion, TorsionConfig};
-use crate::session::InsertionConfig;
+use crate::session::{InsertionConfig, rotation_peak};
+use std::time::Duration;
+
+pub(super) const ROTATION_ACCELERATION_MAX: &str = "stage.rotation.acceleration_max_deg_per_s2";
 
 /// Notes every contradiction in `config`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
@@ -53,19 +56,27 @@ fn insertion(config: &Config, reader: &mut Reader) {
     });
 }
 
+/// The rotation that the law may ask for is within the limits of the axis, and so is its reversal.
 fn rotation(config: &Config, reader: &mut Reader) {
     let (_, key) = config.control.rotation_max_rad_per_mm();
-    let per_mm = config.number(key);
-    let speed = config.insertion.speed_mm_per_s;
+    let (per_mm, speed) = (config.number(key), config.insertion.speed_mm_per_s);
+    let (speed_key, sync_key) = ("insertion.speed_mm_per_s", "can.sync_ms");
     let max_key = "stage.rotation.speed_max_deg_per_s";
-    let max = config.number(max_key);
-    let deg_per_s = per_mm * speed;
-    reader.check(&[key, "insertion.speed_mm_per_s", max_key], deg_per_s > max, || {
+    let (deg_per_s, max) = (per_mm * speed, config.number(max_key));
+    reader.check(&[key, speed_key, max_key], deg_per_s > max, || {
         format!(
             "{key} is {per_mm}: at {speed} mm/s that is {deg_per_s} deg/s, over {max_key} = {max}; turn \
              by {:.4} deg/mm or insert at {:.4} mm/s",
             max / speed,
             max / per_mm,
+        )
+    });
+    let (max_key, max) = (ROTATION_ACCELERATION_MAX, config.number(ROTATION_ACCELERATION_MAX));
+    let peak = rotation_peak(per_mm, speed, Duration::from_millis(config.can.sync_ms.into()));
+    reader.check(&[key, speed_key, sync_key, max_key], peak > max, || {
+        format!(
+            "{key} is {per_mm}: reversed within a SYNC at {speed} mm/s, that is {peak:.0} deg/s², \
+             over {max_key} = {max}; raise it, or turn or insert more slowly"
         )
     });
 }

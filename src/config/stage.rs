@@ -6,7 +6,7 @@ use super::can::CanConfig;
 use super::error::ConfigError;
 use crate::keys::{section, within};
 use crate::stage;
-use crate::stage::{Axis, AxisConfig, HeartbeatConfig};
+use crate::stage::{Axis, AxisConfig};
 
 section! {
     /// `[stage]`: the two drives.
@@ -48,10 +48,8 @@ impl StageConfig {
         stage::StageConfig {
             sync_period: millis(can.sync_ms),
             bench_node: can.bench_node,
-            heartbeat: HeartbeatConfig {
-                producer_period: millis(can.heartbeat_ms),
-                consumer_time: millis(can.heartbeat_timeout_ms),
-            },
+            heartbeat_ms: can.heartbeat_ms,
+            heartbeat_timeout_ms: can.heartbeat_timeout_ms,
             sdo_timeout: millis(can.sdo_timeout_ms),
             sdo_attempts: can.sdo_attempts.into(),
             boot_timeout: can.boot_timeout,

@@ -44,15 +44,12 @@ impl StopConfig {
     /// What is wrong with the interface or the nodes. A source that is not TOML counts as empty, and
     /// its problems are reported if interface or nodes are missing.
     pub fn from_source(source: Option<Source<'_>>, sets: &[String]) -> Result<Self, ConfigError> {
-        let parse = |name: &str, text: &str, layer| {
-            value::parse_file(name, text, layer).map_err(|problems| ConfigError { problems })
-        };
         let mut layers = Vec::new();
         let mut problems = Vec::new();
-        match source.map(|source| parse(source.name, source.text, 1)) {
+        match source.map(|source| value::parse_file(source.name, source.text, 1)) {
             Some(Ok(entries)) => layers.push(entries),
-            Some(Err(error)) => {
-                problems = error.problems;
+            Some(Err(syntax)) => {
+                problems = syntax;
                 let kept = source.map(|source| salvaged(source.text)).unwrap_or_default();
                 layers.push(value::parse_what_can_be("salvaged", &kept, 1));
             }
@@ -62,9 +59,7 @@ impl StopConfig {
             match value::parse_set(set, layer) {
                 Ok(entries) => layers.push(entries),
                 // It was to name the interface or a node.
-                Err(problem) if names_what_a_stop_needs(set) => {
-                    return Err(ConfigError { problems: vec![problem] });
-                }
+                Err(problems) if names_what_a_stop_needs(set) => return Err(problems.into()),
                 Err(_) => {}
             }
         }
@@ -101,8 +96,7 @@ impl StopConfig {
         });
         for (key, coarse) in COARSE {
             if !tree.keys().any(|given| given == key || is_inside(given, key)) {
-                let entries = value::parse_set(coarse, 1);
-                tree.extend(entries.map_err(|problem| ConfigError { problems: vec![problem] })?);
+                tree.extend(value::parse_set(coarse, 1)?);
             }
         }
         let rest = Config::of(Reader::new(tree).read(Config::KEYS));

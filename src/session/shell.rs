@@ -165,7 +165,7 @@ impl Shell {
     /// while the bench is silent on purpose.
     pub(super) fn silence_max(&self) -> Option<Duration> {
         let is_missed = matches!(self.power, Power::On(_)) && self.is_running() && !self.is_silent;
-        is_missed.then_some(self.config.heartbeat.consumer_time)
+        is_missed.then_some(self.config.heartbeat_timeout())
     }
 
     /// Records an event of the stage.

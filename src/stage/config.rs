@@ -231,15 +231,6 @@ impl AxisConfig {
     }
 }
 
-/// Who watches whom, and how closely. Periods are sent to the drives in whole milliseconds.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct HeartbeatConfig {
-    /// Between two heartbeats, of the bench and of each drive (0x1017).
-    pub producer_period: Duration,
-    /// Silence that counts as loss, for the bench and for each drive (0x1016).
-    pub consumer_time: Duration,
-}
-
 /// The whole stage.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageConfig {
@@ -247,8 +238,10 @@ pub struct StageConfig {
     pub sync_period: Duration,
     /// The bench's own node number, whose heartbeat the drives watch.
     pub bench_node: NodeId,
-    /// Supervision, both ways.
-    pub heartbeat: HeartbeatConfig,
+    /// Between two heartbeats, of the bench and of each drive (0x1017), ms.
+    pub heartbeat_ms: u16,
+    /// Silence that counts as loss, for the bench and for each drive (0x1016), ms.
+    pub heartbeat_timeout_ms: u16,
     /// Longest wait for an SDO answer.
     pub sdo_timeout: Duration,
     /// How often an SDO is tried.
@@ -291,6 +284,11 @@ impl StageConfig {
         Standstill::new(counts_per_unit).window(self.sync_period)
     }
 
+    /// Silence that counts as loss, for the bench and for each drive.
+    pub fn heartbeat_timeout(&self) -> Duration {
+        Duration::from_millis(self.heartbeat_timeout_ms.into())
+    }
+
     /// The nodes of the drives.
     pub fn nodes(&self) -> PerAxis<NodeId> {
         PerAxis { insertion: self.insertion.node, rotation: self.rotation.node }
@@ -316,14 +314,11 @@ impl StageConfig {
                 self.sync_period.as_micros()
             ));
         }
-        let HeartbeatConfig { producer_period, consumer_time } = self.heartbeat;
-        let (producer, consumer) = (millis(producer_period), millis(consumer_time));
-        if !matches!((producer, consumer), (Some(1..), Some(1..))) || consumer <= producer {
+        let (period_ms, timeout_ms) = (self.heartbeat_ms, self.heartbeat_timeout_ms);
+        if period_ms == 0 || timeout_ms <= period_ms {
             return Err(format!(
-                "heartbeat every {} ms, lost after {} ms: 1 to 65535 ms, and the second must be the \
-                 longer",
-                producer_period.as_millis(),
-                consumer_time.as_millis()
+                "heartbeat every {period_ms} ms, lost after {timeout_ms} ms: 1 to 65535 ms, and the \
+                 second must be the longer"
             ));
         }
         Axis::BOTH.into_iter().try_for_each(|axis| self.validate_axis(axis))
@@ -389,11 +384,6 @@ pub(super) fn unsigned_counts(scale: Scale, value: f64) -> Option<u32> {
     (1.0..=f64::from(u32::MAX)).contains(&counts).then_some(counts as u32)
 }
 
-/// A duration in whole milliseconds that fit 16 bits.
-pub(super) fn millis(duration: Duration) -> Option<u16> {
-    u16::try_from(duration.as_millis()).ok()
-}
-
 /// `period` as object 0x60C2 has it: a count of 1 to 255 and a power of ten of a second.
 pub(super) fn interpolation_period(period: Duration) -> Option<(u8, i8)> {
     [(-3, 1_000_000), (-4, 100_000), (-5, 10_000), (-6, 1_000)].into_iter().find_map(
@@ -441,9 +431,7 @@ mod tests {
         };
         assert!(text(|c| c.rotation.node = c.bench_node).starts_with("node 127 is used twice"));
         assert!(text(|c| c.sync_period = Duration::from_secs(1)).contains("1000000 µs"));
-        assert!(
-            text(|c| c.heartbeat.consumer_time = c.heartbeat.producer_period).contains("100 ms")
-        );
+        assert!(text(|c| c.heartbeat_timeout_ms = c.heartbeat_ms).contains("100 ms"));
         assert!(
             text(|c| c.rotation.following_error_max = Some(0.0))
                 .starts_with("rotation: a following error of 0 deg: ")

@@ -104,18 +104,18 @@ impl Stage {
             return Err(no_homing(axis));
         }
         config.validate()?;
-        let consumer_time = config.heartbeat.consumer_time;
+        let timeout = config.heartbeat_timeout();
         let until = now + config.listen_first;
         let mut stage = Stage {
             phase: Phase::Listening { until },
             bring_ups: PerAxis::default(),
             drives: PerAxis::from_fn(|axis| Drive::new(&config, axis, homes[axis])),
             monitors: PerAxis::from_fn(|axis| {
-                HeartbeatConsumer::new(config.axis(axis).node, consumer_time)
+                HeartbeatConsumer::new(config.axis(axis).node, timeout)
             }),
             heartbeat: HeartbeatProducer::new(
                 config.bench_node,
-                config.heartbeat.producer_period,
+                Duration::from_millis(config.heartbeat_ms.into()),
                 until,
             ),
             sync: SyncProducer::new(config.sync_period, Time::NEVER),
@@ -383,7 +383,7 @@ impl Stage {
         if let Some(fault) = bring_up.and_then(|bring_up| bring_up.so_far().found_in_fault) {
             self.drives[axis].allow_reset(fault.error_code);
         }
-        self.monitors[axis].deadline = now + self.config.heartbeat.consumer_time;
+        self.monitors[axis].deadline = now + self.config.heartbeat_timeout();
         if self.bring_ups.all(Option::is_none) {
             for axis in Axis::BOTH {
                 self.send_nmt(NmtCommand::StartRemoteNode, axis);

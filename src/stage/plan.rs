@@ -1,7 +1,7 @@
 //! The steps of bring-up, in order: what is read from a drive, and what is written to it.
 
 use super::bring_up::{FoundFault, Identity, Object, Script, optional};
-use super::config::{interpolation_period, millis, unsigned_counts};
+use super::config::{interpolation_period, unsigned_counts};
 use super::{AxisConfig, HomingConfig, Reference, Sign, StageEvent};
 use crate::canopen::cia402::{Controlword, DriveState, Mode, Statusword, object as drive};
 use crate::canopen::emcy::EmcyCode;
@@ -177,12 +177,11 @@ impl Script {
 
     async fn supervise(&self) -> Result<(), String> {
         self.begin("setting heartbeats");
-        let (config, heartbeat) = (self.drive(), self.config.heartbeat);
-        let producer_ms = millis(heartbeat.producer_period).unwrap_or(u16::MAX);
-        let consumer_ms = millis(heartbeat.consumer_time).unwrap_or(u16::MAX);
+        let config = self.drive();
+        let timeout_ms = u32::from(self.config.heartbeat_timeout_ms);
         self.note(|so_far| so_far.may_be_supervised = true);
-        let watched = u32::from(self.config.bench_node.get()) << 16 | u32::from(consumer_ms);
-        self.write(PRODUCER_HEARTBEAT, producer_ms).await?;
+        let watched = u32::from(self.config.bench_node.get()) << 16 | timeout_ms;
+        self.write(PRODUCER_HEARTBEAT, self.config.heartbeat_ms).await?;
         self.write(consumer_heartbeat(1), watched).await?;
         match config.communication_error_behaviour {
             // A node without it behaves as by 0.

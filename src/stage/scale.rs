@@ -37,8 +37,7 @@ impl Field for CountsRatio {
     const KIND: Kind = CountsPer::KIND;
     fn take(value: Option<&Value>) -> Self {
         let CountsPer { counts, per } = CountsPer::take(value);
-        let positive = |number| NonZeroU32::new(number).unwrap_or(NonZeroU32::MIN);
-        CountsRatio { counts: positive(counts), per: positive(per) }
+        CountsRatio::new(counts, per).unwrap_or(const { CountsRatio::new(1, 1).unwrap() })
     }
 }
 

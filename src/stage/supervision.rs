@@ -87,7 +87,7 @@ impl Stage {
                 "boot-up message in mid-run, the drive restarted; is its supply stable?".to_owned()
             }
             HeartbeatEvent::Lost => {
-                let ms = self.config.heartbeat.consumer_time.as_millis();
+                let ms = self.config.heartbeat_timeout_ms;
                 format!("no heartbeat for {ms} ms, is the drive powered and on the bus?")
             }
             HeartbeatEvent::State(state) if state != NmtState::Operational && !may_be_old => {

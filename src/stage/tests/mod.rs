@@ -28,10 +28,8 @@ impl StageConfig {
         StageConfig {
             sync_period: Duration::from_millis(10),
             bench_node: BENCH,
-            heartbeat: HeartbeatConfig {
-                producer_period: Duration::from_millis(100),
-                consumer_time: Duration::from_millis(300),
-            },
+            heartbeat_ms: 100,
+            heartbeat_timeout_ms: 300,
             sdo_timeout: Duration::from_millis(150),
             sdo_attempts: 3,
             boot_timeout: Duration::from_secs(5),
