@@ -143,7 +143,7 @@ fn needed(config: &Config, left: &Left) -> Option<&'static str> {
     let is_in_fault = !left.drives.all(|drive| !is_in_fault(drive));
     match left.unknown {
         Some(_) => Some("status"),
-        None => (is_in_fault && !config.stage.fault_reset_on_start).then_some("reset"),
+        None => (is_in_fault && !config.stage.power.fault_reset_on_start).then_some("reset"),
     }
 }
 

@@ -273,11 +273,11 @@ pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure
     let CanInterface::Socket(name) = config.bus() else { return open_bus(config.bus()) };
     let mut bus = SocketCan::open(name)?;
     // As many as may go unanswered, and the one under way.
-    let syncs_max = usize::from(config.can.missed_feedback_max) + 1;
+    let syncs_max = usize::from(config.can.bus.missed_feedback_max) + 1;
     bus.confirm_sending(syncs_max)?;
     if config.can.listen == Listen::Stage {
         let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
-        let nodes = [config.can.bench_node, insertion.node, rotation.node];
+        let nodes = [config.can.bus.bench_node, insertion.node, rotation.node];
         bus.listen_to(&nodes)?;
     }
     Ok(Box::new(bus))

@@ -106,7 +106,7 @@ impl Config {
             *switches = rehearsal::switches(*switches, along, per_mm);
             *switches_turned = rehearsal::switches(*switches_turned, about, per_turn / TAU);
         }
-        let bench = Some(self.can.bench_node);
+        let bench = Some(self.can.bus.bench_node);
         let faults = emulator.fault.iter().map(|fault| Fault { bench, ..fault.clone() });
         Ok(VirtualStageConfig {
             insertion,

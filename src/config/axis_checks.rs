@@ -155,7 +155,7 @@ fn axis(config: &Config, which: Axis, axis: &AxisConfig, reader: &mut Reader) {
     }
     // The bench allows for what the target does in two SYNC periods beyond the drive's window: a drive
     // that waits no longer than these notices no later than the bench.
-    let (timeout_key, sync_ms) = (key("following_error_timeout_ms"), config.can.sync_ms);
+    let (timeout_key, sync_ms) = (key("following_error_timeout_ms"), config.can.bus.sync_ms);
     let timeout_ms = axis.following_error_timeout_ms.unwrap_or_default();
     reader.check(&["can.sync_ms", &timeout_key], timeout_ms > 2 * sync_ms, || {
         format!(

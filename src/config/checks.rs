@@ -40,13 +40,13 @@ fn insertion(config: &Config, reader: &mut Reader) {
         format!("{arrival_key} is {arrival_mm}, allowed: up to half of {step_key}, which is {step}")
     });
     // A step is taken at a SYNC: at most one a period.
-    let per_sync = speed * f64::from(config.can.sync_ms) * 1e-3;
+    let per_sync = speed * f64::from(config.can.bus.sync_ms) * 1e-3;
     let [speed_key, sync_key] = ["insertion.speed_mm_per_s", "can.sync_ms"];
     reader.check(&[step_key, speed_key, sync_key], per_sync > step, || {
         format!(
             "{step_key} is {step}, allowed: at least what {speed_key} = {speed} moves in {sync_key} = \
              {}, which is {per_sync}",
-            config.can.sync_ms
+            config.can.bus.sync_ms
         )
     });
     let baseline = config.observer.finite_difference.baseline_mm;
@@ -72,7 +72,7 @@ fn rotation(config: &Config, reader: &mut Reader) {
         )
     });
     let (max_key, max) = (ROTATION_ACCELERATION_MAX, config.number(ROTATION_ACCELERATION_MAX));
-    let peak = rotation_peak(per_mm, speed, Duration::from_millis(config.can.sync_ms.into()));
+    let peak = rotation_peak(per_mm, speed, Duration::from_millis(config.can.bus.sync_ms.into()));
     reader.check(&[key, speed_key, sync_key, max_key], peak > max, || {
         format!(
             "{key} is {per_mm}: reversed within a SYNC at {speed} mm/s, that is {peak:.0} deg/s², \
@@ -148,7 +148,7 @@ fn noise(config: &Config, reader: &mut Reader) {
 
 fn bus(config: &Config, reader: &mut Reader) {
     let nodes = [
-        ("can.bench_node", config.can.bench_node),
+        ("can.bench_node", config.can.bus.bench_node),
         ("stage.insertion.node", config.stage.insertion.node),
         ("stage.rotation.node", config.stage.rotation.node),
     ];
@@ -160,7 +160,7 @@ fn bus(config: &Config, reader: &mut Reader) {
         }
     }
 
-    let (period, timeout) = (config.can.heartbeat_ms, config.can.heartbeat_timeout_ms);
+    let (period, timeout) = (config.can.bus.heartbeat_ms, config.can.bus.heartbeat_timeout_ms);
     let too_short = u32::from(timeout) < 2 * u32::from(period);
     reader.check(&["can.heartbeat_timeout_ms", "can.heartbeat_ms"], too_short, || {
         format!(
@@ -232,7 +232,7 @@ fn tracker(config: &Config, reader: &mut Reader) {
     let braking = config.tracker.hold.braking_mm_per_s2;
     let is_seen_here = config.tip_source() == TrackerSource::Emulated;
     let period_s = if is_seen_here { config.emulator.tracker_rate_hz.recip() } else { 0.0 };
-    let noticed_s = period_s + (latency_ms + 2.0 * f64::from(config.can.sync_ms)) * 1e-3;
+    let noticed_s = period_s + (latency_ms + 2.0 * f64::from(config.can.bus.sync_ms)) * 1e-3;
     let least_mm = speed * noticed_s + 0.5 * speed * speed / braking;
     let [key, brake] = ["tracker.hold_after_mm", "tracker.hold_braking_mm_per_s2"];
     let keys = [key, "insertion.speed_mm_per_s", brake, latency];

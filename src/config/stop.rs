@@ -104,7 +104,7 @@ impl StopConfig {
         (stage.insertion.node, stage.rotation.node) = (insertion, rotation);
         // A coarse axis is seen to stand all the same.
         let windows = stage::Axis::BOTH.map(|axis| 2 * stage.standstill_window(axis));
-        stage.stop_timeout = stage.stop_timeout.max(windows[0]).max(windows[1]);
+        stage.power.stop_timeout = stage.power.stop_timeout.max(windows[0]).max(windows[1]);
         Ok(StopConfig { interface, stage })
     }
 }
@@ -158,8 +158,8 @@ mod tests {
         assert_eq!(nodes(&rig), [1, 2]);
         assert_eq!(rig.stage.insertion.ratio, CountsRatio::new(590_000, 127).unwrap());
         assert_eq!(rig.stage.rotation.ratio, CountsRatio::new(75_760, 1).unwrap());
-        assert_eq!(rig.stage.sdo_timeout, Duration::from_millis(300));
-        assert_eq!(rig.stage.stop_timeout, Duration::from_secs(4));
+        assert_eq!(rig.stage.bus.sdo_timeout(), Duration::from_millis(300));
+        assert_eq!(rig.stage.power.stop_timeout, Duration::from_secs(4));
     }
 
     /// Each of these a run refuses.
@@ -190,9 +190,9 @@ mod tests {
         }
         let all = read(RIG, &elsewhere).expect("all of them");
         assert_eq!(all.stage.insertion.ratio, CountsRatio::new(100, 1).unwrap(), "a coarse one");
-        assert_eq!(all.stage.stop_timeout, Duration::from_secs(2), "as by default");
+        assert_eq!(all.stage.power.stop_timeout, Duration::from_secs(2), "as by default");
         assert_eq!(
-            (all.stage.sdo_timeout, all.stage.sdo_attempts),
+            (all.stage.bus.sdo_timeout(), all.stage.bus.sdo_attempts),
             (Duration::from_millis(150), 3)
         );
     }
@@ -200,13 +200,17 @@ mod tests {
     /// A stage that cannot work so is stopped; it is given the time that its counts need to stand.
     #[test]
     fn a_scale_or_a_time_that_a_run_refuses_does_not_keep_a_stop_from_being_sent() {
-        let stop_timeout = |set| read(RIG, &[set]).unwrap().stage.stop_timeout;
+        let stop_timeout = |set| read(RIG, &[set]).unwrap().stage.power.stop_timeout;
         assert_eq!(stop_timeout("stage.stop_timeout_s=0.5"), Duration::from_millis(500));
         let coarse = "stage.insertion.counts_per_mm={ counts = 20, mm = 1 }";
         assert_eq!(stop_timeout(coarse), Duration::from_secs(5));
         let unknown = ["can.interface=udp", "stage.stop_timeout_s=0.5"];
         let stop = read("", &unknown).unwrap();
-        assert!(stop.stage.stop_timeout > Duration::from_secs(1), "{:?}", stop.stage.stop_timeout);
+        assert!(
+            stop.stage.power.stop_timeout > Duration::from_secs(1),
+            "{:?}",
+            stop.stage.power.stop_timeout
+        );
     }
 
     /// As it may be saved half-way through an edit, while a needle moves.

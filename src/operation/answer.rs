@@ -101,7 +101,7 @@ pub(super) struct Answering {
 impl Answering {
     pub(super) fn new(config: &StageConfig, settings: AnswerSettings) -> Self {
         Answering {
-            sync_period: config.sync_period,
+            sync_period: config.bus.sync_period(),
             gate: settings.gate.clone(),
             settings,
             counts: GateCounts::default(),

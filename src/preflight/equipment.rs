@@ -79,7 +79,8 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
     let found = format!("{name} {}{state}", if is_up { "up" } else { "down" });
     let bus = Check::new("bus", found, UP).unless(is_up && may_send, Fail, set(BRING_UP));
 
-    let load_of = |rate: u32| CYCLE_BITS * 1e3 / f64::from(config.can.sync_ms) / f64::from(rate);
+    let load_of =
+        |rate: u32| CYCLE_BITS * 1e3 / f64::from(config.can.bus.sync_ms) / f64::from(rate);
     let found = bit_rate.map_or_else(unknown, |rate| {
         let (kbit_per_s, load) = (f64::from(rate) * 1e-3, load_of(rate) * 1e2);
         format!("{kbit_per_s} kbit/s, {load:.0}% load by SYNC")
@@ -112,7 +113,8 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
         Ok(status) => status,
         Err(trouble) => {
             let can = &config.can;
-            let limit = format!("{} requests of {} ms", can.sdo_attempts, can.sdo_timeout_ms);
+            let limit =
+                format!("{} requests of {} ms", can.bus.sdo_attempts, can.bus.sdo_timeout_ms);
             let next = "is it powered, and are node and bit rate right?";
             return vec![Check::new(name, trouble, limit).unless(false, Fail, next)];
         }
@@ -146,7 +148,7 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
         Check::new(&name, format!("node {node}, {identity}; {statusword}"), limit)
             .unless(is_named, Warn, write)
             .unless(state != Some(DriveState::OperationEnabled), Warn, POWERED)
-            .unless(!is_faulty || config.stage.fault_reset_on_start, Fail, reset)
+            .unless(!is_faulty || config.stage.power.fault_reset_on_start, Fail, reset)
             .unless(is_right, Fail, other),
     ];
     let errors: Vec<String> =

@@ -231,35 +231,71 @@ impl AxisConfig {
     }
 }
 
+section! {
+    /// What the drives are told on the bus, and how long they are waited for.
+    #[derive(Copy)]
+    pub struct BusConfig {
+        /// Period of SYNC, ms.
+        sync_ms: u16 [within(1.0, 100.0)] = 10;
+        /// The bench's own node number: the drives watch its heartbeat.
+        bench_node: NodeId = 127;
+        /// Period of the bench's and the drives' heartbeats, ms.
+        heartbeat_ms: u16 [within(5.0, 10_000.0)] = 25;
+        /// A heartbeat that is missing for this long stops the run, and the drives, ms.
+        heartbeat_timeout_ms: u16 [within(10.0, 60_000.0)] = 100;
+        /// Longest wait for the answer to one SDO request, ms.
+        sdo_timeout_ms: u16 [within(10.0, 10_000.0)] = 150;
+        /// How often an SDO request is sent before giving up.
+        sdo_attempts: u8 [within(1.0, 20.0)] = 3;
+        /// Longest wait for a drive to boot, s.
+        boot_timeout as "boot_timeout_s": Duration [within(0.1, 120.0)] = 2.0;
+        /// How often the bring-up of a drive is begun, if the drive restarts in the middle of it.
+        boot_attempts: u8 [within(1.0, 20.0)] = 3;
+        /// SYNCs in a row without both drives' answers that are tolerated.
+        missed_feedback_max: u8 [within(0.0, 100.0)] = 1;
+    }
+}
+
+impl BusConfig {
+    /// Period of SYNC.
+    pub fn sync_period(&self) -> Duration {
+        Duration::from_millis(self.sync_ms.into())
+    }
+
+    /// Silence that counts as loss, for the bench and for each drive.
+    pub fn heartbeat_timeout(&self) -> Duration {
+        Duration::from_millis(self.heartbeat_timeout_ms.into())
+    }
+
+    /// Longest wait for the answer to one SDO request.
+    pub fn sdo_timeout(&self) -> Duration {
+        Duration::from_millis(self.sdo_timeout_ms.into())
+    }
+}
+
+section! {
+    /// How power is switched on and off.
+    #[derive(Copy)]
+    pub struct PowerConfig {
+        /// Reset a drive that is found in fault, once, instead of refusing to start.
+        fault_reset_on_start: bool = false;
+        /// Longest wait for both drives to be enabled, brakes included, s.
+        enable_timeout as "enable_timeout_s": Duration [within(0.1, 60.0)] = 3.0;
+        /// Of that, the longest wait for each step up to "switched on", charging included, s. A drive
+        /// that takes longer is held, for example by its safety input, and the start is given up.
+        state_transition_timeout as "let_on_s": Duration [within(0.05, 60.0)] = 0.5;
+        /// Longest wait for both axes to stand after a stop, s.
+        stop_timeout as "stop_timeout_s": Duration [within(0.1, 60.0)] = 2.0;
+    }
+}
+
 /// The whole stage.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageConfig {
-    /// Between two SYNCs.
-    pub sync_period: Duration,
-    /// The bench's own node number, whose heartbeat the drives watch.
-    pub bench_node: NodeId,
-    /// Between two heartbeats, of the bench and of each drive (0x1017), ms.
-    pub heartbeat_ms: u16,
-    /// Silence that counts as loss, for the bench and for each drive (0x1016), ms.
-    pub heartbeat_timeout_ms: u16,
-    /// Longest wait for an SDO answer.
-    pub sdo_timeout: Duration,
-    /// How often an SDO is tried.
-    pub sdo_attempts: u32,
-    /// Longest wait for a drive to answer at all.
-    pub boot_timeout: Duration,
-    /// How often a drive may be brought up: it may restart in the middle of it.
-    pub boot_attempts: u32,
-    /// Longest way from Operational to both drives in Operation Enabled; brakes take their time.
-    pub enable_timeout: Duration,
-    /// For a drive to leave Switch On Disabled, and Ready To Switch On, once it is told to.
-    pub state_transition_timeout: Duration,
-    /// Longest wait for standstill, and for power to be off.
-    pub stop_timeout: Duration,
-    /// SYNCs in a row without both positions that are tolerated; the next is a fault.
-    pub missed_feedback_max: u32,
-    /// Reset a drive found in Fault. Otherwise it is an error that names the fault.
-    pub fault_reset_on_start: bool,
+    /// What the drives are told on the bus.
+    pub bus: BusConfig,
+    /// How power is switched on and off.
+    pub power: PowerConfig,
     /// How long another master is listened for before the first frame is sent: as long as the
     /// heartbeat of a living one may be late.
     pub listen_first: Duration,
@@ -281,12 +317,7 @@ impl StageConfig {
     /// How long the counts of `axis` are watched to see that it stands.
     pub fn standstill_window(&self, axis: Axis) -> Duration {
         let counts_per_unit = self.axis(axis).scale(axis, 0).counts_per_unit();
-        Standstill::new(counts_per_unit).window(self.sync_period)
-    }
-
-    /// Silence that counts as loss, for the bench and for each drive.
-    pub fn heartbeat_timeout(&self) -> Duration {
-        Duration::from_millis(self.heartbeat_timeout_ms.into())
+        Standstill::new(counts_per_unit).window(self.bus.sync_period())
     }
 
     /// The nodes of the drives.
@@ -300,21 +331,21 @@ impl StageConfig {
     /// The first thing that the stage cannot work with.
     pub fn validate(&self) -> Result<(), String> {
         let PerAxis { insertion, rotation } = self.nodes();
-        let nodes = [insertion, rotation, self.bench_node];
+        let nodes = [insertion, rotation, self.bus.bench_node];
         let is_used_twice = |node: &&NodeId| nodes.iter().filter(|other| other == node).count() > 1;
         if let Some(node) = nodes.iter().find(is_used_twice) {
             return Err(format!(
                 "node {node} is used twice among the bench, insertion and rotation"
             ));
         }
-        if interpolation_period(self.sync_period).is_none() {
+        let BusConfig {
+            sync_ms, heartbeat_ms: period_ms, heartbeat_timeout_ms: timeout_ms, ..
+        } = self.bus;
+        if !(1..=255).contains(&sync_ms) {
             return Err(format!(
-                "a SYNC period of {} µs does not fit object 0x60C2: 1 to 255 times 1, 0.1, 0.01 or \
-                 0.001 ms",
-                self.sync_period.as_micros()
+                "a SYNC period of {sync_ms} ms does not fit object 0x60C2: 1 to 255 ms"
             ));
         }
-        let (period_ms, timeout_ms) = (self.heartbeat_ms, self.heartbeat_timeout_ms);
         if period_ms == 0 || timeout_ms <= period_ms {
             return Err(format!(
                 "heartbeat every {period_ms} ms, lost after {timeout_ms} ms: 1 to 65535 ms, and the \
@@ -360,12 +391,12 @@ impl StageConfig {
         }
         let window = self.standstill_window(axis);
         // It brakes first, and the last SYNC counts when the next is due.
-        if window + 2 * self.sync_period >= self.stop_timeout {
+        if window + 2 * self.bus.sync_period() >= self.power.stop_timeout {
             return Err(format!(
                 "{axis}: {:.0} ms of its counts are needed to see it stand, and stop_timeout_s is \
                  {:.3}: set a longer one",
                 window.as_secs_f64() * 1e3,
-                self.stop_timeout.as_secs_f64()
+                self.power.stop_timeout.as_secs_f64()
             ));
         }
         Ok(())
@@ -384,17 +415,6 @@ pub(super) fn unsigned_counts(scale: Scale, value: f64) -> Option<u32> {
     (1.0..=f64::from(u32::MAX)).contains(&counts).then_some(counts as u32)
 }
 
-/// `period` as object 0x60C2 has it: a count of 1 to 255 and a power of ten of a second.
-pub(super) fn interpolation_period(period: Duration) -> Option<(u8, i8)> {
-    [(-3, 1_000_000), (-4, 100_000), (-5, 10_000), (-6, 1_000)].into_iter().find_map(
-        |(exponent, unit_ns): (i8, u128)| {
-            let whole = period.as_nanos().is_multiple_of(unit_ns);
-            let count = u8::try_from(period.as_nanos() / unit_ns).ok()?;
-            (whole && count > 0).then_some((count, exponent))
-        },
-    )
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -410,18 +430,6 @@ mod tests {
     }
 
     #[test]
-    fn the_interpolation_period_is_a_count_and_a_power_of_ten() {
-        let period = |us| interpolation_period(Duration::from_micros(us));
-        assert_eq!(period(10_000), Some((10, -3)));
-        assert_eq!(period(255_000), Some((255, -3)));
-        assert_eq!(period(1_500), Some((15, -4)));
-        assert_eq!(period(125), Some((125, -6)));
-        assert_eq!(period(256_000), None);
-        assert_eq!(period(1_255), None);
-        assert_eq!(period(0), None);
-    }
-
-    #[test]
     fn mistakes_are_named() {
         assert_eq!(config().validate(), Ok(()));
         let text = |change: fn(&mut StageConfig)| {
@@ -429,9 +437,9 @@ mod tests {
             change(&mut config);
             config.validate().expect_err("refused").to_string()
         };
-        assert!(text(|c| c.rotation.node = c.bench_node).starts_with("node 127 is used twice"));
-        assert!(text(|c| c.sync_period = Duration::from_secs(1)).contains("1000000 µs"));
-        assert!(text(|c| c.heartbeat_timeout_ms = c.heartbeat_ms).contains("100 ms"));
+        assert!(text(|c| c.rotation.node = c.bus.bench_node).starts_with("node 127 is used twice"));
+        assert!(text(|c| c.bus.sync_ms = 1000).contains("1000 ms"));
+        assert!(text(|c| c.bus.heartbeat_timeout_ms = c.bus.heartbeat_ms).contains("100 ms"));
         assert!(
             text(|c| c.rotation.following_error_max = Some(0.0))
                 .starts_with("rotation: a following error of 0 deg: ")

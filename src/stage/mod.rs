@@ -55,7 +55,7 @@ mod supervision;
 mod tests;
 
 pub use bring_up::{FoundFault, Identity};
-pub use config::{Axis, AxisConfig, PerAxis, RawSdo, StageConfig};
+pub use config::{Axis, AxisConfig, BusConfig, PerAxis, PowerConfig, RawSdo, StageConfig};
 pub use dialogue::Dialogue;
 pub use drive::DriveReport;
 pub use event::{Counters, DriveFlag, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};

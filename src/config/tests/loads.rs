@@ -231,7 +231,7 @@ fn the_stage_is_told_in_counts_and_radians() {
     );
     assert_eq!(rotation.sdo, [first, second]);
     assert_eq!(rotation.following_error_max, Some(3.6f64.to_radians()));
-    assert_eq!(stage.heartbeat_timeout_ms, 100);
+    assert_eq!(stage.bus.heartbeat_timeout_ms, 100);
 }
 
 #[test]

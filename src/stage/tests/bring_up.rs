@@ -224,7 +224,7 @@ fn power_waits_until_it_is_permitted() {
 #[test]
 fn what_happens_while_power_is_awaited_ends_it() {
     let awaiting = || {
-        let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
+        let mut bench = Bench::new(resetting_config());
         bench.stage.permit_power(false);
         bench.run_until(|event| matches!(event, StageEvent::Located(_)));
         bench.run_for(Duration::from_secs(1));

@@ -26,19 +26,23 @@ impl StageConfig {
     pub(crate) fn new(insertion: AxisConfig, rotation: AxisConfig) -> Self {
         const BENCH: NodeId = NodeId::new(127).unwrap();
         StageConfig {
-            sync_period: Duration::from_millis(10),
-            bench_node: BENCH,
-            heartbeat_ms: 100,
-            heartbeat_timeout_ms: 300,
-            sdo_timeout: Duration::from_millis(150),
-            sdo_attempts: 3,
-            boot_timeout: Duration::from_secs(5),
-            boot_attempts: 3,
-            enable_timeout: Duration::from_secs(3),
-            state_transition_timeout: Duration::from_millis(500),
-            stop_timeout: Duration::from_secs(2),
-            missed_feedback_max: 1,
-            fault_reset_on_start: false,
+            bus: BusConfig {
+                sync_ms: 10,
+                bench_node: BENCH,
+                heartbeat_ms: 100,
+                heartbeat_timeout_ms: 300,
+                sdo_timeout_ms: 150,
+                sdo_attempts: 3,
+                boot_timeout: Duration::from_secs(5),
+                boot_attempts: 3,
+                missed_feedback_max: 1,
+            },
+            power: PowerConfig {
+                fault_reset_on_start: false,
+                enable_timeout: Duration::from_secs(3),
+                state_transition_timeout: Duration::from_millis(500),
+                stop_timeout: Duration::from_secs(2),
+            },
             listen_first: Duration::from_millis(300),
             insertion,
             rotation,
@@ -89,6 +93,13 @@ fn config() -> StageConfig {
     let depth = AxisLimits { min: -1.0, max: 150.0, speed_max: 10.0, acceleration_max: None };
     let angle = AxisLimits { min: -700.0, max: 700.0, speed_max: 20.0, acceleration_max: None };
     StageConfig::new(axis(1, COUNTS_PER_MM, depth), axis(2, COUNTS_PER_TURN, angle))
+}
+
+/// The same; a drive that is found in fault is reset.
+fn resetting_config() -> StageConfig {
+    let mut config = config();
+    config.power.fault_reset_on_start = true;
+    config
 }
 
 /// The stage, its drives and the bus between them.
