@@ -127,12 +127,8 @@ impl Config {
     /// The drive of `axis`, which moves by so many mm or turns a second, and its counts per mm or turn.
     fn emulated_drive(&self, axis: &AxisConfig, units_per_s: f64) -> (drive::DriveConfig, f64) {
         let counts_per_unit = axis.ratio.to_f64();
-        let identity = drive::Identity {
-            vendor: axis.vendor_id.unwrap_or(EMULATED_VENDOR_ID),
-            product: axis.product_code.unwrap_or(EMULATED_PRODUCT_CODE),
-            revision: 1,
-            serial: u32::from(axis.node.get()),
-        };
+        let vendor = axis.vendor_id.unwrap_or(EMULATED_VENDOR_ID);
+        let product = axis.product_code.unwrap_or(EMULATED_PRODUCT_CODE);
         let speed_max_counts_per_s = (2.0 * counts_per_unit * units_per_s).ceil() as u32;
         let raw_objects = axis.sdo.iter().filter(|_| self.emulator.rehearse);
         let drive = drive::DriveConfig {
@@ -142,7 +138,7 @@ impl Config {
             more_objects: raw_objects
                 .map(|raw| (ObjectAddress::new(raw.index, raw.subindex), raw.bits))
                 .collect(),
-            ..drive::DriveConfig::new(axis.node, identity)
+            ..drive::DriveConfig::new(axis.node, vendor, product)
         };
         let sign = if axis.sign == Sign::Negative { -1.0 } else { 1.0 };
         (drive, counts_per_unit * sign)

@@ -7,7 +7,7 @@ use needle_bench::canopen::nmt::NmtState;
 
 use needle_bench::canopen::{Frame, NodeId};
 use needle_bench::config::Config;
-use needle_bench::emulator::drive::{Drive, DriveConfig, Identity};
+use needle_bench::emulator::drive::{Drive, DriveConfig};
 use needle_bench::emulator::fault::{Fault, FaultKind};
 use needle_bench::stage::{
     Axis, AxisConfig, AxisLimits, CountsRatio, Feedback, HomingConfig, Output, PerAxis, Reference,
@@ -15,7 +15,8 @@ use needle_bench::stage::{
 };
 use needle_bench::units::Time;
 
-const IDENTITY: Identity = Identity { vendor: 0x1ee7, product: 1, revision: 1, serial: 7 };
+const VENDOR: u32 = 0x1ee7;
+const PRODUCT: u32 = 1;
 
 struct Bench {
     now: Time,
@@ -35,7 +36,7 @@ fn axis(id: u8, counts: u32, speed_max: f64) -> AxisConfig {
     let ratio = CountsRatio::new(counts, 1).expect("not zero");
     AxisConfig {
         node: node(id),
-        vendor_id: Some(IDENTITY.vendor),
+        vendor_id: Some(VENDOR),
         product_code: None,
         ratio,
         sign: Sign::Positive,
@@ -72,7 +73,7 @@ impl Bench {
     fn new() -> Self {
         let now = Time::ZERO;
         let drive = |id, start_counts| {
-            let config = DriveConfig::new(node(id), IDENTITY);
+            let config = DriveConfig::new(node(id), VENDOR, PRODUCT);
             Drive::new(DriveConfig { start_counts, ..config })
         };
         Bench {
@@ -232,7 +233,7 @@ fn a_run_that_finds_another_type_takes_power_off_its_own_drive_alone() {
     let mut bench = Bench::new();
     bench.drive_on(50);
     let mut config = config();
-    config.rotation.product_code = Some(IDENTITY.product + 1);
+    config.rotation.product_code = Some(PRODUCT + 1);
     // Listening for another master would outlast the supervision that the drives were left with.
     config.listen_first = Duration::ZERO;
     bench.stage = Stage::new(config, bench.now).expect("valid");

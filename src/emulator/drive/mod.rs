@@ -30,20 +30,16 @@ use crate::keys::choice;
 /// The configuration of an emulated drive.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DriveConfig {
-    /// Its node number.
+    /// Its node number, and its serial number (0x1018:04).
     pub node: NodeId,
-    /// Its identity, 0x1018.
-    pub identity: Identity,
-    /// Its name, 0x1008.
-    pub name: String,
+    /// Its vendor (0x1018:01), assigned by CiA.
+    pub vendor: u32,
+    /// Its product (0x1018:02).
+    pub product: u32,
     /// Position of axis and encoder at power-on.
     pub start_counts: i64,
     /// The maximum speed of the motor, and the power-on value of 0x607F.
     pub speed_max_counts_per_s: u32,
-    /// The maximum acceleration of the motor, and the power-on value of 0x60C5.
-    pub acceleration_max_counts_per_s2: u32,
-    /// Counts between two index pulses of the encoder.
-    pub index_counts: u32,
     /// Limit and home switches.
     pub switches: Switches,
     /// The make that it imitates.
@@ -52,19 +48,6 @@ pub struct DriveConfig {
     pub homed: bool,
     /// Objects of its own besides those of the data sheet, and their bits.
     pub more_objects: Vec<(ObjectAddress, u8)>,
-}
-
-/// The identity of a drive, object 0x1018.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct Identity {
-    /// Subindex 1, assigned by CiA.
-    pub vendor: u32,
-    /// Subindex 2.
-    pub product: u32,
-    /// Subindex 3.
-    pub revision: u32,
-    /// Subindex 4.
-    pub serial: u32,
 }
 
 choice! {
@@ -84,15 +67,13 @@ choice! {
 
 impl DriveConfig {
     /// A drive at position 0, without switches, with a maximum speed of 200,000 counts/s.
-    pub fn new(node: NodeId, identity: Identity) -> Self {
+    pub fn new(node: NodeId, vendor: u32, product: u32) -> Self {
         DriveConfig {
             node,
-            identity,
-            name: "emulated drive".into(),
+            vendor,
+            product,
             start_counts: 0,
             speed_max_counts_per_s: 200_000,
-            acceleration_max_counts_per_s2: 100_000_000,
-            index_counts: 2000,
             switches: Switches::default(),
             model: Model::Generic,
             homed: false,

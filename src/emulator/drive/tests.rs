@@ -21,7 +21,6 @@ use crate::units::Time;
 
 const NODE: NodeId = NodeId::new(5).unwrap();
 const MASTER: NodeId = NodeId::new(127).unwrap();
-const IDENTITY: Identity = Identity { vendor: 0xfb, product: 0x6552, revision: 1, serial: 7 };
 const PERIOD: Duration = Duration::from_millis(10);
 
 /// A drive and its master.
@@ -168,7 +167,7 @@ impl Bench {
 }
 
 fn config() -> DriveConfig {
-    DriveConfig::new(NODE, IDENTITY)
+    DriveConfig::new(NODE, 0xfb, 0x6552)
 }
 
 /// A drive moving at 10,000 counts/s at position 300, in the middle of a period.
