@@ -9,7 +9,7 @@ use nalgebra::Vector3;
 use needle_bench::canopen::sdo::{SdoClient, SdoRequest};
 use needle_bench::canopen::{NodeId, ObjectAddress};
 use needle_bench::config::{Config, Source};
-use needle_bench::emulator::drive::{Drive, DriveConfig, Identity};
+use needle_bench::emulator::drive::{Drive, DriveConfig};
 use needle_bench::emulator::{Noise, StageOutput, VirtualStage};
 use needle_bench::geometry::{FixedAngles, Pose};
 use needle_bench::needle::{Increment, Needle, TipPosition};
@@ -179,8 +179,7 @@ fn study(c: &mut Criterion) {
 /// An SDO upload of the identity: the bench's client and the emulated drive's server.
 fn sdo(c: &mut Criterion) {
     let node = NodeId::new(1).expect("a node");
-    let identity = Identity { vendor: 1, product: 2, revision: 3, serial: 4 };
-    let mut drive = Drive::new(DriveConfig::new(node, identity));
+    let mut drive = Drive::new(DriveConfig::new(node, 1, 2));
     while drive.poll_transmit().is_some() {}
     let mut client = SdoClient::new(node, Duration::from_millis(150));
     let request = SdoRequest::Upload(ObjectAddress::new(0x1018, 1));

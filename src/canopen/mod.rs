@@ -4,7 +4,7 @@
 //! frames and deadlines.
 //!
 //! Master side: [`sdo::SdoClient`], [`heartbeat::HeartbeatConsumer`], [`sync::SyncProducer`],
-//! [`cia402::EnableSequence`]. Device side: [`node::Node`] with its [`object_dictionary`] and
+//! [`cia402::EnableSequence`]. Device side, for the emulated drives: [`object_dictionary`] and
 //! [`sdo::SdoServer`]. Bytes of either side: [`nmt`], [`emcy`], [`pdo`], [`cob`].
 
 pub mod cia402;
@@ -14,12 +14,11 @@ pub mod emcy;
 pub mod frame;
 pub mod heartbeat;
 pub mod nmt;
-pub mod node;
 pub mod object;
 pub mod object_dictionary;
 pub mod pdo;
 pub mod sdo;
 pub mod sync;
 
-pub use frame::{CanId, Frame, NodeId, NotAFrame};
+pub use frame::{CanId, Frame, NodeId};
 pub use object::ObjectAddress;

@@ -154,7 +154,7 @@ fn needed(config: &Config, left: &Left) -> Option<&'static str> {
     let is_in_fault = !left.drives.all(|drive| !is_in_fault(drive));
     match left.unknown {
         Some(_) => Some("status"),
-        None => (is_in_fault && !config.stage.fault_reset_on_start).then_some("reset"),
+        None => (is_in_fault && !config.stage.power.fault_reset_on_start).then_some("reset"),
     }
 }
 
@@ -194,7 +194,7 @@ impl Withdrawal {
         }
         // The axis reads 0 where the withdrawal begins, and its limits count from there.
         let needed_mm = -(inserted_mm + 0.05).ceil();
-        let min_mm = (insertion.min > needed_mm).then_some(needed_mm);
+        let min_mm = (insertion.limits.min > needed_mm).then_some(needed_mm);
         Withdrawal { by_mm: Some(inserted_mm), min_mm }
     }
 
@@ -218,7 +218,7 @@ impl Withdrawal {
             config.emulator.insertion_start_mm = position.insertion_mm;
         }
         if let Some(min_mm) = self.min_mm {
-            config.stage.insertion.min = min_mm;
+            config.stage.insertion.limits.min = min_mm;
         }
         config
     }
@@ -428,7 +428,7 @@ mod tests {
             let withdrawal = Withdrawal::of(&config, 12.96);
             let allowed = withdrawal.allowed(config, &stopped(12.96, stood()));
             assert_eq!(allowed.emulator.insertion_start_mm, 5.0, "where the stage stands");
-            assert!(allowed.stage.insertion.min <= -13.0 || withdrawal.by_mm.is_none());
+            assert!(allowed.stage.insertion.limits.min <= -13.0 || withdrawal.by_mm.is_none());
             withdrawal.options()
         };
         assert_eq!(options(&[]), "");

@@ -18,8 +18,8 @@ use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
 use crate::operation::Plan;
 use crate::runtime::{
-    Clock, DriveOutcome, EmulationReport, Interrupt, Moment, OnRecordFailure, Operator, Pace,
-    RealTime, RunReport, Sink, TipSource, complete_record, run_live, run_virtual,
+    Clock, DriveOutcome, EmulationReport, Interrupt, Moment, Operator, Pace, RealTime, RunReport,
+    Sink, TipSource, complete_record, run_live, run_virtual,
 };
 use crate::session::Done;
 use crate::telemetry::{Backpressure, Recorder, Scene, check_room, utc_text};
@@ -124,10 +124,7 @@ impl<'a> Job<'a> {
         interrupt: &Interrupt,
     ) -> Result<Performed, Failure> {
         let config = self.config;
-        let on_record_failure = match config.record.on_failure {
-            OnFailure::Stop => OnRecordFailure::Stop,
-            OnFailure::GoOn => OnRecordFailure::GoOn,
-        };
+        let stops_on_record_failure = config.record.on_failure == OnFailure::Stop;
         let begin = |now| self.plan.clone().begin(now).map_err(Failure::configuration);
         self.live.map_or(Ok(()), is_free)?;
         if config.is_emulated() {
@@ -139,7 +136,7 @@ impl<'a> Job<'a> {
                 self.records_tracker().then(|| replay(&config.tracker, Time::ZERO)).transpose()?;
             let tips = tips.map(|replay| replay.map_or(emulated, TipSource::Recorded));
             let (recorder, _) = self.record(SystemTime::now(), Backpressure::Block)?;
-            let sink = Sink::new(recorder, on_record_failure, operator, interrupt);
+            let sink = Sink::new(recorder, stops_on_record_failure, operator, interrupt);
             let mut session = begin(Time::ZERO)?;
             let pace = self.paced.then(Pace::begin);
             let report = run_virtual(&mut session, stage, tips, pace, sink);
@@ -154,7 +151,7 @@ impl<'a> Job<'a> {
         let clock = Clock::start();
         let mut tracker = self.open_tracker(runtime, clock)?;
         let (recorder, realtime) = self.record(clock.origin_utc(), Backpressure::DropAndCount)?;
-        let sink = Sink::new(recorder, on_record_failure, operator, interrupt);
+        let sink = Sink::new(recorder, stops_on_record_failure, operator, interrupt);
         // Last, since the session's deadlines begin to run.
         let mut session = begin(clock.now())?;
         let (bus, tips) = (bus.as_mut(), tracker.as_mut());
@@ -276,11 +273,11 @@ pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure
     let CanInterface::Socket(name) = config.bus() else { return open_bus(config.bus()) };
     let mut bus = SocketCan::open(name)?;
     // As many as may go unanswered, and the one under way.
-    let syncs_max = usize::from(config.can.missed_feedback_max) + 1;
+    let syncs_max = usize::from(config.can.bus.missed_feedback_max) + 1;
     bus.confirm_sending(syncs_max)?;
     if config.can.listen == Listen::Stage {
         let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
-        let nodes = [config.can.bench_node, insertion.node, rotation.node];
+        let nodes = [config.can.bus.bench_node, insertion.node, rotation.node];
         bus.listen_to(&nodes)?;
     }
     Ok(Box::new(bus))

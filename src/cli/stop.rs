@@ -40,7 +40,7 @@ pub(super) fn stop(configured: &Configured, as_json: bool) -> Result<ExitCode, F
     let clock = Clock::start();
     let begun = clock.now();
     let mut halt = Halt::new(&settings.stage, begun);
-    let give_up = begun + settings.stage.stop_timeout;
+    let give_up = begun + settings.stage.power.stop_timeout;
     let trouble = talk_despite_errors(&mut halt, bus.as_mut(), clock, give_up);
     let status = report(&halt, &trouble, as_json);
     let checked =

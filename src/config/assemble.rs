@@ -1,12 +1,13 @@
 //! From sections of the configuration to settings of the pure parts of the bench, in mm, rad and per mm.
 
 use super::needle::torsion;
-use super::{AxisSection, CanInterface, Config, ConfigError, ReadMask, TrackerSource, rehearsal};
+use super::{CanInterface, Config, ConfigError, ReadMask, TrackerSource, rehearsal};
 use crate::canopen::ObjectAddress;
 use crate::emulator::fault::Fault;
 use crate::emulator::{TargetModel, VirtualStageConfig, drive};
 use crate::observer::InvariantConfig;
 use crate::session::{InsertionConfig, ObserverConfig, SessionConfig};
+use crate::stage::{AxisConfig, Sign};
 use std::f64::consts::TAU;
 
 /// Identity of an emulated drive if the configuration expects none: not a vendor's number.
@@ -91,8 +92,8 @@ impl Config {
             (emulator.insertion_switches_mm, emulator.rotation_switches_deg);
         let turns_per_s = self.number("stage.rotation.speed_max_deg_per_s") / 360.0;
         let (along, about) = (&self.stage.insertion, &self.stage.rotation);
-        let mut insertion = self.emulated_drive(along, along.speed_max)?;
-        let mut rotation = self.emulated_drive(about, turns_per_s)?;
+        let mut insertion = self.emulated_drive(along, along.limits.speed_max);
+        let mut rotation = self.emulated_drive(about, turns_per_s);
         let (per_mm, per_turn) = (insertion.1, rotation.1);
         let [zero, zero_turned] = [along.zero, about.zero].map(|zero| zero.unwrap_or(0).into());
         insertion.0.start_counts = zero + (emulator.insertion_start_mm * per_mm).round() as i64;
@@ -105,7 +106,7 @@ impl Config {
             *switches = rehearsal::switches(*switches, along, per_mm);
             *switches_turned = rehearsal::switches(*switches_turned, about, per_turn / TAU);
         }
-        let bench = Some(self.can.bench_node);
+        let bench = Some(self.can.bus.bench_node);
         let faults = emulator.fault.iter().map(|fault| Fault { bench, ..fault.clone() });
         Ok(VirtualStageConfig {
             insertion,
@@ -124,18 +125,10 @@ impl Config {
     }
 
     /// The drive of `axis`, which moves by so many mm or turns a second, and its counts per mm or turn.
-    fn emulated_drive<const AXIS: usize>(
-        &self,
-        axis: &AxisSection<AXIS>,
-        units_per_s: f64,
-    ) -> Result<(drive::DriveConfig, f64), ConfigError> {
-        let counts_per_unit = axis.ratio()?.to_f64();
-        let identity = drive::Identity {
-            vendor: axis.vendor_id.unwrap_or(EMULATED_VENDOR_ID),
-            product: axis.product_code.unwrap_or(EMULATED_PRODUCT_CODE),
-            revision: 1,
-            serial: u32::from(axis.node.get()),
-        };
+    fn emulated_drive(&self, axis: &AxisConfig, units_per_s: f64) -> (drive::DriveConfig, f64) {
+        let counts_per_unit = axis.ratio.to_f64();
+        let vendor = axis.vendor_id.unwrap_or(EMULATED_VENDOR_ID);
+        let product = axis.product_code.unwrap_or(EMULATED_PRODUCT_CODE);
         let speed_max_counts_per_s = (2.0 * counts_per_unit * units_per_s).ceil() as u32;
         let raw_objects = axis.sdo.iter().filter(|_| self.emulator.rehearse);
         let drive = drive::DriveConfig {
@@ -145,8 +138,9 @@ impl Config {
             more_objects: raw_objects
                 .map(|raw| (ObjectAddress::new(raw.index, raw.subindex), raw.bits))
                 .collect(),
-            ..drive::DriveConfig::new(axis.node, identity)
+            ..drive::DriveConfig::new(axis.node, vendor, product)
         };
-        Ok((drive, counts_per_unit * f64::from(axis.sign)))
+        let sign = if axis.sign == Sign::Negative { -1.0 } else { 1.0 };
+        (drive, counts_per_unit * sign)
     }
 }

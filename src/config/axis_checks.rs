@@ -1,12 +1,10 @@
 //! Contradictions within `[stage]`: settings of an axis, its drive and its operations.
 
-use std::time::Duration;
-
 use super::Config;
-use super::axis::{AxisSection, INSERTION};
+use super::checks::ROTATION_ACCELERATION_MAX;
 use super::reader::Reader;
-use crate::session::{PROFILE_PEAK, rotation_peak};
-use crate::stage::Reference;
+use crate::session::PROFILE_PEAK;
+use crate::stage::{Axis, AxisConfig, Reference};
 
 /// Objects that a drive of the bench must have, and why. Of the others that the bring-up writes, a
 /// drive may lack:
@@ -66,17 +64,17 @@ const STOPPING: [(&str, &[i16], &str); 4] = [
 
 /// Notes every contradiction.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
-    axis(config, &config.stage.insertion, reader);
-    axis(config, &config.stage.rotation, reader);
+    axis(config, Axis::Insertion, &config.stage.insertion, reader);
+    axis(config, Axis::Rotation, &config.stage.rotation, reader);
     accelerations(config, reader);
 }
 
 /// Those of one axis. Numbers in messages are in the unit of their key.
-fn axis<const AXIS: usize>(config: &Config, axis: &AxisSection<AXIS>, reader: &mut Reader) {
+fn axis(config: &Config, which: Axis, axis: &AxisConfig, reader: &mut Reader) {
     let [name, unit, scale, per] = [
         ["insertion", "mm", "counts_per_mm.counts", "counts_per_mm.mm"],
         ["rotation", "deg", "counts_per_turn.counts", "counts_per_turn.turns"],
-    ][AXIS];
+    ][which as usize];
     let key = |key: &str| format!("stage.{name}.{key}");
     let hardware = config.stage.hardware;
     let [reference, homing, zero] = ["reference", "homing", "zero"].map(key);
@@ -108,8 +106,10 @@ fn axis<const AXIS: usize>(config: &Config, axis: &AxisSection<AXIS>, reader: &m
     let offset = config.number(&offset_key);
     let zero_counts = axis.zero.map_or(f64::NAN, f64::from);
     let counts_per_unit =
-        config.number(&key(scale)) / config.number(&key(per)) / [1.0, 360.0][AXIS];
-    let home_at = |offset: f64| 0.0 - offset - f64::from(axis.sign) * zero_counts / counts_per_unit;
+        config.number(&key(scale)) / config.number(&key(per)) / [1.0, 360.0][which as usize];
+    let (sign_key, method_key) = (key("sign"), key("homing.method"));
+    let sign = config.number(&sign_key);
+    let home_at = |offset: f64| 0.0 - offset - sign * zero_counts / counts_per_unit;
     let home = home_at(offset);
     reader.check(&[&low, &high, &zero, &offset_key], home < min || home > max, || {
         format!(
@@ -119,23 +119,21 @@ fn axis<const AXIS: usize>(config: &Config, axis: &AxisSection<AXIS>, reader: &m
     });
     // The needle's axis has its way on one side of its end switch, where home is.
     let home = if offset.is_nan() { home_at(0.0) } else { home_at(offset) };
-    let (method_key, sign_key) = (key("homing.method"), key("sign"));
-    let method = axis.homing.filter(|_| AXIS == INSERTION).map_or(0, |homing| homing.method);
+    let method = axis.homing.filter(|_| which == Axis::Insertion).map_or(0, |homing| homing.method);
     let (toward, other) = match method {
-        1 | 17 => (-axis.sign, method + 1),
-        2 | 18 => (axis.sign, method - 1),
-        _ => (0, 0),
+        1 | 17 => (-sign, method + 1),
+        2 | 18 => (sign, method - 1),
+        _ => (0.0, 0),
     };
     let [beyond, before] =
-        if toward > 0 { [max - home, home - min] } else { [home - min, max - home] };
+        if toward > 0.0 { [max - home, home - min] } else { [home - min, max - home] };
     let keys = [&*method_key, &sign_key, &zero, &low, &high];
-    reader.check(&keys, toward != 0 && beyond > before, || {
-        let end = if toward > 0 { "deep" } else { "withdrawn" };
+    reader.check(&keys, toward != 0.0 && beyond > before, || {
+        let end = if toward > 0.0 { "deep" } else { "withdrawn" };
         format!(
-            "{method_key} is {method}, which with sign = {} seeks the switch at the {end} end: home is \
+            "{method_key} is {method}, which with sign = {sign} seeks the switch at the {end} end: home is \
              {home:.3} {unit}, the limits of {min} to {max} {unit} go {beyond:.1} {unit} beyond it; is it \
-             {other}?",
-            axis.sign
+             {other}?"
         )
     });
     for (name, stopping, allowed) in STOPPING {
@@ -157,7 +155,7 @@ fn axis<const AXIS: usize>(config: &Config, axis: &AxisSection<AXIS>, reader: &m
     }
     // The bench allows for what the target does in two SYNC periods beyond the drive's window: a drive
     // that waits no longer than these notices no later than the bench.
-    let (timeout_key, sync_ms) = (key("following_error_timeout_ms"), config.can.sync_ms);
+    let (timeout_key, sync_ms) = (key("following_error_timeout_ms"), config.can.bus.sync_ms);
     let timeout_ms = axis.following_error_timeout_ms.unwrap_or_default();
     reader.check(&["can.sync_ms", &timeout_key], timeout_ms > 2 * sync_ms, || {
         format!(
@@ -170,12 +168,7 @@ fn axis<const AXIS: usize>(config: &Config, axis: &AxisSection<AXIS>, reader: &m
 
 /// Where the braking of a quick stop is not configured, its object may be written in the units that the
 /// drive has of its own.
-fn raw_sdos<const AXIS: usize>(
-    axis: &AxisSection<AXIS>,
-    key: impl Fn(&str) -> String,
-    unit: &str,
-    reader: &mut Reader,
-) {
+fn raw_sdos(axis: &AxisConfig, key: impl Fn(&str) -> String, unit: &str, reader: &mut Reader) {
     for (n, sdo) in axis.sdo.iter().enumerate() {
         let [index_key, value_key, bits_key] =
             ["index", "value", "bits"].map(|name| key(&format!("sdo[{n}].{name}")));
@@ -224,11 +217,10 @@ fn reserved(index: u16) -> Option<&'static str> {
 /// bound to break.
 fn accelerations(config: &Config, reader: &mut Reader) {
     let along = "stage.insertion.acceleration_max_mm_per_s2";
-    let about = "stage.rotation.acceleration_max_deg_per_s2";
     for (key, max_key) in [
         ("insertion.acceleration_mm_per_s2", along),
         ("stage.insertion.jog_acceleration_mm_per_s2", along),
-        ("stage.rotation.jog_acceleration_deg_per_s2", about),
+        ("stage.rotation.jog_acceleration_deg_per_s2", ROTATION_ACCELERATION_MAX),
     ] {
         let [acceleration, max] = [key, max_key].map(|key| config.number(key));
         reader.check(&[key, max_key], PROFILE_PEAK * acceleration > max, || {
@@ -239,15 +231,4 @@ fn accelerations(config: &Config, reader: &mut Reader) {
             )
         });
     }
-    let (_, key) = config.control.rotation_max_rad_per_mm();
-    let (per_mm, speed, max) =
-        (config.number(key), config.insertion.speed_mm_per_s, config.number(about));
-    let peak = rotation_peak(per_mm, speed, Duration::from_millis(config.can.sync_ms.into()));
-    let keys = [key, "insertion.speed_mm_per_s", "can.sync_ms", about];
-    reader.check(&keys, peak > max, || {
-        format!(
-            "{key} is {per_mm}: reversed within a SYNC at {speed} mm/s, that is {peak:.0} deg/s², \
-             over {about} = {max}; raise it, or turn or insert more slowly"
-        )
-    });
 }

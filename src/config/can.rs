@@ -2,12 +2,12 @@
 
 use core::net::{Ipv4Addr, SocketAddrV4};
 use std::fmt;
-use std::time::Duration;
 
 use toml::Value;
 
 use crate::canopen::NodeId;
-use crate::keys::{Field, Kind, Rule, choice, section, within};
+use crate::keys::{Field, Kind, Rule, choice, section};
+use crate::stage::BusConfig;
 
 section! {
     /// `[can]`: the bus and the times of CANopen on it.
@@ -18,24 +18,8 @@ section! {
         interface: CanInterface [BUS] = "memory";
         /// What the bench receives, where the kernel can choose.
         listen: Listen = "all";
-        /// Period of SYNC, ms.
-        sync_ms: u16 [within(1.0, 100.0)] = 10;
-        /// The bench's own node number: the drives watch its heartbeat.
-        bench_node: NodeId = 127;
-        /// Period of the bench's and the drives' heartbeats, ms.
-        heartbeat_ms: u16 [within(5.0, 10_000.0)] = 25;
-        /// A heartbeat that is missing for this long stops the run, and the drives, ms.
-        heartbeat_timeout_ms: u16 [within(10.0, 60_000.0)] = 100;
-        /// Longest wait for the answer to one SDO request, ms.
-        sdo_timeout_ms: u16 [within(10.0, 10_000.0)] = 150;
-        /// How often an SDO request is sent before giving up.
-        sdo_attempts: u8 [within(1.0, 20.0)] = 3;
-        /// Longest wait for a drive to boot, s.
-        boot_timeout as "boot_timeout_s": Duration [within(0.1, 120.0)] = 2.0;
-        /// How often the bring-up of a drive is begun, if the drive restarts in the middle of it.
-        boot_attempts: u8 [within(1.0, 20.0)] = 3;
-        /// SYNCs in a row without both drives' answers that are tolerated.
-        missed_feedback_max: u8 [within(0.0, 100.0)] = 1;
+        /// What the drives are told, and how long they are waited for.
+        bus: BusConfig, flat;
     }
 }
 

@@ -11,7 +11,10 @@ use super::{CanInterface, Config, GoalKind};
 use crate::emulator::fault::Fault;
 use crate::keys::{Key, expanded};
 use crate::needle::{Torsion, TorsionConfig};
-use crate::session::InsertionConfig;
+use crate::session::{InsertionConfig, rotation_peak};
+use std::time::Duration;
+
+pub(super) const ROTATION_ACCELERATION_MAX: &str = "stage.rotation.acceleration_max_deg_per_s2";
 
 /// Notes every contradiction in `config`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
@@ -37,13 +40,13 @@ fn insertion(config: &Config, reader: &mut Reader) {
         format!("{arrival_key} is {arrival_mm}, allowed: up to half of {step_key}, which is {step}")
     });
     // A step is taken at a SYNC: at most one a period.
-    let per_sync = speed * f64::from(config.can.sync_ms) * 1e-3;
+    let per_sync = speed * f64::from(config.can.bus.sync_ms) * 1e-3;
     let [speed_key, sync_key] = ["insertion.speed_mm_per_s", "can.sync_ms"];
     reader.check(&[step_key, speed_key, sync_key], per_sync > step, || {
         format!(
             "{step_key} is {step}, allowed: at least what {speed_key} = {speed} moves in {sync_key} = \
              {}, which is {per_sync}",
-            config.can.sync_ms
+            config.can.bus.sync_ms
         )
     });
     let baseline = config.observer.finite_difference.baseline_mm;
@@ -53,19 +56,27 @@ fn insertion(config: &Config, reader: &mut Reader) {
     });
 }
 
+/// The rotation that the law may ask for is within the limits of the axis, and so is its reversal.
 fn rotation(config: &Config, reader: &mut Reader) {
     let (_, key) = config.control.rotation_max_rad_per_mm();
-    let per_mm = config.number(key);
-    let speed = config.insertion.speed_mm_per_s;
+    let (per_mm, speed) = (config.number(key), config.insertion.speed_mm_per_s);
+    let (speed_key, sync_key) = ("insertion.speed_mm_per_s", "can.sync_ms");
     let max_key = "stage.rotation.speed_max_deg_per_s";
-    let max = config.number(max_key);
-    let deg_per_s = per_mm * speed;
-    reader.check(&[key, "insertion.speed_mm_per_s", max_key], deg_per_s > max, || {
+    let (deg_per_s, max) = (per_mm * speed, config.number(max_key));
+    reader.check(&[key, speed_key, max_key], deg_per_s > max, || {
         format!(
             "{key} is {per_mm}: at {speed} mm/s that is {deg_per_s} deg/s, over {max_key} = {max}; turn \
              by {:.4} deg/mm or insert at {:.4} mm/s",
             max / speed,
             max / per_mm,
+        )
+    });
+    let (max_key, max) = (ROTATION_ACCELERATION_MAX, config.number(ROTATION_ACCELERATION_MAX));
+    let peak = rotation_peak(per_mm, speed, Duration::from_millis(config.can.bus.sync_ms.into()));
+    reader.check(&[key, speed_key, sync_key, max_key], peak > max, || {
+        format!(
+            "{key} is {per_mm}: reversed within a SYNC at {speed} mm/s, that is {peak:.0} deg/s², \
+             over {max_key} = {max}; raise it, or turn or insert more slowly"
         )
     });
 }
@@ -137,7 +148,7 @@ fn noise(config: &Config, reader: &mut Reader) {
 
 fn bus(config: &Config, reader: &mut Reader) {
     let nodes = [
-        ("can.bench_node", config.can.bench_node),
+        ("can.bench_node", config.can.bus.bench_node),
         ("stage.insertion.node", config.stage.insertion.node),
         ("stage.rotation.node", config.stage.rotation.node),
     ];
@@ -149,7 +160,7 @@ fn bus(config: &Config, reader: &mut Reader) {
         }
     }
 
-    let (period, timeout) = (config.can.heartbeat_ms, config.can.heartbeat_timeout_ms);
+    let (period, timeout) = (config.can.bus.heartbeat_ms, config.can.bus.heartbeat_timeout_ms);
     let too_short = u32::from(timeout) < 2 * u32::from(period);
     reader.check(&["can.heartbeat_timeout_ms", "can.heartbeat_ms"], too_short, || {
         format!(
@@ -221,7 +232,7 @@ fn tracker(config: &Config, reader: &mut Reader) {
     let braking = config.tracker.hold.braking_mm_per_s2;
     let is_seen_here = config.tip_source() == TrackerSource::Emulated;
     let period_s = if is_seen_here { config.emulator.tracker_rate_hz.recip() } else { 0.0 };
-    let noticed_s = period_s + (latency_ms + 2.0 * f64::from(config.can.sync_ms)) * 1e-3;
+    let noticed_s = period_s + (latency_ms + 2.0 * f64::from(config.can.bus.sync_ms)) * 1e-3;
     let least_mm = speed * noticed_s + 0.5 * speed * speed / braking;
     let [key, brake] = ["tracker.hold_after_mm", "tracker.hold_braking_mm_per_s2"];
     let keys = [key, "insertion.speed_mm_per_s", brake, latency];

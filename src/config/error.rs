@@ -43,6 +43,12 @@ pub struct ConfigError {
     pub problems: Vec<Problem>,
 }
 
+impl From<Vec<Problem>> for ConfigError {
+    fn from(problems: Vec<Problem>) -> Self {
+        ConfigError { problems }
+    }
+}
+
 impl ConfigError {
     /// The problems, if there are any.
     pub(super) fn unless_empty(problems: Vec<Problem>) -> Result<(), Self> {

@@ -69,9 +69,7 @@ pub(super) fn preset(layers: &[Entries], layer: usize) -> Result<Entries, Config
     let named = last(layers, PRESET_KEY).and_then(|entry| entry.value.as_str());
     let named = named.and_then(|name| PRESETS.iter().find(|(preset, _)| *preset == name));
     match named {
-        Some((name, text)) => {
-            value::parse_file(name, text, layer).map_err(|problems| ConfigError { problems })
-        }
+        Some((name, text)) => Ok(value::parse_file(name, text, layer)?),
         None => Ok(Entries::new()),
     }
 }

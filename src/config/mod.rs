@@ -22,7 +22,6 @@
 //! rad. This module reads no files: the caller hands it their text.
 
 mod assemble;
-mod axis;
 mod axis_checks;
 mod can;
 mod checks;
@@ -47,23 +46,21 @@ mod tracker;
 mod value;
 mod warnings;
 
-pub use axis::{AxisSection, RawSdo};
 pub use can::{CanConfig, CanInterface, Listen};
 pub use control::{ControlConfig, ControlKind};
-pub use emulator::{EmulatorConfig, Noise, SEED_MAX, SwitchesConfig, TrackerPreset};
-pub use error::{ConfigError, Problem, nearest_key};
-pub use goal::{GoalConfig, GoalKind, ObstacleConfig, ReadMask, WorkspaceConfig};
+pub use emulator::{EmulatorConfig, SEED_MAX, TrackerPreset};
+pub use error::{ConfigError, nearest_key};
+pub use goal::{GoalConfig, GoalKind, ReadMask, WorkspaceConfig};
 pub use include::ReadFile;
-pub use needle::{Arc, NeedleConfig};
+pub use needle::NeedleConfig;
 pub use observer::{ObserverConfig, ObserverKind};
 pub use pose::PoseConfig;
 pub use record::{CalibrationConfig, EvaluationConfig, OnFailure, RecordConfig};
-pub use registration::{Fiducials, GivenRegistration, RegistrationConfig};
+pub use registration::RegistrationConfig;
 pub use stage::StageConfig;
 pub use stop::StopConfig;
 pub use study::StudyConfig;
-pub use tracker::{GatesConfig, TrackerConfig, TrackerMode, TrackerSource};
-pub use value::Origin;
+pub use tracker::{TrackerConfig, TrackerMode, TrackerSource};
 
 use crate::keys::{self, Field, Rule, section};
 use crate::session::InsertionConfig;
@@ -72,7 +69,8 @@ use std::path::Path;
 use toml::{Table, Value};
 
 /// The default configuration, commented: what each key means.
-pub const DEFAULT_TOML: &str = include_str!("../../bench-config/virtual.toml");
+#[cfg(test)]
+pub(crate) const DEFAULT_TOML: &str = include_str!("../../bench-config/virtual.toml");
 
 /// The number of the layer under the files.
 const PRESET: usize = 1;
@@ -167,8 +165,7 @@ impl Config {
         let (mut config, mut tree) = Config::checked(reader::merge(layers.clone()), unusable)?;
         if config.emulator.rehearse {
             let implied = rehearsal::layer(&config);
-            let implied = value::parse_file("rehearsal", &implied, PRESET);
-            layers[0].extend(implied.map_err(|problems| ConfigError { problems })?);
+            layers[0].extend(value::parse_file("rehearsal", &implied, PRESET)?);
             (config, tree) = Config::checked(reader::merge(layers), Vec::new())?;
         }
         let warnings = warnings::all(&config, &tree);
@@ -229,8 +226,7 @@ fn layers(sources: &[Source<'_>], sets: &[String]) -> Result<Vec<value::Entries>
     let files = sources.iter().zip(PRESET + 1..);
     let files = files.map(|(s, layer)| value::parse_file(s.name, s.text, layer));
     let sets = sets.iter().zip(PRESET + 1 + sources.len()..);
-    let sets =
-        sets.map(|(set, layer)| value::parse_set(set, layer).map_err(|problem| vec![problem]));
+    let sets = sets.map(|(set, layer)| value::parse_set(set, layer));
     let (mut layers, mut problems) = (Vec::new(), Vec::new());
     for layer in files.chain(sets) {
         match layer {

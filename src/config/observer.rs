@@ -4,9 +4,11 @@
 
 use super::Config;
 use crate::geometry::FixedAngles;
-use crate::keys::{choice, section, within};
+use crate::keys::{Rule, choice, section, within};
 use crate::observer::{CoupledConfig, FiniteDifferenceConfig, InvariantConfig};
 use crate::session::{self, Samples};
+
+const START_PITCH: Rule = within(-80.0, 80.0);
 
 section! {
     /// `[observer]`.
@@ -19,7 +21,7 @@ section! {
         samples: Samples = "all";
         /// Angles assumed at the start, in the plane frame; the position is the first measured one.
         start: FixedAngles => "{ yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }",
-            narrowed(&[("pitch_deg", within(-80.0, 80.0))]);
+            narrowed(&[("pitch_deg", START_PITCH)]);
         /// The invariant observer; the check of the stream's handedness uses it as well.
         invariant: InvariantConfig;
         /// The coupled observer.

@@ -4,10 +4,10 @@
 //! the one that the bench believes in, and the tracker has the noise that the gates expect. Everything
 //! under `[emulator]` that is given still counts.
 
-use super::axis::AxisSection;
 use super::{Config, TrackerPreset};
 use crate::emulator::drive::Switches;
 use crate::geometry::FixedAngles;
+use crate::stage::AxisConfig;
 use crate::tracker::TrackerKind;
 use std::fmt::Write as _;
 
@@ -68,11 +68,7 @@ pub(super) fn layer(config: &Config) -> String {
 
 /// The switches of an axis that has `counts_per_unit` of mm or rad: those `given`, and if its homing seeks
 /// another one, that one at the place where homing changes no position.
-pub(super) fn switches<const AXIS: usize>(
-    given: Switches,
-    axis: &AxisSection<AXIS>,
-    counts_per_unit: f64,
-) -> Switches {
+pub(super) fn switches(given: Switches, axis: &AxisConfig, counts_per_unit: f64) -> Switches {
     let Some(homing) = axis.homing else { return given };
     // From home the drive's zero is by the offset, and it is 0 now.
     let home = -(homing.offset.unwrap_or(0.0) * counts_per_unit).round() as i64;

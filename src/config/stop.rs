@@ -44,15 +44,12 @@ impl StopConfig {
     /// What is wrong with the interface or the nodes. A source that is not TOML counts as empty, and
     /// its problems are reported if interface or nodes are missing.
     pub fn from_source(source: Option<Source<'_>>, sets: &[String]) -> Result<Self, ConfigError> {
-        let parse = |name: &str, text: &str, layer| {
-            value::parse_file(name, text, layer).map_err(|problems| ConfigError { problems })
-        };
         let mut layers = Vec::new();
         let mut problems = Vec::new();
-        match source.map(|source| parse(source.name, source.text, 1)) {
+        match source.map(|source| value::parse_file(source.name, source.text, 1)) {
             Some(Ok(entries)) => layers.push(entries),
-            Some(Err(error)) => {
-                problems = error.problems;
+            Some(Err(syntax)) => {
+                problems = syntax;
                 let kept = source.map(|source| salvaged(source.text)).unwrap_or_default();
                 layers.push(value::parse_what_can_be("salvaged", &kept, 1));
             }
@@ -62,9 +59,7 @@ impl StopConfig {
             match value::parse_set(set, layer) {
                 Ok(entries) => layers.push(entries),
                 // It was to name the interface or a node.
-                Err(problem) if names_what_a_stop_needs(set) => {
-                    return Err(ConfigError { problems: vec![problem] });
-                }
+                Err(problems) if names_what_a_stop_needs(set) => return Err(problems.into()),
                 Err(_) => {}
             }
         }
@@ -101,16 +96,15 @@ impl StopConfig {
         });
         for (key, coarse) in COARSE {
             if !tree.keys().any(|given| given == key || is_inside(given, key)) {
-                let entries = value::parse_set(coarse, 1);
-                tree.extend(entries.map_err(|problem| ConfigError { problems: vec![problem] })?);
+                tree.extend(value::parse_set(coarse, 1)?);
             }
         }
         let rest = Config::of(Reader::new(tree).read(Config::KEYS));
-        let mut stage = rest.stage.to_unchecked_stage(&rest.can)?;
+        let mut stage = rest.stage.to_unchecked_stage(&rest.can);
         (stage.insertion.node, stage.rotation.node) = (insertion, rotation);
         // A coarse axis is seen to stand all the same.
         let windows = stage::Axis::BOTH.map(|axis| 2 * stage.standstill_window(axis));
-        stage.stop_timeout = stage.stop_timeout.max(windows[0]).max(windows[1]);
+        stage.power.stop_timeout = stage.power.stop_timeout.max(windows[0]).max(windows[1]);
         Ok(StopConfig { interface, stage })
     }
 }
@@ -164,8 +158,8 @@ mod tests {
         assert_eq!(nodes(&rig), [1, 2]);
         assert_eq!(rig.stage.insertion.ratio, CountsRatio::new(590_000, 127).unwrap());
         assert_eq!(rig.stage.rotation.ratio, CountsRatio::new(75_760, 1).unwrap());
-        assert_eq!(rig.stage.sdo_timeout, Duration::from_millis(300));
-        assert_eq!(rig.stage.stop_timeout, Duration::from_secs(4));
+        assert_eq!(rig.stage.bus.sdo_timeout(), Duration::from_millis(300));
+        assert_eq!(rig.stage.power.stop_timeout, Duration::from_secs(4));
     }
 
     /// Each of these a run refuses.
@@ -196,9 +190,9 @@ mod tests {
         }
         let all = read(RIG, &elsewhere).expect("all of them");
         assert_eq!(all.stage.insertion.ratio, CountsRatio::new(100, 1).unwrap(), "a coarse one");
-        assert_eq!(all.stage.stop_timeout, Duration::from_secs(2), "as by default");
+        assert_eq!(all.stage.power.stop_timeout, Duration::from_secs(2), "as by default");
         assert_eq!(
-            (all.stage.sdo_timeout, all.stage.sdo_attempts),
+            (all.stage.bus.sdo_timeout(), all.stage.bus.sdo_attempts),
             (Duration::from_millis(150), 3)
         );
     }
@@ -206,13 +200,17 @@ mod tests {
     /// A stage that cannot work so is stopped; it is given the time that its counts need to stand.
     #[test]
     fn a_scale_or_a_time_that_a_run_refuses_does_not_keep_a_stop_from_being_sent() {
-        let stop_timeout = |set| read(RIG, &[set]).unwrap().stage.stop_timeout;
+        let stop_timeout = |set| read(RIG, &[set]).unwrap().stage.power.stop_timeout;
         assert_eq!(stop_timeout("stage.stop_timeout_s=0.5"), Duration::from_millis(500));
         let coarse = "stage.insertion.counts_per_mm={ counts = 20, mm = 1 }";
         assert_eq!(stop_timeout(coarse), Duration::from_secs(5));
         let unknown = ["can.interface=udp", "stage.stop_timeout_s=0.5"];
         let stop = read("", &unknown).unwrap();
-        assert!(stop.stage.stop_timeout > Duration::from_secs(1), "{:?}", stop.stage.stop_timeout);
+        assert!(
+            stop.stage.power.stop_timeout > Duration::from_secs(1),
+            "{:?}",
+            stop.stage.power.stop_timeout
+        );
     }
 
     /// As it may be saved half-way through an edit, while a needle moves.

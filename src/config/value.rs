@@ -137,8 +137,8 @@ fn number_with_unit(text: &str, line: usize) -> Option<String> {
 /// # Errors
 /// If the key or the value is missing, or if the value begins like a TOML string, array or table but is
 /// not valid.
-pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, Problem> {
-    let syntax = |message: String| Problem::syntax(Origin::Set, message);
+pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, Vec<Problem>> {
+    let syntax = |message: String| vec![Problem::syntax(Origin::Set, message)];
     let (key, written) =
         text.split_once('=').map(|(k, v)| (k.trim(), v.trim())).unwrap_or_default();
     if key.is_empty() || written.is_empty() || key.split('.').any(str::is_empty) {

@@ -5,10 +5,14 @@
 /// properties are the methods of [`Key`]. With `field as "key"` the field has another name, and the
 /// value is converted from the unit of the key to mm, rad or s. Fields under `beside` have no key,
 /// and a value to begin with.
+///
+/// The table of an axis is `struct NAME of AXIS`: its keys may depend on the axis, which is 0 or 1. The key
+/// that holds such a table says which keys are allowed: `table(NAME::keys_of::<1>())`. A field is then read
+/// from the key of either axis, whichever is there.
 macro_rules! section {
     (
         $(#[$attribute:meta])*
-        pub struct $section:ident $(<const $unit:ident: $of:ty>)? {
+        pub struct $section:ident $(of $axis:ident)? {
             $($(#[doc = $text:literal])* $field:ident $(as $key:tt)?: $type:ty
                 $([$rule:expr])? $(= $default:expr)? $(=> $toml:expr)?
                 $(, $more:ident $(($($value:expr),*))?)*;)*
@@ -17,23 +21,31 @@ macro_rules! section {
     ) => {
         $(#[$attribute])*
         #[derive(Debug, Clone, PartialEq)]
-        pub struct $section $(<const $unit: $of>)? {
+        pub struct $section {
             $($(#[doc = $text])* pub $field: $type,)*
             $($($(#[$about])* $seen $beside: $other,)*)?
         }
-        impl $(<const $unit: $of>)? $section $(<$unit>)? {
-            pub(crate) const KEYS: &'static [$crate::keys::Key] = &[$(
-                $crate::keys::section!(@key $type, concat!($($text, "\n"),*), $field $($key)?)
-                $(.rule($rule))? $(.default(stringify!($default)))? $(.default($toml))?
-                $(.$more($($($value),*)?))*
-            ),*];
+        impl $section {
+            pub(crate) const KEYS: &'static [$crate::keys::Key] =
+                Self::keys_of $(::<{ const $axis: usize = 0; $axis }>)? ();
+            pub(crate) const fn keys_of $(<const $axis: usize>)? () -> &'static [$crate::keys::Key] {
+                const { &[$(
+                    $crate::keys::section!(@key $type, concat!($($text, "\n"),*), $field $($key)?)
+                    $(.rule($rule))? $(.default(stringify!($default)))? $(.default($toml))?
+                    $(.$more($($($value),*)?))*
+                ),*] }
+            }
         }
-        impl $(<const $unit: $of>)? $crate::keys::Field for $section $(<$unit>)? {
+        impl $crate::keys::Field for $section {
             const KIND: $crate::keys::Kind = $crate::keys::Kind::Table(Self::KEYS);
             fn take(table: Option<&toml::Value>) -> Self {
-                let mut parts = Self::KEYS.iter().map(|key| key.part(table));
+                let others = Self::keys_of $(::<{ const $axis: usize = 1; $axis }>)? ();
+                let mut parts = Self::KEYS.iter().zip(others);
+                let mut part = || {
+                    parts.next().and_then(|(key, other)| key.part(table).or_else(|| other.part(table)))
+                };
                 $section {
-                    $($field: $crate::keys::Field::take(parts.next().flatten().as_ref()),)*
+                    $($field: $crate::keys::Field::take(part().as_ref()),)*
                     $($($beside: $initial,)*)?
                 }
             }
@@ -48,8 +60,7 @@ macro_rules! section {
 }
 pub(crate) use section;
 
-/// Declares an enumeration: the names that its variants have in TOML, and what they mean. After `for`,
-/// of one that is declared elsewhere.
+/// Declares an enumeration: the names that its variants have in TOML, and what they mean.
 macro_rules! choice {
     (
         $(#[$doc:meta])*
@@ -60,16 +71,11 @@ macro_rules! choice {
         pub enum $name {
             $($(#[doc = $text])* $variant,)+
         }
-        $crate::keys::choice! {
-            for $name { $($(#[doc = $text])* $variant = $word,)+ }
-        }
         impl std::fmt::Display for $name {
             fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
                 f.pad(match self { $($name::$variant => $word),+ })
             }
         }
-    };
-    (for $name:ident { $($(#[doc = $text:literal])* $variant:ident = $word:literal,)+ }) => {
         impl $crate::keys::Field for $name {
             const KIND: $crate::keys::Kind =
                 $crate::keys::Kind::OneOf(&[$(($word, concat!($($text, "\n"),*))),+]);

@@ -166,6 +166,10 @@ impl Key {
         Key { is_flat: true, ..self }
     }
 
+    pub(crate) const fn table(self, keys: &'static [Key]) -> Self {
+        Key { kind: Kind::Table(keys), ..self }
+    }
+
     pub(crate) const fn whole(self) -> Self {
         Key { is_whole: true, ..self }
     }

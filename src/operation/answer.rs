@@ -15,7 +15,7 @@ use crate::session::{
     Lane, PROVED, Record, SampleRecord, Severity, Shell, State, Task, tracker_news,
 };
 use crate::stage::{Feedback, SetPoint, StageConfig, StageEvent};
-use crate::tracker::{Event, Gate, GateCounts, Refusal, Sample};
+use crate::tracker::{Event, GateCounts, Refusal, Sample};
 use crate::units::Time;
 
 /// Rest before each mean, and the time over which it is taken.
@@ -88,7 +88,6 @@ impl AnswerSettings {
 pub(super) struct Answering {
     settings: AnswerSettings,
     sync_period: Duration,
-    gate: Gate,
     counts: GateCounts,
     leg: Leg,
     means: Vec<Mean>,
@@ -101,8 +100,7 @@ pub(super) struct Answering {
 impl Answering {
     pub(super) fn new(config: &StageConfig, settings: AnswerSettings) -> Self {
         Answering {
-            sync_period: config.sync_period,
-            gate: settings.gate.clone(),
+            sync_period: config.bus.sync_period(),
             settings,
             counts: GateCounts::default(),
             leg: Leg::Resting { since: None },
@@ -114,7 +112,7 @@ impl Answering {
 
     /// Takes a position of the sensor. Positions count while the base rests.
     fn take_sample(&mut self, shell: &mut Shell, sample: Sample) {
-        let admitted = self.gate.admit(&sample);
+        let admitted = self.settings.gate.admit(&sample);
         self.counts.count(admitted.as_ref().err());
         let refused = admitted.as_ref().err().cloned();
         shell.record(Record::Sample(SampleRecord {

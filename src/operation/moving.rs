@@ -139,7 +139,7 @@ pub(super) struct MoveOneAxis {
 
 impl MoveOneAxis {
     pub(super) fn new(config: &StageConfig, way: Move) -> Self {
-        MoveOneAxis { way, sync_period: config.sync_period, moving: None, done: Vec::new() }
+        MoveOneAxis { way, sync_period: config.bus.sync_period(), moving: None, done: Vec::new() }
     }
 
     /// The move from `at`; a goal out of the limits is refused.

@@ -25,8 +25,8 @@ struct Silence {
 impl Silence {
     /// A silence from `since` on. The last heartbeat may have gone out just then.
     fn new(config: &StageConfig, since: Time) -> Self {
-        let within = config.heartbeat.consumer_time + MARGIN;
-        let looks = Halt::watch(config, since, since + within + config.stop_timeout);
+        let within = config.bus.heartbeat_timeout() + MARGIN;
+        let looks = Halt::watch(config, since, since + within + config.power.stop_timeout);
         Silence { since, within, noticed_after: PerAxis::default(), looks }
     }
 

@@ -7,7 +7,7 @@ use crate::canopen::cia402::DriveState;
 use crate::config::{CanInterface, Config};
 use crate::math;
 use crate::session::PlaneOutOfReach;
-use crate::stage::{Axis, AxisLimits, AxisStatus, Reference, Zero};
+use crate::stage::{Axis, AxisLimits, AxisStatus, Reference};
 use crate::tracker::{StampPolicy, Workspace};
 use nalgebra::Vector3;
 
@@ -79,7 +79,8 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
     let found = format!("{name} {}{state}", if is_up { "up" } else { "down" });
     let bus = Check::new("bus", found, UP).unless(is_up && may_send, Fail, set(BRING_UP));
 
-    let load_of = |rate: u32| CYCLE_BITS * 1e3 / f64::from(config.can.sync_ms) / f64::from(rate);
+    let load_of =
+        |rate: u32| CYCLE_BITS * 1e3 / f64::from(config.can.bus.sync_ms) / f64::from(rate);
     let found = bit_rate.map_or_else(unknown, |rate| {
         let (kbit_per_s, load) = (f64::from(rate) * 1e-3, load_of(rate) * 1e2);
         format!("{kbit_per_s} kbit/s, {load:.0}% load by SYNC")
@@ -112,7 +113,8 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
         Ok(status) => status,
         Err(trouble) => {
             let can = &config.can;
-            let limit = format!("{} requests of {} ms", can.sdo_attempts, can.sdo_timeout_ms);
+            let limit =
+                format!("{} requests of {} ms", can.bus.sdo_attempts, can.bus.sdo_timeout_ms);
             let next = "is it powered, and are node and bit rate right?";
             return vec![Check::new(name, trouble, limit).unless(false, Fail, next)];
         }
@@ -133,11 +135,11 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
     let AxisStatus { node, identity, statusword, .. } = status;
     let state = statusword.state();
     let is_faulty = matches!(state, Some(DriveState::Fault | DriveState::FaultReactionActive));
-    let is_named = drive.vendor.is_some() && drive.product.is_some();
-    let is_right = drive.vendor.is_none_or(|vendor| vendor == identity.vendor)
-        && drive.product.is_none_or(|product| product == identity.product);
+    let is_named = drive.vendor_id.is_some() && drive.product_code.is_some();
+    let is_right = drive.vendor_id.is_none_or(|vendor| vendor == identity.vendor)
+        && drive.product_code.is_none_or(|product| product == identity.product);
     let id = |expected: Option<u32>| expected.map_or("any".to_owned(), |id| format!("{id:#010X}"));
-    let (vendor, product) = (id(drive.vendor), id(drive.product));
+    let (vendor, product) = (id(drive.vendor_id), id(drive.product_code));
     let limit = format!("vendor {vendor}, product {product}; no fault, no power");
     let write = format!("write vendor_id and product_code into [stage.{axis}]");
     let other = format!("not the drive of [stage.{axis}]: is node right?");
@@ -146,7 +148,7 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
         Check::new(&name, format!("node {node}, {identity}; {statusword}"), limit)
             .unless(is_named, Warn, write)
             .unless(state != Some(DriveState::OperationEnabled), Warn, POWERED)
-            .unless(!is_faulty || config.stage.fault_reset_on_start, Fail, reset)
+            .unless(!is_faulty || config.stage.power.fault_reset_on_start, Fail, reset)
             .unless(is_right, Fail, other),
     ];
     let errors: Vec<String> =
@@ -165,7 +167,7 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
         checks.push(homing.unless(status.homed != Some(false), Fail, next));
     }
     let way = if axis == Axis::Insertion { config.insertion.depth_mm } else { 0.0 };
-    if let Some(position) = status.position.filter(|_| !drive.wraps && drive.zero != Zero::Here) {
+    if let Some(position) = status.position.filter(|_| !drive.wraps && drive.zero.is_some()) {
         checks.push(room(axis, position, way, &drive.limits));
     }
     checks

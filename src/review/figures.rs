@@ -89,7 +89,7 @@ pub(super) fn limits(config_toml: &str) -> Result<Limits, ConfigError> {
     let source = Source { name: "config.toml", text: config_toml };
     let config = Config::from_sources(&[source], &[])?;
     let stage = config.stage.to_stage(&config.can)?;
-    let following = |axis| stage.axis(axis).following_error_limit(stage.sync_period);
+    let following = |axis| stage.axis(axis).following_error_limit(stage.bus.sync_period());
     let (insertion, tracker) = (&config.insertion, &config.tracker);
     let mut limits = Limits::from([
         (GOAL, insertion.depth_mm),

@@ -202,8 +202,8 @@ mod tests {
     fn stage() -> (StageConfig, VirtualStage) {
         let config = Config::from_sources(&[], &[]).expect("valid");
         let mut stage = config.stage.to_stage(&config.can).expect("valid");
-        stage.stop_timeout = Duration::from_millis(600);
-        stage.sdo_timeout = Duration::from_millis(50);
+        stage.power.stop_timeout = Duration::from_millis(600);
+        stage.bus.sdo_timeout_ms = 50;
         let emulated = config.virtual_stage().expect("valid");
         (stage, VirtualStage::new(emulated, Time::ZERO))
     }
@@ -218,7 +218,8 @@ mod tests {
         let mut bus = RefusingBus { stage, clock, refuses, sent: Vec::new(), deaf };
         let begun = clock.now();
         let mut halt = Halt::new(&config, begun);
-        let trouble = talk_despite_errors(&mut halt, &mut bus, clock, begun + config.stop_timeout);
+        let trouble =
+            talk_despite_errors(&mut halt, &mut bus, clock, begun + config.power.stop_timeout);
         (bus, halt, trouble, clock.now().since(begun))
     }
 

@@ -21,7 +21,7 @@ pub use interrupt::Interrupt;
 pub use live::run_live;
 pub use realtime::{RealTime, enter_real_time};
 pub use recording::{Describe, RecordedRun, complete_record, make_recording};
-pub use sink::{Holds, OnRecordFailure, Operator, RunReport, Sink, gates_to_json};
+pub use sink::{Holds, Operator, RunReport, Sink, gates_to_json};
 pub use stage_server::{TipServer, serve_stage};
 pub use study::{DrawnGoal, Study};
 pub use timing::{Clock, TimingFigures, TimingReport};

@@ -37,15 +37,6 @@ pub trait Operator {
     }
 }
 
-/// What a run does when its record can no longer be kept.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum OnRecordFailure {
-    /// It is stopped, safely.
-    Stop,
-    /// It goes on; what is lost is reported and counted.
-    GoOn,
-}
-
 /// How often an insertion was held, by what held it.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
 pub struct Holds {
@@ -63,7 +54,7 @@ pub struct Sink<'a> {
     figures: RunFigures,
     holds: Holds,
     drives: Vec<DriveIdentity>,
-    on_failure: OnRecordFailure,
+    stops_on_failure: bool,
     /// How long it took to hand each record to the recorder, ns.
     handed_over: DurationHistogram,
     operator: &'a mut dyn Operator,
@@ -96,19 +87,26 @@ pub struct RunReport {
 }
 
 impl<'a> Sink<'a> {
-    /// Records go to `recorder`, news to `operator`, who may raise `interrupt`; `on_failure` says what to
-    /// do when recording fails.
+    /// Records go to `recorder`, news to `operator`, who may raise `interrupt`. When recording
+    /// fails the run is stopped if `stops_on_failure`; otherwise it goes on, and what is lost is
+    /// reported and counted.
     pub fn new(
         recorder: Recorder,
-        on_failure: OnRecordFailure,
+        stops_on_failure: bool,
         operator: &'a mut dyn Operator,
         interrupt: &Interrupt,
     ) -> Self {
-        let (figures, handed_over) = (RunFigures::default(), DurationHistogram::default());
         operator.recorded_to(recorder.run_dir());
-        let (holds, drives) = (Holds::default(), Vec::new());
-        let interrupt = interrupt.clone();
-        Sink { recorder, figures, holds, drives, on_failure, handed_over, operator, interrupt }
+        Sink {
+            recorder,
+            figures: RunFigures::default(),
+            holds: Holds::default(),
+            drives: Vec::new(),
+            stops_on_failure,
+            handed_over: DurationHistogram::default(),
+            operator,
+            interrupt: interrupt.clone(),
+        }
     }
 
     fn identify(&mut self, axis: Axis, node: NodeId, identity: &Identity) {
@@ -128,19 +126,17 @@ impl<'a> Sink<'a> {
     fn look_after_record(&mut self, now: Time, is_ending: bool) -> Option<String> {
         let mut reason = None;
         while let Some(news) = self.recorder.news() {
-            let trouble = match (news, self.on_failure) {
-                (RecordNews::Failed(error), OnRecordFailure::Stop)
-                    if reason.is_none() && !is_ending =>
-                {
+            let trouble = match news {
+                RecordNews::Failed(error) if !self.stops_on_failure => {
+                    format!("{error}; the run goes on (record.on_failure)")
+                }
+                RecordNews::Failed(error) if reason.is_none() && !is_ending => {
                     self.operator.record_trouble(&error.to_string());
                     reason = Some(format!("record: {error}"));
                     continue;
                 }
-                (RecordNews::Failed(error), OnRecordFailure::Stop) => error.to_string(),
-                (RecordNews::Failed(error), OnRecordFailure::GoOn) => {
-                    format!("{error}; the run goes on (record.on_failure)")
-                }
-                (RecordNews::Warning(text), _) => text,
+                RecordNews::Failed(error) => error.to_string(),
+                RecordNews::Warning(text) => text,
             };
             self.operator.record_trouble(&trouble);
             let text = format!("record: {trouble}");

@@ -165,7 +165,7 @@ impl Shell {
     /// while the bench is silent on purpose.
     pub(super) fn silence_max(&self) -> Option<Duration> {
         let is_missed = matches!(self.power, Power::On(_)) && self.is_running() && !self.is_silent;
-        is_missed.then_some(self.config.heartbeat.consumer_time)
+        is_missed.then_some(self.config.bus.heartbeat_timeout())
     }
 
     /// Records an event of the stage.
@@ -249,7 +249,7 @@ impl Shell {
 
     /// The longest a stop may take by the stage's own timeouts, and a margin.
     fn stop_timeout(&self) -> Duration {
-        self.config.stop_timeout * 2 + STOP_MARGIN
+        self.config.power.stop_timeout * 2 + STOP_MARGIN
     }
 
     /// When the shell itself, or else its stage, has something to do.

@@ -74,7 +74,7 @@ impl Tracking {
             travel: TravelCheck::new(tracker.track.noise_sd_mm, config.needle.curvature_per_mm()),
             counts: GateCounts::default(),
             census: Census::default(),
-            unpaired_max: UNPAIRED_MAX.max(2 * config.stage.sync_period),
+            unpaired_max: UNPAIRED_MAX.max(2 * config.stage.bus.sync_period()),
             config: tracker,
             waiting: VecDeque::new(),
             records: VecDeque::new(),

@@ -60,7 +60,7 @@ pub(super) struct BringUp {
     script: Script,
     /// Gives where the axis stood (0x6064), or why the drive could not be brought up.
     pub(super) conversation: Conversation<Result<i32, String>>,
-    restarts_left: u32,
+    restarts_left: u8,
 }
 
 /// How far a bring-up has come.
@@ -89,7 +89,7 @@ impl BringUp {
         BringUp {
             conversation: Conversation::begin(&script.sdo, now, script.clone().run()),
             script,
-            restarts_left: config.boot_attempts.saturating_sub(1),
+            restarts_left: config.bus.boot_attempts.saturating_sub(1),
         }
     }
 
@@ -173,7 +173,7 @@ impl Script {
         answer: Result<SdoReply, SdoError>,
     ) -> Result<Option<SdoReply>, String> {
         let object = request.object();
-        let may_lack = is_optional || self.drive().optional_objects.contains(&object);
+        let may_lack = is_optional || self.drive().optional_objects.contains(&object.index);
         let error = match answer {
             Ok(reply) => return Ok(Some(reply)),
             Err(error) => error,
@@ -187,7 +187,7 @@ impl Script {
             return Ok(None);
         }
         let hint = if is_absent { "; list it as optional if the drive does without" } else { "" };
-        let attempts = self.config.sdo_attempts;
+        let attempts = self.config.bus.sdo_attempts;
         Err(match (error, request) {
             (SdoError::Aborted(code), SdoRequest::Download(_, value)) => {
                 format!("{object}: writing {value} was refused with SDO abort {code}{hint}")
@@ -252,7 +252,8 @@ impl Script {
         object: ObjectAddress,
         value: SdoValue,
     ) -> Result<(), String> {
-        let patience = self.config.sdo_timeout.saturating_mul(self.config.sdo_attempts);
+        let patience =
+            self.config.bus.sdo_timeout().saturating_mul(self.config.bus.sdo_attempts.into());
         let give_up = self.sdo.now() + patience;
         while let Some(received) = self.read(object).await? {
             let checked = check(object, value, received);

@@ -4,10 +4,13 @@ use std::fmt;
 use std::ops::{Index, IndexMut};
 use std::time::Duration;
 
+use super::limits::{ACCELERATION, SPEED};
+use super::scale::CountsPer;
 use super::standstill::Standstill;
 use super::{AxisLimits, CountsRatio, HomingConfig, Reference, Scale, Sign};
 use crate::canopen::sdo::SdoValue;
 use crate::canopen::{NodeId, ObjectAddress};
+use crate::keys::{NO_KEY, Rule, hardware_is_decided, over, section, within};
 
 /// One of the two axes of the stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -86,76 +89,122 @@ impl<T> IndexMut<Axis> for PerAxis<T> {
     }
 }
 
-/// An object that a particular drive needs written, before the stage's own.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct RawSdo {
-    /// The object.
-    pub object: ObjectAddress,
-    /// What to write.
-    pub value: SdoValue,
-    /// Read it back and compare. False for objects that do not read as written (0x1010, 0x1011).
-    pub read_back: bool,
-}
-
-/// Where an axis reads zero.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Zero {
-    /// Where it stands when it is enabled.
-    #[default]
-    Here,
-    /// At this position of the drive (0x6064), for an axis that was homed or is absolute.
-    Counts(i32),
-}
-
 /// What an axis does in 30 ms at its highest speed: a servo's lag, where no following-error window
 /// is configured.
 const FOLLOWING_LAG: Duration = Duration::from_millis(30);
 
-/// One axis: its drive, scale and limits.
-#[derive(Debug, Clone, PartialEq)]
-pub struct AxisConfig {
-    /// The drive.
-    pub node: NodeId,
-    /// Refuse a drive of another vendor (0x1018:01).
-    pub vendor: Option<u32>,
-    /// Refuse another product (0x1018:02).
-    pub product: Option<u32>,
-    /// Counts per mm (insertion) or per turn (rotation).
-    pub ratio: CountsRatio,
-    /// Which way the counts grow.
-    pub sign: Sign,
-    /// Where the axis reads zero.
-    pub zero: Zero,
-    /// How the drive knows where it is.
-    pub reference: Reference,
-    /// How it is homed, where it can be.
-    pub homing: Option<HomingConfig>,
-    /// The drive goes on the short way past the end of its 32-bit position.
-    pub wraps: bool,
-    /// Soft limits, mm or rad and seconds.
-    pub limits: AxisLimits,
-    /// How far the drive may be from where it is to be (0x6065, but mm or rad); `None` for what it
-    /// does in 30 ms at the highest speed. The stage allows for two SYNC periods more.
-    pub following_error_max: Option<f64>,
-    /// 0x6066: how long the drive waits beyond that window before it faults, in whole milliseconds;
-    /// `None` leaves it as the drive has it.
-    pub following_error_timeout: Option<Duration>,
-    /// 0x6085, but mm/s² or rad/s²; `None` leaves it as the drive has it.
-    pub quick_stop_deceleration: Option<f64>,
-    /// 0x605A: how quick stop decelerates. 5 and 6 stay in Quick Stop Active.
-    pub quick_stop_option: i16,
-    /// 0x605E: how the drive stops on a fault of its own, where it can be told. 2 is on the
-    /// quick-stop ramp.
-    pub fault_reaction_option: i16,
-    /// 0x6007: what the drive does by itself when the bench falls silent. 3 is quick stop.
-    pub abort_connection_option: i16,
-    /// 0x1029:01: where the node goes when the bench falls silent. 0 is Pre-operational, which
-    /// makes the drive do what 0x6007 says.
-    pub communication_error_behaviour: u8,
-    /// Objects that this drive may lack: what is to be read or written there is skipped.
-    pub optional_objects: Vec<ObjectAddress>,
-    /// Written before the stage's own objects, in this order.
-    pub raw_sdos: Vec<RawSdo>,
+const IDENTITY: Rule = Rule::Or("any", "a 32-bit whole number");
+const OBJECT: Rule = within(0x1000 as f64, 0xFFFF as f64);
+const SPEED_MAX: [&str; 2] =
+    ["stage.insertion.speed_max_mm_per_s", "stage.rotation.speed_max_deg_per_s"];
+
+section! {
+    /// An axis: its drive, scale and limits. Lengths are in mm, angles in rad.
+    pub struct AxisConfig of AXIS {
+        /// The drive's CANopen node ID.
+        node: NodeId => ["1", "2"][AXIS], hardware_must_give;
+        /// The expected vendor ID (1018:1), or "any".
+        vendor_id: Option<u32> [IDENTITY] = 0x0000_02F1, hardware_must_give;
+        /// The expected product code (1018:2), or "any".
+        product_code: Option<u32> [IDENTITY] = 0x0000_0402, hardware_must_give;
+        /// 1, or -1 if the drive counts in the opposite direction to the axis.
+        sign: Sign [Rule::Integers(&[1, -1])] = 1, hardware_must_give;
+        /// Where the position of the drive comes from.
+        reference: Reference = "absolute", hardware_must_give;
+        /// The drive's position, in counts, at which the axis reads 0. "start" takes the position at
+        /// which each run or operation starts; the limits then count from there. Hardware may use
+        /// "start" only if the axis wraps.
+        zero: Option<i32> [Rule::Or("start", "a position in counts")] => ["0", "\"start\""][AXIS],
+            hardware_must_give;
+        /// True if the drive's 32-bit position wraps around and the axis keeps moving.
+        wraps: bool = false, hardware_may_omit;
+        /// Following-error timeout (6066): how long the drive may be outside its window before it
+        /// faults, ms; at most two SYNC periods. If omitted, the drive keeps its own.
+        following_error_timeout_ms: Option<u16>, hardware_may_omit;
+        /// Quick stop option code (605A): 6 brakes on the quick-stop ramp and stays in Quick Stop Active.
+        quick_stop_option: i16 = 6, hardware_may_omit;
+        /// Fault reaction option code (605E): 2 brakes on the quick-stop ramp. Skipped if the drive
+        /// lacks the object.
+        fault_reaction_option: i16 = 2, hardware_may_omit;
+        /// Abort connection option code (6007), for a lost bench heartbeat: 3 is a quick stop.
+        abort_connection_option: i16 = 3, hardware_may_omit;
+        /// NMT state that the node enters when the bench's heartbeat is lost (1029:1): 0 is
+        /// Pre-operational.
+        communication_error_behaviour: u8 = 0, hardware_may_omit;
+        /// Objects that the drive may lack, such as `[0x60C2]`. An object without which the axis cannot be
+        /// moved, watched or stopped is refused.
+        optional_objects: Vec<u16> [OBJECT] = [], hardware_may_omit;
+        /// Objects to write unchanged and in this order, before those that the bench writes. An object
+        /// that moves the axis, or that the bench writes itself, is refused.
+        sdo: Vec<RawSdo> [Rule::Fields("index, subindex, value, bits")] = [], hardware_may_omit;
+        /// Scale, as an exact ratio.
+        ratio as (["counts_per_mm", "counts_per_turn"][AXIS]): CountsRatio
+            => ["{ counts = 4646, mm = 1 }", "{ counts = 378_830, turns = 5 }"][AXIS],
+            table(CountsPer::keys_of::<AXIS>()), whole, hardware_must_give;
+        /// The soft limits, mm or rad and seconds.
+        limits: AxisLimits, table(AxisLimits::keys_of::<AXIS>()), flat;
+        /// The drive's following-error window (6065). The bench checks it too, and adds the travel of
+        /// two SYNC periods at the highest speed. If omitted: the travel of 30 ms at the highest speed.
+        following_error_max as (["following_error_mm", "following_error_deg"][AXIS]): Option<f64>
+            [[over(0.0, 100.0), over(0.0, 3600.0)][AXIS]], hardware_may_omit;
+        /// Quick-stop deceleration (6085). With hardware it may be omitted: the drive keeps its own.
+        quick_stop_deceleration
+            as (["quick_stop_deceleration_mm_per_s2", "quick_stop_deceleration_deg_per_s2"][AXIS]):
+            Option<f64> [ACCELERATION[AXIS]] => ["21.5239", "475.147"][AXIS], hardware_must_give;
+        /// Speed of `needle-bench stage jog`.
+        jog_speed as (["jog_speed_mm_per_s", "jog_speed_deg_per_s"][AXIS]): f64 [SPEED[AXIS]]
+            => ["2.0", "30.0"][AXIS], at_most(SPEED_MAX[AXIS]), hardware_may_omit;
+        /// Acceleration of `needle-bench stage jog`, and of `withdraw`.
+        jog_acceleration as (["jog_acceleration_mm_per_s2", "jog_acceleration_deg_per_s2"][AXIS]):
+            f64 [ACCELERATION[AXIS]] => ["10.0", "90.0"][AXIS], hardware_may_omit;
+        /// Speed of `needle-bench stage withdraw`.
+        withdraw_speed as (["withdraw_speed_mm_per_s", NO_KEY][AXIS]): Option<f64> [SPEED[AXIS]]
+            = 2.0, at_most(SPEED_MAX[AXIS]), hardware_may_omit;
+        /// How `needle-bench stage home` homes the axis (CiA 402 mode 6). Without this key the axis
+        /// cannot be homed.
+        homing: Option<HomingConfig> => [
+            "{ method = 33, timeout_s = 60.0, homed_bit = 12 }",
+            "{ method = 37, timeout_s = 10.0, homed_bit = 12 }",
+        ][AXIS], table(HomingConfig::keys_of::<AXIS>()), hardware_must_give;
+    }
+}
+
+const _: () = assert!(
+    hardware_is_decided(AxisConfig::keys_of::<{ Axis::Insertion as usize }>())
+        && hardware_is_decided(AxisConfig::keys_of::<{ Axis::Rotation as usize }>()),
+    "declare for each key whether hardware must give it, may omit it, or takes the default"
+);
+
+section! {
+    /// One object to write to a drive, unchanged.
+    #[derive(Copy)]
+    pub struct RawSdo {
+        /// Size of the object in bits.
+        bits: u8 [Rule::Integers(&[8, 16, 32])];
+        /// Index.
+        index: u16 [OBJECT];
+        /// Subindex.
+        subindex: u8;
+        /// Value, signed or unsigned; it must fit `bits`.
+        value: i64 [within(i32::MIN as f64, u32::MAX as f64)];
+        /// Whether the bench reads the object back and compares. Use false for objects that read back
+        /// another value than was written, such as 1010.
+        read_back: bool = true, everywhere;
+    }
+}
+
+impl RawSdo {
+    /// The object, and what to write to it.
+    ///
+    /// # Errors
+    /// The value does not fit the bits.
+    pub(super) fn to_write(self) -> Result<(ObjectAddress, SdoValue), String> {
+        let object = ObjectAddress::new(self.index, self.subindex);
+        let value = SdoValue::sized(self.value, self.bits / 8).ok_or_else(|| {
+            format!("sdo {object}: {} does not fit {} bits", self.value, self.bits)
+        })?;
+        Ok((object, value))
+    }
 }
 
 impl AxisConfig {
@@ -177,50 +226,76 @@ impl AxisConfig {
 
     /// The scale of `axis` whose zero is as configured, or at `here_counts`.
     pub fn scale(&self, axis: Axis, here_counts: i64) -> Scale {
-        let zero_counts = match self.zero {
-            Zero::Here => here_counts,
-            Zero::Counts(counts) => counts.into(),
-        };
+        let zero_counts = self.zero.map_or(here_counts, i64::from);
         Scale::new(axis, self.ratio, self.sign, zero_counts)
     }
 }
 
-/// Who watches whom, and how closely. Periods are sent to the drives in whole milliseconds.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct HeartbeatConfig {
-    /// Between two heartbeats, of the bench and of each drive (0x1017).
-    pub producer_period: Duration,
-    /// Silence that counts as loss, for the bench and for each drive (0x1016).
-    pub consumer_time: Duration,
+section! {
+    /// What the drives are told on the bus, and how long they are waited for.
+    #[derive(Copy)]
+    pub struct BusConfig {
+        /// Period of SYNC, ms.
+        sync_ms: u16 [within(1.0, 100.0)] = 10;
+        /// The bench's own node number: the drives watch its heartbeat.
+        bench_node: NodeId = 127;
+        /// Period of the bench's and the drives' heartbeats, ms.
+        heartbeat_ms: u16 [within(5.0, 10_000.0)] = 25;
+        /// A heartbeat that is missing for this long stops the run, and the drives, ms.
+        heartbeat_timeout_ms: u16 [within(10.0, 60_000.0)] = 100;
+        /// Longest wait for the answer to one SDO request, ms.
+        sdo_timeout_ms: u16 [within(10.0, 10_000.0)] = 150;
+        /// How often an SDO request is sent before giving up.
+        sdo_attempts: u8 [within(1.0, 20.0)] = 3;
+        /// Longest wait for a drive to boot, s.
+        boot_timeout as "boot_timeout_s": Duration [within(0.1, 120.0)] = 2.0;
+        /// How often the bring-up of a drive is begun, if the drive restarts in the middle of it.
+        boot_attempts: u8 [within(1.0, 20.0)] = 3;
+        /// SYNCs in a row without both drives' answers that are tolerated.
+        missed_feedback_max: u8 [within(0.0, 100.0)] = 1;
+    }
+}
+
+impl BusConfig {
+    /// Period of SYNC.
+    pub fn sync_period(&self) -> Duration {
+        Duration::from_millis(self.sync_ms.into())
+    }
+
+    /// Silence that counts as loss, for the bench and for each drive.
+    pub fn heartbeat_timeout(&self) -> Duration {
+        Duration::from_millis(self.heartbeat_timeout_ms.into())
+    }
+
+    /// Longest wait for the answer to one SDO request.
+    pub fn sdo_timeout(&self) -> Duration {
+        Duration::from_millis(self.sdo_timeout_ms.into())
+    }
+}
+
+section! {
+    /// How power is switched on and off.
+    #[derive(Copy)]
+    pub struct PowerConfig {
+        /// Reset a drive that is found in fault, once, instead of refusing to start.
+        fault_reset_on_start: bool = false;
+        /// Longest wait for both drives to be enabled, brakes included, s.
+        enable_timeout as "enable_timeout_s": Duration [within(0.1, 60.0)] = 3.0;
+        /// Of that, the longest wait for each step up to "switched on", charging included, s. A drive
+        /// that takes longer is held, for example by its safety input, and the start is given up.
+        state_transition_timeout as "let_on_s": Duration [within(0.05, 60.0)] = 0.5;
+        /// Longest wait for both axes to stand after a stop, s.
+        stop_timeout as "stop_timeout_s": Duration [within(0.1, 60.0)] = 2.0;
+    }
 }
 
 /// The whole stage.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageConfig {
-    /// Between two SYNCs.
-    pub sync_period: Duration,
-    /// The bench's own node number, whose heartbeat the drives watch.
-    pub bench_node: NodeId,
-    /// Supervision, both ways.
-    pub heartbeat: HeartbeatConfig,
-    /// Longest wait for an SDO answer.
-    pub sdo_timeout: Duration,
-    /// How often an SDO is tried.
-    pub sdo_attempts: u32,
-    /// Longest wait for a drive to answer at all.
-    pub boot_timeout: Duration,
-    /// How often a drive may be brought up: it may restart in the middle of it.
-    pub boot_attempts: u32,
-    /// Longest way from Operational to both drives in Operation Enabled; brakes take their time.
-    pub enable_timeout: Duration,
-    /// For a drive to leave Switch On Disabled, and Ready To Switch On, once it is told to.
-    pub state_transition_timeout: Duration,
-    /// Longest wait for standstill, and for power to be off.
-    pub stop_timeout: Duration,
-    /// SYNCs in a row without both positions that are tolerated; the next is a fault.
-    pub missed_feedback_max: u32,
-    /// Reset a drive found in Fault. Otherwise it is an error that names the fault.
-    pub fault_reset_on_start: bool,
+    /// What the drives are told on the bus.
+    pub bus: BusConfig,
+    /// How power is switched on and off.
+    pub power: PowerConfig,
     /// How long another master is listened for before the first frame is sent: as long as the
     /// heartbeat of a living one may be late.
     pub listen_first: Duration,
@@ -242,7 +317,7 @@ impl StageConfig {
     /// How long the counts of `axis` are watched to see that it stands.
     pub fn standstill_window(&self, axis: Axis) -> Duration {
         let counts_per_unit = self.axis(axis).scale(axis, 0).counts_per_unit();
-        Standstill::new(counts_per_unit).window(self.sync_period)
+        Standstill::new(counts_per_unit).window(self.bus.sync_period())
     }
 
     /// The nodes of the drives.
@@ -256,28 +331,25 @@ impl StageConfig {
     /// The first thing that the stage cannot work with.
     pub fn validate(&self) -> Result<(), String> {
         let PerAxis { insertion, rotation } = self.nodes();
-        let nodes = [insertion, rotation, self.bench_node];
+        let nodes = [insertion, rotation, self.bus.bench_node];
         let is_used_twice = |node: &&NodeId| nodes.iter().filter(|other| other == node).count() > 1;
         if let Some(node) = nodes.iter().find(is_used_twice) {
             return Err(format!(
                 "node {node} is used twice among the bench, insertion and rotation"
             ));
         }
-        if interpolation_period(self.sync_period).is_none() {
+        let BusConfig {
+            sync_ms, heartbeat_ms: period_ms, heartbeat_timeout_ms: timeout_ms, ..
+        } = self.bus;
+        if !(1..=255).contains(&sync_ms) {
             return Err(format!(
-                "a SYNC period of {} µs does not fit object 0x60C2: 1 to 255 times 1, 0.1, 0.01 or \
-                 0.001 ms",
-                self.sync_period.as_micros()
+                "a SYNC period of {sync_ms} ms does not fit object 0x60C2: 1 to 255 ms"
             ));
         }
-        let HeartbeatConfig { producer_period, consumer_time } = self.heartbeat;
-        let (producer, consumer) = (millis(producer_period), millis(consumer_time));
-        if !matches!((producer, consumer), (Some(1..), Some(1..))) || consumer <= producer {
+        if period_ms == 0 || timeout_ms <= period_ms {
             return Err(format!(
-                "heartbeat every {} ms, lost after {} ms: 1 to 65535 ms, and the second must be the \
-                 longer",
-                producer_period.as_millis(),
-                consumer_time.as_millis()
+                "heartbeat every {period_ms} ms, lost after {timeout_ms} ms: 1 to 65535 ms, and the \
+                 second must be the longer"
             ));
         }
         Axis::BOTH.into_iter().try_for_each(|axis| self.validate_axis(axis))
@@ -319,12 +391,12 @@ impl StageConfig {
         }
         let window = self.standstill_window(axis);
         // It brakes first, and the last SYNC counts when the next is due.
-        if window + 2 * self.sync_period >= self.stop_timeout {
+        if window + 2 * self.bus.sync_period() >= self.power.stop_timeout {
             return Err(format!(
                 "{axis}: {:.0} ms of its counts are needed to see it stand, and stop_timeout_s is \
                  {:.3}: set a longer one",
                 window.as_secs_f64() * 1e3,
-                self.stop_timeout.as_secs_f64()
+                self.power.stop_timeout.as_secs_f64()
             ));
         }
         Ok(())
@@ -343,22 +415,6 @@ pub(super) fn unsigned_counts(scale: Scale, value: f64) -> Option<u32> {
     (1.0..=f64::from(u32::MAX)).contains(&counts).then_some(counts as u32)
 }
 
-/// A duration in whole milliseconds that fit 16 bits.
-pub(super) fn millis(duration: Duration) -> Option<u16> {
-    u16::try_from(duration.as_millis()).ok()
-}
-
-/// `period` as object 0x60C2 has it: a count of 1 to 255 and a power of ten of a second.
-pub(super) fn interpolation_period(period: Duration) -> Option<(u8, i8)> {
-    [(-3, 1_000_000), (-4, 100_000), (-5, 10_000), (-6, 1_000)].into_iter().find_map(
-        |(exponent, unit_ns): (i8, u128)| {
-            let whole = period.as_nanos().is_multiple_of(unit_ns);
-            let count = u8::try_from(period.as_nanos() / unit_ns).ok()?;
-            (whole && count > 0).then_some((count, exponent))
-        },
-    )
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -374,18 +430,6 @@ mod tests {
     }
 
     #[test]
-    fn the_interpolation_period_is_a_count_and_a_power_of_ten() {
-        let period = |us| interpolation_period(Duration::from_micros(us));
-        assert_eq!(period(10_000), Some((10, -3)));
-        assert_eq!(period(255_000), Some((255, -3)));
-        assert_eq!(period(1_500), Some((15, -4)));
-        assert_eq!(period(125), Some((125, -6)));
-        assert_eq!(period(256_000), None);
-        assert_eq!(period(1_255), None);
-        assert_eq!(period(0), None);
-    }
-
-    #[test]
     fn mistakes_are_named() {
         assert_eq!(config().validate(), Ok(()));
         let text = |change: fn(&mut StageConfig)| {
@@ -393,11 +437,9 @@ mod tests {
             change(&mut config);
             config.validate().expect_err("refused").to_string()
         };
-        assert!(text(|c| c.rotation.node = c.bench_node).starts_with("node 127 is used twice"));
-        assert!(text(|c| c.sync_period = Duration::from_secs(1)).contains("1000000 µs"));
-        assert!(
-            text(|c| c.heartbeat.consumer_time = c.heartbeat.producer_period).contains("100 ms")
-        );
+        assert!(text(|c| c.rotation.node = c.bus.bench_node).starts_with("node 127 is used twice"));
+        assert!(text(|c| c.bus.sync_ms = 1000).contains("1000 ms"));
+        assert!(text(|c| c.bus.heartbeat_timeout_ms = c.bus.heartbeat_ms).contains("100 ms"));
         assert!(
             text(|c| c.rotation.following_error_max = Some(0.0))
                 .starts_with("rotation: a following error of 0 deg: ")

@@ -99,12 +99,13 @@ impl Stage {
         if !self.both_heard() {
             return;
         }
+        let missed_max = u32::from(self.config.bus.missed_feedback_max);
         for axis in Axis::BOTH {
             let drive = &mut self.drives[axis];
             let missed = drive.missed_in_a_row.saturating_add(1);
             drive.missed_in_a_row = if drive.fresh { 0 } else { missed };
             if let Some((syncs, frame)) = drive.conflicts_in_a_row()
-                && syncs > self.config.missed_feedback_max
+                && syncs > missed_max
             {
                 let fault = format!(
                     "{axis}: two TPDO1 that differ after each of {syncs} SYNCs in a row, the second \
@@ -119,7 +120,7 @@ impl Stage {
         }
         self.missed_in_a_row = self.missed_in_a_row.saturating_add(1);
         self.counters.feedback_missed += 1;
-        if self.missed_in_a_row > self.config.missed_feedback_max {
+        if self.missed_in_a_row > missed_max {
             let syncs = self.missed_in_a_row;
             // The other may merely be late this time.
             let PerAxis { insertion, rotation } = &self.drives;
@@ -151,7 +152,7 @@ impl Stage {
             self.tell(StageEvent::Located(self.both(Drive::commanded)));
         }
         if self.power_permitted {
-            self.phase = Phase::Enabling { give_up: now + self.config.enable_timeout };
+            self.phase = Phase::Enabling { give_up: now + self.config.power.enable_timeout };
             self.tell(StageEvent::Progress(Progress::Enabling));
             // Targets are armed in a later cycle: the owner may refuse to go on from here.
             self.lead_to_enabled();
@@ -161,7 +162,7 @@ impl Stage {
     /// Enabling has timed out; the first drive that `is_late` is the reason.
     fn fail_enabling(&mut self, now: Time, is_late: impl Fn(&Drive) -> bool) {
         let (axis, statusword) = self.first(is_late);
-        let timeout_ms = self.config.enable_timeout.as_millis();
+        let timeout_ms = self.config.power.enable_timeout.as_millis();
         let heard = match statusword {
             Some(word) => format!("statusword {word}"),
             None => "no TPDO1 was heard".to_owned(),
@@ -188,7 +189,7 @@ impl Stage {
         }
         for axis in Axis::BOTH {
             if let Some(statusword) =
-                self.drives[axis].refuses_to_switch_on(self.config.state_transition_timeout)
+                self.drives[axis].refuses_to_switch_on(self.config.power.state_transition_timeout)
             {
                 return self.fail_switch_on(now, axis, statusword);
             }
@@ -242,7 +243,7 @@ impl Stage {
                 "its last target",
             );
         } else if standing || now >= give_up {
-            let give_up = now + self.config.stop_timeout;
+            let give_up = now + self.config.power.stop_timeout;
             self.phase = Phase::Disabling { quick, standing, give_up };
             self.tell(StageEvent::Progress(Progress::Disabling));
             if quick {
@@ -265,7 +266,7 @@ impl Stage {
     ) {
         let (axis, statusword) = self.first(is_late);
         let (statusword, ms) =
-            (statusword.unwrap_or_default(), self.config.stop_timeout.as_millis());
+            (statusword.unwrap_or_default(), self.config.power.stop_timeout.as_millis());
         let fault = format!(
             "{axis}: {what} {ms} ms after {since} (statusword {statusword}); if it does not stop now, \
              press the emergency stop"
@@ -274,7 +275,7 @@ impl Stage {
     }
 
     pub(super) fn begin_stop(&mut self, now: Time, quick: bool) {
-        self.phase = Phase::Stopping { quick, give_up: now + self.config.stop_timeout };
+        self.phase = Phase::Stopping { quick, give_up: now + self.config.power.stop_timeout };
         self.tell(StageEvent::Progress(Progress::Stopping));
         for axis in Axis::BOTH {
             self.drives[axis].next_counts = None;
@@ -335,7 +336,7 @@ impl Stage {
                 self.drives[axis].take_statusword(Statusword(u16::from_le_bytes([low, high])));
             }
             (object::POSITION_ACTUAL, &[a, b, c, d]) => {
-                let after = self.config.sync_period.saturating_mul(LOOK_SYNCS as u32);
+                let after = self.config.bus.sync_period().saturating_mul(LOOK_SYNCS as u32);
                 self.drives[axis].take_position(i32::from_le_bytes([a, b, c, d]), after);
             }
             _ => {}

@@ -45,7 +45,7 @@ pub(super) struct Sdo(Rc<RefCell<Line>>);
 #[derive(Debug)]
 struct Line {
     client: SdoClient,
-    attempts_max: u32,
+    attempts_max: u8,
     now: Time,
     /// When the script's pause ends.
     wake: Time,
@@ -56,8 +56,8 @@ struct Line {
 impl Sdo {
     pub(super) fn new(config: &StageConfig, axis: Axis) -> Self {
         Sdo(Rc::new(RefCell::new(Line {
-            client: SdoClient::new(config.axis(axis).node, config.sdo_timeout),
-            attempts_max: config.sdo_attempts,
+            client: SdoClient::new(config.axis(axis).node, config.bus.sdo_timeout()),
+            attempts_max: config.bus.sdo_attempts,
             now: Time::ZERO,
             wake: Time::NEVER,
             outputs: VecDeque::new(),

@@ -90,7 +90,7 @@ impl Drive {
         Drive {
             axis,
             config: config.axis(axis).clone(),
-            sync_period: config.sync_period,
+            sync_period: config.bus.sync_period(),
             homes,
             armed: None,
             commanded: Commanded { counts: 0, step_counts: 0 },
@@ -111,7 +111,7 @@ impl Drive {
             was_warned: false,
             warnings: 0,
             held: 0,
-            held_max: config.missed_feedback_max.max(1),
+            held_max: config.bus.missed_feedback_max.max(1).into(),
             asked: None,
             found: None,
             emcy: (None, 0),

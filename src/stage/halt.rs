@@ -29,7 +29,7 @@ pub type Halt = WithBothDrives<i32>;
 impl Halt {
     /// Begins to stop at `now`.
     pub fn new(config: &StageConfig, now: Time) -> Self {
-        let give_up = now + config.stop_timeout;
+        let give_up = now + config.power.stop_timeout;
         let nodes = config.nodes();
         let leave = [nodes.insertion, nodes.rotation]
             .map(|node| nmt_frame(NmtCommand::EnterPreOperational, Some(node)));
@@ -77,7 +77,7 @@ impl AxisHalt {
             sdo: Sdo::new(config, axis),
             is_unanswered: false,
             give_up,
-            off_by: now + config.stop_timeout * 2,
+            off_by: now + config.power.stop_timeout * 2,
             standstill: Standstill::new(config.axis(axis).scale(axis, 0).counts_per_unit()),
         }
     }

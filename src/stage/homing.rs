@@ -1,24 +1,17 @@
 //! Homing: a drive finds its home by itself (CiA 402-2, mode 6), and the stage watches.
 
+use super::limits::SPEED;
 use super::machine::Phase;
 use super::{Axis, Stage, StageEvent};
 use crate::canopen::cia402::{Controlword, Statusword};
-use crate::keys::choice;
+use crate::keys::{choice, over, section, within};
 use crate::units::Time;
 use std::time::Duration;
 
-/// Where the position of a drive (0x6064) comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Reference {
-    /// It is right from power-on: an absolute encoder, or an axis of which it does not matter.
-    #[default]
-    Absolute,
-    /// From homing: without it the axis is not enabled, but to be homed.
-    Homing,
-}
-
 choice! {
-    for Reference {
+    /// Where the position of a drive (0x6064) comes from. It is right from power-on with an absolute encoder,
+    /// or where it does not matter. An axis that needs homing is not enabled without it, except to be homed.
+    pub enum Reference {
         /// The drive's position is right from power-on.
         Absolute = "absolute",
         /// From homing: before `needle-bench stage home` nothing is moved.
@@ -26,25 +19,33 @@ choice! {
     }
 }
 
-/// Homing by the drive (CiA 402-2, mode 6). What is `None` is left as the drive has it: some take
-/// speeds in units of their own.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct HomingConfig {
-    /// 0x6098: how home is found.
-    pub method: i8,
-    /// 0x6099:01, but mm/s or rad/s: towards the switch.
-    pub speed_switch: Option<f64>,
-    /// 0x6099:02, but mm/s or rad/s: towards zero.
-    pub speed_zero: Option<f64>,
-    /// 0x609A, but mm/s² or rad/s².
-    pub acceleration: Option<f64>,
-    /// 0x607C, but mm or rad: from the home position to zero, as the drive counts it.
-    pub offset: Option<f64>,
-    /// Longest way home.
-    pub timeout: Duration,
-    /// The bit of the statusword that says that the axis was homed. 12 is the standard's and means
-    /// that in homing mode only; some drives have one of their own, such as 15, in every mode.
-    pub homed_bit: u8,
+section! {
+    /// How an axis is homed by its drive (CiA 402-2, mode 6). For an omitted key the drive keeps its own value.
+    #[derive(Copy)]
+    pub struct HomingConfig of AXIS {
+        /// Homing method (6098): 33 is the next index pulse in the negative direction, 37 the current
+        /// position.
+        method: i8;
+        /// Speed towards the switch (6099:1).
+        speed_switch as (["speed_switch_mm_per_s", "speed_switch_deg_per_s"][AXIS]): Option<f64>
+            [SPEED[AXIS]];
+        /// Speed towards zero (6099:2).
+        speed_zero as (["speed_zero_mm_per_s", "speed_zero_deg_per_s"][AXIS]): Option<f64>
+            [SPEED[AXIS]];
+        /// Acceleration (609A).
+        acceleration as (["acceleration_mm_per_s2", "acceleration_deg_per_s2"][AXIS]): Option<f64>
+            [over(0.0, 1e6)];
+        /// Home offset (607C): from the home position to the drive's zero. Home must be inside the
+        /// limits.
+        offset as (["offset_mm", "offset_deg"][AXIS]): Option<f64>
+            [[within(-1000.0, 1000.0), within(-360_000.0, 360_000.0)][AXIS]];
+        /// Timeout of a homing. Bits left set by an earlier homing are ignored until they clear, or
+        /// until the axis stands one second after the start.
+        timeout as "timeout_s": Duration [within(2.0, 3600.0)];
+        /// The statusword bit that says that the axis is homed: 12 by the standard (valid only in homing
+        /// mode), 15 on some drives.
+        homed_bit: u8 [within(8.0, 15.0)];
+    }
 }
 
 impl HomingConfig {

@@ -6,18 +6,30 @@
 use std::time::Duration;
 
 use super::{Axis, Scale};
+use crate::keys::{Rule, over, section, within};
 
-/// How far, how fast and how hard an axis may be commanded, in mm or rad and seconds.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct AxisLimits {
-    /// Lowest target.
-    pub min: f64,
-    /// Highest target.
-    pub max: f64,
-    /// Highest speed, per second: bounds the step from one SYNC to the next.
-    pub speed_max: f64,
-    /// Highest acceleration, per second squared: bounds the change of that step.
-    pub acceleration_max: Option<f64>,
+pub(super) const SPEED: [Rule; 2] = [over(0.0, 100.0), over(0.0, 36_000.0)];
+pub(super) const ACCELERATION: [Rule; 2] = [over(0.0, 1e4), over(0.0, 1e6)];
+
+section! {
+    /// How far, how fast and how hard an axis may be commanded, in mm or rad and seconds.
+    #[derive(Copy)]
+    pub struct AxisLimits of AXIS {
+        /// Lower soft limit, measured from zero. The drive enforces it too (607D:1), a little wider.
+        min as (["min_mm", "min_deg"][AXIS]): f64
+            [[within(-1000.0, 0.0), within(-360_000.0, 0.0)][AXIS]] => ["-1.0", "-7200.0"][AXIS],
+            hardware_must_give;
+        /// Upper soft limit, measured from zero. The drive enforces it too (607D:2), a little wider.
+        max as (["max_mm", "max_deg"][AXIS]): f64
+            [[over(0.0, 1000.0), within(0.0, 360_000.0)][AXIS]] => ["310.0", "7200.0"][AXIS],
+            hardware_must_give;
+        /// Highest speed of any set-point.
+        speed_max as (["speed_max_mm_per_s", "speed_max_deg_per_s"][AXIS]): f64 [SPEED[AXIS]]
+            => ["10.0", "360.0"][AXIS], hardware_must_give;
+        /// Highest acceleration of any set-point; if omitted, acceleration is not checked.
+        acceleration_max as (["acceleration_max_mm_per_s2", "acceleration_max_deg_per_s2"][AXIS]):
+            Option<f64> [ACCELERATION[AXIS]], hardware_may_omit;
+    }
 }
 
 impl AxisLimits {

@@ -104,21 +104,21 @@ impl Stage {
             return Err(no_homing(axis));
         }
         config.validate()?;
-        let consumer_time = config.heartbeat.consumer_time;
+        let timeout = config.bus.heartbeat_timeout();
         let until = now + config.listen_first;
         let mut stage = Stage {
             phase: Phase::Listening { until },
             bring_ups: PerAxis::default(),
             drives: PerAxis::from_fn(|axis| Drive::new(&config, axis, homes[axis])),
             monitors: PerAxis::from_fn(|axis| {
-                HeartbeatConsumer::new(config.axis(axis).node, consumer_time)
+                HeartbeatConsumer::new(config.axis(axis).node, timeout)
             }),
             heartbeat: HeartbeatProducer::new(
-                config.bench_node,
-                config.heartbeat.producer_period,
+                config.bus.bench_node,
+                Duration::from_millis(config.bus.heartbeat_ms.into()),
                 until,
             ),
-            sync: SyncProducer::new(config.sync_period, Time::NEVER),
+            sync: SyncProducer::new(config.bus.sync_period(), Time::NEVER),
             sync_time: now,
             sync_count: 0,
             missed_in_a_row: 0,
@@ -299,7 +299,7 @@ impl Stage {
     pub fn fall_silent(&mut self) {
         self.faulted = true;
         self.heartbeat =
-            HeartbeatProducer::new(self.config.bench_node, Duration::ZERO, Time::NEVER);
+            HeartbeatProducer::new(self.config.bus.bench_node, Duration::ZERO, Time::NEVER);
     }
 
     /// What did not go as it should and did no harm.
@@ -383,14 +383,17 @@ impl Stage {
         if let Some(fault) = bring_up.and_then(|bring_up| bring_up.so_far().found_in_fault) {
             self.drives[axis].allow_reset(fault.error_code);
         }
-        self.monitors[axis].deadline = now + self.config.heartbeat.consumer_time;
+        self.monitors[axis].deadline = now + self.config.bus.heartbeat_timeout();
         if self.bring_ups.all(Option::is_none) {
             for axis in Axis::BOTH {
                 self.send_nmt(NmtCommand::StartRemoteNode, axis);
             }
-            let give_up = now + self.config.enable_timeout;
+            let give_up = now + self.config.power.enable_timeout;
             self.phase = Phase::Standby { give_up, located: false };
-            self.sync = SyncProducer::new(self.config.sync_period, now + self.config.sync_period);
+            self.sync = SyncProducer::new(
+                self.config.bus.sync_period(),
+                now + self.config.bus.sync_period(),
+            );
             self.tell(StageEvent::Progress(Progress::Standby));
         }
     }

@@ -55,8 +55,8 @@ mod supervision;
 mod tests;
 
 pub use bring_up::{FoundFault, Identity};
-pub use config::{Axis, AxisConfig, HeartbeatConfig, PerAxis, RawSdo, StageConfig, Zero};
-pub use dialogue::{Dialogue, WithBothDrives};
+pub use config::{Axis, AxisConfig, BusConfig, PerAxis, PowerConfig, RawSdo, StageConfig};
+pub use dialogue::Dialogue;
 pub use drive::DriveReport;
 pub use event::{Counters, DriveFlag, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};
 pub use halt::Halt;

@@ -1,7 +1,7 @@
 //! The steps of bring-up, in order: what is read from a drive, and what is written to it.
 
 use super::bring_up::{FoundFault, Identity, Object, Script, optional};
-use super::config::{interpolation_period, millis, unsigned_counts};
+use super::config::unsigned_counts;
 use super::{AxisConfig, HomingConfig, Reference, Sign, StageEvent};
 use crate::canopen::cia402::{Controlword, DriveState, Mode, Statusword, object as drive};
 use crate::canopen::emcy::EmcyCode;
@@ -45,7 +45,7 @@ impl Script {
     /// Reads until the drive answers: is it a CiA 402 drive?
     async fn find(&self) -> Result<(), String> {
         self.begin("looking for the drive");
-        let boot_timeout = self.config.boot_timeout;
+        let boot_timeout = self.config.bus.boot_timeout;
         let give_up = self.sdo.now() + boot_timeout;
         let look = SdoRequest::Upload(DEVICE_TYPE);
         let answer = loop {
@@ -80,8 +80,8 @@ impl Script {
 
     async fn identify(&self) -> Result<(), String> {
         self.begin("checking its identity");
-        let vendor = self.read_identity(1, self.drive().vendor).await?;
-        let product = self.read_identity(2, self.drive().product).await?;
+        let vendor = self.read_identity(1, self.drive().vendor_id).await?;
+        let product = self.read_identity(2, self.drive().product_code).await?;
         self.note(|so_far| so_far.identified = true);
         // Not a reset: the drive may hold a load.
         self.sdo.leave_operational();
@@ -129,7 +129,7 @@ impl Script {
         let error_code = self.read(optional(drive::ERROR_CODE)).await?;
         fault.error_code = error_code.map(|code| EmcyCode(code.to_u32() as u16));
         self.note(|so_far| so_far.found_in_fault = Some(fault));
-        if self.config.fault_reset_on_start {
+        if self.config.power.fault_reset_on_start {
             return Ok(());
         }
         let history = self.read(optional(error_history(1))).await?.map(SdoValue::to_u32);
@@ -150,15 +150,16 @@ impl Script {
     async fn configure(&self) -> Result<(), String> {
         self.begin("writing the configured objects");
         let config = self.drive();
-        for raw in &config.raw_sdos {
+        for raw in &config.sdo {
+            let (object, value) = raw.to_write()?;
             match raw.read_back {
-                true => self.write(raw.object, raw.value).await?,
-                false => self.command(raw.object, raw.value).await?,
+                true => self.write(object, value).await?,
+                false => self.command(object, value).await?,
             }
         }
-        if let Some(timeout) = config.following_error_timeout.and_then(millis) {
+        if let Some(timeout_ms) = config.following_error_timeout_ms {
             // A drive without it does not wait.
-            self.write(optional(drive::FOLLOWING_ERROR_TIMEOUT), timeout).await?;
+            self.write(optional(drive::FOLLOWING_ERROR_TIMEOUT), timeout_ms).await?;
         }
         let window = Some(config.following_error_window());
         self.write_counts(drive::FOLLOWING_ERROR_WINDOW, window).await?;
@@ -176,12 +177,11 @@ impl Script {
 
     async fn supervise(&self) -> Result<(), String> {
         self.begin("setting heartbeats");
-        let (config, heartbeat) = (self.drive(), self.config.heartbeat);
-        let producer_ms = millis(heartbeat.producer_period).unwrap_or(u16::MAX);
-        let consumer_ms = millis(heartbeat.consumer_time).unwrap_or(u16::MAX);
+        let config = self.drive();
+        let timeout_ms = u32::from(self.config.bus.heartbeat_timeout_ms);
         self.note(|so_far| so_far.may_be_supervised = true);
-        let watched = u32::from(self.config.bench_node.get()) << 16 | u32::from(consumer_ms);
-        self.write(PRODUCER_HEARTBEAT, producer_ms).await?;
+        let watched = u32::from(self.config.bus.bench_node.get()) << 16 | timeout_ms;
+        self.write(PRODUCER_HEARTBEAT, self.config.bus.heartbeat_ms).await?;
         self.write(consumer_heartbeat(1), watched).await?;
         match config.communication_error_behaviour {
             // A node without it behaves as by 0.
@@ -259,10 +259,9 @@ impl Script {
 
     async fn set_modes(&self) -> Result<(), String> {
         self.begin("setting its mode of operation");
-        let period = interpolation_period(self.config.sync_period);
-        let (count, exponent) = period.unwrap_or((u8::MAX, -3));
-        self.write(drive::INTERPOLATION_PERIOD_EXPONENT, exponent).await?;
-        self.write(drive::INTERPOLATION_PERIOD_VALUE, count).await?;
+        // In units of 10^-3 s.
+        self.write(drive::INTERPOLATION_PERIOD_EXPONENT, -3_i8).await?;
+        self.write(drive::INTERPOLATION_PERIOD_VALUE, self.config.bus.sync_ms as u8).await?;
         match self.drive().homing {
             Some(homing) if self.homed => {
                 self.configure_homing(homing).await?;

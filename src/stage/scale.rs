@@ -7,6 +7,8 @@ use std::f64::consts::TAU;
 use std::num::NonZeroU32;
 
 use super::Axis;
+use crate::keys::{Field, Kind, Rule, section, within};
+use toml::Value;
 
 /// Counts per mm (insertion) or per turn (rotation), as a ratio of integers.
 ///
@@ -16,6 +18,27 @@ use super::Axis;
 pub struct CountsRatio {
     counts: NonZeroU32,
     per: NonZeroU32,
+}
+
+const COUNTS: Rule = within(1.0, u32::MAX as f64);
+
+section! {
+    /// The ratio as it is written.
+    #[expect(unreachable_pub, reason = "a section is public")]
+    pub struct CountsPer of AXIS {
+        /// Number of counts.
+        counts: u32 [COUNTS];
+        /// Number of units that these counts make.
+        per as (["mm", "turns"][AXIS]): u32 [COUNTS];
+    }
+}
+
+impl Field for CountsRatio {
+    const KIND: Kind = CountsPer::KIND;
+    fn take(value: Option<&Value>) -> Self {
+        let CountsPer { counts, per } = CountsPer::take(value);
+        CountsRatio::new(counts, per).unwrap_or(const { CountsRatio::new(1, 1).unwrap() })
+    }
 }
 
 impl CountsRatio {
@@ -79,6 +102,13 @@ pub enum Sign {
     Positive,
     /// Against the axis.
     Negative,
+}
+
+impl Field for Sign {
+    const KIND: Kind = i8::KIND;
+    fn take(value: Option<&Value>) -> Self {
+        if i8::take(value) < 0 { Sign::Negative } else { Sign::Positive }
+    }
 }
 
 impl Sign {

@@ -17,7 +17,7 @@ impl Stage {
         }
         let nodes = self.config.nodes();
         let drives = [nodes.insertion, nodes.rotation];
-        if let Some(word) = command_of_another_master(frame, self.config.bench_node, drives) {
+        if let Some(word) = command_of_another_master(frame, self.config.bus.bench_node, drives) {
             let fault = format!(
                 "another master on the bus: {word} ({frame}); stop it, or give it other nodes: two \
                  masters cannot share an axis"
@@ -32,7 +32,7 @@ impl Stage {
             let node = self.config.axis(axis).node;
             [cob::rpdo(node), cob::sdo_rx(node)].contains(&cob_id)
         };
-        [cob::NMT, cob::SYNC, cob::heartbeat(self.config.bench_node)].contains(&cob_id)
+        [cob::NMT, cob::SYNC, cob::heartbeat(self.config.bus.bench_node)].contains(&cob_id)
             || Axis::BOTH.into_iter().any(of_drive)
     }
 
@@ -87,7 +87,7 @@ impl Stage {
                 "boot-up message in mid-run, the drive restarted; is its supply stable?".to_owned()
             }
             HeartbeatEvent::Lost => {
-                let ms = self.config.heartbeat.consumer_time.as_millis();
+                let ms = self.config.bus.heartbeat_timeout_ms;
                 format!("no heartbeat for {ms} ms, is the drive powered and on the bus?")
             }
             HeartbeatEvent::State(state) if state != NmtState::Operational && !may_be_old => {

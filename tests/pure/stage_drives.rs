@@ -7,15 +7,16 @@ use needle_bench::canopen::nmt::NmtState;
 
 use needle_bench::canopen::{Frame, NodeId};
 use needle_bench::config::Config;
-use needle_bench::emulator::drive::{Drive, DriveConfig, Identity};
+use needle_bench::emulator::drive::{Drive, DriveConfig};
 use needle_bench::emulator::fault::{Fault, FaultKind};
 use needle_bench::stage::{
     Axis, AxisConfig, AxisLimits, CountsRatio, Feedback, HomingConfig, Output, PerAxis, Reference,
-    SetPoint, Sign, Stage, StageConfig, StageEvent, Zero,
+    SetPoint, Sign, Stage, StageConfig, StageEvent,
 };
 use needle_bench::units::Time;
 
-const IDENTITY: Identity = Identity { vendor: 0x1ee7, product: 1, revision: 1, serial: 7 };
+const VENDOR: u32 = 0x1ee7;
+const PRODUCT: u32 = 1;
 
 struct Bench {
     now: Time,
@@ -35,24 +36,27 @@ fn axis(id: u8, counts: u32, speed_max: f64) -> AxisConfig {
     let ratio = CountsRatio::new(counts, 1).expect("not zero");
     AxisConfig {
         node: node(id),
-        vendor: Some(IDENTITY.vendor),
-        product: None,
+        vendor_id: Some(VENDOR),
+        product_code: None,
         ratio,
         sign: Sign::Positive,
-        zero: Zero::Here,
+        zero: None,
         reference: Reference::Absolute,
         homing: None,
         wraps: false,
         limits,
         following_error_max: None,
-        following_error_timeout: None,
+        following_error_timeout_ms: None,
         quick_stop_deceleration: None,
         quick_stop_option: 6,
         fault_reaction_option: 2,
         abort_connection_option: 3,
         communication_error_behaviour: 0,
         optional_objects: Vec::new(),
-        raw_sdos: Vec::new(),
+        sdo: Vec::new(),
+        jog_speed: 2.0,
+        jog_acceleration: 10.0,
+        withdraw_speed: None,
     }
 }
 
@@ -69,7 +73,7 @@ impl Bench {
     fn new() -> Self {
         let now = Time::ZERO;
         let drive = |id, start_counts| {
-            let config = DriveConfig::new(node(id), IDENTITY);
+            let config = DriveConfig::new(node(id), VENDOR, PRODUCT);
             Drive::new(DriveConfig { start_counts, ..config })
         };
         Bench {
@@ -229,7 +233,7 @@ fn a_run_that_finds_another_type_takes_power_off_its_own_drive_alone() {
     let mut bench = Bench::new();
     bench.drive_on(50);
     let mut config = config();
-    config.rotation.product = Some(IDENTITY.product + 1);
+    config.rotation.product_code = Some(PRODUCT + 1);
     // Listening for another master would outlast the supervision that the drives were left with.
     config.listen_first = Duration::ZERO;
     bench.stage = Stage::new(config, bench.now).expect("valid");
@@ -272,7 +276,7 @@ fn both_axes_are_homed_by_their_drives_and_a_run_may_begin() {
             timeout: Duration::from_secs(60),
             homed_bit: HomingConfig::ATTAINED_BIT,
         });
-        axis.zero = Zero::Counts(0);
+        axis.zero = Some(0);
     }
     bench.stage = Stage::new(config.clone(), bench.now).expect("valid");
     let fault = bench.fault();

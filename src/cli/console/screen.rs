@@ -44,7 +44,7 @@ impl Setup {
         let Config { can, insertion, stage, tracker, .. } = config;
         Setup {
             nodes: [stage.insertion.node, stage.rotation.node].map(NodeId::get),
-            sync_period: Duration::from_millis(can.sync_ms.into()),
+            sync_period: can.bus.sync_period(),
             tip_age_max_s: tracker.hold.after.as_secs_f64(),
             noise_sd_mm: tracker.gates.track.noise_sd_mm,
             step_mm: insertion.step_mm,

@@ -17,7 +17,7 @@ use crate::archive::Manifest;
 use crate::config::{CanInterface, Config};
 use crate::operation::{AnswerSettings, Goal, Move, Operation as Task, OperationConfig};
 use crate::session::Done;
-use crate::stage::{Axis, StageConfig, Zero};
+use crate::stage::{Axis, StageConfig};
 use crate::tracker::{Gate, Registration};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand};
@@ -387,7 +387,7 @@ fn goal(
             .in_counts_of(axis, stage.axis(axis).ratio)
             .map(Goal::By)
             .map_err(Failure::configuration),
-        (None, Some(_)) if stage.axis(axis).zero == Zero::Here => {
+        (None, Some(_)) if stage.axis(axis).zero.is_none() => {
             Err(Failure::configuration(format_args!(
                 "--to: stage.{axis}.zero is \"start\": positions count from where each command begins, \
              so --to would mean --by; give --by, or set stage.{axis}.zero in counts of the drive"

@@ -1,7 +1,7 @@
 //! What an axis, its drive and its operations are told.
 
 use crate::config::{Config, Source};
-use crate::stage::{HomingConfig, Reference, Zero};
+use crate::stage::{HomingConfig, Reference};
 
 fn refusal(text: &str) -> String {
     let source = Source { name: "bench.toml", text };
@@ -140,7 +140,7 @@ fn the_stage_is_told_how_its_axes_are_homed() {
     let config = Config::from_sources(&[source], &[]).expect("valid");
     let stage = config.stage.to_stage(&config.can).expect("a stage");
     assert_eq!(stage.insertion.reference, Reference::Homing);
-    assert_eq!(stage.insertion.zero, Zero::Counts(-500));
+    assert_eq!(stage.insertion.zero, Some(-500));
     let insertion = stage.insertion.homing.expect("homing");
     assert_eq!((insertion.method, insertion.speed_zero), (33, None));
     assert_eq!(insertion.homed_bit, HomingConfig::ATTAINED_BIT);

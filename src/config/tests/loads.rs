@@ -1,9 +1,9 @@
 //! What loads, and to what.
 
 use super::*;
-use crate::canopen::ObjectAddress;
-use crate::canopen::sdo::SdoValue;
+use crate::config::needle::Arc;
 use crate::emulator::{self, CorrelatedNoise};
+use crate::stage::RawSdo;
 
 #[test]
 fn every_shipped_configuration_loads_and_reads_back_the_same() {
@@ -224,18 +224,14 @@ fn the_stage_is_told_in_counts_and_radians() {
     assert_eq!(rotation.limits.max, 7200f64.to_radians());
     assert_eq!(rotation.sign, crate::stage::Sign::Negative);
     assert_eq!(rotation.ratio.to_f64(), 1000.0);
-    assert!(rotation.optional_objects.contains(&ObjectAddress::new(0x60C2, 2)));
-    let written: Vec<_> =
-        rotation.raw_sdos.iter().map(|raw| (raw.object, raw.value, raw.read_back)).collect();
-    assert_eq!(
-        written,
-        [
-            (ObjectAddress::new(0x2310, 1), SdoValue::from(-2i16), true),
-            (ObjectAddress::new(0x1010, 1), SdoValue::from(0x6576_6173u32), false),
-        ]
+    assert!(rotation.optional_objects.contains(&0x60C2));
+    let (first, second) = (
+        RawSdo { bits: 16, index: 0x2310, subindex: 1, value: -2, read_back: true },
+        RawSdo { bits: 32, index: 0x1010, subindex: 1, value: 0x6576_6173, read_back: false },
     );
+    assert_eq!(rotation.sdo, [first, second]);
     assert_eq!(rotation.following_error_max, Some(3.6f64.to_radians()));
-    assert_eq!(stage.heartbeat.consumer_time.as_millis(), 100);
+    assert_eq!(stage.bus.heartbeat_timeout_ms, 100);
 }
 
 #[test]

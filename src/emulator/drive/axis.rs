@@ -1,5 +1,7 @@
-//! The drive's program: state machine, stops and faults.
+//! The axis behind the node: state machine, stops and faults. It takes its commands from the objects and
+//! puts its state there.
 
+use super::device::Device;
 use super::homing::{self, Homing};
 use super::inputs::{End, Inputs};
 use super::motion::Motion;
@@ -9,7 +11,6 @@ use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::{Controlword, DriveState, Mode, Statusword, object};
 use crate::canopen::emcy::{EmcyCode, error_register};
 use crate::canopen::nmt::NmtState;
-use crate::canopen::node::{Application, Device};
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::canopen::sdo::AbortCode;
 use crate::emulator::fault::{Fault, FaultKind};
@@ -28,7 +29,7 @@ const REFERENCED: u16 = 1 << 15;
 /// The axis behind the node. Positions are encoder counts, not wrapped to 32 bits; positions on the
 /// bus are relative to `zero`.
 #[derive(Debug, Clone)]
-pub struct Axis {
+pub(super) struct Axis {
     pub(super) config: DriveConfig,
     pub(super) inputs: Inputs,
     state: DriveState,
@@ -274,7 +275,7 @@ impl Axis {
         let controlword = Controlword(device.objects.integer(object::CONTROLWORD) as u16);
         self.state == DriveState::OperationEnabled
             && self.has_torque()
-            && device.nmt_state() == NmtState::Operational
+            && device.nmt_state == NmtState::Operational
             && !controlword.has(Controlword::HALT_BIT)
     }
 
@@ -348,7 +349,7 @@ impl Axis {
         };
         let flags = [
             (Statusword::VOLTAGE_ENABLED, self.voltage),
-            (Statusword::REMOTE, device.nmt_state() == NmtState::Operational),
+            (Statusword::REMOTE, device.nmt_state == NmtState::Operational),
             (Statusword::TARGET_REACHED, reached),
             (Statusword::INTERNAL_LIMIT, follows && limited || powered && on_switch),
             // These two bits have other names in homing.
@@ -372,10 +373,9 @@ impl Axis {
             _ => Time::NEVER,
         }
     }
-}
 
-impl Application for Axis {
-    fn update(&mut self, now: Time, device: &mut Device) {
+    /// Brings the axis's objects up to `now`. Called before an object is read, sampled or sent.
+    pub(super) fn update(&mut self, now: Time, device: &mut Device) {
         self.updated = now;
         if let Motion::Brake(_) | Motion::Ramped(_) = self.motion
             && self.motion.end().is_some_and(|end| now >= end)
@@ -411,7 +411,11 @@ impl Application for Axis {
         values.into_iter().for_each(|(address, value)| device.objects.set(address, value));
     }
 
-    fn check_write(&self, _: &Device, address: ObjectAddress, value: i64) -> Result<(), AbortCode> {
+    /// Whether the object at `address` may become `value`. Type, access and limits have been checked.
+    ///
+    /// # Errors
+    /// The abort code to refuse with.
+    pub(super) fn check_write(&self, address: ObjectAddress, value: i64) -> Result<(), AbortCode> {
         let known = match address {
             object::MODES_OF_OPERATION => MODES.contains(&Mode(value as i8)),
             object::HOMING_METHOD => homing::is_supported(value, &self.inputs.switches),
@@ -421,7 +425,8 @@ impl Application for Axis {
         if known { Ok(()) } else { Err(AbortCode::INVALID_VALUE) }
     }
 
-    fn written(&mut self, now: Time, address: ObjectAddress, device: &mut Device) {
+    /// The object at `address` was written over the bus.
+    pub(super) fn written(&mut self, now: Time, address: ObjectAddress, device: &mut Device) {
         match address {
             object::CONTROLWORD => self.controlword_written(now, device),
             object::MODES_OF_OPERATION => self.mode_written(now, device),
@@ -429,30 +434,36 @@ impl Application for Axis {
         }
     }
 
-    fn sample(&mut self, now: Time, device: &mut Device) {
+    /// SYNC came while the node is Operational: brings the objects to what this SYNC samples.
+    pub(super) fn sample(&mut self, now: Time, device: &mut Device) {
         self.motion.settle(now);
         self.update(now, device);
     }
 
-    fn sync(&mut self, now: Time, device: &mut Device) {
+    /// The same SYNC: commands take effect. Its TPDOs are sampled, and the RPDOs that waited for it
+    /// are written.
+    pub(super) fn sync(&mut self, now: Time, device: &mut Device) {
         if self.follows(device) {
             self.take_target(now, device);
         }
     }
 
-    fn nmt_state_changed(&mut self, now: Time, before: NmtState, device: &mut Device) {
+    /// The NMT state is no longer `before`; the new one is in `device`.
+    pub(super) fn nmt_state_changed(&mut self, now: Time, before: NmtState, device: &mut Device) {
         let left = before == NmtState::Operational;
         if left && self.state == DriveState::OperationEnabled {
             self.abort_connection(now, EmcyCode::COMMUNICATION, device);
         }
     }
 
-    fn heartbeat_lost(&mut self, now: Time, device: &mut Device) {
+    /// A node that this one supervises fell silent or restarted. [`EmcyCode::HEARTBEAT`] is raised.
+    pub(super) fn heartbeat_lost(&mut self, now: Time, device: &mut Device) {
         self.partner_lost = true;
         self.abort_connection(now, EmcyCode::HEARTBEAT, device);
     }
 
-    fn heartbeat_returned(&mut self, device: &mut Device) {
+    /// All supervised nodes that were lost are back.
+    pub(super) fn heartbeat_returned(&mut self, device: &mut Device) {
         self.partner_lost = false;
         // During a fault the error stays active until the fault is reset.
         if !matches!(self.state, DriveState::Fault | DriveState::FaultReactionActive) {
@@ -460,7 +471,8 @@ impl Application for Axis {
         }
     }
 
-    fn reset(&mut self, now: Time, _: &mut Device) {
+    /// All objects have their power-on values again and no error is active.
+    pub(super) fn reset(&mut self, now: Time) {
         self.power_off(now);
         self.demand = whole(self.motion.position_at(now));
         self.target_limited = false;
@@ -470,7 +482,8 @@ impl Application for Axis {
         self.referenced = false;
     }
 
-    fn deadline(&self) -> Time {
+    /// When the axis is due.
+    pub(super) fn deadline(&self) -> Time {
         let end = match self.motion {
             Motion::Brake(_) | Motion::Ramped(_) => self.motion.end().unwrap_or(Time::NEVER),
             Motion::Hold { .. } | Motion::Linear { .. } => Time::NEVER,

@@ -3,14 +3,14 @@
 use std::time::Duration;
 
 use super::axis::{Axis, whole};
+use super::device::Device;
 use crate::canopen::cia402::{Mode, object};
 use crate::canopen::emcy::{EmcyCode, error_register};
-use crate::canopen::node::Device;
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::units::Time;
 
 use super::motion::Motion;
-use super::objects::MAX_ACCELERATION;
+use super::objects::{ACCELERATION_MAX_COUNTS_PER_S2, MAX_ACCELERATION};
 
 /// The value of 0x6065 that disables the following-error supervision (CiA 402-2).
 const WINDOW_OFF: i64 = u32::MAX as i64;
@@ -62,7 +62,7 @@ impl Axis {
         let distance = self.demand as f64 - from;
         let reach = self.speed_limit(objects) * seconds;
         let set = objects.integer(MAX_ACCELERATION) as f64;
-        let change = set.min(self.config.acceleration_max_counts_per_s2.into()) * seconds * seconds;
+        let change = set.min(ACCELERATION_MAX_COUNTS_PER_S2) * seconds * seconds;
         let on = self.motion.velocity_at(now) * seconds;
         let way = distance.clamp(-reach, reach).clamp(on - change, on + change);
         if way == distance { self.demand as f64 } else { (from + way).round() }

@@ -1,15 +1,18 @@
 //! Homing (CiA 402-2, mode 6): its legs, and how the axis moves along them.
 
 use super::axis::{Axis, whole};
+use super::device::Device;
 use super::inputs::{End, Switches};
 use super::motion::Motion;
-use super::objects::MAX_ACCELERATION;
+use super::objects::{ACCELERATION_MAX_COUNTS_PER_S2, MAX_ACCELERATION};
 use super::profile::Profile;
 use crate::canopen::cia402::{Controlword, Mode, object};
 use crate::canopen::emcy::{EmcyCode, error_register};
-use crate::canopen::node::Device;
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::units::Time;
+
+/// Counts between two index pulses of the encoder.
+const INDEX_COUNTS: i64 = 2000;
 
 /// One move of a homing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -54,12 +57,11 @@ pub(super) fn plan(
     method: i64,
     at_counts: i64,
     switches: &Switches,
-    index_counts: u32,
+    index_counts: i64,
     overrun_counts: i64,
 ) -> Option<(Vec<Leg>, i64)> {
-    let index = i64::from(index_counts.max(1));
-    let above = |counts: i64| (counts.div_euclid(index) + 1) * index;
-    let below = |counts: i64| (counts - 1).div_euclid(index) * index;
+    let above = |counts: i64| (counts.div_euclid(index_counts) + 1) * index_counts;
+    let below = |counts: i64| (counts - 1).div_euclid(index_counts) * index_counts;
     let slow = |to_counts| Leg { to_counts, fast: false, onto: None };
     let seek = |to_counts, onto| Leg { to_counts, fast: true, onto };
     let plan = match method {
@@ -114,7 +116,7 @@ impl Axis {
         let speed = if fast { object::HOMING_SPEED_SWITCH } else { object::HOMING_SPEED_ZERO };
         let acceleration = (objects.integer(object::HOMING_ACCELERATION) as f64)
             .min(objects.integer(MAX_ACCELERATION) as f64)
-            .min(self.config.acceleration_max_counts_per_s2.into());
+            .min(ACCELERATION_MAX_COUNTS_PER_S2);
         let speed = (objects.integer(speed) as f64).min(self.speed_limit(objects));
         (speed.max(1.0), acceleration.max(1.0))
     }
@@ -140,7 +142,7 @@ impl Axis {
         let overrun = whole(speed * speed / (2.0 * acceleration)).max(1);
         self.brake(now, whole(acceleration));
         let (at, switches) = (whole(self.motion.to()), &self.inputs.switches);
-        self.homing = match plan(method, at, switches, self.config.index_counts, overrun) {
+        self.homing = match plan(method, at, switches, INDEX_COUNTS, overrun) {
             Some((legs, home_counts)) => Homing::Under { legs, home_counts },
             None => Homing::Failed,
         };

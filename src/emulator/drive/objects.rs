@@ -2,13 +2,16 @@
 
 use std::fmt::Display;
 
-use super::{DriveConfig, Identity, Model};
+use super::{DriveConfig, Model};
 use crate::canopen::ObjectAddress;
 use crate::canopen::eds::Eds;
 use crate::canopen::pdo::{PDOS, PdoDirection};
 
 /// u32, counts per second squared.
 pub(super) const MAX_ACCELERATION: ObjectAddress = ObjectAddress::new(0x60c5, 0);
+
+/// The maximum acceleration of the motor: the power-on value of [`MAX_ACCELERATION`].
+pub(super) const ACCELERATION_MAX_COUNTS_PER_S2: f64 = 100_000_000.0;
 
 /// The data sheet of a generic drive. PDOs come as real drives have them: event-driven, and without
 /// the mapping that a master under SYNC needs.
@@ -21,26 +24,15 @@ const NOT_IN_EPOS4: [u16; 6] = [0x1006, 0x1007, 0x1019, 0x6066, 0x6091, 0x6092];
 
 pub(super) fn data_sheet(config: &DriveConfig) -> Eds {
     let mut eds = Eds::parse(GENERIC);
-    let DriveConfig { name, identity, .. } = config;
-    let Identity { vendor, product, revision, serial } = identity;
-    eds.set(
-        "FileInfo",
-        "Description",
-        format_args!("{name}, CiA 402 servo drive of needle-bench's emulator"),
-    );
-    eds.set("DeviceInfo", "ProductName", name);
+    let DriveConfig { node, vendor, product, .. } = config;
     eds.set("DeviceInfo", "VendorNumber", format_args!("0x{vendor:08X}"));
     eds.set("DeviceInfo", "ProductNumber", format_args!("0x{product:08X}"));
-    eds.set("DeviceInfo", "RevisionNumber", format_args!("0x{revision:08X}"));
     let mut set_default = |section, value: &dyn Display| eds.set(section, "DefaultValue", value);
-    set_default("1008", name);
     set_default("100A", &env!("CARGO_PKG_VERSION"));
     set_default("1018sub1", vendor);
     set_default("1018sub2", product);
-    set_default("1018sub3", revision);
-    set_default("1018sub4", serial);
+    set_default("1018sub4", node);
     set_default("607F", &config.speed_max_counts_per_s);
-    set_default("60C5", &config.acceleration_max_counts_per_s2);
     for (address, bits) in &config.more_objects {
         eds.add_number(*address, *bits);
     }

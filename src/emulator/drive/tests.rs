@@ -2,6 +2,7 @@
 
 mod homing;
 mod inputs;
+mod node;
 mod stops;
 
 use std::time::Duration;
@@ -9,17 +10,17 @@ use std::time::Duration;
 use proptest::prelude::*;
 
 use super::*;
-use crate::canopen::cia402::{EnableSequence, Statusword, object};
-use crate::canopen::nmt::NmtState;
-use crate::canopen::nmt::heartbeat_frame;
+use crate::canopen::cia402::{DriveState, EnableSequence, Statusword, object};
+use crate::canopen::nmt::{NmtCommand, NmtState, heartbeat_frame, nmt_frame};
 use crate::canopen::pdo::MappedObject;
 use crate::canopen::sdo::{AbortCode, SdoClient, SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::canopen::sync::sync_frame;
 use crate::canopen::{Frame, ObjectAddress, cob};
+use crate::emulator::fault::{Fault, FaultKind};
+use crate::units::Time;
 
 const NODE: NodeId = NodeId::new(5).unwrap();
 const MASTER: NodeId = NodeId::new(127).unwrap();
-const IDENTITY: Identity = Identity { vendor: 0xfb, product: 0x6552, revision: 1, serial: 7 };
 const PERIOD: Duration = Duration::from_millis(10);
 
 /// A drive and its master.
@@ -166,7 +167,7 @@ impl Bench {
 }
 
 fn config() -> DriveConfig {
-    DriveConfig::new(NODE, IDENTITY)
+    DriveConfig::new(NODE, 0xfb, 0x6552)
 }
 
 /// A drive moving at 10,000 counts/s at position 300, in the middle of a period.
@@ -392,7 +393,7 @@ proptest! {
             let state = bench.state();
             let operational = bench.drive.nmt_state() == NmtState::Operational;
             let (then, before) = (bench.now, bench.position());
-            let speed_before = bench.drive.application().motion.velocity_at(bench.now).abs();
+            let speed_before = bench.drive.axis.motion.velocity_at(bench.now).abs();
             match input {
                 Input::Command(word, target) => bench.command(word, target.into()),
                 Input::Sync => { bench.give(sync_frame()); }
@@ -412,7 +413,7 @@ proptest! {
                     | DriveState::FaultReactionActive
             );
             prop_assert!(moved == 0.0 || powered, "{moved} counts in {state}");
-            let speed = bench.drive.application().motion.velocity_at(bench.now).abs();
+            let speed = bench.drive.axis.motion.velocity_at(bench.now).abs();
             if !operational {
                 prop_assert!(speed <= speed_before + 1e-6, "gains speed out of Operational");
             }

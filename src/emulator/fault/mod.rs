@@ -98,56 +98,9 @@ choice! {
     }
 }
 
-/// The drives of a fault.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, derive_more::Display)]
-pub enum FaultyDrives {
-    /// The insertion drive.
-    #[display("insertion")]
-    Insertion,
-    /// The rotation drive.
-    #[display("rotation")]
-    Rotation,
-    /// Both.
-    #[display("both drives")]
-    Both,
-}
-
-/// Frames by what they carry.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, derive_more::Display)]
-pub enum FrameClass {
-    /// Any.
-    #[display("frames")]
-    Any,
-    /// PDO 1 of this direction.
-    #[display("PDOs")]
-    Pdo,
-    /// Service data.
-    #[display("SDOs")]
-    Sdo,
-    /// Heartbeats and boot-up messages of the drive.
-    #[display("heartbeats")]
-    Heartbeat,
-    /// Emergency messages of the drive.
-    #[display("emergency messages")]
-    Emergency,
-    /// SYNC.
-    #[display("SYNCs")]
-    Sync,
-}
-
-/// The direction of a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, derive_more::Display)]
-pub enum Toward {
-    /// From a drive.
-    #[display("to the bench")]
-    Bench,
-    /// To a drive.
-    #[display("to the drives")]
-    Drives,
-}
-
 choice! {
-    for FaultyDrives {
+    /// The drives of a fault.
+    pub enum FaultyDrives {
         /// Both.
         Both = "both",
         /// The insertion drive.
@@ -158,7 +111,8 @@ choice! {
 }
 
 choice! {
-    for FrameClass {
+    /// Frames by what they carry.
+    pub enum FrameClass {
         /// All.
         Any = "any",
         /// Process data.
@@ -175,7 +129,8 @@ choice! {
 }
 
 choice! {
-    for Toward {
+    /// The direction of a frame.
+    pub enum Toward {
         /// From the drives.
         Bench = "bench",
         /// To the drives.
@@ -267,7 +222,10 @@ impl Fault {
 impl fmt::Display for Fault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if self.kind.has("axis") {
-            write!(f, "{}: ", self.axis)?;
+            match self.axis {
+                FaultyDrives::Both => write!(f, "both drives: "),
+                drive => write!(f, "{drive}: "),
+            }?;
         }
         match self.kind {
             FaultKind::Silent => write!(f, "off the bus"),
@@ -288,12 +246,19 @@ impl fmt::Display for Fault {
                     .map_or(Ok(()), |period| write!(f, " every {} ms", period.as_secs_f64() * 1e3))
             }
             _ => {
-                write!(f, "{}", self.frames)?;
+                f.write_str(match self.frames {
+                    FrameClass::Any => "frames",
+                    FrameClass::Pdo => "PDOs",
+                    FrameClass::Sdo => "SDOs",
+                    FrameClass::Heartbeat => "heartbeats",
+                    FrameClass::Emergency => "emergency messages",
+                    FrameClass::Sync => "SYNCs",
+                })?;
                 let bench = self.bench.filter(|_| self.frames == FrameClass::Heartbeat);
                 if let (Toward::Drives, Some(bench)) = (self.toward, bench) {
                     write!(f, " of node {bench}")?;
                 }
-                write!(f, " {} {}", self.toward, self.action())?;
+                write!(f, " to the {} {}", self.toward, self.action())?;
                 self.count.map_or(Ok(()), |count| write!(f, ", {count} of them"))
             }
         }?;

@@ -1,7 +1,7 @@
 use super::*;
 use crate::archive::Manifest;
 use crate::config::Config;
-use crate::runtime::{Interrupt, OnRecordFailure, Operator};
+use crate::runtime::{Interrupt, Operator};
 use crate::session::{Lane, Outcome, Output, Progress, Session, Severity};
 use crate::stage::Counters;
 use crate::telemetry::tests::{CONFIG_TOML, manifest};
@@ -148,7 +148,7 @@ fn a_bench_that_was_away_names_itself() {
     let mut drive = bus.endpoint();
     let mut bench = bus.endpoint();
     drive.send(&Frame::new(0x81, &[0x30, 0x81, 0x11, 0, 0, 0, 0, 0])).unwrap();
-    let sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody, &Interrupt::default());
+    let sink = Sink::new(recorder, true, &mut nobody, &Interrupt::default());
     let report = run_live(&mut late, &mut bench, None, clock, None, sink);
     let reason = report.outcome.stop_reason().expect("stopped");
     assert!(reason.starts_with("bench: was held up for "), "{reason}");
@@ -256,7 +256,7 @@ fn live(
     let bus = MemoryBus::new();
     let (mut drives, mut bench) = (bus.endpoint(), bus.endpoint());
     frames.iter().for_each(|frame| drives.send(frame).unwrap());
-    let sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody, &Interrupt::default());
+    let sink = Sink::new(recorder, true, &mut nobody, &Interrupt::default());
     run_live(machine, &mut bench, tracker, clock, None, sink);
     std::fs::remove_dir_all(dir).unwrap();
     let sent = std::iter::from_fn(|| drives.receive(Duration::ZERO).unwrap());
@@ -390,7 +390,7 @@ fn behind_a_refused_frame_only_the_stop_is_sent() {
     let mut nobody = Nobody;
     let recorder =
         Recorder::create(&dir, manifest, CONFIG_TOML.to_owned(), Backpressure::Block).unwrap();
-    let sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody, &Interrupt::default());
+    let sink = Sink::new(recorder, true, &mut nobody, &Interrupt::default());
     let mut session = Session::new(config.session().unwrap(), clock.now()).unwrap();
     let mut bus = Refusing::default();
     let report = run_ticking(&mut session, &mut bus, clock, sink);

@@ -246,7 +246,7 @@ impl Insert {
         let seen_at_mm = insertion.measured(seen_at).insertion_mm.max(0.0);
         let stands_at_mm = insertion
             .profile
-            .held_at_mm(tracker.hold.braking_mm_per_s2, self.config.stage.sync_period);
+            .held_at_mm(tracker.hold.braking_mm_per_s2, self.config.stage.bus.sync_period());
         let (age_s, limit_s) =
             (self.tracking.age_s(now).unwrap_or(f64::INFINITY), tracker.hold.after.as_secs_f64());
         let (blind_mm, braking_mm) = (at.insertion_mm - seen_at_mm, stands_at_mm - at.insertion_mm);

@@ -211,7 +211,7 @@ impl Insert {
                 }
             }
         }
-        shell.command(insertion.advance(self.config.stage.sync_period))
+        shell.command(insertion.advance(self.config.stage.bus.sync_period()))
     }
 
     /// Takes one step: observe, decide, record. Gives the rotation rate for the next step, and with a
@@ -437,5 +437,5 @@ impl Task for Insert {
 fn history_points(config: &SessionConfig) -> usize {
     // Positions are gathered for half as long before the watch over the stream takes their mean.
     let span = config.tracker.hold.after * 2 + HISTORY_MARGIN;
-    (span.as_nanos() / config.stage.sync_period.as_nanos().max(1)) as usize + 2
+    (span.as_nanos() / config.stage.bus.sync_period().as_nanos().max(1)) as usize + 2
 }

@@ -90,9 +90,9 @@ fn both_axes_are_enabled_at_one_sync_and_nothing_moves() {
 #[test]
 fn a_homed_axis_keeps_its_zero() {
     let mut config = config();
-    config.insertion.zero = Zero::Counts(1000 - COUNTS_PER_MM);
+    config.insertion.zero = Some(1000 - COUNTS_PER_MM);
     config.rotation.sign = Sign::Negative;
-    config.rotation.zero = Zero::Counts(COUNTS_PER_TURN - 20);
+    config.rotation.zero = Some(COUNTS_PER_TURN - 20);
     let mut bench = Bench::new(config);
     let feedback = bench.until_feedback();
     assert_eq!(feedback.measured.insertion_mm, 1.0);
@@ -102,7 +102,7 @@ fn a_homed_axis_keeps_its_zero() {
 #[test]
 fn an_axis_that_stands_outside_its_limits_is_not_enabled() {
     let mut config = config();
-    config.insertion.zero = Zero::Counts(1000 + 2 * COUNTS_PER_MM);
+    config.insertion.zero = Some(1000 + 2 * COUNTS_PER_MM);
     let mut bench = Bench::new(config);
     assert_eq!(
         bench.until_fault().to_string(),
@@ -138,7 +138,7 @@ fn a_drive_switched_on_late_is_waited_for() {
 #[test]
 fn a_drive_of_another_make_is_refused() {
     let mut other = config();
-    other.rotation.vendor = Some(0x22);
+    other.rotation.vendor_id = Some(0x22);
     assert_eq!(
         fault_of(other, |_| {}),
         "node 2 (rotation): 0x1018:01: expected 0x00000022, received 0x000000FB, \
@@ -177,13 +177,9 @@ fn a_lost_sdo_is_tried_again_and_then_named_with_the_attempts() {
 
 #[test]
 fn configured_objects_are_written_and_a_refusal_is_named() {
-    let raw = |index| RawSdo {
-        object: ObjectAddress::new(index, 0),
-        value: 7_u16.into(),
-        read_back: true,
-    };
+    let raw = |index| RawSdo { bits: 16, index, subindex: 0, value: 7, read_back: true };
     let mut config = config();
-    config.insertion.raw_sdos = vec![raw(0x2001), raw(0x2000)];
+    config.insertion.sdo = vec![raw(0x2001), raw(0x2000)];
     let text = fault_of(config, |bench| bench.insertion.set(0x2001, 0, 0_u16));
     assert_eq!(
         text,
@@ -200,7 +196,7 @@ fn an_optional_object_may_be_absent() {
     });
     assert!(text.contains("0x6007:00: writing 0x0003 was refused"), "{text}");
     let mut config = config();
-    config.insertion.optional_objects = vec![object];
+    config.insertion.optional_objects = vec![object.index];
     let mut bench = Bench::new(config);
     bench.insertion.objects.remove(&object);
     bench.run_until(|event| *event == StageEvent::Ready);
@@ -228,7 +224,7 @@ fn power_waits_until_it_is_permitted() {
 #[test]
 fn what_happens_while_power_is_awaited_ends_it() {
     let awaiting = || {
-        let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
+        let mut bench = Bench::new(resetting_config());
         bench.stage.permit_power(false);
         bench.run_until(|event| matches!(event, StageEvent::Located(_)));
         bench.run_for(Duration::from_secs(1));
@@ -336,7 +332,7 @@ fn a_node_whose_identity_is_not_known_or_wrong_is_not_written_to() {
         assert_eq!(bench.insertion.state, DriveState::OperationEnabled, "as it was found");
     }
     let mut config = config();
-    config.rotation.product = Some(0x22);
+    config.rotation.product_code = Some(0x22);
     let mut bench = Bench::new(config);
     bench.insertion.state = DriveState::OperationEnabled;
     bench.until_fault();
@@ -365,7 +361,7 @@ fn a_drive_that_cannot_be_enabled_is_named() {
 fn the_drives_keep_the_limits_too() {
     let mut config = config();
     config.rotation.sign = Sign::Negative;
-    config.insertion.zero = Zero::Counts(500);
+    config.insertion.zero = Some(500);
     config.insertion.following_error_max = Some(0.5);
     config.insertion.quick_stop_deceleration = Some(20.0);
     let mut bench = Bench::new(config);
@@ -385,8 +381,8 @@ fn the_drives_keep_the_limits_too() {
 #[test]
 fn a_drive_is_told_how_long_it_may_wait_beyond_its_window() {
     let mut config = config();
-    config.insertion.following_error_timeout = Some(Duration::from_millis(20));
-    config.rotation.following_error_timeout = Some(Duration::from_millis(20));
+    config.insertion.following_error_timeout_ms = Some(20);
+    config.rotation.following_error_timeout_ms = Some(20);
     let mut bench = Bench::new(config);
     bench.insertion.set(0x6066, 0, 5000_u16);
     bench.run_until(|event| *event == StageEvent::Ready);

@@ -14,7 +14,7 @@ fn a_drive_found_in_fault_is_named_or_reset_as_configured() {
          0x603F 0x7320 position sensor, 0x1003:01 0x00007320); \
          clear its cause, then: needle-bench stage reset"
     );
-    let config = StageConfig { fault_reset_on_start: true, ..config() };
+    let config = resetting_config();
     let mut bench = Bench::new(config);
     bench.rotation.state = DriveState::Fault;
     bench.run_until(|event| *event == StageEvent::Ready);
@@ -23,7 +23,7 @@ fn a_drive_found_in_fault_is_named_or_reset_as_configured() {
 
 #[test]
 fn a_fault_that_a_reset_does_not_end_is_not_reset_again() {
-    let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
+    let mut bench = Bench::new(resetting_config());
     bench.rotation.state = DriveState::Fault;
     bench.rotation.keeps_its_fault = true;
     let said = bench.until_fault().to_string();
@@ -40,7 +40,7 @@ fn a_fault_that_comes_later_is_never_reset() {
     let configuring =
         StageEvent::Progress(Progress::BringUp(Axis::Rotation, "writing the configured objects"));
     for begun in [configuring, enabling] {
-        let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
+        let mut bench = Bench::new(resetting_config());
         bench.run_until(|event| *event == begun);
         bench.rotation.state = DriveState::Fault;
         bench.receive(bench.rotation.emergency(0x9000));
@@ -55,7 +55,7 @@ fn a_fault_that_comes_later_is_never_reset() {
 /// A stage that is about to enable its drives, of which the rotation's was found in Fault and may
 /// be reset.
 fn enabling_after_a_fault() -> Bench {
-    let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
+    let mut bench = Bench::new(resetting_config());
     bench.rotation.state = DriveState::Fault;
     bench.run_until(|event| *event == StageEvent::Progress(Progress::Standby));
     bench
@@ -100,7 +100,7 @@ fn only_the_fault_that_was_found_is_excused() {
     bench.run_for(Duration::from_secs(5));
     assert_eq!(bench.rotation.resets, 0);
 
-    let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
+    let mut bench = Bench::new(resetting_config());
     bench.rotation.state = DriveState::Fault;
     bench.rotation.objects.remove(&ObjectAddress::new(0x603f, 0));
     bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
@@ -111,7 +111,7 @@ fn only_the_fault_that_was_found_is_excused() {
 /// A drive that was found in Fault waits in it, and is reset once power may come.
 #[test]
 fn a_drive_found_in_fault_is_reset_when_power_is_permitted() {
-    let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
+    let mut bench = Bench::new(resetting_config());
     bench.stage.permit_power(false);
     bench.rotation.state = DriveState::Fault;
     bench.run_for(Duration::from_secs(5));

@@ -9,7 +9,7 @@ const INSERTION: PerAxis<bool> = PerAxis { insertion: true, rotation: false };
 fn homing_config() -> StageConfig {
     let mut config = config();
     config.insertion.reference = Reference::Homing;
-    config.insertion.zero = Zero::Counts(0);
+    config.insertion.zero = Some(0);
     config.insertion.homing = Some(HomingConfig {
         speed_switch: Some(2.0),
         speed_zero: Some(0.5),

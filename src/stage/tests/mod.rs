@@ -26,21 +26,23 @@ impl StageConfig {
     pub(crate) fn new(insertion: AxisConfig, rotation: AxisConfig) -> Self {
         const BENCH: NodeId = NodeId::new(127).unwrap();
         StageConfig {
-            sync_period: Duration::from_millis(10),
-            bench_node: BENCH,
-            heartbeat: HeartbeatConfig {
-                producer_period: Duration::from_millis(100),
-                consumer_time: Duration::from_millis(300),
+            bus: BusConfig {
+                sync_ms: 10,
+                bench_node: BENCH,
+                heartbeat_ms: 100,
+                heartbeat_timeout_ms: 300,
+                sdo_timeout_ms: 150,
+                sdo_attempts: 3,
+                boot_timeout: Duration::from_secs(5),
+                boot_attempts: 3,
+                missed_feedback_max: 1,
             },
-            sdo_timeout: Duration::from_millis(150),
-            sdo_attempts: 3,
-            boot_timeout: Duration::from_secs(5),
-            boot_attempts: 3,
-            enable_timeout: Duration::from_secs(3),
-            state_transition_timeout: Duration::from_millis(500),
-            stop_timeout: Duration::from_secs(2),
-            missed_feedback_max: 1,
-            fault_reset_on_start: false,
+            power: PowerConfig {
+                fault_reset_on_start: false,
+                enable_timeout: Duration::from_secs(3),
+                state_transition_timeout: Duration::from_millis(500),
+                stop_timeout: Duration::from_secs(2),
+            },
             listen_first: Duration::from_millis(300),
             insertion,
             rotation,
@@ -54,24 +56,27 @@ impl AxisConfig {
     pub(crate) fn new(node: NodeId, ratio: CountsRatio, limits: AxisLimits) -> Self {
         AxisConfig {
             node,
-            vendor: None,
-            product: None,
+            vendor_id: None,
+            product_code: None,
             ratio,
             sign: Sign::Positive,
-            zero: Zero::Here,
+            zero: None,
             reference: Reference::Absolute,
             homing: None,
             wraps: false,
             limits,
             following_error_max: None,
-            following_error_timeout: None,
+            following_error_timeout_ms: None,
             quick_stop_deceleration: None,
             quick_stop_option: 6,
             fault_reaction_option: 2,
             abort_connection_option: 3,
             communication_error_behaviour: 0,
             optional_objects: Vec::new(),
-            raw_sdos: Vec::new(),
+            sdo: Vec::new(),
+            jog_speed: 2.0,
+            jog_acceleration: 10.0,
+            withdraw_speed: None,
         }
     }
 }
@@ -88,6 +93,13 @@ fn config() -> StageConfig {
     let depth = AxisLimits { min: -1.0, max: 150.0, speed_max: 10.0, acceleration_max: None };
     let angle = AxisLimits { min: -700.0, max: 700.0, speed_max: 20.0, acceleration_max: None };
     StageConfig::new(axis(1, COUNTS_PER_MM, depth), axis(2, COUNTS_PER_TURN, angle))
+}
+
+/// The same; a drive that is found in fault is reset.
+fn resetting_config() -> StageConfig {
+    let mut config = config();
+    config.power.fault_reset_on_start = true;
+    config
 }
 
 /// The stage, its drives and the bus between them.

@@ -38,7 +38,8 @@ fn a_drive_that_left_operational_loses_its_power_too() {
 /// Five SYNCs of a quick cycle are no time: an axis at 0.4 mm/s moves 2 µm in them.
 #[test]
 fn a_slow_axis_of_a_quick_cycle_does_not_stand() {
-    let config = StageConfig { sync_period: Duration::from_millis(1), ..config() };
+    let mut config = config();
+    config.bus.sync_ms = 1;
     let mut bench = Bench::new(config);
     bench.run_until(|event| matches!(event, StageEvent::Feedback(_)));
     bench.stage.disable(bench.now);
@@ -186,7 +187,7 @@ fn one_lost_position_is_no_acceleration() {
 fn positions_that_may_be_lost_are_no_acceleration() {
     let mut config = config();
     config.insertion.limits.acceleration_max = Some(10.0);
-    config.missed_feedback_max = 3;
+    config.bus.missed_feedback_max = 3;
     let mut bench = Bench::new(config);
     let feedback = bench.until_feedback();
     let (mut at, mut speed) = (feedback.commanded.insertion_mm, 0.0);
@@ -296,14 +297,14 @@ fn an_axis_far_from_its_target_stops_the_run() {
 }
 
 /// The fault of a depth reported `off_mm` from its target, at 10 mm/s at most, if it is one.
-fn fault_of_a_depth_off(sync_ms: u64, window_mm: Option<f64>, off_mm: f64) -> Option<String> {
+fn fault_of_a_depth_off(sync_ms: u16, window_mm: Option<f64>, off_mm: f64) -> Option<String> {
     let mut config = config();
-    config.sync_period = Duration::from_millis(sync_ms);
+    config.bus.sync_ms = sync_ms;
     config.insertion.following_error_max = window_mm;
     let mut bench = Bench::new(config);
     bench.until_feedback();
     bench.insertion.tpdos_lost = 1;
-    bench.run_for(Duration::from_millis(sync_ms));
+    bench.run_for(Duration::from_millis(sync_ms.into()));
     let counts = 1000 + (off_mm * f64::from(COUNTS_PER_MM)).round() as i32;
     let report = [0x37, 0x02].into_iter().chain(counts.to_le_bytes());
     bench.receive(Frame::new(0x181, &report.collect::<Vec<_>>()));
@@ -335,7 +336,7 @@ fn how_far_an_axis_may_lag_is_a_matter_of_the_drive_and_not_of_the_sync_period()
 #[test]
 fn a_narrow_window_and_a_long_sync_period_let_the_axis_run_at_its_highest_speed() {
     let mut config = config();
-    config.sync_period = Duration::from_millis(100);
+    config.bus.sync_ms = 100;
     config.insertion.following_error_max = Some(0.2);
     let mut bench = Bench::new(config);
     bench.until_feedback();

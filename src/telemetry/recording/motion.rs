@@ -102,7 +102,7 @@ impl Motion {
 fn limits(scene: &Scene) -> Vec<NamedValue<&'static str>> {
     let (insertion, rotation) = (&scene.stage.insertion, &scene.stage.rotation);
     let rotation_speed_max = rotation.limits.speed_max.to_degrees();
-    let sync_period = scene.stage.sync_period;
+    let sync_period = scene.stage.bus.sync_period();
     let insertion_lag_max = insertion.following_error_limit(sync_period);
     let rotation_lag_max = rotation.following_error_limit(sync_period).to_degrees();
     let rotation_cmd_max = scene.rotation_max_rad_per_mm.to_degrees();

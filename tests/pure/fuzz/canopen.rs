@@ -11,7 +11,7 @@ use needle_bench::canopen::sdo::{
     AbortCode, ObjectAccess, SdoClient, SdoReply, SdoRequest, SdoServer, SdoValue,
 };
 use needle_bench::canopen::{CanId, Frame, NodeId, ObjectAddress};
-use needle_bench::emulator::drive::{Drive, DriveConfig, Identity};
+use needle_bench::emulator::drive::{Drive, DriveConfig};
 use needle_bench::units::Time;
 use std::time::Duration;
 
@@ -165,9 +165,8 @@ fn is_sdo(frame: &Frame) {
 
 #[test]
 fn a_drive_answers_what_it_is_asked_and_stays_itself() {
-    let identity = Identity { vendor: 1, product: 2, revision: 3, serial: 4 };
     fuzz(&transfers(), |input, _| {
-        let mut drive = Drive::new(DriveConfig::new(NODE, identity));
+        let mut drive = Drive::new(DriveConfig::new(NODE, 1, 2));
         let mut now = Time::ZERO;
         for (wait, frame) in frames(input) {
             now = now + wait;

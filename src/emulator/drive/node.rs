@@ -1,44 +1,46 @@
-//! A CANopen device (CiA 301): NMT slave, SDO server, PDOs, SYNC, heartbeat and emergencies
-//! around an [`Application`].
-
-mod device;
-mod parameters;
-mod pdo;
-#[cfg(test)]
-mod tests;
+//! The drive's node (CiA 301): NMT slave, SDO server, PDOs, SYNC, heartbeat and emergencies around the
+//! axis.
 
 use std::collections::VecDeque;
 use std::time::Duration;
 
-pub use device::{Application, Device};
-
-use self::parameters::SUPERVISED_LEN;
-use self::pdo::{Rpdo, Tpdo, Values};
-use super::emcy::{EmcyCode, error_register};
-use super::heartbeat::{HeartbeatConsumer, HeartbeatEvent, HeartbeatProducer};
-use super::nmt::{NmtCommand, NmtState, heartbeat_frame, parse_nmt};
-use super::object::communication::{self, consumer_heartbeat};
-use super::object_dictionary::ObjectDictionary;
-use super::pdo::PdoDirection;
-use super::sdo::{AbortCode, ObjectAccess, SdoServer, SdoValue};
-use super::sync::is_sync;
-use super::{Frame, NodeId, ObjectAddress};
+use super::DriveConfig;
+use super::axis::Axis;
+use super::device::Device;
+use super::objects::data_sheet;
+use super::parameters::{self, SUPERVISED_LEN};
+use super::pdo::{Rpdo, Tpdo, Values};
+use crate::canopen::cia402::DriveState;
+use crate::canopen::emcy::{EmcyCode, error_register};
+use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatEvent, HeartbeatProducer};
+use crate::canopen::nmt::{NmtCommand, NmtState, heartbeat_frame, nmt_frame, parse_nmt};
+use crate::canopen::object::communication::{self, consumer_heartbeat};
+use crate::canopen::object_dictionary::ObjectDictionary;
+use crate::canopen::pdo::PdoDirection;
+use crate::canopen::sdo::{AbortCode, ObjectAccess, SdoServer, SdoValue};
+use crate::canopen::sync::is_sync;
+use crate::canopen::{Frame, NodeId, ObjectAddress};
+use crate::emulator::fault::{Fault, FaultKind};
 use crate::units::Time;
 
 /// How long the SDO server waits for the next segment.
 const SDO_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// A node on the bus, sans-IO.
+/// An emulated CiA 402 drive, sans-IO.
 ///
 /// Hand in every frame of the bus, call [`handle_timeout`](Self::handle_timeout) at
 /// [`deadline`](Self::deadline), and after either drain [`poll_transmit`](Self::poll_transmit).
 /// A receive PDO of a synchronous type acts at the next SYNC; transmit PDOs are sampled at SYNC
 /// before that, so the effect of a command shows one SYNC later, as with real devices.
+///
+/// In cyclic synchronous position the axis reaches the target received before a SYNC exactly, at
+/// constant speed, one interpolation period (0x60C2) after that SYNC. So the position reported at each
+/// SYNC is the target of the SYNC before.
 #[derive(Debug, Clone)]
-pub struct Node<A> {
+pub struct Drive {
     id: NodeId,
-    device: Device,
-    application: A,
+    pub(super) device: Device,
+    pub(super) axis: Axis,
     server: SdoServer,
     rpdos: [Rpdo; 4],
     tpdos: [Tpdo; 4],
@@ -55,15 +57,21 @@ struct Supervised {
     lost: bool,
 }
 
-impl<A: Application> Node<A> {
-    /// A node that has just been switched on; its boot-up message waits to be sent.
-    pub fn switched_on(now: Time, id: NodeId, objects: ObjectDictionary, application: A) -> Self {
-        let mut node = Node {
+impl Drive {
+    /// A drive that has just been switched on; its boot-up message waits to be sent.
+    pub fn new(config: DriveConfig) -> Self {
+        let objects = data_sheet(&config).objects(config.node);
+        Drive::with_objects(config, objects)
+    }
+
+    pub(super) fn with_objects(config: DriveConfig, objects: ObjectDictionary) -> Self {
+        let (now, id) = (Time::ZERO, config.node);
+        let mut node = Drive {
             id,
             rpdos: [0, 1, 2, 3].map(|offset| Rpdo::load(&objects, offset)),
             tpdos: [0, 1, 2, 3].map(|offset| Tpdo::load(&objects, offset)),
             device: Device::new(objects),
-            application,
+            axis: Axis::new(config),
             server: SdoServer::new(id, SDO_TIMEOUT),
             producer: HeartbeatProducer::new(id, Duration::ZERO, now),
             supervised: Vec::new(),
@@ -80,19 +88,31 @@ impl<A: Application> Node<A> {
 
     /// The NMT state.
     pub fn nmt_state(&self) -> NmtState {
-        self.device.nmt_state()
+        self.device.nmt_state
     }
 
-    /// The program of the device.
-    pub fn application(&self) -> &A {
-        &self.application
+    /// The state of the CiA 402 state machine.
+    pub fn state(&self) -> DriveState {
+        self.axis.state()
     }
 
-    /// Changes the application by something other than the bus: a supply that fails, a switch that
-    /// closes.
-    pub fn apply(&mut self, now: Time, change: impl FnOnce(&mut A, &mut Device)) {
-        change(&mut self.application, &mut self.device);
-        self.flush(now);
+    /// The true position of the axis in counts, not wrapped to 32 bits and not rounded.
+    pub fn position_counts_at(&self, now: Time) -> f64 {
+        self.axis.position_at(now)
+    }
+
+    /// A fault of the drive or its axis begins or ends; faults of frames and of the bus do nothing here.
+    pub fn apply_fault(&mut self, now: Time, fault: &Fault, begins: bool) {
+        match fault.kind {
+            // It restarts again at the end, so that its boot-up message is received.
+            FaultKind::Restart => {
+                self.handle_frame(now, &nmt_frame(NmtCommand::ResetNode, Some(self.id)));
+            }
+            _ => {
+                self.axis.apply_fault(now, fault, begins, &mut self.device);
+                self.flush(now);
+            }
+        }
     }
 
     /// Takes any frame of the bus.
@@ -137,7 +157,7 @@ impl<A: Application> Node<A> {
         let operational = self.nmt_state() == NmtState::Operational;
         let pdos = self.tpdos.iter().filter(|_| operational).map(Tpdo::deadline);
         let consumers = self.supervised.iter().map(|supervised| supervised.consumer.deadline);
-        let own = [self.server.deadline(), self.producer.deadline, self.application.deadline()];
+        let own = [self.server.deadline(), self.producer.deadline, self.axis.deadline()];
         pdos.chain(consumers).chain(own).min().unwrap_or(Time::NEVER)
     }
 
@@ -155,7 +175,7 @@ impl<A: Application> Node<A> {
                 self.enter(now, NmtState::PreOperational);
                 self.device.objects.reset(0x0000..=0xffff);
                 self.device.forget_errors();
-                self.application.reset(now, &mut self.device);
+                self.axis.reset(now);
                 self.boot(now);
             }
         }
@@ -174,7 +194,7 @@ impl<A: Application> Node<A> {
         if state == NmtState::Stopped {
             self.server.reset();
         }
-        self.application.nmt_state_changed(now, before, &mut self.device);
+        self.axis.nmt_state_changed(now, before, &mut self.device);
     }
 
     /// Starts communication with the parameters in the objects, and sends the boot-up message.
@@ -209,7 +229,7 @@ impl<A: Application> Node<A> {
         supervised.lost = true;
         let lost = [supervised.consumer.node.get(), 0, 0, 0, 0];
         self.device.raise(EmcyCode::HEARTBEAT, error_register::COMMUNICATION, lost);
-        self.application.heartbeat_lost(now, &mut self.device);
+        self.axis.heartbeat_lost(now, &mut self.device);
         let operational = self.nmt_state() == NmtState::Operational;
         match self.device.objects.integer(communication::COMMUNICATION_ERROR_BEHAVIOUR) {
             0 if operational => self.enter(now, NmtState::PreOperational),
@@ -220,19 +240,19 @@ impl<A: Application> Node<A> {
 
     fn heartbeat_returned(&mut self) {
         if !self.supervised.iter().any(|supervised| supervised.lost) {
-            self.application.heartbeat_returned(&mut self.device);
+            self.axis.heartbeat_returned(&mut self.device);
         }
     }
 
     fn handle_sdo(&mut self, now: Time, frame: &Frame) {
-        let Node { device, application, server, .. } = self;
-        let mut access = Access { now, device, application, written: None };
+        let Drive { device, axis, server, .. } = self;
+        let mut access = Access { now, device, axis, written: None };
         server.handle_frame(now, frame, &mut access);
         match access.written {
             Some(object @ ObjectAddress { index: 0x1000..=0x1fff, .. }) => {
                 self.communication_written(now, object);
             }
-            Some(object) => self.application.written(now, object, &mut self.device),
+            Some(object) => self.axis.written(now, object, &mut self.device),
             None => {}
         }
     }
@@ -279,14 +299,14 @@ impl<A: Application> Node<A> {
     fn handle_process_data(&mut self, now: Time, frame: &Frame) {
         let sync = self.device.objects.integer(communication::SYNC_COB_ID) as u16;
         if is_sync(frame, sync) {
-            self.application.sample(now, &mut self.device);
+            self.axis.sample(now, &mut self.device);
             let samples = self.tpdos.iter_mut().filter_map(|tpdo| tpdo.sync(&self.device.objects));
             self.outgoing.extend(samples);
             for n in 0..self.rpdos.len() {
                 let values = self.rpdos[n].sync();
                 self.write_values(now, values);
             }
-            self.application.sync(now, &mut self.device);
+            self.axis.sync(now, &mut self.device);
             return;
         }
         let Some(rpdo) = self.rpdos.iter_mut().find(|rpdo| rpdo.is_for(frame)) else { return };
@@ -302,25 +322,25 @@ impl<A: Application> Node<A> {
         }
     }
 
-    /// Writes all values of a PDO, then informs the application, so that a command never acts on
+    /// Writes all values of a PDO, then informs the axis, so that a command never acts on
     /// the target of an earlier PDO. A value that an SDO could not write is left out.
     fn write_values(&mut self, now: Time, values: Values) {
         let mut written = Vec::with_capacity(values.len());
         for (object, bits) in values {
             let Ok(value) = self.device.objects.parse_bits(object, bits) else { continue };
-            if self.application.check_write(&self.device, object, value).is_ok() {
+            if self.axis.check_write(object, value).is_ok() {
                 self.device.objects.set(object, value);
                 written.push(object);
             }
         }
         for object in written {
-            self.application.written(now, object, &mut self.device);
+            self.axis.written(now, object, &mut self.device);
         }
     }
 
     /// Queues the frames that follow from the last input.
     fn flush(&mut self, now: Time) {
-        self.application.update(now, &mut self.device);
+        self.axis.update(now, &mut self.device);
         self.outgoing.extend(std::iter::from_fn(|| self.server.poll_transmit()));
         if self.nmt_state() == NmtState::Stopped {
             return;
@@ -339,16 +359,16 @@ impl<A: Application> Node<A> {
 }
 
 /// The objects as the SDO server reaches them.
-struct Access<'a, A> {
+struct Access<'a> {
     now: Time,
     device: &'a mut Device,
-    application: &'a mut A,
+    axis: &'a mut Axis,
     written: Option<ObjectAddress>,
 }
 
-impl<A: Application> ObjectAccess for Access<'_, A> {
+impl ObjectAccess for Access<'_> {
     fn read(&mut self, object: ObjectAddress) -> Result<Vec<u8>, AbortCode> {
-        self.application.update(self.now, self.device);
+        self.axis.update(self.now, self.device);
         self.device.objects.read(object)
     }
 
@@ -357,7 +377,7 @@ impl<A: Application> ObjectAccess for Access<'_, A> {
         if (0x1000..=0x1fff).contains(&object.index) {
             parameters::check_write(&self.device.objects, object, number)?;
         } else {
-            self.application.check_write(self.device, object, number)?;
+            self.axis.check_write(object, number)?;
         }
         self.device.objects.set(object, number);
         self.written = Some(object);

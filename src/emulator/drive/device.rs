@@ -1,69 +1,22 @@
-//! What a node's communication and its application share: objects, NMT state and errors.
+//! What the drive's communication and its axis share: objects, NMT state and errors.
 
 use std::collections::VecDeque;
 
-use crate::canopen::ObjectAddress;
 use crate::canopen::emcy::{Emcy, EmcyCode, error_register};
 use crate::canopen::nmt::NmtState;
 use crate::canopen::object::communication::{ERROR_REGISTER, error_history};
 use crate::canopen::object_dictionary::ObjectDictionary;
-use crate::canopen::sdo::AbortCode;
-use crate::units::Time;
 
 /// Errors kept in the history.
 const ERROR_HISTORY_LEN: u8 = 8;
 /// Emergency messages kept while the node may not send them.
 const EMCY_QUEUE_LEN: usize = 16;
 
-/// The program of a device: it takes its commands from the objects and puts its state there.
-///
-/// The methods get the time and the [`Device`]; none may block or read a clock.
-pub trait Application {
-    /// Brings the application's objects up to `now`. Called before an object is read, sampled or sent.
-    fn update(&mut self, now: Time, device: &mut Device);
-
-    /// Whether `object` may become `value`. Type, access and limits have been checked.
-    ///
-    /// # Errors
-    /// The abort code to refuse with.
-    fn check_write(
-        &self,
-        device: &Device,
-        object: ObjectAddress,
-        value: i64,
-    ) -> Result<(), AbortCode>;
-
-    /// `object` was written over the bus.
-    fn written(&mut self, now: Time, object: ObjectAddress, device: &mut Device);
-
-    /// SYNC came while the node is Operational: brings the objects to what this SYNC samples.
-    fn sample(&mut self, now: Time, device: &mut Device);
-
-    /// The same SYNC: commands take effect. Its TPDOs are sampled, and the RPDOs that waited for it
-    /// are written.
-    fn sync(&mut self, now: Time, device: &mut Device);
-
-    /// The NMT state is no longer `before`; the new one is in `device`.
-    fn nmt_state_changed(&mut self, now: Time, before: NmtState, device: &mut Device);
-
-    /// A node this one supervises fell silent or restarted. [`EmcyCode::HEARTBEAT`] is raised.
-    fn heartbeat_lost(&mut self, now: Time, device: &mut Device);
-
-    /// All supervised nodes that were lost are back.
-    fn heartbeat_returned(&mut self, device: &mut Device);
-
-    /// All objects have their power-on values again and no error is active.
-    fn reset(&mut self, now: Time, device: &mut Device);
-
-    /// When the application is due.
-    fn deadline(&self) -> Time;
-}
-
 /// Objects, NMT state and errors of a node.
 #[derive(Debug, Clone)]
-pub struct Device {
-    /// The object dictionary.
-    pub objects: ObjectDictionary,
+pub(super) struct Device {
+    pub(super) objects: ObjectDictionary,
+    /// The state that the NMT master put the node in.
     pub(super) nmt_state: NmtState,
     active: Vec<(EmcyCode, u8)>,
     outgoing: VecDeque<Emcy>,
@@ -79,16 +32,11 @@ impl Device {
         }
     }
 
-    /// The state the NMT master put the node in.
-    pub fn nmt_state(&self) -> NmtState {
-        self.nmt_state
-    }
-
     /// Raises an error: error register, history and emergency message. An error that is active is not
     /// raised again.
     ///
     /// `register` holds the bits of [`error_register`] beside the generic one.
-    pub fn raise(&mut self, code: EmcyCode, register: u8, manufacturer: [u8; 5]) {
+    pub(super) fn raise(&mut self, code: EmcyCode, register: u8, manufacturer: [u8; 5]) {
         if self.is_active(code) {
             return;
         }
@@ -99,7 +47,7 @@ impl Device {
     }
 
     /// Ends one error, and sends an emergency message with code 0.
-    pub fn clear(&mut self, code: EmcyCode) {
+    pub(super) fn clear(&mut self, code: EmcyCode) {
         if self.is_active(code) {
             self.active.retain(|(active, _)| *active != code);
             self.report_cleared();
@@ -107,7 +55,7 @@ impl Device {
     }
 
     /// Ends all errors.
-    pub fn clear_all(&mut self) {
+    pub(super) fn clear_all(&mut self) {
         if !self.active.is_empty() {
             self.active.clear();
             self.report_cleared();
@@ -115,7 +63,7 @@ impl Device {
     }
 
     /// True while this error was raised and not cleared.
-    pub fn is_active(&self, code: EmcyCode) -> bool {
+    pub(super) fn is_active(&self, code: EmcyCode) -> bool {
         self.active.iter().any(|(active, _)| *active == code)
     }
 

@@ -1,102 +1,57 @@
-//! A node with a small program: it echoes its input object and counts what it is told.
+//! The drive's communication: each of its PDOs carries the target position, which limits of the test bound.
 
 use super::*;
 use crate::canopen::CanId;
 use crate::canopen::eds::Eds;
-use crate::canopen::nmt::{nmt_frame, parse_heartbeat};
-use crate::canopen::object_dictionary::{Access as Rights, DataType, Entry};
-use crate::canopen::pdo::MappedObject;
-use crate::canopen::sync::sync_frame;
+use crate::canopen::nmt::parse_heartbeat;
 
-const NODE: NodeId = NodeId::new(5).unwrap();
-const MASTER: NodeId = NodeId::new(127).unwrap();
-const INPUT: ObjectAddress = ObjectAddress::new(0x2000, 0);
-const OUTPUT: ObjectAddress = ObjectAddress::new(0x2001, 0);
-
-/// Copies INPUT to OUTPUT.
-#[derive(Debug, Default)]
-struct Echo {
-    syncs: u32,
-    losses: u32,
-    resets: u32,
-}
-
-impl Application for Echo {
-    fn update(&mut self, _: Time, device: &mut Device) {
-        let value = device.objects.integer(INPUT);
-        device.objects.set(OUTPUT, value);
-    }
-    fn check_write(&self, _: &Device, _: ObjectAddress, _: i64) -> Result<(), AbortCode> {
-        Ok(())
-    }
-    fn written(&mut self, _: Time, _: ObjectAddress, _: &mut Device) {}
-    fn sample(&mut self, now: Time, device: &mut Device) {
-        self.update(now, device);
-    }
-    fn sync(&mut self, _: Time, _: &mut Device) {
-        self.syncs += 1;
-    }
-    fn nmt_state_changed(&mut self, _: Time, _: NmtState, _: &mut Device) {}
-    fn heartbeat_lost(&mut self, _: Time, _: &mut Device) {
-        self.losses += 1;
-    }
-    fn heartbeat_returned(&mut self, device: &mut Device) {
-        device.clear(EmcyCode::HEARTBEAT);
-    }
-    fn reset(&mut self, _: Time, _: &mut Device) {
-        self.resets += 1;
-    }
-    fn deadline(&self) -> Time {
-        Time::NEVER
-    }
-}
+const TARGET: ObjectAddress = object::TARGET_POSITION;
 
 fn at(ms: i64) -> Time {
     Time::from_nanos(ms * 1_000_000)
 }
 
-fn node() -> Node<Echo> {
-    let mut eds = Eds::parse(include_str!("../../emulator/drive/drive.eds"));
+fn node() -> Drive {
+    let sheet = objects::data_sheet(&config()).to_string();
+    let limited = sheet.replace("[607A]", "[607A]\nLowLimit=-1000\nHighLimit=1000");
+    let mut eds = Eds::parse(&limited);
+    let entry = MappedObject { object: TARGET, bits: 32 }.to_u32();
     for n in 0..4 {
-        for (communication, mapping, object) in [(0x1400, 0x1600, INPUT), (0x1800, 0x1a00, OUTPUT)]
-        {
-            let entry = MappedObject { object, bits: 32 }.to_u32();
+        for (communication, mapping) in [(0x1400, 0x1600), (0x1800, 0x1a00)] {
             eds.set(&format!("{:04X}sub2", communication + n), "DefaultValue", 1);
             eds.set(&format!("{:04X}sub0", mapping + n), "DefaultValue", 1);
             eds.set(&format!("{:04X}sub1", mapping + n), "DefaultValue", entry);
         }
     }
-    let mut objects = eds.objects(NODE);
-    let mut input = Entry::new(DataType::Signed(32), Rights::ReadWrite, 0);
-    (input.mappable, input.limits) = (Some(PdoDirection::Receive), Some(-1000..=1000));
-    let mut output = Entry::new(DataType::Signed(32), Rights::ReadOnly, 0);
-    output.mappable = Some(PdoDirection::Transmit);
-    objects.entries.extend([(INPUT, input), (OUTPUT, output)]);
-    let mut node = Node::switched_on(at(0), NODE, objects, Echo::default());
+    let mut node = Drive::with_objects(config(), eds.objects(NODE));
     assert_eq!(sent(&mut node), "705#00");
     node
 }
 
-fn sent(node: &mut Node<Echo>) -> String {
+fn target(node: &Drive) -> i64 {
+    node.device.objects.integer(TARGET)
+}
+
+fn sent(node: &mut Drive) -> String {
     let frames = std::iter::from_fn(|| node.poll_transmit()).map(|frame| frame.to_string());
     frames.collect::<Vec<_>>().join(" ")
 }
 
-fn give(node: &mut Node<Echo>, ms: i64, frame: Frame) -> String {
+fn give(node: &mut Drive, ms: i64, frame: Frame) -> String {
     node.handle_frame(at(ms), &frame);
     sent(node)
 }
 
-fn nmt(node: &mut Node<Echo>, ms: i64, command: NmtCommand) -> String {
+fn nmt(node: &mut Drive, ms: i64, command: NmtCommand) -> String {
     give(node, ms, nmt_frame(command, Some(NODE)))
 }
 
-fn sdo(node: &mut Node<Echo>, bytes: [u8; 8]) -> String {
+fn sdo(node: &mut Drive, bytes: [u8; 8]) -> String {
     give(node, 0, Frame::new(0x605, &bytes))
 }
 
 /// Writes by expedited SDO; empty on success, else the abort code as on the bus.
-fn write(node: &mut Node<Echo>, index: u16, sub: u8, data: &[u8]) -> String {
+fn write(node: &mut Drive, index: u16, sub: u8, data: &[u8]) -> String {
     let [low, high] = index.to_le_bytes();
     let mut bytes = [0x23 | (4 - data.len() as u8) << 2, low, high, sub, 0, 0, 0, 0];
     bytes[4..4 + data.len()].copy_from_slice(data);
@@ -104,7 +59,7 @@ fn write(node: &mut Node<Echo>, index: u16, sub: u8, data: &[u8]) -> String {
     answer.strip_prefix(&format!("585#80{low:02X}{high:02X}{sub:02X}")).unwrap_or("").into()
 }
 
-fn started() -> Node<Echo> {
+fn started() -> Drive {
     let mut node = node();
     assert_eq!(nmt(&mut node, 0, NmtCommand::StartRemoteNode), "");
     node
@@ -113,7 +68,7 @@ fn started() -> Node<Echo> {
 #[test]
 fn it_says_who_it_is() {
     let mut node = node();
-    assert_eq!(sdo(&mut node, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]), "585#43181001F1020000");
+    assert_eq!(sdo(&mut node, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]), "585#43181001FB000000");
     assert_eq!(sdo(&mut node, [0x40, 0x08, 0x10, 0, 0, 0, 0, 0]), "585#410810000E000000");
     assert_eq!(sdo(&mut node, [0x40, 0x18, 0x10, 9, 0, 0, 0, 0]), "585#8018100911000906");
     assert_eq!(write(&mut node, 0x1018, 1, &[0; 4]), "02000106");
@@ -123,11 +78,10 @@ fn it_says_who_it_is() {
 fn received_data_waits_for_sync_and_samples_come_before_it() {
     let mut node = started();
     assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0, 0, 0])), "");
-    assert_eq!(node.device.objects.integer(INPUT), 0);
+    assert_eq!(target(&node), 0);
     assert_eq!(give(&mut node, 10, sync_frame()), "185#00000000");
-    assert_eq!(node.device.objects.integer(INPUT), 7);
+    assert_eq!(target(&node), 7);
     assert_eq!(give(&mut node, 20, sync_frame()), "185#07000000");
-    assert_eq!(node.application().syncs, 2);
 }
 
 #[test]
@@ -136,7 +90,7 @@ fn of_two_pdos_before_a_sync_the_newer_counts() {
     give(&mut node, 1, Frame::new(0x205, &[7, 0, 0, 0]));
     give(&mut node, 2, Frame::new(0x205, &[8, 0, 0, 0]));
     give(&mut node, 10, sync_frame());
-    assert_eq!(node.device.objects.integer(INPUT), 8);
+    assert_eq!(target(&node), 8);
 }
 
 #[test]
@@ -149,7 +103,7 @@ fn pdos_flow_in_operational_only() {
     nmt(&mut node, 4, NmtCommand::EnterPreOperational);
     nmt(&mut node, 5, NmtCommand::StartRemoteNode);
     give(&mut node, 6, sync_frame());
-    assert_eq!(node.device.objects.integer(INPUT), 0, "what was latched is gone with the state");
+    assert_eq!(target(&node), 0, "what was latched is gone with the state");
 }
 
 #[test]
@@ -169,7 +123,7 @@ fn short_pdos_are_not_used_and_values_out_of_limits_neither() {
     assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0])), "", "said once");
     assert_eq!(give(&mut node, 2, Frame::new(0x205, &[0, 0, 1, 0])), "085#0000000000000000");
     give(&mut node, 10, sync_frame());
-    assert_eq!(node.device.objects.integer(INPUT), 0);
+    assert_eq!(target(&node), 0);
     assert_eq!(sdo(&mut node, [0x40, 0x03, 0x10, 1, 0, 0, 0, 0]), "585#4303100110820000");
     assert_eq!(write(&mut node, 0x1003, 0, &[1]), "30000906");
     assert_eq!(write(&mut node, 0x1003, 0, &[0]), "");
@@ -179,9 +133,9 @@ fn short_pdos_are_not_used_and_values_out_of_limits_neither() {
 #[test]
 fn remapping_follows_the_rules() {
     let mut node = node();
-    let wide = MappedObject::new(0x2001, 0, 32).to_u32().to_le_bytes();
+    let wide = MappedObject::new(0x607a, 0, 32).to_u32().to_le_bytes();
     let register = MappedObject::new(0x1001, 0, 8).to_u32().to_le_bytes();
-    let target = MappedObject::new(0x2002, 0, 32).to_u32().to_le_bytes();
+    let absent = MappedObject::new(0x2002, 0, 32).to_u32().to_le_bytes();
     let on = 0x4000_0185u32.to_le_bytes();
     let off = 0xc000_0185u32.to_le_bytes();
     let other = 0x4000_0187u32.to_le_bytes();
@@ -190,8 +144,8 @@ fn remapping_follows_the_rules() {
     assert_eq!(write(&mut node, 0x1800, 1, &off), "");
     assert_eq!(write(&mut node, 0x1a00, 1, &register), "00000106", "still mapped");
     assert_eq!(write(&mut node, 0x1a00, 0, &[0]), "");
-    assert_eq!(write(&mut node, 0x1a00, 1, &target), "00000206", "no such object");
-    assert_eq!(write(&mut node, 0x1a00, 1, &[16, 0, 1, 0x20]), "41000406", "wrong length");
+    assert_eq!(write(&mut node, 0x1a00, 1, &absent), "00000206", "no such object");
+    assert_eq!(write(&mut node, 0x1a00, 1, &[16, 0, 0x7a, 0x60]), "41000406", "wrong length");
     assert_eq!(write(&mut node, 0x1a00, 1, &register), "");
     for sub in 2..=4 {
         assert_eq!(write(&mut node, 0x1a00, sub, &wide), "");
@@ -209,9 +163,10 @@ fn remapping_follows_the_rules() {
     assert_eq!(give(&mut node, 10, sync_frame()), "");
     assert_eq!(give(&mut node, 20, sync_frame()), "185#0000000000", "every second SYNC");
 
+    assert_eq!(write(&mut node, 0x607a, 0, &[7, 0, 0, 0]), "");
     assert_eq!(nmt(&mut node, 30, NmtCommand::ResetCommunication), "705#00");
     assert_eq!(sdo(&mut node, [0x40, 0x00, 0x1a, 0, 0, 0, 0, 0]), "585#4F001A0001000000");
-    assert_eq!(node.application().resets, 0);
+    assert_eq!(target(&node), 7, "objects of the axis stay");
 }
 
 #[test]
@@ -242,14 +197,17 @@ fn its_heartbeat_says_its_state() {
     nmt(&mut node, 150, NmtCommand::StopRemoteNode);
     node.handle_timeout(at(200));
     assert_eq!(sent(&mut node), "705#04");
+    nmt(&mut node, 210, NmtCommand::EnterPreOperational);
+    assert_eq!(write(&mut node, 0x607a, 0, &[7, 0, 0, 0]), "");
     nmt(&mut node, 250, NmtCommand::ResetNode);
-    assert_eq!(node.application().resets, 1);
+    assert_eq!(target(&node), 0);
     assert_eq!(node.deadline(), Time::NEVER, "0x1017 is 0 again");
 }
 
 #[test]
 fn a_lost_heartbeat_raises_8130_and_leaves_operational() {
     let mut node = started();
+    assert_eq!(write(&mut node, 0x6007, 0, &[0, 0]), "", "no fault of the axis");
     let supervise = (u32::from(MASTER.get()) << 16 | 50).to_le_bytes();
     assert_eq!(write(&mut node, 0x1016, 1, &supervise), "");
     assert_eq!(write(&mut node, 0x1016, 2, &supervise), "43000406", "twice the same node");
@@ -260,12 +218,12 @@ fn a_lost_heartbeat_raises_8130_and_leaves_operational() {
     assert_eq!(node.deadline(), at(60));
     node.handle_timeout(at(60));
     assert_eq!(sent(&mut node), "085#3081117F00000000");
-    assert_eq!((node.nmt_state(), node.application().losses), (NmtState::PreOperational, 1));
+    assert_eq!(node.nmt_state(), NmtState::PreOperational);
     assert_eq!(give(&mut node, 70, beat), "085#0000000000000000");
 
     nmt(&mut node, 70, NmtCommand::StartRemoteNode);
-    give(&mut node, 80, heartbeat_frame(MASTER, NmtState::BootUp));
-    assert_eq!(node.application().losses, 2, "a restart of the master is a loss too");
+    let lost = give(&mut node, 80, heartbeat_frame(MASTER, NmtState::BootUp));
+    assert_eq!(lost, "085#3081117F00000000", "a restart of the master is a loss too");
 }
 
 #[test]
