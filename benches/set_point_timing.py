@@ -12,14 +12,12 @@ tests/peers/requirements.txt and a build: cargo build (--profile release: cargo 
 """
 
 import argparse
-import pathlib
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 
-from sync_timing import GROUP, PERIOD_S, ROOT, Witness, quantile
+from sync_timing import PERIOD_S, ROOT, Rig, Witness, python_can_bus, quantile
 
 SYNC, TPDO1, RPDO1 = 0x80, (0x181, 0x182), (0x201, 0x202)
 
@@ -40,16 +38,6 @@ def answers_us(frames):
     return found
 
 
-def bench(build, common, seconds, realtime):
-    runs = tempfile.TemporaryDirectory()
-    run = [build / "needle-bench", "run", *common, "--set", f"record.dir={runs.name}", "-q"]
-    depth = ["--set", f"insertion.depth_mm={2 * seconds}", "--set", "insertion.speed_mm_per_s=2"]
-    command = [*run, *depth, *(["--realtime"] if realtime else [])]
-    ended = subprocess.run(command, capture_output=True, text=True)
-    if ended.returncode != 0:
-        sys.exit(f"the bench did not run: {ended.stderr}")
-
-
 def python_loop(interface, seconds):
     """Both drives Operational, without power, with pyigtl's newest position in each cycle."""
     sys.path.insert(0, str(ROOT / "tests/peers"))
@@ -57,12 +45,9 @@ def python_loop(interface, seconds):
     import pyigtl
     from canopen_enable import ACTUAL_POSITION, Master
 
-    bus = {"interface": "udp_multicast", "channel": GROUP}
-    if interface != "udp":
-        bus = {"interface": "socketcan", "channel": interface}
     tracker = pyigtl.OpenIGTLinkClient(host="127.0.0.1", port=18944)
     with canopen.Network() as network:
-        network.connect(**bus)
+        network.connect(**python_can_bus(interface))
         masters = [Master(network, node, round(PERIOD_S * 1000)) for node in (1, 2)]
         waiting, tip_mm = set(), None
 
@@ -108,24 +93,20 @@ def main():
         python_loop(args.interface, args.seconds)
         return
 
-    build = pathlib.Path(ROOT / "target" / args.profile)
-    common = [str(ROOT / "bench-config/vcan.toml"), "--set", f"can.interface={args.interface}"]
+    rig = Rig(ROOT / "target" / args.profile, args.interface)
     found = {"bench": [], "loop in Python": []}
     for number in range(args.rounds):
         for name, rows in found.items():
-            silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-            stage = subprocess.Popen([build / "vcan-stage", *common], **silent)
-            time.sleep(1)
-            witness = Witness(args.interface, {SYNC, *TPDO1, *RPDO1})
-            witness.start()
-            if name == "bench":
-                bench(build, common, args.seconds, args.realtime)
-            else:
-                loop = [sys.executable, __file__, "--as-loop", "--interface", args.interface]
-                subprocess.run([*loop, "--seconds", str(args.seconds)], check=True, stdout=subprocess.DEVNULL)
-            answers = sorted(answers_us(witness.finish()))
-            stage.kill()
-            stage.wait()
+            with rig.stage():
+                witness = Witness(args.interface, {SYNC, *TPDO1, *RPDO1})
+                witness.start()
+                if name == "bench":
+                    rig.run(args.seconds, args.realtime)
+                else:
+                    loop = [sys.executable, __file__, "--as-loop", "--interface", args.interface]
+                    loop += ["--seconds", str(args.seconds)]
+                    subprocess.run(loop, check=True, stdout=subprocess.DEVNULL)
+                answers = sorted(answers_us(witness.finish()))
             if len(answers) < 100:
                 sys.exit(f"{name}: hardly any set-point was seen: {len(answers)}")
             row = [quantile(answers, q) for q in (0.5, 0.99, 1.0)]

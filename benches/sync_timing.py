@@ -12,6 +12,7 @@ cyclictest (Debian: rt-tests), and a build: cargo build.
 """
 
 import argparse
+import contextlib
 import json
 import pathlib
 import socket
@@ -116,26 +117,49 @@ def cyclictest_figures(process, path):
     return {f"cyclictest_us_{name}": us for name, us in found.items()}
 
 
+def python_can_bus(interface):
+    """What python-can calls this bus."""
+    if interface == "udp":
+        return {"interface": "udp_multicast", "channel": GROUP}
+    return {"interface": "socketcan", "channel": interface}
+
+
+class Rig:
+    """The bench and its drives on one bus, of one build."""
+
+    def __init__(self, build, interface):
+        self.build = build
+        self.common = [str(ROOT / "bench-config/vcan.toml"), "--set", f"can.interface={interface}"]
+
+    @contextlib.contextmanager
+    def stage(self):
+        """Drives and tracker, while the block runs."""
+        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        stage = subprocess.Popen([self.build / "vcan-stage", *self.common], **silent)
+        time.sleep(1)
+        try:
+            yield
+        finally:
+            stage.kill()
+            stage.wait()
+
+    def run(self, seconds, realtime):
+        """What the manifest of an insertion that takes so long says of its timing."""
+        with tempfile.TemporaryDirectory() as runs:
+            run = [self.build / "needle-bench", "run", *self.common, "--set", f"record.dir={runs}", "-q"]
+            depth = ["--set", f"insertion.depth_mm={2 * seconds}", "--set", "insertion.speed_mm_per_s=2"]
+            command = [*run, *depth, *(["--realtime"] if realtime else [])]
+            ended = subprocess.run(command, capture_output=True, text=True)
+            manifests = list(pathlib.Path(runs).glob("*/manifest.json"))
+            if ended.returncode != 0 or not manifests:
+                sys.exit(f"the bench did not run: {ended.stderr}")
+            return json.loads(manifests[0].read_text())["timing"]
+
+
 def bench(interface, seconds, realtime):
-    target = ROOT / "target" / "debug"
-    name = "udp" if interface == "udp" else interface
-    common = [str(ROOT / "bench-config/vcan.toml"), "--set", f"can.interface={name}"]
-    runs = tempfile.TemporaryDirectory()
-    stage = subprocess.Popen(
-        [target / "vcan-stage", *common], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    time.sleep(1)
-    run = [target / "needle-bench", "run", *common, "--set", f"record.dir={runs.name}", "-q"]
-    depth = ["--set", f"insertion.depth_mm={2 * seconds}", "--set", "insertion.speed_mm_per_s=2"]
-    ended = subprocess.run(
-        [*run, *depth, *(["--realtime"] if realtime else [])], capture_output=True, text=True
-    )
-    stage.kill()
-    stage.wait()
-    manifests = list(pathlib.Path(runs.name).glob("*/manifest.json"))
-    if ended.returncode != 0 or not manifests:
-        sys.exit(f"the bench did not run: {ended.stderr}")
-    timing = json.loads(manifests[0].read_text())["timing"]
+    rig = Rig(ROOT / "target/debug", interface)
+    with rig.stage():
+        timing = rig.run(seconds, realtime)
     return {
         "sent_us_p50": timing["sync_late_us_p50"],
         "sent_us_p99": timing["sync_late_us_p99"],
@@ -146,10 +170,7 @@ def bench(interface, seconds, realtime):
 
 
 def python(what, interface, seconds):
-    if interface == "udp":
-        bus = {"interface": "udp_multicast", "channel": GROUP}
-    else:
-        bus = {"interface": "socketcan", "channel": interface}
+    bus = python_can_bus(interface)
     code = {
         "python-canopen": f"""
 import canopen, time

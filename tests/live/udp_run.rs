@@ -107,8 +107,9 @@ fn a_bench_killed_leaves_drives_that_stop_by_themselves() {
     let stage = Stage::start(&[]);
     let mut witness = UdpBus::join(stage.group).unwrap();
     let bench = scratch.bench(&[], &stage.settings(&["can.heartbeat_timeout_ms=400", SLOW]));
-    let mut reported_mm = 0.0;
+    let (mut reported_mm, end) = (0.0, Instant::now() + LONG);
     let mut next = |reported_mm: &mut f64| {
+        assert!(Instant::now() < end, "{reported_mm} mm in, and no more");
         let event = witness.receive(LONG).unwrap();
         let Some(BusEvent::Frame(frame)) = event else { panic!("silent, or {event:?}") };
         if let (Some(0x181), &[_, _, a, b, c, d]) = (frame.cob_id(), frame.data()) {

@@ -6,7 +6,7 @@ use std::fs;
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
-use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
+use std::sync::{Arc, Mutex, Once, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -37,9 +37,12 @@ pub(crate) fn beside_others() -> RwLockReadGuard<'static, ()> {
 /// In an emulated machine the programs come over a file system at a few MB/s: they are read once, so
 /// that no page of them is awaited in the middle of a run.
 fn read_programs() {
-    for program in [env!("CARGO_BIN_EXE_needle-bench"), env!("CARGO_BIN_EXE_vcan-stage")] {
-        fs::read(program).unwrap_or_else(|error| panic!("{program}: {error}"));
-    }
+    static READ: Once = Once::new();
+    READ.call_once(|| {
+        for program in [env!("CARGO_BIN_EXE_needle-bench"), env!("CARGO_BIN_EXE_vcan-stage")] {
+            fs::read(program).unwrap_or_else(|error| panic!("{program}: {error}"));
+        }
+    });
 }
 
 /// A running program whose output is collected line by line.

@@ -4,6 +4,7 @@ use crate::support::programs::LONG;
 use crate::support::udp_stage::{COUNTS_PER_MM, Stage};
 use needle_bench::transport::can::{BusEvent, CanBus};
 use needle_bench::transport::udp::UdpBus;
+use std::time::Instant;
 
 const SYNC: u16 = 0x080;
 const TPDO1_INSERTION: u16 = 0x181;
@@ -14,15 +15,19 @@ pub(crate) struct Witness {
     bus: UdpBus,
     pub(crate) syncs: usize,
     inserted_mm: f64,
+    /// The drives go on to be heard when a bench has stopped that was to insert.
+    end: Instant,
 }
 
 impl Witness {
     pub(crate) fn of(stage: &Stage) -> Self {
-        Witness { bus: UdpBus::join(stage.group).unwrap(), syncs: 0, inserted_mm: 0.0 }
+        let bus = UdpBus::join(stage.group).unwrap();
+        Witness { bus, syncs: 0, inserted_mm: 0.0, end: Instant::now() + 2 * LONG }
     }
 
     /// The next frame's COB-ID.
     pub(crate) fn hear(&mut self) -> Option<u16> {
+        assert!(Instant::now() < self.end, "{:.1} mm in, and no more", self.inserted_mm);
         let event = self.bus.receive(LONG).unwrap();
         let Some(BusEvent::Frame(frame)) = event else { panic!("silent, or {event:?}") };
         match (frame.cob_id(), frame.data()) {
