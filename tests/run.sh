@@ -5,8 +5,9 @@
 #
 # Installs what is missing (apt packages as root or with sudo; a Python environment under
 # ~/.cache/needle-bench), then: shell scripts, formatting, licences where cargo-deny is there, the tests
-# on real SocketCAN, in a virtual machine where this kernel has no vcan, and all other tests beside
-# clippy and documentation. Stops at the first failure. With CI=true a test that lacks something fails.
+# on real SocketCAN, in a virtual machine where this kernel has no vcan, and all other tests. Clippy,
+# documentation and the tests in virtual time run beside those two, when the processors have nothing else to
+# do. Stops at the first failure. With CI=true a test that lacks something fails.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PATH=$PATH:$HOME/.cargo/bin
@@ -14,9 +15,10 @@ PATH=$PATH:$HOME/.cargo/bin
 # draws new ones.
 export PROPTEST_RNG_SEED=${PROPTEST_RNG_SEED:-1}
 
-stage_name='' stage_start=0
+stage_name='' stage_start=0 beside=''
 finish() {
     local status=$?
+    if [ -n "$beside" ]; then kill -- "-$beside" 2>/dev/null || true; fi
     if [ "$status" != 0 ]; then
         echo "tests/run.sh: FAILED at \"$stage_name\" after $((SECONDS - stage_start)) s (status $status), see above" >&2
     fi
@@ -139,23 +141,34 @@ test_on_vcan() {
         cargo test --test vcan
 }
 
-# The tests in real time mostly wait, so that six of them share two processors. What they leave goes to
-# what has time: the tests in virtual time, clippy and rustdoc, which run only where nothing else wants to.
-test_the_rest() {
-    local said status=0
+# What needs time but is in no hurry, since tests in real time mostly wait: it runs only where nothing else
+# wants to, in a process group of its own, which ends with this script.
+begin_beside() {
     said=$(mktemp)
+    set -m
     (
         chrt --idle --pid 0 "$BASHPID"
         cargo test --test pure
         cargo test --doc
         lint
-    ) >"$said" 2>&1 &
-    cargo test --lib --bins || status=$?
-    cargo test --test live -- --test-threads=6 || status=$?
-    wait $! || status=$?
+    ) </dev/null >"$said" 2>&1 &
+    beside=$!
+    set +m
+}
+
+end_beside() {
+    local status=0
+    wait "$beside" || status=$?
+    beside=''
     cat "$said"
     rm "$said"
     return "$status"
+}
+
+# Six of the tests in real time share two processors.
+test_on_host() {
+    cargo test --lib --bins
+    cargo test --test live -- --test-threads=6
 }
 
 stage 'system packages' install_packages
@@ -167,6 +180,8 @@ stage 'formatting' cargo fmt --check
 stage 'licences' check_licences
 stage 'vcan' vcan/run.sh true
 stage 'build of the tests' cargo test --no-run
+begin_beside
 stage 'tests on vcan' test_on_vcan
-stage 'other tests, clippy and documentation' test_the_rest
+stage 'tests on the host' test_on_host
+stage 'tests in virtual time, clippy and documentation' end_beside
 echo "tests/run.sh: all passed in $SECONDS s"

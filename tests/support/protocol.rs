@@ -65,12 +65,13 @@ const RIG: [&str; 8] = [
 ];
 
 /// What differs from bench-config/rig-epos4.toml on every bus, and why; docs/rig.md says so too.
-const CHANGES: [Change; 10] = [
-    // Less to wait for: a shorter needle, and the highest speeds that the limits allow.
+const CHANGES: [Change; 11] = [
+    // Less to wait for: a shorter needle, the highest speed that the limits allow, and a faster withdrawal.
     ("depth_mm = 50.0", "depth_mm = 25.0"),
     ("speed_mm_per_s = 1.0\nacceleration", "speed_mm_per_s = 2.0\nacceleration"),
     ("jog_speed_mm_per_s = 1.0", "jog_speed_mm_per_s = 2.0"),
-    ("withdraw_speed_mm_per_s = 1.0", "withdraw_speed_mm_per_s = 2.0"),
+    ("speed_max_mm_per_s = 2.0", "speed_max_mm_per_s = 5.0"),
+    ("withdraw_speed_mm_per_s = 1.0", "withdraw_speed_mm_per_s = 5.0"),
     // A busy machine, or an emulated one, does not run a thread for 200 ms now and then: the answers and the
     // heartbeat that are due meanwhile come late, positions that come late are as far behind their target, and
     // the needle goes on meanwhile.
