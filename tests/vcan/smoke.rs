@@ -4,15 +4,15 @@
 
 use std::time::{Duration, SystemTime};
 
-/// A kernel that is busy hands a frame over some time after it was sent.
-const ARRIVES: Duration = Duration::from_secs(1);
-
 use crate::support::link::ip;
 use crate::support::vcan;
 use needle_bench::canopen::{CanId, Frame, NodeId};
 use needle_bench::transport::can::{BusError, BusEvent, CanBus, CanError};
 use needle_bench::transport::socketcan::SocketCan;
 use socketcan::{CanErrorFrame, CanFrame, CanSocket, Socket};
+
+/// A kernel that is busy hands a frame over some time after it was sent.
+const ARRIVES: Duration = Duration::from_secs(1);
 
 /// Long enough for an emulated machine on a busy one; nothing waits this long unless it fails.
 const LONG: Duration = Duration::from_secs(20);
