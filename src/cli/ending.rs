@@ -10,6 +10,7 @@ use crate::session::{Left, Outcome};
 use crate::stage::{Axis, DriveReport};
 use crate::study::{OFF_PLANE_LIMIT_MM, PlanStatus};
 use crate::telemetry::{Finished, TelemetryError};
+use crate::text::fixed;
 use std::fmt;
 use std::fs;
 use std::path::Path;
@@ -58,8 +59,9 @@ pub(super) fn ending(config: &Config, report: &RunReport) -> String {
     }
     lines.push(match (report.outcome.stop_reason(), plane_missed_by_mm(report)) {
         (None, _) if plan_status(config, report) == Some(PlanStatus::Missed) => format!(
-            "completed, not at the target: farther from it than goal.tolerance_mm = {}; see \
-             target_error_pred_mm in steps.csv for where it was lost",
+            "completed, not at the target: {} mm from it by the estimate (limit goal.tolerance_mm = {}); \
+             target_error_pred_mm in steps.csv shows where it was lost",
+            fixed(report.figures.report().target_error_est_mm, 3),
             config.goal.tolerance_mm
         ),
         (None, None) => "completed".to_owned(),

@@ -182,8 +182,21 @@ fn a_curvature_so_wrong_that_no_path_is_left_ends_the_run() {
 /// A run that completes is not one that arrives.
 #[test]
 fn a_target_that_is_missed_is_not_said_to_be_met() {
-    let said = run(&Scratch::new(), &["goal.tolerance_mm=0.0001"]);
-    assert_eq!((said.status, &said.json()["plan_status"]), (0, &Value::from("missed")));
+    let scratch = Scratch::new();
+    let said = run(&scratch, &["goal.tolerance_mm=0.0001"]);
+    let json = said.json();
+    assert_eq!((said.status, &json["plan_status"]), (0, &Value::from("missed")));
+    let folder = json["run_dir"].as_str().unwrap();
+    let review = |more: &[&str]| needle_bench(&scratch, &[&["review", folder], more].concat());
+    assert_eq!(review(&["--json"]).json()["plan_status"], "missed");
+    let text = review(&[]).stdout;
+    assert!(text.ends_with("completed, not at the target\n"), "{text}");
+    let text = ["run", "goal.toml", "--quiet", "--set", "goal.tolerance_mm=0.0001"];
+    let text = needle_bench(&scratch, &text).stdout;
+    let last = text.lines().last().unwrap();
+    let off_mm = number(&json, "target_error_est_mm");
+    let said = format!("completed, not at the target: {off_mm:.3} mm from it by the estimate");
+    assert!(last.starts_with(&said), "{last}");
 }
 
 /// A tip off the plane is not where its path in the plane is.
