@@ -33,8 +33,7 @@ pub struct Group {
     pub target_error_mm: Option<MedianInterval>,
 }
 
-/// The totals of one group. A run that was stopped counts as infinitely far off the plane, and from
-/// its target.
+/// The totals of one group. A run that was stopped counts as infinitely far from its plane or target.
 pub(super) fn group(label: String, runs: &[(&Folder, Keys)]) -> Group {
     let is_completed = |run: &Folder| run.manifest.outcome == Some(RunOutcome::Completed);
     let completed = runs.iter().filter(|(run, _)| is_completed(run)).count();

@@ -232,7 +232,7 @@ impl AxisConfig {
 }
 
 section! {
-    /// What the drives are told on the bus, and how long they are waited for.
+    /// CANopen settings of the bench: SYNC, heartbeats, timeouts and attempts.
     #[derive(Copy)]
     pub struct BusConfig {
         /// Period of SYNC, ms.
@@ -292,7 +292,7 @@ section! {
 /// The whole stage.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageConfig {
-    /// What the drives are told on the bus.
+    /// SYNC, heartbeats, timeouts and attempts.
     pub bus: BusConfig,
     /// How power is switched on and off.
     pub power: PowerConfig,

@@ -20,7 +20,8 @@ choice! {
 }
 
 section! {
-    /// How an axis is homed by its drive (CiA 402-2, mode 6). For an omitted key the drive keeps its own value.
+    /// How an axis is homed by its drive (CiA 402-2, mode 6). Lengths are in mm, angles in rad, times in s.
+    /// For an omitted key the drive keeps its own value.
     #[derive(Copy)]
     pub struct HomingConfig of AXIS {
         /// Homing method (6098): 33 is the next index pulse in the negative direction, 37 the current

@@ -13,7 +13,6 @@ use crate::canopen::emcy::{EmcyCode, error_register};
 use crate::canopen::nmt::NmtState;
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::canopen::sdo::AbortCode;
-use crate::emulator::fault::{Fault, FaultKind};
 use crate::units::Time;
 
 /// The modes that the drive supports.
@@ -21,8 +20,6 @@ const MODES: [Mode; 3] = [Mode::NONE, Mode::HOMING, Mode::CSP];
 /// Manufacturer-specific emergency codes of limit switches, those of an EPOS4.
 const NEGATIVE_LIMIT_SWITCH: EmcyCode = EmcyCode(0xff06);
 const POSITIVE_LIMIT_SWITCH: EmcyCode = EmcyCode(0xff07);
-/// Emergency code of the safety input: an external error.
-const INTERLOCK: EmcyCode = EmcyCode(0x9000);
 /// Bit 15, manufacturer-specific: the axis was homed.
 const REFERENCED: u16 = 1 << 15;
 
@@ -48,7 +45,7 @@ pub(super) struct Axis {
     after_stop: Option<DriveState>,
     /// The last controlword.
     before: Controlword,
-    voltage: bool,
+    pub(super) voltage: bool,
     /// Something blocks the axis.
     pub(super) stalled: bool,
     /// A supervised node is lost: a fault reset is refused.
@@ -96,58 +93,8 @@ impl Axis {
         self.motion.position_at(now)
     }
 
-    /// A fault of the axis begins or ends.
-    pub(super) fn apply_fault(
-        &mut self,
-        now: Time,
-        fault: &Fault,
-        begins: bool,
-        device: &mut Device,
-    ) {
-        let stuck = |end| begins.then_some(end);
-        match fault.kind {
-            FaultKind::Stall => {
-                self.stalled = begins;
-                if begins {
-                    let ramped = matches!(self.motion, Motion::Ramped(_));
-                    self.motion = Motion::Hold { at: self.motion.position_at(now) };
-                    if ramped {
-                        let register = error_register::PROFILE;
-                        self.fault(now, EmcyCode::FOLLOWING_ERROR, register, device);
-                    }
-                }
-            }
-            FaultKind::DriveFault if begins => {
-                let code = EmcyCode(fault.code.unwrap_or_default());
-                self.fault(now, code, code.register(), device);
-            }
-            FaultKind::NegativeSwitch => self.inputs.stuck = stuck(End::Negative),
-            FaultKind::PositiveSwitch => self.inputs.stuck = stuck(End::Positive),
-            FaultKind::EmergencyStop => {
-                self.inputs.interlocked = begins;
-                self.without_torque(now, INTERLOCK, 0, device);
-            }
-            FaultKind::NoVoltage => {
-                self.voltage = !begins;
-                self.without_torque(now, EmcyCode::UNDERVOLTAGE, error_register::VOLTAGE, device);
-            }
-            _ => {}
-        }
-    }
-
-    fn has_torque(&self) -> bool {
+    pub(super) fn has_torque(&self) -> bool {
         self.voltage && !self.inputs.interlocked
-    }
-
-    fn without_torque(&mut self, now: Time, code: EmcyCode, register: u8, device: &mut Device) {
-        let powered = matches!(
-            self.state,
-            DriveState::SwitchedOn | DriveState::OperationEnabled | DriveState::QuickStopActive
-        );
-        if !self.has_torque() && powered {
-            self.stand(now);
-            self.fault(now, code, register, device);
-        }
     }
 
     fn controlword_written(&mut self, now: Time, device: &mut Device) {
@@ -259,7 +206,7 @@ impl Axis {
     }
 
     /// Stops at once: without power a lead screw or a high gear ratio does not coast.
-    fn stand(&mut self, now: Time) {
+    pub(super) fn stand(&mut self, now: Time) {
         self.motion = Motion::Hold { at: self.motion.position_at(now) };
         self.after_stop = None;
         self.lag = 0;

@@ -9,6 +9,7 @@
 mod axis;
 mod csp;
 mod device;
+mod fault_injection;
 mod homing;
 mod inputs;
 mod motion;

@@ -1,0 +1,65 @@
+//! The scripted faults of the axis.
+
+use super::axis::Axis;
+use super::device::Device;
+use super::inputs::End;
+use super::motion::Motion;
+use crate::canopen::cia402::DriveState;
+use crate::canopen::emcy::{EmcyCode, error_register};
+use crate::emulator::fault::{Fault, FaultKind};
+use crate::units::Time;
+
+/// Emergency code of the safety input: an external error.
+const INTERLOCK: EmcyCode = EmcyCode(0x9000);
+
+impl Axis {
+    /// A fault of the axis begins or ends.
+    pub(super) fn apply_fault(
+        &mut self,
+        now: Time,
+        fault: &Fault,
+        begins: bool,
+        device: &mut Device,
+    ) {
+        let stuck = |end| begins.then_some(end);
+        match fault.kind {
+            FaultKind::Stall => {
+                self.stalled = begins;
+                if begins {
+                    let ramped = matches!(self.motion, Motion::Ramped(_));
+                    self.motion = Motion::Hold { at: self.motion.position_at(now) };
+                    if ramped {
+                        let register = error_register::PROFILE;
+                        self.fault(now, EmcyCode::FOLLOWING_ERROR, register, device);
+                    }
+                }
+            }
+            FaultKind::DriveFault if begins => {
+                let code = EmcyCode(fault.code.unwrap_or_default());
+                self.fault(now, code, code.register(), device);
+            }
+            FaultKind::NegativeSwitch => self.inputs.stuck = stuck(End::Negative),
+            FaultKind::PositiveSwitch => self.inputs.stuck = stuck(End::Positive),
+            FaultKind::EmergencyStop => {
+                self.inputs.interlocked = begins;
+                self.without_torque(now, INTERLOCK, 0, device);
+            }
+            FaultKind::NoVoltage => {
+                self.voltage = !begins;
+                self.without_torque(now, EmcyCode::UNDERVOLTAGE, error_register::VOLTAGE, device);
+            }
+            _ => {}
+        }
+    }
+
+    fn without_torque(&mut self, now: Time, code: EmcyCode, register: u8, device: &mut Device) {
+        let powered = matches!(
+            self.state(),
+            DriveState::SwitchedOn | DriveState::OperationEnabled | DriveState::QuickStopActive
+        );
+        if !self.has_torque() && powered {
+            self.stand(now);
+            self.fault(now, code, register, device);
+        }
+    }
+}
