@@ -7,6 +7,7 @@ one client after the other until then. While the file CARRIED is there, the tool
 """
 
 import argparse
+import logging
 import sys
 import time
 from pathlib import Path
@@ -25,6 +26,8 @@ def main():
     parser.add_argument("--stay", action="store_true", help="serve one client after the other")
     parser.add_argument("--carried", type=Path, help="file of the place that the tool is carried to")
     args = parser.parse_args()
+    # pyigtl takes a client that ends for an error.
+    logging.disable(logging.ERROR)
 
     source = pyigtl.OpenIGTLinkClient(host=args.from_host, port=args.from_port)
     if source.wait_for_message(args.device, timeout=60.0) is None:
