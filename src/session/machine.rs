@@ -250,6 +250,8 @@ impl Machine for Session {
             }
             return;
         }
+        let caught_up = self.task.catch_up();
+        self.shell.stop_on_error(caught_up);
         self.shell.record(Record::Input { time: now, input: input.clone() });
         match input {
             Input::Frame(frame) => {

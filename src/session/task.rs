@@ -54,6 +54,15 @@ pub(crate) trait Task {
     /// Takes any frame of the bus, which the stage has taken already.
     fn take_frame(&mut self, _shell: &Shell, _frame: &Frame) {}
 
+    /// Does what the last input left to do, once the frames that answer it may have left; called before
+    /// the next one. Until then [`deadline`](Self::deadline) is past.
+    ///
+    /// # Errors
+    /// The reason to stop for.
+    fn catch_up(&mut self) -> Result<(), String> {
+        Ok(())
+    }
+
     /// Does what is due; called after every input.
     ///
     /// # Errors

@@ -51,6 +51,8 @@ pub(super) struct Insert {
     hold: Option<Hold>,
     /// The last hold by the tracker that ended by itself.
     ended_hold: Option<EndedHold>,
+    /// When the feedback was measured up to which the watch over the stream is to be carried.
+    unwatched: Option<Time>,
     progress: Progress,
 }
 
@@ -73,6 +75,7 @@ impl Insert {
             insertion: None,
             hold: None,
             ended_hold: None,
+            unwatched: None,
             progress: Progress { depth_mm: config.insertion.depth_mm, ..Progress::default() },
             config,
         })
@@ -188,8 +191,7 @@ impl Insert {
     ) -> Result<(), String> {
         let oldest = feedback.time - self.config.tracker.hold.after;
         self.estimation.carry_to(oldest, &self.history)?;
-        let due = feedback.time - self.config.tracker.hold.after / 2;
-        self.estimation.watch(due, oldest, &self.history)?;
+        self.unwatched = Some(feedback.time);
         if self.config.tracker.judges_stream {
             self.tracking.travel.check().map_err(|error| format!("tracker: {error}"))?;
         }
@@ -349,6 +351,13 @@ impl Task for Insert {
         Ok(true)
     }
 
+    /// The watch over the stream takes far longer than a set-point, which does not depend on it.
+    fn catch_up(&mut self) -> Result<(), String> {
+        let Some(time) = self.unwatched.take() else { return Ok(()) };
+        let after = self.config.tracker.hold.after;
+        self.estimation.watch(time - after / 2, time - after, &self.history)
+    }
+
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
         match event {
             StageEvent::Feedback(feedback) => self.take_feedback(shell, feedback),
@@ -392,7 +401,7 @@ impl Task for Insert {
         if !shell.is_running() {
             self.tracking.refuse_unpaired(shell.now);
             self.drain_tracking(shell);
-        } else if shell.now >= self.deadline(shell) {
+        } else if self.insertion.is_none() && shell.now >= self.tip_due(shell.power()) {
             return Err(self.explain_no_tip(shell.now));
         }
         Ok(())
@@ -401,7 +410,7 @@ impl Task for Insert {
     fn deadline(&self, shell: &Shell) -> Time {
         match self.insertion {
             None => self.tip_due(shell.power()),
-            Some(_) => Time::NEVER,
+            Some(_) => self.unwatched.unwrap_or(Time::NEVER),
         }
     }
 
