@@ -71,6 +71,8 @@ pub(super) fn drive(world: &mut impl World) -> Outcome {
         if world.take_arrived() {
             continue;
         }
+        // What answers them leaves before anything that is due is done.
+        carry_out(world);
         let now = world.now();
         match world.witness().stop_reason(now, stop_asked) {
             Some(reason) => {

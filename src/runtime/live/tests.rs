@@ -211,6 +211,9 @@ impl Machine for Answering {
             Input::Tracker(Event::Disconnected { reason }) => {
                 self.outcome = Some(Outcome::Stopped(reason.clone()));
             }
+            Input::Tick => {
+                assert!(self.outputs.is_empty(), "made and not sent: {:?}", self.outputs)
+            }
             _ => {}
         }
         self.inputs.push(input);
@@ -313,6 +316,16 @@ fn a_deadline_goes_before_the_tracker() {
     let is_tick = |input: &Input| matches!(input, Input::Tick);
     assert_eq!(machine.inputs.iter().position(is_tick), Some(10), "{:?}", machine.inputs);
     assert_eq!(machine.tracker_events().len(), 63);
+}
+
+/// What a machine does after its answer to a frame, when it is due at once, delays no answer.
+#[test]
+fn an_answer_leaves_before_what_is_due() {
+    let mut machine = Answering::new(Duration::ZERO, 0);
+    let mut link = stream("Needle", 1);
+    let sent = live("answer", &mut machine, &[Frame::new(0x181, &[0; 6])], Some(&mut link));
+    assert_eq!(sent, [set_point()]);
+    assert!(matches!(machine.inputs[..2], [Input::Frame(_), Input::Tick]), "{:?}", machine.inputs);
 }
 
 #[test]

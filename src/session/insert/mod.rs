@@ -51,8 +51,10 @@ pub(super) struct Insert {
     hold: Option<Hold>,
     /// The last hold by the tracker that ended by itself.
     ended_hold: Option<EndedHold>,
-    /// When the feedback was measured up to which the watch over the stream is to be carried.
-    unwatched: Option<Time>,
+    /// Measurements that the observers have not been told.
+    untold: Vec<Measurement>,
+    /// The time of the feedback after which they are to be told.
+    catches_up: Option<Time>,
     progress: Progress,
 }
 
@@ -75,7 +77,8 @@ impl Insert {
             insertion: None,
             hold: None,
             ended_hold: None,
-            unwatched: None,
+            untold: Vec::new(),
+            catches_up: None,
             progress: Progress { depth_mm: config.insertion.depth_mm, ..Progress::default() },
             config,
         })
@@ -120,9 +123,11 @@ impl Insert {
         shell.record(Record::Stage(Feedback { measured: at, commanded, ..*feedback }));
         let mut inserted = Ok(());
         if shell.is_running() {
-            inserted = self
-                .correct(measurements, &mut insertion)
-                .and_then(|()| self.insert(shell, feedback, at, &mut insertion));
+            measurements.into_iter().for_each(|measurement| {
+                self.estimation.gather(&measurement);
+                self.untold.extend(insertion.measure(measurement));
+            });
+            inserted = self.insert(shell, feedback, at, &mut insertion);
         }
         self.insertion = Some(insertion);
         inserted
@@ -164,20 +169,12 @@ impl Insert {
         self.insertion = Some(insertion);
     }
 
-    /// Corrects the observers with the measurements that are due at once. An error is the reason to stop
-    /// for.
-    fn correct(
-        &mut self,
-        measurements: Vec<Measurement>,
-        insertion: &mut Insertion,
-    ) -> Result<(), String> {
-        for measurement in measurements {
-            self.estimation.gather(&measurement);
-            if let Some(measurement) = insertion.measure(measurement) {
-                self.estimation.take(&measurement, &self.history)?;
-            }
+    /// Tells the observers what was measured until `time`. An error is the reason to stop for.
+    fn correct(&mut self, time: Time) -> Result<(), String> {
+        for measurement in self.untold.drain(..) {
+            self.estimation.take(&measurement, &self.history)?;
         }
-        Ok(())
+        self.estimation.carry_to(time - self.config.tracker.hold.after, &self.history)
     }
 
     /// One SYNC of the insertion: checks, the step that is due, the next set-point. An error is
@@ -189,15 +186,14 @@ impl Insert {
         at: SetPoint,
         insertion: &mut Insertion,
     ) -> Result<(), String> {
-        let oldest = feedback.time - self.config.tracker.hold.after;
-        self.estimation.carry_to(oldest, &self.history)?;
-        self.unwatched = Some(feedback.time);
+        self.catches_up = Some(feedback.time);
         if self.config.tracker.judges_stream {
             self.tracking.travel.check().map_err(|error| format!("tracker: {error}"))?;
         }
         self.watch_tip(shell, feedback.time, at, insertion)?;
         insertion.check_arrival(feedback.time, at.insertion_mm)?;
         if let Some(due) = insertion.due(feedback.time, at.insertion_mm) {
+            self.correct(feedback.time)?;
             let command = self.step(shell, feedback.time, at, insertion, &due)?;
             match command {
                 Some((rotation_rad_per_mm, left_mm)) => {
@@ -351,9 +347,11 @@ impl Task for Insert {
         Ok(true)
     }
 
-    /// The watch over the stream takes far longer than a set-point, which does not depend on it.
+    /// A set-point between two steps does not depend on what the observers make of the positions, and
+    /// leaves first: that takes far longer.
     fn catch_up(&mut self) -> Result<(), String> {
-        let Some(time) = self.unwatched.take() else { return Ok(()) };
+        let Some(time) = self.catches_up.take() else { return Ok(()) };
+        self.correct(time)?;
         let after = self.config.tracker.hold.after;
         self.estimation.watch(time - after / 2, time - after, &self.history)
     }
@@ -410,7 +408,7 @@ impl Task for Insert {
     fn deadline(&self, shell: &Shell) -> Time {
         match self.insertion {
             None => self.tip_due(shell.power()),
-            Some(_) => self.unwatched.unwrap_or(Time::NEVER),
+            Some(_) => self.catches_up.unwrap_or(Time::NEVER),
         }
     }
 

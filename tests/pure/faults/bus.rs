@@ -4,7 +4,9 @@ use crate::support::bench::{Bench, configured};
 use crate::support::stop::{Measured, Stop, documented, stopped};
 use needle_bench::canopen::cia402::DriveState;
 use needle_bench::canopen::{CanId, Frame};
-use needle_bench::session::{Input, Machine};
+use needle_bench::emulator::StageOutput;
+use needle_bench::session::{Input, Machine, Output};
+use needle_bench::tracker::Event;
 use std::time::Duration;
 
 #[test]
@@ -28,6 +30,48 @@ fn foreign_and_misshapen_frames_have_no_effect() {
     for told in ["frame from elsewhere, 16 so far", "frame of the wrong length, 16 so far"] {
         assert!(bench.events().any(|text| text.starts_with(told)), "{told}");
     }
+}
+
+/// What is left to do after a set-point is due as soon as it may have left, and then is done.
+#[test]
+fn a_set_point_waits_for_no_observer() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+    bench.run_to_mm(5.0);
+    let mut answered = 0;
+    while answered < 100 {
+        assert!(bench.session.outcome().is_none(), "{}", bench.reason());
+        let due = bench.session.deadline().min(bench.stage.deadline());
+        bench.now = bench.now.max(due);
+        bench.stage.handle_timeout(bench.now);
+        bench.session.handle(bench.now, Input::Tick);
+        assert!(bench.session.deadline() > bench.now, "done");
+        let mut made = sent(&mut bench);
+        while let Some(output) = bench.stage.poll() {
+            let input = match output {
+                StageOutput::Frame(frame) => Input::Frame(frame),
+                StageOutput::Tip { tip, .. } => Input::Tracker(Event::Sample(bench.sample(&tip))),
+                StageOutput::Target(_) | StageOutput::FaultBegan(_) => continue,
+            };
+            bench.session.handle(bench.now, input);
+            made.extend(sent(&mut bench));
+        }
+        if made.contains(&0x202) {
+            assert!(bench.session.deadline() <= bench.now, "left to do");
+            answered += 1;
+        }
+    }
+}
+
+/// Hands the drives what the session sends, and gives the identifiers.
+fn sent(bench: &mut Bench) -> Vec<u16> {
+    let mut sent = Vec::new();
+    while let Some(output) = bench.session.poll() {
+        if let Output::Transmit { frame, .. } = output {
+            bench.stage.handle_frame(bench.now, &frame);
+            sent.extend(frame.cob_id());
+        }
+    }
+    sent
 }
 
 #[test]
