@@ -1,5 +1,5 @@
 //! The end of a run: its exit status and last lines, where the needle is, what the drives are doing, and
-//! the one next command.
+//! which command comes next.
 
 use super::{ENVIRONMENT_FAILED, STOPPED};
 use crate::archive::file;

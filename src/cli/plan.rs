@@ -72,7 +72,7 @@ pub(super) fn mask_reader(
 /// The image in `path`, as an obstacle.
 fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, String> {
     let header = NiftiHeader::from_file(path).map_err(|error| reason(&error))?;
-    // The checksum of a record is that of one file.
+    // A record has one checksum for a mask, so the mask must be one file.
     if &header.magic != b"n+1\0" {
         return Err("its voxels are in another file (.img); write both as one .nii".to_owned());
     }

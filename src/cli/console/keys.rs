@@ -73,8 +73,8 @@ impl Keys {
     }
 }
 
-/// Length of the first key in `bytes`, or of the first escape sequence, such as an arrow's, which is none;
-/// `None` where the end of a sequence has not come.
+/// Length of the first key in `bytes`, or of the first escape sequence (an arrow key's, say), which is no key of
+/// the console; `None` where the end of a sequence has not come.
 fn first_len(bytes: &[u8]) -> Option<usize> {
     match bytes {
         [] | [ESCAPE] | [ESCAPE, b'O'] => None,
