@@ -7,8 +7,8 @@ sees them, with cyclictest beside each.
 The witness takes the time at which the kernel received each SYNC. Of each sender it prints the standard
 deviation of the intervals, and by how much they differ from 10 ms, p50 and p99. For the bench it also
 prints how late its manifest says that they were sent, and how long after the feedback the set-points were;
-for all, how late cyclictest was woken in the same seconds. It needs the packages of tests/peers/requirements.txt and
-cyclictest (Debian: rt-tests), and a build: cargo build.
+for all, how late cyclictest was woken in the same seconds, and jitterdebugger with --realtime. It needs the packages of
+tests/peers/requirements.txt, cyclictest (Debian: rt-tests), with --realtime jitterdebugger, and a build: cargo build.
 """
 
 import argparse
@@ -95,26 +95,36 @@ def figures(frames):
     }
 
 
-def cyclictest(seconds, realtime):
-    path = tempfile.NamedTemporaryFile(suffix=".json")
-    priority = ["-p", "79", "-m"] if realtime else []
-    loops = str(int(seconds / PERIOD_S))
-    command = ["cyclictest", "-q", "-i", "10000", "-l", loops, "-h", "100000", *priority]
-    process = subprocess.Popen([*command, f"--json={path.name}"], stdout=subprocess.DEVNULL)
-    return process, path
+class Wakes:
+    """How late cyclictest is woken; with a real-time priority jitterdebugger too, which always has one."""
 
+    def __init__(self, seconds, realtime):
+        self.folder = tempfile.TemporaryDirectory()
+        loops = str(int(seconds / PERIOD_S))
+        priority = ["-p", "79", "-m"] if realtime else []
+        cyclictest = ["cyclictest", "-q", "-i", "10000", "-l", loops, "-h", "100000", *priority]
+        commands = [[*cyclictest, f"--json={self.folder.name}/cyclictest.json"]]
+        if realtime:
+            commands.append(["jitterdebugger", "-i", "10000", "-l", loops, "-o", self.folder.name])
+        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        self.processes = [subprocess.Popen(command, **silent) for command in commands]
 
-def cyclictest_figures(process, path):
-    process.wait()
-    thread = json.load(open(path.name))["thread"]["0"]
-    rows = sorted((int(us), count) for us, count in thread["histogram"].items())
-    total, seen, found = sum(count for _, count in rows), 0, {}
-    for us, count in rows:
-        seen += count
-        for name, q in (("p50", 0.5), ("p99", 0.99)):
-            if seen >= q * total:
-                found.setdefault(name, us)
-    return {f"cyclictest_us_{name}": us for name, us in found.items()}
+    def figures(self):
+        for process in self.processes:
+            process.wait()
+        found = {}
+        for name, file, threads in (
+            ("cyclictest", "cyclictest.json", "thread"),
+            ("jitterdebugger", "results.json", "cpu"),
+        ):
+            path = pathlib.Path(self.folder.name, file)
+            if path.exists():
+                histograms = (one["histogram"] for one in json.loads(path.read_text())[threads].values())
+                rows = (row for histogram in histograms for row in histogram.items())
+                late = sorted(us for text, count in rows for us in [int(text)] * count)
+                found[f"{name}_us_p50"] = quantile(late, 0.5)
+                found[f"{name}_us_p99"] = quantile(late, 0.99)
+        return found
 
 
 def python_can_bus(interface):
@@ -208,12 +218,12 @@ def main():
         for sender in senders:
             witness = Witness(args.interface, {0x80})
             witness.start()
-            beside = cyclictest(args.seconds, args.realtime)
+            wakes = Wakes(args.seconds, args.realtime)
             if sender == "bench":
                 more = bench(args.interface, args.seconds, args.realtime)
             else:
                 more = python(sender, args.interface, args.seconds)
-            row = {**figures(witness.finish()), **more, **cyclictest_figures(*beside)}
+            row = {**figures(witness.finish()), **more, **wakes.figures()}
             found[sender].append(row)
             text = ", ".join(f"{key} {value:.0f}" for key, value in row.items())
             print(f"{number + 1} {sender}: {text}", flush=True)
