@@ -10,7 +10,7 @@ use crate::archive::{Manifest, RunOutcome};
 use crate::config::{CanInterface, Config, TrackerSource};
 use crate::preflight::{
     BusFacts, Check, Listening, TrackerReport, Verdict, bus, calibrations, changes, disk, drive,
-    plane, proof, to_text, tracker, worst,
+    plane, proof, start_roll, to_text, tracker, worst,
 };
 use crate::runtime::Interrupt;
 use crate::stage::{Axis, AxisStatus};
@@ -89,6 +89,7 @@ impl Preflight {
         });
         let report = heard.ok().flatten();
         checks.extend(calibrations(rig, now_unix_us));
+        checks.extend(start_roll(rig));
         checks.extend(report.as_ref().and_then(|report| plane(config, report)));
         let dir = Path::new(&config.record.dir);
         let free_mb = free_mb(dir).map_err(|error| format!("{}: {error}", dir.display()));

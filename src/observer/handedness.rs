@@ -29,6 +29,8 @@ const INDEPENDENT_PER_MM: f64 = 20.0;
 const SEARCH_SHARE: f64 = 0.5;
 /// Standard deviation of yaw and pitch of a heading that is not known at the start.
 const HEADING_UNKNOWN_RAD: f64 = FRAC_PI_4;
+/// The roll at the start is judged where it is known to so much, rad.
+pub const ROLL_KNOWN_RAD: f64 = FRAC_PI_2;
 /// The first positions show the heading at the start. It is not judged any more after this depth.
 const HEADING_SHOWN_MM: f64 = 30.0;
 
@@ -109,7 +111,7 @@ impl HandednessWatch {
             let [yaw, pitch] = [HEADING_UNKNOWN_RAD; 2];
             unknown(Alternative::Tilted, FixedAngles { yaw, pitch, ..start_sd });
         }
-        if start_sd.roll <= FRAC_PI_2 {
+        if start_sd.roll <= ROLL_KNOWN_RAD {
             unknown(Alternative::Turned, FixedAngles { roll: PI, ..start_sd });
         }
         HandednessWatch {

@@ -20,7 +20,7 @@ mod whiteness;
 pub use coupled::{Coupled, CoupledConfig, CoupledError, Gains};
 pub use estimate::{Belief, Estimate, Shaft, Slack, standard_deviations};
 pub use finite_difference::{BaselineError, FiniteDifference, FiniteDifferenceConfig};
-pub use handedness::{HandednessWatch, StreamContradiction};
+pub use handedness::{HandednessWatch, ROLL_KNOWN_RAD, StreamContradiction};
 pub use invariant::{Invariant, InvariantConfig, NoiseConfig};
 pub use whiteness::{PositionNoise, Whiteness};
 

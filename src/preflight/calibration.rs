@@ -5,6 +5,7 @@ use super::Verdict::{Fail, Warn};
 use crate::archive::unix_us_of;
 use crate::calibration::Provenance;
 use crate::config::{Config, RegistrationConfig};
+use crate::observer::ROLL_KNOWN_RAD;
 
 const DAY_US: f64 = 86_400e6;
 /// Two clocks may differ by an hour; a date further ahead is not believed.
@@ -103,6 +104,18 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
     let next = "needle-bench calibrate needle";
     let needle = aged("needle", found, &days_limit, fit.map(|fit| &fit.provenance), next);
     vec![registration, tip, needle]
+}
+
+/// Whether a registration that is turned about the needle would show in a run: against the roll at the start
+/// alone. `None` of an emulated rig.
+pub fn start_roll(config: &Config) -> Option<Check> {
+    let sd_deg = config.observer.to_invariant().start_sd.roll.to_degrees();
+    let limit = format!("up to {:.0} deg", ROLL_KNOWN_RAD.to_degrees());
+    let next = "a registration turned about the needle will not show: compare tracker watch with a tool \
+                moved along each axis, or tell observer.start.roll_deg and observer.invariant.start_sd";
+    let check = Check::new("start roll", format!("known to {sd_deg:.0} deg"), limit);
+    let is_known = sd_deg <= ROLL_KNOWN_RAD.to_degrees();
+    config.stage.hardware.then(|| check.unless(is_known, Warn, next))
 }
 
 /// The last completed `stage prove` on this bus, and the keys of stage and bus that changed since.

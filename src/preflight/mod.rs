@@ -6,7 +6,7 @@ mod calibration;
 mod equipment;
 mod listening;
 
-pub use calibration::{Earlier, calibrations, changes, proof};
+pub use calibration::{Earlier, calibrations, changes, proof, start_roll};
 pub use equipment::{BusFacts, bus, disk, drive, plane, tracker};
 pub use listening::{Listening, TrackerReport};
 

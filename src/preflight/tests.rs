@@ -246,6 +246,21 @@ fn calibrations_get_old() {
     }
 }
 
+/// A registration turned about the needle shows against the roll that is told, and nowhere else.
+#[test]
+fn a_roll_that_is_not_told_is_said() {
+    let of = |sd_deg: f64| {
+        let sd = format!("yaw_deg = 12.0, pitch_deg = 8.0, roll_deg = {sd_deg:.1}");
+        let check = start_roll(&rig(&[&format!("observer.invariant.start_sd={{ {sd} }}")]));
+        check.map(|check| (check.verdict, check.found))
+    };
+    assert_eq!(of(180.0), Some((Verdict::Warn, "known to 180 deg".to_owned())));
+    assert_eq!(of(90.0), Some((Verdict::Pass, "known to 90 deg".to_owned())));
+    let mut emulated = rig(&[]);
+    emulated.stage.hardware = false;
+    assert_eq!(start_roll(&emulated), None);
+}
+
 #[test]
 fn a_proof_counts_for_the_configuration_it_was_made_with() {
     let config = rig(&[]);

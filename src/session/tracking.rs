@@ -55,6 +55,8 @@ pub(crate) struct Tracking {
     status_is_ok: bool,
     /// Samples of the tool that the link dropped.
     dropped: u64,
+    /// Positions in a row that a model refused, and how often there were two.
+    off_model: (u32, u32),
 }
 
 /// A sample on its way; the position is there while it waits to be judged.
@@ -85,6 +87,7 @@ impl Tracking {
             malformed: None,
             status_is_ok: false,
             dropped: 0,
+            off_model: (0, 0),
         }
     }
 
@@ -229,14 +232,17 @@ impl Tracking {
         self.counts.count(refusal.as_ref());
         match refusal {
             None => {
+                self.off_model.0 = 0;
                 self.last_refusal = None;
                 self.jump = None;
                 self.malformed = None;
                 self.status_is_ok = false;
             }
             Some(refusal) => {
-                if refusal.effect == Effect::Loses {
-                    self.jump = Some(refusal.to_string());
+                match refusal.effect {
+                    Effect::Loses => self.jump = Some(refusal.to_string()),
+                    _ if refusal.gate == GateName::Innovation => self.warn_of_jump(now, &refusal),
+                    _ => {}
                 }
                 if is_tool(&record.received.tool, &self.config.gate.tool) {
                     self.last_refusal = Some(refusal.to_string());
@@ -247,6 +253,22 @@ impl Tracking {
             }
         }
         self.report_track(now);
+    }
+
+    /// Warns of a second position in a row that the model refuses. The observer may come to believe a jump
+    /// that is too small, or of too slow a stream, to lose the track. Said at the first pair, and at each
+    /// doubling of their count.
+    fn warn_of_jump(&mut self, time: Time, refusal: &Refusal) {
+        let (in_a_row, pairs) = &mut self.off_model;
+        *in_a_row += 1;
+        *pairs += u32::from(*in_a_row == 2);
+        if *in_a_row == 2 && pairs.is_power_of_two() && self.track.is_held() {
+            let text = format!(
+                "two positions in a row do not fit the model (pair {pairs} of this run): {refusal}"
+            );
+            let (lane, severity) = (Lane::Tracker, Severity::Warning);
+            self.records.push_back(Record::Event { time, lane, severity, text });
+        }
     }
 
     /// Records that the track was lost or found again.
