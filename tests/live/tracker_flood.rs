@@ -142,50 +142,61 @@ fn timed(name: &str, scratch: &Scratch, bench: Ended) -> Ended {
     bench
 }
 
-/// The run was completed, and little of the flood reached the session. The SYNCs skipped have a wide
-/// limit: a machine that others work on skips some without any flood.
+/// The run was completed, and little of the flood reached the session. A machine that others work on skips
+/// SYNCs without any flood: of three runs, one skips less than one in twenty.
 #[track_caller]
-fn assert_it_goes_on((bench, scratch): &(Ended, Scratch)) {
-    bench.assert_status(0);
-    let timing = &programs::manifest(&scratch.run_dir())["timing"];
-    let count = |key: &str| timing[key].as_u64().unwrap();
-    assert!(count("syncs_skipped") * 4 < count("syncs"), "{timing}");
+fn assert_it_goes_on(run: impl Fn() -> (Ended, Scratch)) -> (Ended, Scratch) {
+    let skips_few = |(_, scratch): &(Ended, Scratch)| {
+        let timing = &programs::manifest(&scratch.run_dir())["timing"];
+        let count = |key: &str| timing[key].as_u64().unwrap();
+        count("syncs_skipped") * 20 < count("syncs")
+    };
+    let runs = std::iter::repeat_with(|| {
+        let run = run();
+        run.0.assert_status(0);
+        run
+    });
+    let (bench, scratch) =
+        runs.take(3).find(skips_few).expect("few SYNCs skipped in one of three runs");
     let samples = programs::read(&scratch.run_dir().join("tracker.ndjson"));
     assert!(!samples.contains("StylusToTracker"), "another tool's samples were handed on");
     let inputs = programs::read(&scratch.run_dir().join("inputs.log"));
     let notices = inputs.lines().filter(|line| line.contains(" status ")).count();
     assert!(notices < 300, "statuses at a bounded rate: {notices}");
+    (bench, scratch)
 }
 
 #[test]
 fn bursts_of_another_tool_delay_no_sync() {
     let (period, duration) = (Duration::from_millis(700), Duration::from_secs(3));
-    let messages = position("StylusToTracker");
-    assert_it_goes_on(&flooded("flood-bursts", Flood::of(messages, 60_000, period, duration)));
+    let flood = || Flood::of(position("StylusToTracker"), 60_000, period, duration);
+    assert_it_goes_on(|| flooded("flood-bursts", flood()));
 }
 
 #[test]
 fn a_flood_of_another_tool_that_lasts_delays_no_sync() {
     let (period, duration) = (Duration::from_millis(1), Duration::from_secs(2));
-    let messages = position("StylusToTracker");
-    assert_it_goes_on(&flooded("flood-lasting", Flood::of(messages, 2000, period, duration)));
+    let flood = || Flood::of(position("StylusToTracker"), 2000, period, duration);
+    assert_it_goes_on(|| flooded("flood-lasting", flood()));
 }
 
 /// The positions come as NDJSON through a pipe, which waits where the bench does not read.
 #[test]
 fn a_flood_on_standard_input_delays_no_sync() {
     let _alone = alone();
-    let scratch = Scratch::new("flood-pipe");
-    let stage = Stage::start(&[]);
-    let (stdin, bench) = io::pipe().expect("a pipe");
     let (period, duration) = (Duration::from_millis(1), Duration::from_secs(2));
-    let messages = line("StylusToTracker", [1.0, 2.0, 3.0]).into_bytes();
-    let (from, flood) = (stage.tracker(), Flood::of(messages, 2000, period, duration));
-    thread::spawn(move || hand_on(from, bench, &flood, ndjson));
-    let from_there = ["tracker.source=\"ndjson\"", "tracker.address=\"-\""];
-    let settings = stage.settings(&[SLOW, from_there].concat());
-    let bench = Program::start_on(&mut scratch.command(&["--json"], &settings), stdin).end();
-    assert_it_goes_on(&(timed("flood-pipe", &scratch, bench), scratch));
+    assert_it_goes_on(|| {
+        let scratch = Scratch::new("flood-pipe");
+        let stage = Stage::start(&[]);
+        let (stdin, bench) = io::pipe().expect("a pipe");
+        let messages = line("StylusToTracker", [1.0, 2.0, 3.0]).into_bytes();
+        let (from, flood) = (stage.tracker(), Flood::of(messages, 2000, period, duration));
+        thread::spawn(move || hand_on(from, bench, &flood, ndjson));
+        let from_there = ["tracker.source=\"ndjson\"", "tracker.address=\"-\""];
+        let settings = stage.settings(&[SLOW, from_there].concat());
+        let bench = Program::start_on(&mut scratch.command(&["--json"], &settings), stdin).end();
+        (timed("flood-pipe", &scratch, bench), scratch)
+    });
 }
 
 #[test]
@@ -194,16 +205,16 @@ fn a_flood_of_statuses_delays_no_sync() {
     let status = Status { code, subcode, error_name: String::new(), message: "ok".to_owned() };
     let messages = encode(&Message::new("Server", None, Body::Status(status)));
     let (period, duration) = (Duration::from_millis(1), Duration::from_secs(2));
-    assert_it_goes_on(&flooded("flood-statuses", Flood::of(messages, 200, period, duration)));
+    let flood = || Flood::of(messages.clone(), 200, period, duration);
+    assert_it_goes_on(|| flooded("flood-statuses", flood()));
 }
 
 /// Each position comes 125 times, all at once: 5000 samples a second of its own tool. Of those that
 /// wait together the control thread takes the newest 64.
 #[test]
 fn its_own_tool_at_five_thousand_a_second_delays_no_sync() {
-    let none = Flood { repeats: 125, ..Flood::of(Vec::new(), 0, Duration::MAX, Duration::ZERO) };
-    let run = flooded("flood-own", none);
-    assert_it_goes_on(&run);
+    let none = || Flood { repeats: 125, ..Flood::of(Vec::new(), 0, Duration::MAX, Duration::ZERO) };
+    let run = assert_it_goes_on(|| flooded("flood-own", none()));
     let accepted = run.0.json()["tracker_samples"]["accepted"].as_u64().unwrap();
     assert!(accepted > 5000, "{accepted}");
     let events = programs::read(&run.1.run_dir().join("events.log"));
