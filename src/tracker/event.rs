@@ -144,7 +144,12 @@ impl Census {
             None => "is the tool in view, and does the server send it?".to_owned(),
         };
         let peer = clipped(peer, SHOWN_MAX);
-        let text = format!("tracker: {peer} sent {messages} messages, none of \"{tool}\"; {next}");
+        let (of_tool, next) = match self.has(&tool) {
+            true => ("no new position", "is the tool in view?"),
+            false => ("none", &*next),
+        };
+        let text =
+            format!("tracker: {peer} sent {messages} messages, {of_tool} of \"{tool}\"; {next}");
         clipped(&text, MESSAGE_MAX).into_owned()
     }
 }
@@ -223,6 +228,17 @@ mod tests {
             census.explain_missing("Needle"),
             "tracker: localhost:18944 sent 1 messages, none of \"Needle\"; saw \"Stylus\", \"Probe\" \
              (IMAGE); set tracker.tool"
+        );
+    }
+
+    #[test]
+    fn a_tool_that_was_seen_is_not_said_to_be_another() {
+        let mut census = Census::default();
+        census.note(&connected());
+        census.note(&sample("Needle"));
+        assert_eq!(
+            census.explain_missing("Needle"),
+            "tracker: localhost:18944 sent 1 messages, no new position of \"Needle\"; is the tool in view?"
         );
     }
 
