@@ -5,7 +5,7 @@ use super::field::Field;
 use super::nearest::path_to_nearest;
 use super::obstacle::World;
 use super::path::{Path, bend_after};
-use super::reserve::reserve_mm;
+use super::reserve::RESERVE_MM;
 use super::route::Route;
 use super::search::{Problem, Status, plan_along, plan_thoroughly};
 use derive_more::Display;
@@ -125,7 +125,7 @@ impl Replanner {
         let distance_mm = |path: &Path| path.distance_mm(&field.world);
         let room_mm = path.as_ref().map_or(f64::INFINITY, distance_mm) - problem.clearance_mm;
         Replanner {
-            reserve_mm: room_mm.clamp(0.0, reserve_mm(problem.in_plane)),
+            reserve_mm: room_mm.clamp(0.0, RESERVE_MM),
             field,
             route,
             problem,

@@ -4,15 +4,9 @@ use super::obstacle::World;
 use super::path::Path;
 use super::search::{Answer, Problem, Status, plan};
 
-/// The extra distance from obstacles, in the plane and in space, mm, wherever a path exists with it. The
-/// shortest path passes obstacles as near as it may, and noise would push the needle past the last point
-/// from which it can pass them. In the plane there is no way past an obstacle but to its two sides.
-const RESERVE_MM: [f64; 2] = [2.0, 0.5];
-
-/// The reserve, mm.
-pub(super) fn reserve_mm(in_plane: bool) -> f64 {
-    RESERVE_MM[usize::from(!in_plane)]
-}
+/// The extra distance from obstacles, mm, wherever a path exists with it. The shortest path passes obstacles
+/// as near as it may, and noise would push the needle past the last point from which it can pass them.
+pub(super) const RESERVE_MM: f64 = 2.0;
 
 /// The parts of the reserve that are tried, the largest first.
 const PARTS: [f64; 3] = [1.0, 0.5, 0.25];
@@ -41,7 +35,7 @@ pub fn plan_with_reserve(
     if shortest.status == Status::None {
         return Err(no_path());
     }
-    let parts = PARTS.map(|part| part * reserve_mm(problem.in_plane));
+    let parts = PARTS.map(|part| part * RESERVE_MM);
     let tries = parts.into_iter().filter(|part_mm| *part_mm > least_mm);
     let least = (least_mm > 0.0).then_some(least_mm);
     let mut last = Status::None;
@@ -99,7 +93,7 @@ mod tests {
     #[test]
     fn the_reserve_is_kept_where_there_is_room() {
         let clearance_mm = problem([0.0, 0.0, 120.0], true).clearance_mm;
-        let half_mm = 0.5 * reserve_mm(true);
+        let half_mm = 0.5 * RESERVE_MM;
         for (gap_mm, kept_mm) in [(2.5, 2.0 * half_mm), (1.1, half_mm), (0.1, 0.0)] {
             let (distance_mm, roomy) = planned(clearance_mm + gap_mm, 0.0, MANY).unwrap();
             assert_eq!(roomy.reserve_mm, kept_mm);

@@ -74,11 +74,13 @@ fn what_was_measured_at_the_rig_is_used_as_it_is() {
     let scratch = Scratch::new();
     let said = rehearse(&scratch, &["run", "--rehearse", "--json", "-q"], &MEASURED);
     assert_eq!(said.status, 0, "{}", said.screen());
-    // The file leaves the product open, the stage was never proved, the calibrations are typed.
+    // The file leaves the product open, the stage was never proved, the calibrations are typed, and the roll at the
+    // start is not told.
     let warned = said.stderr.lines().filter(|line| !line.starts_with(' '));
     let warned: Vec<&str> = warned.map(|line| line[..23].trim_end()).collect();
     let drives = ["insertion drive", "rotation drive"];
-    let names = [&drives[..], &["stage prove", "registration", "tip", "needle"]].concat();
+    let names =
+        [&drives[..], &["stage prove", "registration", "tip", "needle", "start roll"]].concat();
     let names: Vec<String> = names.iter().map(|name| format!("WARN  {name}")).collect();
     assert_eq!(warned, names);
     let json = said.json();
