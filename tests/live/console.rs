@@ -56,6 +56,7 @@ fn the_keys_hold_step_slow_down_resume_and_stop() {
     let stage = Stage::start(&[]);
     let Some(mut bench) = on_terminal(&scratch, &stage, [24, 80], 100) else { return };
     wait_for(&scratch, "inserting");
+    thread::sleep(Duration::from_millis(300));
     bench.press("-");
     wait_for(&scratch, "operator: speed 4.500 mm/s, was 5.000");
     thread::sleep(Duration::from_millis(300));

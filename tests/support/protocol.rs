@@ -249,6 +249,35 @@ impl Rig {
         bench.program.end()
     }
 
+    /// Inserts with the base at this angle at first, and withdraws.
+    fn insert_from(&self, angle: &str) {
+        let turn = ["stage", "jog", "my-rig.toml", "--axis", "rotation", "--to", angle];
+        self.run(&turn).assert_status(0);
+        self.run(&["run", "my-rig.toml", "--yes"]).assert_status(0);
+        self.run(&["stage", "withdraw", "my-rig.toml"]).assert_status(0);
+    }
+
+    /// Makes two runs more, and others where the base has not turned both ways in them.
+    fn calibrate_needle(&self, words: &[&str]) -> Ended {
+        let mut angles = ["-90deg", "0deg", "90deg", "180deg", "-180deg", "-45deg"].into_iter();
+        angles.by_ref().take(2).for_each(|angle| self.insert_from(angle));
+        loop {
+            // The run in air was too short.
+            let runs = self.insertions().split_off(1);
+            let runs: Vec<&str> = runs.iter().map(|run| run.to_str().expect("UTF-8")).collect();
+            let with_runs = words.iter().flat_map(|word| match *word {
+                "RUNS…" => runs.clone(),
+                word => vec![word],
+            });
+            let ended = self.run(&with_runs.collect::<Vec<_>>());
+            let is_asked_for_more = ended.stderr.contains("turn the base both ways");
+            match angles.next().filter(|_| is_asked_for_more) {
+                Some(angle) => self.insert_from(angle),
+                None => return ended,
+            }
+        }
+    }
+
     /// The folders of the runs so far, without those of operations, the oldest first.
     fn insertions(&self) -> Vec<PathBuf> {
         let runs = fs::read_dir(self.path("runs")).into_iter().flatten().flatten();
@@ -285,18 +314,6 @@ impl Rig {
             // The other way to the same two files.
             fs::remove_file(self.path("registration.toml")).expect("collected");
             self.write_points();
-        } else if is("calibrate needle") {
-            // The run in air was too short.
-            for start in ["-90deg", "0deg"] {
-                let turn = ["--axis", "rotation", "--to", start];
-                self.run(&[&["stage", "jog", "my-rig.toml"], &turn[..]].concat()).assert_status(0);
-                self.run(&["run", "my-rig.toml", "--yes"]).assert_status(0);
-                self.run(&["stage", "withdraw", "my-rig.toml"]).assert_status(0);
-            }
-            let runs = self.insertions().split_off(1);
-            let runs = runs.iter().map(|run| run.to_str().expect("UTF-8").to_owned());
-            let at = words.iter().position(|word| word == "RUNS…").expect("the runs");
-            words.splice(at..=at, runs);
         }
         let words: Vec<&str> = words.iter().map(String::as_str).collect();
         let begun = Instant::now();
@@ -304,6 +321,7 @@ impl Rig {
             _ if line.contains("--collect") => self.collect(&words),
             _ if line.contains("--console") => self.on_console(&words),
             _ if is("run") && self.is_hardware() => self.confirmed(&words),
+            _ if is("calibrate needle") => self.calibrate_needle(&words),
             _ => self.run(&words),
         };
         // What it says is printed where it fails: all of it would bury the reason.
