@@ -246,7 +246,7 @@ fn calibrations_get_old() {
     }
 }
 
-/// A registration turned about the needle shows against the roll that is told, and nowhere else.
+/// A run notices a registration that is turned about the needle only where the roll at the start is told.
 #[test]
 fn a_roll_that_is_not_told_is_said() {
     let of = |sd_deg: f64| {

@@ -100,6 +100,8 @@ fn command(key: u8, shared: &Shared, speed_mm_per_s: &mut Option<f64>) -> Option
         (screen.progress.speed_mm_per_s, speed_max_mm_per_s, step_mm)
     };
     let mut tenths = |by: f64| {
+        // Before the first news of an insertion, which begins at the highest speed, none is set.
+        let set_mm_per_s = if set_mm_per_s > 0.0 { set_mm_per_s } else { speed_max };
         let from_mm_per_s = speed_mm_per_s.unwrap_or(set_mm_per_s);
         let mm_per_s = ((from_mm_per_s / speed_max * 10.0).round() + by) * 0.1 * speed_max;
         *speed_mm_per_s = Some(mm_per_s);

@@ -343,6 +343,17 @@ fn a_speed_at_its_limit_is_refused_on_the_screen() {
     }
 }
 
+/// The screen has no speed before the first news of the insertion.
+#[test]
+fn a_speed_asked_for_at_once_counts_from_the_highest() {
+    let shared = Shared::new(setup(), Interrupt::default());
+    let (orders, commands) = sync_channel(COMMANDS);
+    *lock(&shared.screen) = inserted();
+    lock(&shared.screen).progress.speed_mm_per_s = 0.0;
+    Keys::default().take(b"-", &shared, &orders);
+    assert_eq!(commands.try_recv().expect("a command").to_string(), "speed 1.800 mm/s");
+}
+
 /// The bytes that a terminal gets.
 #[derive(Clone, Default)]
 struct Written(Arc<Mutex<Vec<u8>>>);
