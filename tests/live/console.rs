@@ -288,13 +288,20 @@ impl Tmux {
     /// Waits until the screen has `text`, and gives the screen.
     #[track_caller]
     fn wait_for(&self, text: &str) -> String {
+        self.wait_until(|screen| screen.contains(text))
+    }
+
+    /// The same of any condition. A test of a whole screen waits for what is drawn last: tmux also shows a
+    /// screen that is half drawn.
+    #[track_caller]
+    fn wait_until(&self, is_shown: impl Fn(&str) -> bool) -> String {
         let end = Instant::now() + LONG;
         loop {
             let screen = self.run(&["capture-pane", "-p"]);
-            if screen.contains(text) {
+            if is_shown(&screen) {
                 return screen;
             }
-            assert!(Instant::now() < end, "not on the screen: {text:?}, but:\n{screen}");
+            assert!(Instant::now() < end, "not on the screen, which is:\n{screen}");
             thread::sleep(Duration::from_millis(50));
         }
     }
@@ -331,7 +338,9 @@ fn the_console_in_tmux() {
 
     tmux.wait_for(" INSERTING");
     press("Space");
-    let screen = tmux.wait_for(" HELD BY OPERATOR");
+    let is_told =
+        |screen: &str| screen.lines().skip(19).any(|line| line.contains("operator: hold at "));
+    let screen = tmux.wait_until(|screen| screen.contains(" HELD BY OPERATOR") && is_told(screen));
     let lines: Vec<&str> = screen.lines().collect();
     assert_eq!(lines.len(), 24, "{screen}");
     assert!(lines[1].contains(" of 100.0 mm "), "{screen}");
@@ -342,17 +351,20 @@ fn the_console_in_tmux() {
     assert!(lines[23].starts_with(" space hold   r resume   s step 1 mm "), "{screen}");
 
     resize("60", "20");
-    let screen = tmux.wait_for("space hold r resume s step + - speed q stop ? help");
+    let keys = "space hold r resume s step + - speed q stop ? help";
+    let screen =
+        tmux.wait_until(|screen| screen.contains("┌x mm over depth") && screen.contains(keys));
     assert!(screen.starts_with(" HELD BY OPERATOR"), "{screen}");
-    assert!(screen.contains("┌x mm over depth") && !screen.contains("┌tracker"), "{screen}");
+    assert!(!screen.contains("┌tracker"), "{screen}");
     resize("40", "10");
     tmux.wait_for("\nspace hold r resume s step + - q stop ?");
     resize("1", "1");
     thread::sleep(Duration::from_millis(300));
     resize("120", "40");
     press("?");
-    let helped = tmux.wait_for("┌keys─");
-    assert!(helped.contains("withdraw the needle, after a y"), "{helped}");
+    let last = "withdraw the needle, after a y";
+    let helped = tmux.wait_until(|screen| screen.contains("┌keys─") && screen.contains(last));
+    assert!(helped.starts_with(" HELD BY OPERATOR"), "{helped}");
     press("?");
     press("s");
     tmux.wait_for(" HELD AFTER STEP");
