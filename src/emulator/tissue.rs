@@ -1,8 +1,10 @@
 //! The emulated needle in its tissue.
 
-use crate::geometry::{Pose, Twist};
-use crate::needle::{Increment, InsertedPath, Needle, Play, Torsion};
-use nalgebra::Vector3;
+use crate::geometry::Pose;
+use crate::needle::{Cut, Increment, InsertedPath, Needle, Play, Torsion};
+
+/// A needle pulled back to here is out of the tissue, mm.
+const OUT_MM: f64 = 0.1;
 
 /// A needle in tissue. The true position of the stage drives it; its true tip pose follows.
 #[derive(Debug, Clone)]
@@ -14,15 +16,14 @@ pub(crate) struct Tissue {
     /// True depth of the base, mm, and its rotation, rad, at the last advance.
     insertion_true_mm: f64,
     rotation_true_rad: f64,
-    /// Rotation of the tip relative to the path's pose since it last cut, rad.
-    rolled_true_rad: f64,
-    /// Tip pose `X_PB`.
-    tip_true: Pose,
+    /// Tip pose `X_PB`, and the sum of the tip's rotations about its own axis, rad.
+    true_now: Cut,
 }
 
 impl Tissue {
     /// A needle whose tip is at `start` (`X_PB`) when the stage is at (0, 0).
     pub(crate) fn new(needle: Needle, torsion: Torsion, start: Pose) -> Self {
+        let start = Cut { tip: start, roll_rad: 0.0 };
         let mut path = InsertedPath::default();
         path.advance(0.0, start);
         Tissue {
@@ -32,16 +33,16 @@ impl Tissue {
             path,
             insertion_true_mm: 0.0,
             rotation_true_rad: 0.0,
-            rolled_true_rad: 0.0,
-            tip_true: start,
+            true_now: start,
         }
     }
 
     /// Moves the base to this true stage position; both axes move in proportion.
     ///
-    /// Beyond its deepest position the needle cuts (paper Eq. 1). In the channel that it has cut, it
-    /// slides, and a rotation of the base rolls the tip in place. The shaft's torsion decides how much of
-    /// the base's rotation reaches the tip.
+    /// Beyond its deepest position the needle cuts (paper Eq. 1). In the channel that it has cut it
+    /// slides: the channel holds the tip's place and heading, the base its roll. The shaft's torsion
+    /// decides how much of the base's rotation reaches the tip. A needle that was pulled out enters
+    /// fresh tissue.
     pub(crate) fn advance(&mut self, insertion_true_mm: f64, rotation_true_rad: f64) {
         let turn_rad = rotation_true_rad - self.rotation_true_rad;
         let cut_mm = self.path.depth_mm().unwrap_or(0.0);
@@ -51,23 +52,22 @@ impl Tissue {
             if new_mm > 0.0 { turn_rad * new_mm / (to_mm - from_mm) } else { 0.0 };
         if let Ok(turn) = Increment::new(0.0, turn_rad - turn_cutting_rad) {
             let rolls = self.play.advance(&self.torsion, turn);
-            self.rolled_true_rad += rolls.map(|roll| roll.rotation_rad()).sum::<f64>();
+            self.true_now.roll_rad += rolls.map(|roll| roll.rotation_rad()).sum::<f64>();
         }
         self.slide(to_mm.clamp(0.0, cut_mm));
         if let Ok(base) = Increment::new(new_mm, turn_cutting_rad)
             && new_mm > 0.0
         {
-            if self.rolled_true_rad != 0.0 {
-                // The channel keeps its pose; the new part begins with the roll.
-                self.path.advance(cut_mm.next_up(), self.tip_true);
-                self.rolled_true_rad = 0.0;
-            }
             let mut depth_mm = to_mm - new_mm;
             for tip in self.play.advance(&self.torsion, base) {
                 depth_mm += tip.insertion_mm();
-                self.tip_true = self.needle.step(&self.tip_true, tip);
-                self.path.advance(depth_mm, self.tip_true);
+                self.true_now.tip = self.needle.step(&self.true_now.tip, tip);
+                self.true_now.roll_rad += tip.rotation_rad();
+                self.path.advance(depth_mm, self.true_now);
             }
+        }
+        if to_mm < from_mm.min(OUT_MM) {
+            self.leave(to_mm.clamp(0.0, cut_mm), rotation_true_rad);
         }
         self.insertion_true_mm = to_mm;
         self.rotation_true_rad = rotation_true_rad;
@@ -75,21 +75,30 @@ impl Tissue {
 
     /// Moves the tip along the channel.
     fn slide(&mut self, to_mm: f64) {
-        let roll = Vector3::new(0.0, 0.0, self.rolled_true_rad);
-        if let Some(on_path) = self.path.at(to_mm) {
-            self.tip_true = on_path * Pose::exp(&Twist { v: Vector3::zeros(), w: roll });
+        if let Some(cut) = self.path.at(to_mm) {
+            self.true_now.tip = cut.tip_rolled_to(self.true_now.roll_rad);
         }
+    }
+
+    /// The needle is out: nothing holds its tip back from the base's rotation, and its channel is of no
+    /// more use.
+    fn leave(&mut self, at_mm: f64, rotation_true_rad: f64) {
+        self.play = Play::default();
+        self.true_now.roll_rad = rotation_true_rad;
+        self.slide(at_mm);
+        self.path = InsertedPath::default();
+        self.path.advance(at_mm, self.true_now);
     }
 
     /// The true tip pose `X_PB`.
     pub(crate) fn tip_true(&self) -> &Pose {
-        &self.tip_true
+        &self.true_now.tip
     }
 
     /// The true tip pose `X_PB` when the needle had cut to `insertion_true_mm`; `None` for a depth
     /// that it has not reached.
     pub(crate) fn cut_at(&self, insertion_true_mm: f64) -> Option<Pose> {
-        self.path.at(insertion_true_mm)
+        self.path.at(insertion_true_mm).map(|cut| cut.tip)
     }
 }
 
@@ -197,7 +206,42 @@ mod tests {
         let on = needle.step(&rolled, Increment::new(2.0, 0.0).unwrap());
         assert!(distance(tissue.tip_true(), &on) < 1e-9);
         tissue.advance(5.0, 1.2);
-        assert!(distance(tissue.tip_true(), &halfway) < 1e-9);
+        assert!(distance(tissue.tip_true(), &needle.step(&halfway, turned)) < 1e-9);
+    }
+
+    /// A shaft without torsion: what was cut with the base turning is retraced with the base's roll.
+    #[test]
+    fn the_channel_does_not_turn_the_tip() {
+        let mut tissue = tissue();
+        tissue.advance(5.0, 1.0);
+        let halfway = *tissue.tip_true();
+        tissue.advance(10.0, 3.0);
+        for rotation_rad in [3.0, 0.4] {
+            tissue.advance(5.0, rotation_rad);
+            let turned = Increment::new(0.0, rotation_rad - 1.0).unwrap();
+            let rolled = Needle::new(1.0 / 122.0).unwrap().step(&halfway, turned);
+            assert!(distance(tissue.tip_true(), &rolled) < 1e-9);
+        }
+    }
+
+    /// Nothing of the channel is left, nor of the shaft's torsion: the next insertion is as the first one
+    /// of a needle with this roll.
+    #[test]
+    fn a_needle_pulled_out_enters_fresh_tissue() {
+        let mut tissue = twisting(0.5);
+        tissue.advance(10.0, 2.0);
+        tissue.advance(0.05, 2.0);
+        let out = *tissue.tip_true();
+        let turned = Needle::new(1.0 / 122.0).unwrap();
+        let straight = turned.step(&Pose::identity(), Increment::new(0.0, 2.0).unwrap());
+        assert!((out.rotation.matrix() - straight.rotation.matrix()).norm() < 1e-3);
+        let mut first = Tissue::new(turned, tissue.torsion, out);
+        for n in 1..=10 {
+            let deeper_mm = f64::from(n);
+            tissue.advance(0.05 + deeper_mm, 2.0 + 0.2 * deeper_mm);
+            first.advance(deeper_mm, 0.2 * deeper_mm);
+            assert!(distance(tissue.tip_true(), first.tip_true()) < 1e-9);
+        }
     }
 
     /// Cutting or in the channel, the base turns through the band before the tip follows.
@@ -218,6 +262,7 @@ mod tests {
         let dragged = step(&free, 2.0 * 0.3 / 1.3, -0.3);
         assert!(distance(tissue.tip_true(), &dragged) < 1e-9);
         tissue.advance(10.0 + 2.0 / 1.3, -0.5);
-        assert!(distance(tissue.tip_true(), &free) < 1e-9, "retraced through the kink");
+        let back = step(&free, 0.0, -0.3);
+        assert!(distance(tissue.tip_true(), &back) < 1e-9, "retraced through the kink");
     }
 }

@@ -13,7 +13,7 @@ mod two_arc;
 
 pub use kinematics::{Increment, Needle, NeedleError};
 pub use measurement::TipPosition;
-pub use path::InsertedPath;
+pub use path::{Cut, InsertedPath};
 pub use reduction::{Fibre, Reduced};
 pub(crate) use torsion::{HALF_WIDTH, HALF_WIDTH_PER_MM, OFFSET};
 pub use torsion::{Play, Torsion, TorsionConfig};
