@@ -4,6 +4,7 @@ use super::Failure;
 use super::arguments::{Configured, seed};
 use super::output::{give, refuse_existing, shell_word, write_new};
 use super::plan::mask_reader;
+use crate::config::Config;
 use crate::geometry::coordinates;
 use crate::runtime::Study;
 use crate::session::PlaneOutOfReach;
@@ -12,6 +13,7 @@ use crate::text::screen;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use minijinja::context;
+use nalgebra::Vector3;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -90,7 +92,7 @@ pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
     bar.finish_and_clear();
     let trials = trials.map_err(Failure::configuration)?;
     if let Some(path) = &arguments.out {
-        write(path, &trials)?;
+        write(path, &trials, &config)?;
     }
     let inserted_mm: f64 = trials.iter().map(|trial| trial.figures.insertion_mm).sum();
     let summary = StudySummary::of(&trials)
@@ -138,10 +140,15 @@ fn progress_bar(trials: usize) -> ProgressBar {
 }
 
 /// Writes a CSV row for each trial; a field that the trial has no number for is empty.
-fn write(path: &Path, trials: &[TrialResult]) -> Result<(), Failure> {
+fn write(path: &Path, trials: &[TrialResult], config: &Config) -> Result<(), Failure> {
     let mut writer = csv::Writer::from_writer(Vec::new());
     for (number, trial) in trials.iter().enumerate() {
-        let (names, cells): (Vec<_>, Vec<_>) = row(number, trial).into_iter().unzip();
+        let target_mm = match trial.target {
+            Some(_) => config.drawn(trial.seed)?.goal.position_mm,
+            None => None,
+        };
+        let row = row(number, trial, target_mm);
+        let (names, cells): (Vec<_>, Vec<_>) = row.into_iter().unzip();
         if number == 0 {
             writer.write_record(names).map_err(Failure::environment)?;
         }
@@ -151,8 +158,12 @@ fn write(path: &Path, trials: &[TrialResult]) -> Result<(), Failure> {
     write_new(path, &String::from_utf8_lossy(&written))
 }
 
-/// The columns of a trial with their names.
-fn row(number: usize, trial: &TrialResult) -> Vec<(String, String)> {
+/// The columns of a trial with their names; its target is there at the start, plane frame, mm.
+fn row(
+    number: usize,
+    trial: &TrialResult,
+    target_mm: Option<Vector3<f64>>,
+) -> Vec<(String, String)> {
     let TrialResult { stage, figures, .. } = trial;
     let torsion = stage.torsion.config();
     let mut row = Vec::new();
@@ -186,6 +197,9 @@ fn row(number: usize, trial: &TrialResult) -> Vec<(String, String)> {
         add(name, shown(value));
     }
     if let Some(target) = trial.target {
+        for (i, name) in ["target_x_mm", "target_y_mm", "target_z_mm"].into_iter().enumerate() {
+            add(name, shown(target_mm.map(|mm| mm[i])));
+        }
         add("target_refused", target.is_refused.to_string());
         add("target_reached", target.is_reached.to_string());
         add("target_error_mm", shown(target.error_mm));

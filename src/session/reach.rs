@@ -3,6 +3,7 @@
 use super::config::SessionConfig;
 use crate::needle::{Reduced, shortest_into_plane_mm};
 use nalgebra::Vector3;
+use std::f64::consts::FRAC_PI_2;
 
 /// Standard deviations of the position and of the heading that are allowed in the run's favour.
 const SDS: f64 = 3.0;
@@ -12,13 +13,13 @@ const TRIAL_MM: f64 = 60.0;
 const POSITIONS: u32 = 8;
 const HEADINGS: u32 = 48;
 
-/// Refuses a start from which the depth, or 60 mm where it is less, does not suffice for the shortest way into the plane, not even
-/// from the most favourable position and heading within three standard deviations.
+/// Refuses a start from which the depth, or 60 mm where it is less, does not suffice for the shortest way
+/// into the plane, not even from the most favourable position and heading within three standard deviations.
+/// On the way to a target in the plane the tip need only come as near to the plane as the target's tolerance. A
+/// target in space does not need the plane.
 ///
 /// # Errors
 /// The reason, with its numbers.
-///
-/// A target in space does not need the plane.
 pub(super) fn check_reach(config: &SessionConfig, tip_mm: &Vector3<f64>) -> Result<(), String> {
     if config.goal.as_ref().is_some_and(|goal| !goal.problem.in_plane) {
         return Ok(());
@@ -29,6 +30,22 @@ pub(super) fn check_reach(config: &SessionConfig, tip_mm: &Vector3<f64>) -> Resu
     let margin_mm = SDS * variance_mm2.sqrt();
     let (pitch_rad, pitch_sd_rad) =
         (config.handedness.start.pitch, config.handedness.start_sd.pitch);
+    if let Some(goal) = &config.goal {
+        let (off_mm, length_mm) = (tip_mm.x.abs(), goal.path.length_mm());
+        let toward_rad = SDS * pitch_sd_rad - tip_mm.x.signum() * pitch_rad;
+        let mended_mm = length_mm * toward_rad.min(FRAC_PI_2).sin()
+            + 0.5 * config.needle.curvature_per_mm() * length_mm.powi(2);
+        let left_mm = off_mm - margin_mm - mended_mm;
+        let tolerance_mm = goal.problem.tolerance_mm;
+        return match left_mm <= tolerance_mm {
+            true => Ok(()),
+            false => Err(format!(
+                "the target is out of reach: the tip is {off_mm:.1} mm off the plane, of which the path \
+                 to the target, {length_mm:.1} mm, mends {mended_mm:.1} at most; goal.tolerance_mm is \
+                 {tolerance_mm}"
+            )),
+        };
+    }
     let states = spread(tip_mm.x, margin_mm, POSITIONS).flat_map(|x_mm| {
         let headings = spread(pitch_rad, SDS * pitch_sd_rad, HEADINGS);
         headings.map(move |pitch_rad| Reduced { x_mm, pitch_rad, roll_rad: 0.0 })
@@ -92,6 +109,26 @@ mod tests {
         );
         assert!(reach(&["insertion.depth_mm=10"], 5.0).is_ok(), "a trial");
         assert!(reach(&["insertion.depth_mm=10"], 30.0).is_err());
+    }
+
+    #[test]
+    fn a_target_in_the_plane_that_the_tip_passes_beside_is_refused() {
+        let at = |z_mm: f64, x_mm: f64, more: &[&str]| {
+            let target = format!("goal.position_mm=[0.0, 0.0, {z_mm:?}]");
+            reach(&[&["goal.kind=\"target\"", &target], more].concat(), x_mm)
+        };
+        assert_eq!(at(3.0, 3.0, &[]), Ok(()), "within the noise");
+        assert_eq!(at(30.0, 10.0, &[]), Ok(()));
+        let missed = "the target is out of reach: the tip is 5.0 mm off the plane, of which the path to the \
+                      target, 2.0 mm, mends 0.8 at most; goal.tolerance_mm is 1";
+        assert_eq!(at(3.0, 5.0, &[]).unwrap_err(), missed);
+        assert_eq!(at(3.0, -5.0, &[]).unwrap_err(), missed);
+        // A heading that is known leaves less, or leads there.
+        let known = "observer.invariant.start_sd.pitch_deg=1";
+        assert!(at(30.0, 10.0, &[known]).is_err());
+        assert_eq!(at(30.0, 10.0, &[known, "observer.start.pitch_deg=-20"]), Ok(()));
+        assert_eq!(at(30.0, -10.0, &[known, "observer.start.pitch_deg=20"]), Ok(()));
+        assert!(at(30.0, -10.0, &[known, "observer.start.pitch_deg=-20"]).is_err());
     }
 
     /// A heading that is known to lead away leaves less of the depth.

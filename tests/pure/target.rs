@@ -267,9 +267,8 @@ fn a_study_draws_targets_and_obstacles() {
     }
     assert!(!said.stdout.contains("off plane"), "{}", said.stdout);
     let rows = std::fs::read_to_string(scratch.path().join("trials.csv")).unwrap();
-    assert!(
-        rows.contains(",target_refused,target_reached,target_error_mm,clearance_mm_min,settled")
-    );
+    let columns = ",target_x_mm,target_y_mm,target_z_mm,target_refused,target_reached,target_error_mm,clearance_mm_min,settled";
+    assert!(rows.contains(columns), "{rows}");
     assert_eq!(rows.matches(",false,true,0.").count(), 4, "{rows}");
     // Where nothing is begun there is nothing to say of it.
     let json = study(&["goal.reserve_mm=40"]);
