@@ -167,6 +167,8 @@ struct Found {
 
 /// Where obstacles make the way longer by more than this, the target is not tried directly, mm.
 const DETOUR_MM: f64 = 2.0;
+/// Costs that differ by no more are the same, but for rounding, mm.
+const SAME_MM: f64 = 1e-9;
 /// Points of an arc where a path may end.
 const PARTS: u32 = 10;
 /// Goes nowhere.
@@ -344,16 +346,18 @@ impl Search<'_, '_> {
         let distance_mm = (target_mm - tip.position_mm).norm();
         let ends_near = distance_mm <= *tolerance_mm + self.lattice.resolution.step_mm;
         let near = if ends_near { self.nearest_on_arcs(node) } else { None };
-        let tip_aims = Some(tip).filter(|_| may_be_free);
+        // The grid of the route is too coarse to judge a target that is near.
+        let tip_aims = Some(tip).filter(|_| may_be_free || ends_near);
         let turning =
             tip_aims.and_then(|tip| tip.arc_then_straight_to(target_mm, *curvature_per_mm));
         let bent = tip_aims.and_then(|tip| tip.arc_to(target_mm));
         let bent = bent.filter(|arc| arc.curvature_per_mm <= *curvature_per_mm);
-        let ways = [near, turning.map(|arcs| (0.0, arcs)), bent.map(|arc| (0.0, [arc, NO_ARC]))];
+        // Of two that cost the same the first is taken: the one that ends at the target.
+        let ways = [turning.map(|arcs| (0.0, arcs)), bent.map(|arc| (0.0, [arc, NO_ARC])), near];
         for (left_mm, rest) in ways.into_iter().flatten() {
             let whole_mm = length_mm + rest.iter().map(|arc| arc.length_mm).sum::<f64>();
             let cost_mm = whole_mm + f64::from(changes) * CHANGE_MM + left_mm;
-            let is_better = self.best.as_ref().is_none_or(|best| cost_mm < best.cost_mm);
+            let is_better = self.best.as_ref().is_none_or(|best| cost_mm < best.cost_mm - SAME_MM);
             if is_better && whole_mm <= self.problem.length_max_mm && self.are_clear(&tip, &rest) {
                 self.best = Some(Found { cost_mm, node, rest });
             }

@@ -120,7 +120,7 @@ mod tests {
         assert_eq!(at(3.0, 3.0, &[]), Ok(()), "within the noise");
         assert_eq!(at(30.0, 10.0, &[]), Ok(()));
         let missed = "the target is out of reach: the tip is 5.0 mm off the plane, of which the path to the \
-                      target, 2.0 mm, mends 0.8 at most; goal.tolerance_mm is 1";
+                      target, 3.0 mm, mends 1.3 at most; goal.tolerance_mm is 1";
         assert_eq!(at(3.0, 5.0, &[]).unwrap_err(), missed);
         assert_eq!(at(3.0, -5.0, &[]).unwrap_err(), missed);
         // A heading that is known leaves less, or leads there.

@@ -58,6 +58,17 @@ fn with_nothing_in_the_way_the_first_try_is_the_plan() {
     }
 }
 
+/// However near the target is: short of it by the tolerance the path would cost the same.
+#[test]
+fn a_target_straight_ahead_is_the_end() {
+    for (in_plane, z_mm) in [(true, 1.5), (false, 1.5), (true, 3.0), (false, 3.0), (true, 4.7)] {
+        let problem = problem([0.0, 0.0, z_mm], in_plane);
+        let answer = plan(&world(vec![]), &problem);
+        let path = path(&world(vec![]), &problem, &answer);
+        assert!((path.end().position_mm - problem.target_mm).norm() < 1e-9, "{z_mm}: {path:?}");
+    }
+}
+
 /// In space the needle passes a wall that has no way through in the plane.
 #[test]
 fn what_the_plane_does_not_allow_space_may() {
