@@ -50,7 +50,11 @@ impl Tissue {
         let new_mm = (to_mm - from_mm.max(cut_mm)).max(0.0);
         let turn_cutting_rad =
             if new_mm > 0.0 { turn_rad * new_mm / (to_mm - from_mm) } else { 0.0 };
-        if let Ok(turn) = Increment::new(0.0, turn_rad - turn_cutting_rad) {
+        let turn_in_channel_rad = turn_rad - turn_cutting_rad;
+        if from_mm.max(to_mm) <= 0.0 {
+            // In air nothing holds the tip back.
+            self.true_now.roll_rad += turn_in_channel_rad;
+        } else if let Ok(turn) = Increment::new(0.0, turn_in_channel_rad) {
             let rolls = self.play.advance(&self.torsion, turn);
             self.true_now.roll_rad += rolls.map(|roll| roll.rotation_rad()).sum::<f64>();
         }
@@ -222,6 +226,23 @@ mod tests {
             let rolled = Needle::new(1.0 / 122.0).unwrap().step(&halfway, turned);
             assert!(distance(tissue.tip_true(), &rolled) < 1e-9);
         }
+    }
+
+    /// Before the insertion, and after a withdrawal.
+    #[test]
+    fn in_air_the_tip_turns_with_the_base() {
+        let mut tissue = twisting(0.5);
+        let turned = |rad| {
+            Needle::new(1.0 / 122.0)
+                .unwrap()
+                .step(&Pose::identity(), Increment::new(0.0, rad).unwrap())
+        };
+        tissue.advance(0.0, 0.4);
+        assert!(distance(tissue.tip_true(), &turned(0.4)) < 1e-9);
+        tissue.advance(10.0, 2.0);
+        tissue.advance(0.0, 2.0);
+        tissue.advance(0.0, 0.3);
+        assert!(distance(tissue.tip_true(), &turned(0.3)) < 1e-9);
     }
 
     /// Nothing of the channel is left, nor of the shaft's torsion: the next insertion is as the first one
