@@ -66,6 +66,8 @@ pub struct RegistrationFit {
     pub worst_mm: f64,
     /// RMS extent of the fiducials along their principal axes, largest first, mm.
     pub spread_mm: [f64; 3],
+    /// How many times as far apart the tracker has the fiducials as the bench, where that is no chance.
+    pub scale: Option<f64>,
     /// Centroid of the fiducials on the bench, mm.
     centre_bench: Vector3<f64>,
     /// Principal axes on the bench, in the order of `spread_mm`.
@@ -73,6 +75,10 @@ pub struct RegistrationFit {
 }
 
 const MIRRORED: &str = "the sets are mirror images: one axis of one frame points the other way";
+/// Points scatter by chance; a scale that is off by so many of its standard errors is off.
+const SCALE_SDS: f64 = 5.0;
+/// And it is said from here on only: a smaller error moves no point by more than a tracker's.
+const SCALE_SAID: f64 = 0.002;
 const SCATTERED: &str =
     "measure that one again, and see that both frames have the points in the same order";
 
@@ -113,12 +119,14 @@ impl RegistrationFit {
         let (spread_mm, axes) = principal(&bench_mm);
 
         let size_mm = |spread_mm: [f64; 3]| Vector3::from(spread_mm).norm();
-        let scale = size_mm(spread_tracker_mm) / size_mm(spread_mm);
-        if !(1.0 / SCALE_MAX..=SCALE_MAX).contains(&scale) {
+        let times = size_mm(spread_tracker_mm) / size_mm(spread_mm);
+        if !(1.0 / SCALE_MAX..=SCALE_MAX).contains(&times) {
             return refused(format!(
-                "the tracker's points are {scale:.4} times as far apart as the bench's; give both in mm"
+                "the tracker's points are {times:.4} times as far apart as the bench's; give both in mm"
             ));
         }
+        let turned_mm: Vec<_> = tracker_mm.iter().map(|p| rotation * p).collect();
+        let scale = scale_off(&turned_mm, &bench_mm);
         let breadth_mm = spread_tracker_mm[1].min(spread_mm[1]);
         let check_breadth = |limit_mm: f64| match breadth_mm >= limit_mm {
             true => Ok(()),
@@ -131,7 +139,11 @@ impl RegistrationFit {
         check_breadth(BREADTH_MIN_MM.max(BREADTH_PER_LENGTH_MIN * spread_mm[0]))?;
         if rms_mm > rms_max_mm || rms_max_mm.is_nan() {
             let is_solid = spread_mm[2] > BREADTH_PER_LENGTH_MIN * spread_mm[0];
-            let hint = if is_mirrored && is_solid { MIRRORED } else { SCATTERED };
+            let hint = match scale {
+                _ if is_mirrored && is_solid => MIRRORED.to_owned(),
+                Some(scale) => scaled(scale),
+                None => SCATTERED.to_owned(),
+            };
             return refused(format!(
                 "{points} points, {rms_mm:.2} mm RMS (limit {rms_max_mm:.2}); worst is point \
                  {worst_point}, {worst_mm:.1} mm; {hint}"
@@ -144,11 +156,23 @@ impl RegistrationFit {
             worst_point,
             worst_mm,
             spread_mm,
+            scale,
             centre_bench,
             axes,
         };
         check_breadth(BREADTH_PER_ERROR_MIN * fit.localisation_error_mm())?;
         Ok(fit)
+    }
+
+    /// What the fit does not show by its residuals, in words.
+    pub fn remarks(&self) -> Vec<String> {
+        let is_flat = self.spread_mm[2]
+            < (BREADTH_PER_LENGTH_MIN * self.spread_mm[0]).max(self.localisation_error_mm());
+        let flat = || {
+            "the points lie in a plane, and so cannot show a mirrored axis of the tracker: touch one off it"
+                .to_owned()
+        };
+        is_flat.then(flat).into_iter().chain(self.scale.map(scaled)).collect()
     }
 
     /// The RMS error of locating one fiducial (FLE), mm, from the remaining distances:
@@ -173,6 +197,27 @@ impl RegistrationFit {
         let tre2 = fle2 / self.points as f64 * (1.0 + ratios.iter().sum::<f64>() / 3.0);
         (tre2 / 3.0).sqrt()
     }
+}
+
+fn scaled(scale: f64) -> String {
+    format!(
+        "the tracker has the points {scale:.3} times as far apart as the bench: is its scale right, and are \
+         both in mm?"
+    )
+}
+
+/// How many times as far apart `tracker_mm` are as `bench_mm`, both about their mean and of the same
+/// orientation, if that differs from 1 by more than chance: the least squares of `bench = s tracker`,
+/// whose residuals give the standard error of s.
+fn scale_off(tracker_mm: &[Vector3<f64>], bench_mm: &[Vector3<f64>]) -> Option<f64> {
+    let pairs = || tracker_mm.iter().zip(bench_mm);
+    let square_mm2: f64 = tracker_mm.iter().map(Vector3::norm_squared).sum();
+    let scale = pairs().map(|(t, b)| t.dot(b)).sum::<f64>() / square_mm2;
+    let left_mm2: f64 = pairs().map(|(t, b)| (b - t * scale).norm_squared()).sum();
+    // Seven parameters of a similarity.
+    let free = (3 * tracker_mm.len()).checked_sub(7).filter(|free| *free >= 5)?;
+    let sd = (left_mm2 / free as f64 / square_mm2).sqrt();
+    ((scale - 1.0).abs() > (SCALE_SDS * sd).max(SCALE_SAID)).then_some(scale.recip())
 }
 
 fn refused<T>(reason: String) -> Result<T, CalibrationError> {

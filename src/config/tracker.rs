@@ -44,7 +44,8 @@ section! {
         kind: TrackerKind = "electromagnetic";
         /// When the insertion is held.
         hold: HoldConfig, flat;
-        /// Fixed latency of the source, on top of its stamps.
+        /// Least delay from the measurement of a position to its receipt. A sender's clock is learnt from what
+        /// comes soonest, so stamps show only what comes later than that.
         latency as "latency_ms": Duration [within(0.0, 5000.0)] = 0.0;
         /// The stamp that dates a position.
         stamp: StampPolicy = "receive";
@@ -161,7 +162,7 @@ impl TrackerConfig {
     }
 
     /// `X_SB`: the tip in the sensor's frame.
-    pub(super) fn x_sb(&self) -> Pose {
+    pub fn x_sb(&self) -> Pose {
         Pose { rotation: self.tip_tilt.to_rotation(), translation: self.tip_offset_mm.into() }
     }
 

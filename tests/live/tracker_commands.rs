@@ -160,6 +160,8 @@ fn a_registration_is_collected_point_by_point() {
         .args(["--set", &format!("tracker.address=\"127.0.0.1:{}\"", server.port)])
         .args(["--set", "can.interface=vcan0", "--set", "tracker.source=openigtlink"])
         .args(["--set", "tracker.gates.noise_sd_mm=0.1"])
+        // The point that is touched is touched by the tip.
+        .args(["--set", "tracker.tip_offset_mm=[0.0, 0.0, 7.0]"])
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
@@ -207,7 +209,7 @@ fn a_registration_is_collected_point_by_point() {
     assert!(collecting.wait().unwrap().success());
     let json: serde_json::Value = serde_json::from_str(&result).unwrap();
     let registration = &json["registration"];
-    for (key, expected) in [("x_mm", 100.0), ("y_mm", 20.0), ("z_mm", -3.0)] {
+    for (key, expected) in [("x_mm", 100.0), ("y_mm", 20.0), ("z_mm", -10.0)] {
         let found = registration[key].as_f64().unwrap();
         assert!((found - expected).abs() < 0.5, "{json}");
     }

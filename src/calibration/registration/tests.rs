@@ -132,6 +132,37 @@ fn noise_gives_the_errors_that_are_predicted() {
     assert!((error2 / predicted2 - 1.0).abs() < 0.1, "TRE² {error2} for {predicted2}");
 }
 
+/// A tracker whose millimetre is 1% too long, among points that are located to 0.3 mm.
+#[test]
+fn a_wrong_scale_is_named_and_chance_is_not() {
+    let points_mm: Vec<_> = (0..12u64).map(|point| Noise::Uniform(80.0).draw(5, point)).collect();
+    let fit = |set: u64, scale: f64| {
+        let mut pairs = pairs(&Pose::identity(), &points_mm);
+        for (point, pair) in pairs.iter_mut().enumerate() {
+            pair.tracker_mm =
+                pair.tracker_mm * scale + Noise::Gaussian(0.3).draw(set, point as u64);
+        }
+        RegistrationFit::of(&pairs, 3.0).expect("fits")
+    };
+    let scales: Vec<f64> = (0..100).filter_map(|set| fit(set, 1.01).scale).collect();
+    assert!(scales.len() >= 95, "named in {} of 100", scales.len());
+    assert!(scales.iter().all(|scale| (scale - 1.01).abs() < 0.004), "{scales:?}");
+    assert_eq!((0..1000).filter(|&set| fit(set, 1.0).scale.is_some()).count(), 0);
+    let remarks = fit(1, 1.01).remarks().join("; ");
+    assert!(remarks.starts_with("the tracker has the points 1.0"), "{remarks}");
+}
+
+#[test]
+fn points_in_a_plane_are_named() {
+    let remarks = |points_mm: &[Vector3<f64>]| {
+        RegistrationFit::of(&pairs(&Pose::identity(), points_mm), 1.0).expect("fits").remarks()
+    };
+    let flat = square(100.0);
+    assert!(remarks(&flat)[0].contains("lie in a plane"));
+    let solid = [flat, vec![Vector3::new(50.0, 50.0, 20.0)]].concat();
+    assert_eq!(remarks(&solid), Vec::<String>::new());
+}
+
 #[test]
 fn the_error_at_a_target_grows_with_its_distance() {
     let noisy = pairs(&Pose::identity(), &square(100.0));

@@ -225,6 +225,11 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<ExitCode, Failure>
 
 /// The rows of an insertion; every row must have an orientation.
 fn posed(Insertion { path, recording, .. }: &Insertion) -> Result<Vec<PosedRow>, Failure> {
+    if recording.lacks_roll() {
+        let why = "its orientations do not turn with the base; a needle is calibrated from those of a sensor \
+                   of six degrees of freedom";
+        return Err(Failure::in_file(path, why));
+    }
     let posed = recording.rows.iter().map(|row| {
         Some(PosedRow {
             line: row.line,
@@ -279,7 +284,7 @@ fn registration(arguments: &RegistrationArguments) -> Result<ExitCode, Failure> 
         "localisation_error_mm": fit.localisation_error_mm(),
     });
     let overlay = json!({ "tracker": { "registration": registration } });
-    let more = context! { rms_max_mm => arguments.rms_max_mm };
+    let more = context! { rms_max_mm => arguments.rms_max_mm, remarks => fit.remarks() };
     let summary = (include_str!("registration.txt"), more);
     arguments.output.give(summary, REGISTRATION_HEADER, &overlay, &json)
 }

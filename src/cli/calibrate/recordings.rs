@@ -10,7 +10,8 @@ use crate::cli::output::{refuse_existing, tell, write_new};
 use crate::cli::records::{ReplayedRun, position_at, replay_run};
 use crate::cli::stage::{load_stage, perform, sensor_off_axis};
 use crate::cli::tracker::{Listener, listen};
-use crate::tracker::{Event, Gate};
+use crate::geometry::Pose;
+use crate::tracker::{Event, Gate, Registration};
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::collections::VecDeque;
@@ -125,10 +126,12 @@ fn place(line: &str) -> Option<[f64; 3]> {
     numbers?.try_into().ok()
 }
 
-/// The mean position of the first second in which the tool rests. Says once that it waits for that.
+/// The mean position of the tip, in the tracker's frame, of the first second in which the tool rests. Says
+/// once that it waits for that.
 fn at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
     let begun = listener.now();
     let limit_mm = STILL_SDS * listener.config.tracker.to_track().noise_sd_mm;
+    let tip = Registration::new(Pose::identity()).with_tip(listener.config.tracker.x_sb());
     let mut rest = Rest { begun, window: VecDeque::new() };
     let mut moved_mm = None;
     while let Some(event) = listener.next(begun + WAIT_MAX) {
@@ -136,7 +139,8 @@ fn at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
         if !Gate::is_measurement(&sample) {
             continue;
         }
-        let Some((mean_mm, sd_mm)) = rest.take(sample.receive_time, sample.position_mm) else {
+        let tip_mm = tip.tip_mm(&sample).map_err(|refusal| refusal.to_string())?;
+        let Some((mean_mm, sd_mm)) = rest.take(sample.receive_time, tip_mm) else {
             continue;
         };
         if sd_mm <= limit_mm {
