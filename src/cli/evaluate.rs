@@ -33,9 +33,9 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         score(observer.as_mut(), recording, &scoring).map_err(|error| error.to_string())
     };
     for Insertion { path, recording, .. } in &insertions {
-        if recording.has_constant_orientation() {
+        if recording.lacks_roll() {
             tell(format_args!(
-                "warning: {}: its orientations never change: no roll is scored",
+                "warning: {}: its orientations do not turn with the base: no roll is scored",
                 path.display()
             ));
         }

@@ -2,6 +2,7 @@
 
 use super::Failure;
 use super::arguments::{Configured, text_of};
+use super::output::tell;
 use super::perform::scene;
 use super::plan::mask_reader;
 use super::stage;
@@ -170,6 +171,19 @@ impl Insertions {
         let (configuration, files) = self.sorted()?;
         let config = Configured::new(configuration, self.set.iter().cloned().chain(more).collect());
         let config = config.load(Some(RECORDINGS_TOML))?;
+        let is_folder = |path: &&&Path| path.is_dir();
+        if let (None, Some(run)) = (configuration, files.iter().find(is_folder)) {
+            tell(format_args!(
+                "warning: judged with the needle, noises and mount of bench-config/recordings.toml; those of the \
+                 run itself: --config {}",
+                run.join(file::CONFIG).display()
+            ));
+        }
+        if config.tracker.tip_offset_mm != [0.0; 3] && !files.iter().all(|path| path.is_dir()) {
+            tell(
+                "warning: positions in a CSV file are taken as the tip's: tracker.tip_offset_mm is not added",
+            );
+        }
         let mut all: Vec<Insertion> = Vec::new();
         for path in files {
             let (text, recording) = insertion(path)?;

@@ -15,7 +15,7 @@ const FIGURES: [(&str, &str, &str, usize); 14] = [
     (OFF_PLANE, "off plane", "mm", 3),
     ("target_error_mm", "tip from the target at the end", "mm", 3),
     ("target_error_est_mm", "the same, as estimated", "mm", 3),
-    ("clearance_mm_min", "tip from an obstacle, least", "mm", 2),
+    ("clearance_mm_min", "tip from an obstacle, least, estimated", "mm", 2),
     ("settling_mm", "within 1 mm of the plane from", "mm", 1),
     ("steps", "steps", "", 0),
     ("steps_saturated", "steps in which the law saturated", "", 0),

@@ -129,7 +129,7 @@ struct Step {
 /// The rows of `recording` in the plane frame P, which is the tip frame at the first row.
 fn steps(recording: &Recording, mount: &Mount) -> Result<Vec<Step>, EvaluationError> {
     let first = &recording.rows[0];
-    let is_constant = recording.has_constant_orientation();
+    let lacks_roll = recording.lacks_roll();
     // R_PS0: the sensor's first orientation in the plane frame is the inverse of the mount.
     let r_ps = mount.r_sb.inverse() * first.rotation_true.unwrap_or_default().inverse();
     let (mut depth_mm, mut rotation_rad) = (0.0, first.rotation_meas_rad);
@@ -145,7 +145,7 @@ fn steps(recording: &Recording, mount: &Mount) -> Result<Vec<Step>, EvaluationEr
             let way = "way from the first position in mm";
             refused(NeedleError::too_large(way, position_mm.amax()))
         })?;
-        let rotation_true = row.rotation_true.filter(|_| !is_constant);
+        let rotation_true = row.rotation_true.filter(|_| !lacks_roll);
         let rotation_true = rotation_true.map(|rotation| r_ps * rotation * mount.r_sb);
         Ok(Step { increment, depth_mm, tip_meas, rotation_true })
     };
@@ -323,16 +323,16 @@ mod tests {
     fn orientations_that_never_change_are_not_scored() {
         let mount = Mount::new(Vector3::z(), Vector3::x()).unwrap();
         let mut recording = recording(&mount);
-        assert!(!recording.has_constant_orientation());
+        assert!(!recording.lacks_roll());
         for row in &mut recording.rows {
             row.rotation_true = Some(Rotation3::identity());
         }
-        assert!(recording.has_constant_orientation());
+        assert!(recording.lacks_roll());
         let mut observer = FiniteDifference::new(Needle::new(0.0125).unwrap(), 2.0).unwrap();
         let score = evaluate(&mut observer, &recording, &scoring(mount, 1.0, 8.0)).unwrap();
         assert!(score.roll_rms_deg.is_none() && score.position_rms_mm.is_some(), "{score:?}");
         recording.rows.iter_mut().for_each(|row| row.rotation_true = None);
-        assert!(!recording.has_constant_orientation(), "there are none");
+        assert!(!recording.lacks_roll(), "there are none");
     }
 
     /// An observer that counts its calls and always predicts the origin.

@@ -2,12 +2,16 @@
 
 use crate::table::{Table, TableError};
 use nalgebra::{Rotation3, Vector3};
+use std::f64::consts::TAU;
 
 /// The columns that a recording must have, in any order.
 const REQUIRED: [&str; 5] = ["insertion_mm", "rotation_rad", "x_mm", "y_mm", "z_mm"];
 
 /// Two orientations that differ by less are the same, rad.
 const SAME_MAX_RAD: f64 = 1e-3;
+/// A base that has turned by so much shows whether the orientations turn with it, rad: no needle bends by
+/// half of it, and no shaft holds back half of it.
+const TURNED_RAD: f64 = 2.5;
 
 /// One row of a recording, in the recording's own frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -56,15 +60,22 @@ impl Recording {
         }
     }
 
-    /// True if every row has the orientation of the first: a sensor in a needle that bends never does, so a
-    /// tracker without orientations has filled them in.
-    pub fn has_constant_orientation(&self) -> bool {
-        let first = self.rows[0].rotation_true;
+    /// True if the orientations hold no roll. A sensor of five degrees of freedom gives the heading alone, so
+    /// that its orientations do not turn with the base; a tracker without orientations may fill in one for
+    /// all rows.
+    pub fn lacks_roll(&self) -> bool {
+        let first = &self.rows[0];
+        let turns = self.rows.iter().filter_map(|row| {
+            let seen_rad = first.rotation_true?.angle_to(&row.rotation_true?);
+            let base_rad = (row.rotation_meas_rad - first.rotation_meas_rad).rem_euclid(TAU);
+            Some((seen_rad, base_rad.min(TAU - base_rad)))
+        });
+        let most =
+            |(seen, base): (f64, f64), turn: (f64, f64)| (seen.max(turn.0), base.max(turn.1));
+        let (seen_rad, base_rad) = turns.fold((0.0, 0.0), most);
         self.rows.len() > 1
-            && self.rows.iter().all(|row| {
-                let differs = |a: Rotation3<f64>| row.rotation_true.map(|b| a.angle_to(&b));
-                first.and_then(differs).is_some_and(|angle| angle < SAME_MAX_RAD)
-            })
+            && first.rotation_true.is_some()
+            && (seen_rad < SAME_MAX_RAD || (base_rad > TURNED_RAD && seen_rad < 0.5 * TURNED_RAD))
     }
 
     /// True if `other` is the same recording, on whatever lines of its file.
@@ -91,6 +102,33 @@ mod tests {
             Recording::parse(&format!("qw,qx,qy,qz,{HEADER}\n2,0,0,0,1,0.5,1,2,3")).unwrap();
         assert_eq!(posed.rows[0].rotation_true, Some(Rotation3::identity()));
         assert_eq!(posed.rows[0].position_meas_mm, Vector3::new(1.0, 2.0, 3.0));
+    }
+
+    /// The base turns by 20 degrees a mm, and a sensor with it, or not.
+    #[test]
+    fn orientations_that_do_not_turn_with_the_base_lack_roll() {
+        let recording = |depth_mm: u32, turns: f64| {
+            let row = |mm: u32| {
+                let (mm, bend_rad) = (f64::from(mm), f64::from(mm) / 122.0);
+                let roll = Rotation3::from_axis_angle(&Vector3::z_axis(), turns * 0.35 * mm);
+                RecordedRow {
+                    line: 1,
+                    insertion_meas_mm: mm,
+                    rotation_meas_rad: 0.35 * mm,
+                    position_meas_mm: Vector3::new(0.0, 0.0, mm),
+                    rotation_true: Some(
+                        Rotation3::from_axis_angle(&Vector3::x_axis(), bend_rad) * roll,
+                    ),
+                }
+            };
+            Recording { rows: (0..depth_mm).map(row).collect() }
+        };
+        assert!(recording(100, 0.0).lacks_roll());
+        assert!(!recording(100, 1.0).lacks_roll());
+        // The base has turned by too little to tell.
+        assert!(!recording(7, 0.0).lacks_roll());
+        // All but half a radian of the turn has come.
+        assert!(!recording(10, 0.85).lacks_roll());
     }
 
     #[test]
