@@ -5,7 +5,7 @@ use super::{CalibrationError, check_distances, mean, principal};
 use crate::geometry::{FixedAngles, Pose};
 use crate::math;
 use crate::table::{Table, TableError};
-use nalgebra::{Complex, Rotation3, SMatrix, SVector, Vector2, Vector3};
+use nalgebra::{Complex, Matrix2, Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 const POSITION: [&str; 4] = ["rotation_rad", "x_mm", "y_mm", "z_mm"];
@@ -64,6 +64,10 @@ pub struct TipFit {
     pub arc_rad: f64,
     /// A point of the axis in the tracker's frame: the circle's centre, mm.
     pub centre_mm: Vector3<f64>,
+    /// Standard error of the centre where it is least sure, mm, of positions with independent noise.
+    pub centre_sd_mm: f64,
+    /// The same of the direction, rad.
+    pub axis_sd_rad: f64,
     /// The needle's direction in the tracker's frame, a unit vector. The base turns right-handed about
     /// it.
     pub axis: Vector3<f64>,
@@ -151,6 +155,7 @@ impl TipFit {
                  {COHERENCE_MIN:.2}, 1 being exactly); is rotation_rad in rad, and is the needle in air"
             ));
         }
+        let (centre_sd_mm, axis_sd_rad) = circle.errors(&angles);
         let mount = SensorMount::of(samples, &circle);
         if let Some(tilt_rad) = mount.as_ref().map(|mount| mount.axis.angle(&Vector3::z()))
             && tilt_rad > FRAC_PI_2
@@ -167,6 +172,8 @@ impl TipFit {
             rms_mm,
             arc_rad,
             centre_mm: circle.centre_mm,
+            centre_sd_mm,
+            axis_sd_rad,
             axis: circle.normal,
             mount,
         })
@@ -230,6 +237,22 @@ struct Circle {
 }
 
 impl Circle {
+    /// Standard errors of a fit to points at `angles`: of the centre, mm, and of the normal, rad, each in
+    /// the direction in which it is largest. The distances from the circle in its plane determine centre
+    /// and radius, those from the plane its place and tilt.
+    fn errors(&self, angles: &[f64]) -> (f64, f64) {
+        let rows =
+            || angles.iter().map(|&angle| Vector3::new(math::cos(angle), math::sin(angle), 1.0));
+        let normal: Matrix3<f64> = rows().map(|row| row * row.transpose()).sum();
+        let of_both = normal.try_inverse().map_or(f64::INFINITY, |inverse| {
+            let directions: Matrix2<f64> = inverse.fixed_view::<2, 2>(0, 0).into();
+            directions.symmetric_eigenvalues().max().max(0.0)
+        });
+        let points = angles.len() as f64;
+        let sd = |rms_mm: f64| rms_mm * (of_both * points / (points - 3.0)).sqrt();
+        (sd(self.rms_mm.0), sd(self.rms_mm.1) / self.radius_mm)
+    }
+
     /// The least-squares circle within the least-squares plane of the points; `None` if the points
     /// are on a line.
     fn fit(points_mm: &[Vector3<f64>]) -> Option<Circle> {

@@ -171,6 +171,17 @@ impl Insertions {
         let (configuration, files) = self.sorted()?;
         let config = Configured::new(configuration, self.set.iter().cloned().chain(more).collect());
         let config = config.load(Some(RECORDINGS_TOML))?;
+        let mut all: Vec<Insertion> = Vec::new();
+        for &path in &files {
+            let (text, recording) = insertion(path)?;
+            if let Some(first) = all.iter().find(|other| other.recording.is_same(&recording)) {
+                let first = first.path.display();
+                let error =
+                    format!("the same recording as {first}: it would count twice, give each once");
+                return Err(Failure::in_file(path, error));
+            }
+            all.push(Insertion { path: path.to_owned(), text, recording });
+        }
         let is_folder = |path: &&&Path| path.is_dir();
         if let (None, Some(run)) = (configuration, files.iter().find(is_folder)) {
             tell(format_args!(
@@ -183,17 +194,6 @@ impl Insertions {
             tell(
                 "warning: positions in a CSV file are taken as the tip's: tracker.tip_offset_mm is not added",
             );
-        }
-        let mut all: Vec<Insertion> = Vec::new();
-        for path in files {
-            let (text, recording) = insertion(path)?;
-            if let Some(first) = all.iter().find(|other| other.recording.is_same(&recording)) {
-                let first = first.path.display();
-                let error =
-                    format!("the same recording as {first}: it would count twice, give each once");
-                return Err(Failure::in_file(path, error));
-            }
-            all.push(Insertion { path: path.to_owned(), text, recording });
         }
         Ok((config, all))
     }

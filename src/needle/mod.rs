@@ -17,4 +17,4 @@ pub use path::{Cut, InsertedPath};
 pub use reduction::{Fibre, Reduced};
 pub(crate) use torsion::{HALF_WIDTH, HALF_WIDTH_PER_MM, OFFSET};
 pub use torsion::{Play, Torsion, TorsionConfig};
-pub use two_arc::shortest_into_plane_mm;
+pub use two_arc::{approach_max_mm, shortest_into_plane_mm};

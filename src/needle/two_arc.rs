@@ -39,6 +39,13 @@ pub fn shortest_into_plane_mm(needle: &Needle, state: &Reduced) -> Option<f64> {
         .min_by(f64::total_cmp)
 }
 
+/// An upper bound of how much nearer to the plane a needle comes over `length_mm`, mm, that heads for the
+/// plane at `toward_rad`: it bends toward it all the way, and `sin(β + κ s) ≤ sin β + κ s`.
+pub fn approach_max_mm(needle: &Needle, toward_rad: f64, length_mm: f64) -> f64 {
+    length_mm * math::sin(toward_rad.clamp(-FRAC_PI_2, FRAC_PI_2))
+        + 0.5 * needle.curvature_per_mm() * length_mm.powi(2)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,9 +1,8 @@
 //! Whether an insertion can reach the plane, judged before the axes have power.
 
 use super::config::SessionConfig;
-use crate::needle::{Reduced, shortest_into_plane_mm};
+use crate::needle::{Reduced, approach_max_mm, shortest_into_plane_mm};
 use nalgebra::Vector3;
-use std::f64::consts::FRAC_PI_2;
 
 /// Standard deviations of the position and of the heading that are allowed in the run's favour.
 const SDS: f64 = 3.0;
@@ -33,8 +32,7 @@ pub(super) fn check_reach(config: &SessionConfig, tip_mm: &Vector3<f64>) -> Resu
     if let Some(goal) = &config.goal {
         let (off_mm, length_mm) = (tip_mm.x.abs(), goal.path.length_mm());
         let toward_rad = SDS * pitch_sd_rad - tip_mm.x.signum() * pitch_rad;
-        let mended_mm = length_mm * toward_rad.min(FRAC_PI_2).sin()
-            + 0.5 * config.needle.curvature_per_mm() * length_mm.powi(2);
+        let mended_mm = approach_max_mm(&config.needle, toward_rad, length_mm);
         let left_mm = off_mm - margin_mm - mended_mm;
         let tolerance_mm = goal.problem.tolerance_mm;
         return match left_mm <= tolerance_mm {

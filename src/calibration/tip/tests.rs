@@ -44,6 +44,31 @@ fn standing() -> Pose {
     }
 }
 
+/// Over little more than half a turn the direction is known half as well as over a whole one.
+#[test]
+fn the_standard_errors_are_those_that_noise_makes() {
+    let x_tw = standing();
+    let true_axis = x_tw.rotation * Vector3::z();
+    let mut axis_sds = Vec::new();
+    for turn_rad in [TAU, 1.15 * PI] {
+        let (mut centre, mut axis, mut told) = (0.0, 0.0, (0.0, 0.0));
+        for seed in 0..200 {
+            let samples = noisy(turned(&x_tw, &X_SB, turn_rad, 60), 0.05, seed);
+            let fit = TipFit::of(&samples, 0.5).expect("a circle");
+            let off_mm = fit.centre_mm - x_tw.translation;
+            centre += (off_mm - true_axis * true_axis.dot(&off_mm)).norm_squared();
+            axis += fit.axis.angle(&true_axis).powi(2);
+            told = (told.0 + fit.centre_sd_mm.powi(2), told.1 + fit.axis_sd_rad.powi(2));
+        }
+        // Both directions against the one that is the less sure.
+        for ratio in [(centre / told.0).sqrt(), (axis / told.1).sqrt()] {
+            assert!((0.9..1.6).contains(&ratio), "{ratio} at {turn_rad}");
+        }
+        axis_sds.push((told.1 / 200.0).sqrt());
+    }
+    assert!(axis_sds[1] > 1.5 * axis_sds[0], "{axis_sds:?}");
+}
+
 #[track_caller]
 fn refusal(samples: &[TurnSample]) -> String {
     TipFit::of(samples, 0.5).expect_err("refused").to_string()

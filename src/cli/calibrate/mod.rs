@@ -48,6 +48,10 @@ const NO_MOUNT: &str = "\
 # needle's axis cannot be taken off, and is left in the positions.
 ";
 
+/// Student's t at 95%, both sides, of 3 insertions and more: standard errors from so few are not sure themselves.
+const STUDENT_95: [f64; 8] = [4.3, 3.2, 2.8, 2.6, 2.4, 2.4, 2.3, 2.3];
+const STUDENT_MANY: f64 = 2.2;
+
 /// A good tracker's positions are nearer to their circle, mm.
 const RMS_MAX_MM: f64 = 0.5;
 
@@ -220,7 +224,8 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<ExitCode, Failure>
             "bend_axis": <[f64; 3]>::from(fit.bend.bend_axis),
         },
     });
-    output.give((include_str!("needle.txt"), context! {}), NEEDLE_HEADER, &overlay, &overlay)
+    let times = STUDENT_95.get(fit.insertions - 3).unwrap_or(&STUDENT_MANY);
+    output.give((include_str!("needle.txt"), context! { times }), NEEDLE_HEADER, &overlay, &overlay)
 }
 
 /// The rows of an insertion; every row must have an orientation.
@@ -320,6 +325,8 @@ fn tip(arguments: &TipArguments) -> Result<ExitCode, Failure> {
         "axis_tracker": <[f64; 3]>::from(fit.axis),
         "centre_tracker_mm": <[f64; 3]>::from(fit.centre_mm),
         "arc_deg": fit.arc_rad.to_degrees(),
+        "centre_sd_mm": fit.centre_sd_mm,
+        "axis_sd_deg": fit.axis_sd_rad.to_degrees(),
         "has_mount": fit.mount.is_some(),
     });
     let header = format!("{TIP_HEADER}{}\n", if fit.mount.is_some() { "" } else { NO_MOUNT });
