@@ -37,7 +37,8 @@ section! {
         /// The tip never leaves it; no clearance to its walls, mm.
         workspace_mm: WorkspaceConfig =>
             "{ min = [-50.0, -75.0, 0.0], max = [50.0, 75.0, 150.0] }";
-        /// The share of the needle's curvature that a plan leaves unused, for what is not known of it.
+        /// The share of the needle's curvature that a plan leaves unused, for what is not known of it; around
+        /// obstacles 0.15 loses few runs.
         curvature_margin: f64 [within(0.0, 0.9)] = 0.0;
         /// How many steps of the search a plan may take.
         expansions_max: u32 [within(1.0, 1e8)] = 2000000;

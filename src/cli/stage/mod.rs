@@ -200,16 +200,19 @@ impl Motion {
         given.flatten().collect()
     }
 
-    /// The words after `stage withdraw` that finish a withdrawal which went as far as `done`. `None` where
-    /// nothing is left to withdraw, and of another operation.
-    fn remaining(&self, done: &[Done]) -> Option<String> {
+    /// The words after `stage withdraw` that finish a withdrawal which went as far as `done`, and no farther
+    /// than `min_mm`. `None` where nothing is left to withdraw or the rest would be refused, and of another
+    /// operation.
+    fn remaining(&self, done: &[Done], min_mm: f64) -> Option<String> {
         let Motion::Withdraw { by, .. } = self else { return None };
         let Some(by_mm) = by.and_then(|by| by.along(Axis::Insertion).ok()) else {
             return Some(String::new());
         };
-        let moved_mm = done.iter().find_map(|done| Some(done.from? - done.to)).unwrap_or_default();
-        let left_mm = by_mm - moved_mm;
-        (left_mm >= 0.05).then(|| format!(" --by {left_mm:.1}mm"))
+        let moved = done.iter().find_map(|done| Some((done.from?, done.to)));
+        let (from_mm, to_mm) = moved.unwrap_or_default();
+        let left_mm = by_mm - (from_mm - to_mm);
+        let is_allowed = moved.is_none() || from_mm - by_mm >= min_mm;
+        (left_mm >= 0.05 && is_allowed).then(|| format!(" --by {left_mm:.1}mm"))
     }
 
     /// The key that an emulated stage needs besides, for this motion to show anything.
@@ -458,11 +461,12 @@ mod tests {
     fn the_rest_of_a_withdrawal_is_what_was_asked_for_and_not_done() {
         let rest = |line: &str, to: f64| {
             let done = Done { axis: Axis::Insertion, from: Some(30.0), to };
-            Motion::of(line).unwrap().remaining(&[done])
+            Motion::of(line).unwrap().remaining(&[done], -1.0)
         };
         assert_eq!(rest("withdraw --by 20mm", 24.5).as_deref(), Some(" --by 14.5mm"));
         assert_eq!(rest("withdraw --by 20mm", 10.01), None);
         assert_eq!(rest("withdraw", 24.5).as_deref(), Some(""), "to depth 0");
+        assert_eq!(rest("withdraw --by 32mm", 30.0), None, "was refused");
         assert_eq!(rest("jog --axis insertion --by=-20mm", 24.5), None);
     }
 }

@@ -96,7 +96,7 @@ fn summary(
             None => format!("{axis:<11} home, at {to:.3} {unit}"),
         }
     };
-    let rest = motion.remaining(done);
+    let rest = motion.remaining(done, config.stage.insertion.limits.min);
     let left = after_operation(config, path, rest.as_deref(), report);
     let lines: Vec<String> =
         done.iter().map(line).chain(left).chain([ending(config, report)]).collect();
