@@ -1,9 +1,8 @@
-"""Stands between a bench and its drives, each on a bus of its own, udp_multicast or SocketCAN, and changes
-what the drives say and what they are told.
+"""Stands between a bench and its drives, each on a udp_multicast bus of its own, and changes what the
+drives say and what they are told.
 
     can_relay.py --bench 239.75.1.1:43114 --drives 239.75.1.1:43113 \
         --rule 'node=1 from=4mm clear=0x0200' --rule 'node=2 from=4mm emcy=0x8611'
-    can_relay.py --bench vcan0 --drives vcan1 --rule 'node=1 from=4mm hold=0x000f'
 
 A rule is a list of KEY=VALUE: node, from and until, and one thing to do.
     from, until    a depth (4mm, as node 1 reports it, from where it was first), a time (2.5s, since
@@ -40,22 +39,8 @@ CONTROLWORD_CONFIRMED = bytes([0x60, 0x40, 0x60, 0x00, 0, 0, 0, 0])
 EMCY_REGISTER = 0x21
 
 
-class Interface:
-    """One side on SocketCAN; python-can hands no frame to the bus that sent it."""
-
-    def __init__(self, name):
-        self.receiver = can.Bus(interface="socketcan", channel=name)
-
-    def receive(self):
-        """The next frame; None if there is none."""
-        return self.receiver.recv(0)
-
-    def send(self, frame):
-        self.receiver.send(frame)
-
-
-class Group:
-    """One side on UDP: a socket that hears the group, and one of its own port to send from."""
+class Bus:
+    """One side: a socket that hears the group, and one of its own port to send from."""
 
     def __init__(self, address):
         group, port = address.split(":")
@@ -72,18 +57,18 @@ class Group:
         self.own_port = self.sender.getsockname()[1]
 
     def receive(self):
-        """The next frame; None for one that this relay sent."""
+        """The next datagram; None for one that this relay sent."""
         datagram, (_, port) = self.receiver.recvfrom(4096)
-        return None if port == self.own_port else unpack_message(datagram)
+        return None if port == self.own_port else datagram
 
-    def send(self, frame):
-        self.sender.sendto(pack_message(frame), self.destination)
+    def send(self, datagram):
+        self.sender.sendto(datagram, self.destination)
 
-
-def framed(cob_id, data):
-    return can.Message(
-        timestamp=time.time(), arbitration_id=cob_id, is_extended_id=False, data=data
-    )
+    def send_frame(self, cob_id, data):
+        frame = can.Message(
+            timestamp=time.time(), arbitration_id=cob_id, is_extended_id=False, data=data
+        )
+        self.send(pack_message(frame))
 
 
 @dataclass
@@ -190,7 +175,8 @@ class Relay:
             statusword = word
         return statusword
 
-    def from_drives(self, frame):
+    def from_drives(self, datagram):
+        frame = unpack_message(datagram)
         cob_id, data = frame.arbitration_id, bytes(frame.data)
         node, kind = cob_id & 0x7F, cob_id & 0x780
         if kind == TPDO1 and len(data) == 6:
@@ -199,16 +185,17 @@ class Relay:
                 self.moment.see_depth(counts)
             word = self.edited(node, statusword)
             if word != statusword:
-                return self.bench.send(framed(cob_id, struct.pack("<Hi", word, counts)))
+                return self.bench.send_frame(cob_id, struct.pack("<Hi", word, counts))
         elif kind == SDO_ANSWER and data.startswith(STATUSWORD_READ):
             (statusword,) = struct.unpack_from("<H", data, 4)
             word = struct.pack("<H", self.edited(node, statusword))
-            return self.bench.send(framed(cob_id, data[:4] + word + data[6:]))
+            return self.bench.send_frame(cob_id, data[:4] + word + data[6:])
         elif kind == EMCY and node != 0 and any(rule.drop for rule in self.rules_of(node)):
             return self.moment.say(node, f"emergency lost: {data.hex()}")
-        self.bench.send(frame)
+        self.bench.send(datagram)
 
-    def to_drives(self, frame):
+    def to_drives(self, datagram):
+        frame = unpack_message(datagram)
         cob_id, data = frame.arbitration_id, bytes(frame.data)
         node, kind = cob_id & 0x7F, cob_id & 0x780
         held = [rule.hold for rule in self.rules_of(node) if rule.hold is not None]
@@ -218,13 +205,13 @@ class Relay:
             self.tell_controlword(node, data, "RPDO", held)
             if held:
                 data = struct.pack("<H", held[-1]) + data[2:]
-                return self.drives.send(framed(cob_id, data))
+                return self.drives.send_frame(cob_id, data)
         elif kind == SDO_REQUEST and data.startswith(CONTROLWORD_WRITTEN):
             self.controlwords.pop((node, "SDO"), None)
             self.tell_controlword(node, data[4:6], "SDO", held)
             if held:
-                return self.bench.send(framed(SDO_ANSWER + node, CONTROLWORD_CONFIRMED))
-        self.drives.send(frame)
+                return self.bench.send_frame(SDO_ANSWER + node, CONTROLWORD_CONFIRMED)
+        self.drives.send(datagram)
 
     def tell_controlword(self, node, data, way, held):
         (word,) = struct.unpack_from("<H", data)
@@ -238,7 +225,7 @@ class Relay:
             if rule.emcy is not None and not rule.struck and rule.is_on(self.moment):
                 rule.struck = True
                 data = struct.pack("<HB5x", rule.emcy, EMCY_REGISTER)
-                self.bench.send(framed(EMCY + rule.node, data))
+                self.bench.send_frame(EMCY + rule.node, data)
                 self.moment.say(rule.node, f"emergency {rule.emcy:#06x}")
 
 
@@ -246,17 +233,15 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--bench", required=True, metavar="BUS", help="GROUP:PORT or an interface")
-    parser.add_argument("--drives", required=True, metavar="BUS")
+    parser.add_argument("--bench", required=True, metavar="GROUP:PORT")
+    parser.add_argument("--drives", required=True, metavar="GROUP:PORT")
     parser.add_argument("--rule", type=Rule.parse, action="append", default=[], metavar="RULE")
     parser.add_argument("--counts-per-mm", type=float, default=4646.0)
     args = parser.parse_args()
 
     ended = []
     signal.signal(signal.SIGINT, lambda *_: ended.append(True))
-    bench, drives = (
-        Group(bus) if ":" in bus else Interface(bus) for bus in (args.bench, args.drives)
-    )
+    bench, drives = Bus(args.bench), Bus(args.drives)
     moment = Moment(time.monotonic(), args.counts_per_mm)
     relay = Relay(bench, drives, args.rule, moment)
     ways = {bench.receiver: (bench, relay.to_drives), drives.receiver: (drives, relay.from_drives)}
@@ -265,9 +250,9 @@ def main():
         ready, _, _ = select.select(list(ways), [], [], 0.1)
         for receiver in ready:
             bus, hand_on = ways[receiver]
-            frame = bus.receive()
-            if frame is not None:
-                hand_on(frame)
+            datagram = bus.receive()
+            if datagram is not None:
+                hand_on(datagram)
             relay.strike()
     return 0
 
