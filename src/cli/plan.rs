@@ -10,6 +10,7 @@ use crate::plan::{
 };
 use crate::text::screen;
 use clap::Args;
+use flate2::read::MultiGzDecoder;
 use minijinja::context;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use nifti::{NiftiError, NiftiHeader, NiftiObject, RandomAccessNiftiVolume, ReaderOptions};
@@ -90,6 +91,7 @@ fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, 
     let [_, x, y, z, ..] = header.pixdim.map(f64::from);
     let spacing_mm = Vector3::new(x, y, z);
     let voxels = Mask::check(size, &spacing_mm)?;
+    check_length(path, &header, voxels)?;
     let image = ReaderOptions::new().read_file(path).map_err(|error| reason(&error))?;
     let image = image.into_volume();
     let mut at = vec![0; dim.len()];
@@ -114,6 +116,26 @@ fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, 
         );
     }
     Mask::new(size, spacing_mm, &occupied, &pose.to_pose()).map(Obstacle::Mask)
+}
+
+/// Refuses an image that holds more than its voxels, and one whose compressed bytes are damaged: it is not the
+/// one that its header speaks of.
+fn check_length(path: &Path, header: &NiftiHeader, voxels: usize) -> Result<(), String> {
+    let unreadable = |error: io::Error| reason(&NiftiError::Io(error));
+    let file = File::open(path).map_err(unreadable)?;
+    let is_compressed = path.extension().is_some_and(|extension| extension == "gz");
+    let image: Box<dyn Read> =
+        if is_compressed { Box::new(MultiGzDecoder::new(file)) } else { Box::new(file) };
+    let bits = u64::try_from(header.bitpix).unwrap_or_default() * voxels as u64;
+    let expected = f64::from(header.vox_offset) as u64 + bits / 8;
+    // Not farther than is needed: a compressed file may be of any length.
+    let length = io::copy(&mut image.take(expected + 1), &mut io::sink()).map_err(unreadable)?;
+    match length > expected {
+        true => Err(format!(
+            "the mask goes on after the {voxels} voxels of its header: is it cut, or the header another's?"
+        )),
+        false => Ok(()),
+    }
 }
 
 /// The CRC-32 of the file in `path`, read in pieces: a file that is no mask may be of any size.

@@ -17,6 +17,8 @@ pub struct Mask {
 impl Mask {
     /// The most voxels that a mask may have: 256 in each direction.
     pub const VOXELS_MAX: usize = 1 << 24;
+    /// Voxels that are smaller in any direction are not in mm.
+    const SPACING_MIN_MM: f64 = 0.01;
 
     /// The mask of `size` voxels, `spacing_mm` apart, of which those are `occupied` that are true, with
     /// the first coordinate running fastest. `x_pg` is the pose of its grid in the plane frame.
@@ -54,7 +56,7 @@ impl Mask {
     /// The number of voxels of a mask of this `size` and spacing.
     ///
     /// # Errors
-    /// Too many voxels or none; a spacing that is not over zero.
+    /// Too many voxels or none; a spacing under 0.01 mm.
     pub fn check(size: [usize; 3], spacing_mm: &Vector3<f64>) -> Result<usize, String> {
         let voxels = size.iter().try_fold(1usize, |product, count| product.checked_mul(*count));
         let voxels = voxels.unwrap_or(usize::MAX);
@@ -64,10 +66,12 @@ impl Mask {
                 "the mask has {x} x {y} x {z} voxels, allowed: 1 to {max} in all; crop or resample it"
             ));
         }
-        if !spacing_mm.iter().all(|mm| mm.is_finite() && *mm > 0.0) {
+        let least_mm = Self::SPACING_MIN_MM;
+        if !spacing_mm.iter().all(|mm| mm.is_finite() && *mm >= least_mm) {
             let [x, y, z] = (*spacing_mm).into();
             return Err(format!(
-                "the mask's voxels are {x} x {y} x {z} mm, allowed: over 0; set pixdim in its header"
+                "the mask's voxels are {x} x {y} x {z} mm, allowed: {least_mm} or more; set pixdim in its \
+                 header, in mm"
             ));
         }
         Ok(voxels)
@@ -257,8 +261,8 @@ mod tests {
             ]
             .join("\n"),
             @r"
-        the mask's voxels are 0 x 0 x 0 mm, allowed: over 0; set pixdim in its header
-        the mask's voxels are NaN x NaN x NaN mm, allowed: over 0; set pixdim in its header
+        the mask's voxels are 0 x 0 x 0 mm, allowed: 0.01 or more; set pixdim in its header, in mm
+        the mask's voxels are NaN x NaN x NaN mm, allowed: 0.01 or more; set pixdim in its header, in mm
         the mask has 9 values for 2 x 2 x 2 voxels
         the mask has 0 x 2 x 2 voxels, allowed: 1 to 16777216 in all; crop or resample it
         the mask has 512 x 512 x 400 voxels, allowed: 1 to 16777216 in all; crop or resample it

@@ -1,7 +1,10 @@
 //! `needle-bench plan`: what it prints, and what it refuses.
 
 use crate::support::program::{Scratch, needle_bench, refusals, repository};
+use flate2::Compression;
+use flate2::write::GzEncoder;
 use serde_json::Value;
+use std::io::Write;
 
 /// A target straight ahead with a ball in the way.
 const BALL: &str = "\
@@ -259,6 +262,8 @@ fn what_is_no_mask_is_refused() {
         turned,
         metres,
         two_sizes,
+        nifti([20, 10, 10], [1.0; 3], &[1; 2500]),
+        nifti([2, 2, 2], [0.001; 3], &[1; 8]),
         nifti([50, 50, 120], [1.0; 3], &[1; 300_000]),
     ];
     let mut screens = refusals(&scratch, &[&["check", "goal.toml"]]);
@@ -267,4 +272,24 @@ fn what_is_no_mask_is_refused() {
         screens += &refusals(&scratch, &[&["check", "goal.toml"]]);
     }
     insta::assert_snapshot!(screens);
+}
+
+/// A wrong checksum, and a file that was cut after its voxels.
+#[test]
+fn a_damaged_compressed_mask_is_refused() {
+    let scratch = Scratch::new();
+    scratch.write("goal.toml", &MASK.replace("mask.nii", "mask.nii.gz"));
+    let mut encoder = GzEncoder::new(Vec::new(), Compression::default());
+    encoder.write_all(&nifti([20, 10, 10], [1.0; 3], &[1; 2000])).unwrap();
+    let whole = encoder.finish().unwrap();
+    let mut damaged = whole.clone();
+    let checksum = whole.len() - 8;
+    damaged[checksum] ^= 1;
+    for (bytes, status) in [(&whole[..], 0), (&damaged, 2), (&whole[..checksum], 2)] {
+        std::fs::write(scratch.path().join("mask.nii.gz"), bytes).unwrap();
+        let said = needle_bench(&scratch, &["plan", "goal.toml"]);
+        assert_eq!(said.status, status, "{}{}", said.stdout, said.stderr);
+        let is_named = said.stderr.contains("mask.nii.gz: no NIfTI image can be read: ");
+        assert_eq!(is_named, status != 0, "{}", said.stderr);
+    }
 }
