@@ -352,7 +352,7 @@ impl Search<'_, '_> {
             tip_aims.and_then(|tip| tip.arc_then_straight_to(target_mm, *curvature_per_mm));
         let bent = tip_aims.and_then(|tip| tip.arc_to(target_mm));
         let bent = bent.filter(|arc| arc.curvature_per_mm <= *curvature_per_mm);
-        // Of two that cost the same the first is taken: the one that ends at the target.
+        // If two cost the same, the first wins: it ends at the target.
         let ways = [turning.map(|arcs| (0.0, arcs)), bent.map(|arc| (0.0, [arc, NO_ARC])), near];
         for (left_mm, rest) in ways.into_iter().flatten() {
             let whole_mm = length_mm + rest.iter().map(|arc| arc.length_mm).sum::<f64>();

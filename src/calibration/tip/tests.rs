@@ -60,7 +60,7 @@ fn the_standard_errors_are_those_that_noise_makes() {
             axis += fit.axis.angle(&true_axis).powi(2);
             told = (told.0 + fit.centre_sd_mm.powi(2), told.1 + fit.axis_sd_rad.powi(2));
         }
-        // Both directions against the one that is the less sure.
+        // The error has two directions; the standard error is that of the less certain one.
         for ratio in [(centre / told.0).sqrt(), (axis / told.1).sqrt()] {
             assert!((0.9..1.6).contains(&ratio), "{ratio} at {turn_rad}");
         }
