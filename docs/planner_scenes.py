@@ -37,6 +37,7 @@ kind = "target"
 position_mm = [0.0, {goal["x_mm"]}, {goal["y_mm"]}]
 tolerance_mm = {TOLERANCE_MM}
 clearance_mm = {MARGIN_MM}
+curvature_margin = 0.0
 workspace_mm = {{ min = [-1.0, 0.0, 0.0], max = [1.0, {SIDE_MM}, {SIDE_MM}] }}
 {obstacles}
 [needle]

@@ -1,12 +1,18 @@
 #!/usr/bin/env python3
 """How many targets can be reached in space while the roll at the start is not known?
 
-For depths in mm, prints how well the positions up to there tell the roll (RMS error of the posterior mean over
-draws: 20 positions a mm, position at the start not known, heading known to 12 degrees, curvature known, the needle
-bends one way), for uniform noise of +-1 mm and for Gaussian noise of the same variance, and the share of the targets
-that one arc of the full curvature still reaches within 1 mm: after bending in a direction drawn at random up to
-there, and after going straight, which tells nothing of the roll. Targets are drawn as
-`bench-config/target-study.toml` does with `goal.in_plane=false`. Turns of the base cost nothing here. Needs numpy.
+A method knows where the needle starts, its curvature, its yaw to 12 degrees and its pitch to 8 (as
+`bench-config/target-study.toml` tells the bench), and sees 20 positions a mm. It is given more than it can have:
+
+- It learns of the roll what a needle shows that bends one way all the time, which shows most, and yet it may bend as
+  it likes; its turns cost nothing and show nothing.
+- It knows the exact posterior of the roll, bends by the full curvature to where the posterior's mean has the target,
+  and goes straight while the posterior's resultant length is under a limit; the best of several limits counts.
+- After REVEALED_MM the roll is told to it, and one arc of the full curvature leads to the target.
+
+Prints how well the positions tell the roll (RMS error of the posterior's mean), and the share of the targets that
+are then reached within 1 mm and within 0.4 mm, for uniform noise of +-1 mm and for Gaussian noise of the same
+variance. Targets are drawn as `bench-config/target-study.toml` does with `goal.in_plane=false`. Needs numpy.
 docs/targets.md has what follows from it.
 """
 
@@ -16,67 +22,105 @@ import numpy as np
 
 from rotate_to_target import RADIUS_MM, draw_targets
 
-HALF_WIDTH_MM, POSITIONS_PER_MM, HEADING_SD = 1.0, 20, math.radians(12)
-SHARE_MAX, TOLERANCE_MM, TARGETS = 0.9, 1.0, 200_000
-DRAWS = 60
-ROLLS = np.radians(np.arange(-180, 180, 2))
-SLOPES = np.linspace(-4 * HEADING_SD, 4 * HEADING_SD, 801)
-SLOPE_PRIOR = np.exp(-((SLOPES / HEADING_SD) ** 2) / 2)
+HALF_WIDTH_MM, POSITIONS_PER_MM, HEADING_SDS = 1.0, 20, np.radians([12.0, 8.0])
+SHARE_MAX, TARGETS = 0.9, 2_000
+DRAWS, REVEALED_MM, SUBSTEPS = 400, 16, 4
+ROLLS = np.radians(np.arange(-180, 180, 3))
+SLOPES = np.linspace(-4, 4, 401)
+SLOPE_PRIOR = np.exp(-(SLOPES**2) / 2)
 
 
-def uniform_weights(s, positions, bends):
-    """For each bend of one axis: the prior of all slopes and starts that leave every error within the limit."""
-    residuals = positions[:, None] - SLOPES * s[:, None]
-    weights = []
-    for bend in bends:
-        errors = residuals - (bend * s**2 / 2 / RADIUS_MM)[:, None]
-        starts = 2 * HALF_WIDTH_MM - (errors.max(axis=0) - errors.min(axis=0))
-        weights.append(np.sum(SLOPE_PRIOR * starts.clip(0)))
-    return np.array(weights)
+class Uniform:
+    """Likelihood of uniform noise: 1 where every error is within the limit, else 0."""
+
+    def draw(self, random, count):
+        return random.uniform(-HALF_WIDTH_MM, HALF_WIDTH_MM, count)
+
+    def log_likelihood(self, errors_mm):
+        return np.where(np.abs(errors_mm).max(axis=0) <= HALF_WIDTH_MM, 0.0, -np.inf)
 
 
-def gaussian_weights(s, positions, bends):
-    """The same for Gaussian noise, by least squares with the prior of the slope as one more row."""
+class Gaussian:
+    """Likelihood of Gaussian noise with the variance of the uniform one."""
+
     sd_mm = HALF_WIDTH_MM / math.sqrt(3)
-    rows = np.vstack([np.stack([np.ones_like(s), s], axis=1) / sd_mm, [0, 1 / HEADING_SD]])
-    deflections = np.outer(s**2 / 2 / RADIUS_MM, bends)
-    targets = np.vstack([(positions[:, None] - deflections) / sd_mm, np.zeros(len(bends))])
-    left = targets - rows @ np.linalg.lstsq(rows, targets, rcond=None)[0]
-    squares = np.sum(left**2, axis=0)
-    return np.exp(-(squares - squares.min()) / 2)
+
+    def draw(self, random, count):
+        return random.normal(0.0, self.sd_mm, count)
+
+    def log_likelihood(self, errors_mm):
+        return -np.sum((errors_mm / self.sd_mm) ** 2, axis=0) / 2
 
 
-def roll_rms_deg(depth_mm, is_uniform, random):
-    s = np.arange(1, int(depth_mm * POSITIONS_PER_MM) + 1) / POSITIONS_PER_MM
-    sd_mm, squares = HALF_WIDTH_MM / math.sqrt(3), []
-    weights_of = uniform_weights if is_uniform else gaussian_weights
-    for _ in range(DRAWS):
-        roll, weights = random.uniform(-math.pi, math.pi), np.ones(len(ROLLS))
-        for component in (np.cos, np.sin):
-            path = random.normal(0, HEADING_SD) * s + component(roll) * s**2 / 2 / RADIUS_MM
-            noise = random.uniform(-HALF_WIDTH_MM, HALF_WIDTH_MM, len(s)) if is_uniform else random.normal(0, sd_mm, len(s))
-            weights *= weights_of(s, path + noise, component(ROLLS))
-        mean = np.sum(weights * np.exp(1j * (ROLLS - roll)))
-        squares.append(np.angle(mean) ** 2)
-    return math.degrees(math.sqrt(np.mean(squares)))
+def posterior_means(noise, random):
+    """The posterior's mean direction (complex; its length is the resultant length) after each mm, roll at 0."""
+    # Roll and slopes are drawn from the grid: the edge of the uniform noise would exclude what lies beside it.
+    true_roll = random.choice(ROLLS)
+    s = np.arange(1, REVEALED_MM * POSITIONS_PER_MM + 1) / POSITIONS_PER_MM
+    logs = np.zeros((2, len(ROLLS), len(SLOPES)))
+    parts, positions = [], []
+    for sd, component in zip(HEADING_SDS, (np.cos, np.sin)):
+        slope = sd * random.choice(SLOPES, p=SLOPE_PRIOR / SLOPE_PRIOR.sum())
+        path = slope * s + component(true_roll) * s**2 / 2 / RADIUS_MM
+        positions.append(path + noise.draw(random, len(s)))
+        parts.append((sd * SLOPES, component(ROLLS)))
+    means = []
+    for mm in range(REVEALED_MM):
+        now = slice(mm * POSITIONS_PER_MM, (mm + 1) * POSITIONS_PER_MM)
+        at = s[now, None, None]
+        weights = np.ones(len(ROLLS))
+        for log, (slopes, bends), seen in zip(logs, parts, positions):
+            errors = seen[now, None, None] - bends[:, None] * at**2 / 2 / RADIUS_MM - slopes * at
+            log += noise.log_likelihood(errors)
+            likelihood = np.exp(log - log.max()) @ SLOPE_PRIOR
+            weights *= likelihood
+        means.append(np.sum(weights * np.exp(1j * (ROLLS - true_roll))) / weights.sum())
+    return np.array(means)
 
 
-def reached(target, tip, heading):
-    """Share of the targets that one arc from a tip in the plane x = 0 reaches, its heading turned about x."""
-    x, y, z = (target - tip).T
-    c, s = math.cos(heading), math.sin(heading)
-    aside, ahead = np.hypot(x, c * y - s * z), s * y + c * z
-    return np.mean(np.hypot(RADIUS_MM - aside, ahead) >= RADIUS_MM - TOLERANCE_MM)
+def path_end(means, resultant_min):
+    """Tip and heading where the roll is told, for a target in the direction of y."""
+    tip, heading, ds = np.zeros(3), np.array([0.0, 0.0, 1.0]), 1.0 / SUBSTEPS
+    # Nothing is known over the first mm; what the nth mm tells is used over the next one.
+    for mean in np.concatenate([[0.0], means[:-1]]):
+        for _ in range(SUBSTEPS if abs(mean) > resultant_min else 0):
+            bend = np.array([mean.imag, mean.real, 0.0]) / abs(mean)
+            bend -= heading * (bend @ heading)
+            turned = heading + bend / np.linalg.norm(bend) * ds / RADIUS_MM
+            turned /= np.linalg.norm(turned)
+            tip, heading = tip + (heading + turned) / 2 * ds, turned
+        if abs(mean) <= resultant_min:
+            tip = tip + heading
+    return tip, heading
+
+
+def reached(target, tip, heading, tolerance_mm):
+    """Share of the targets that one arc and a straight from there reach."""
+    apart = target - tip
+    ahead = apart @ heading
+    aside = np.linalg.norm(apart - ahead[:, None] * heading, axis=1)
+    return np.mean(np.hypot(RADIUS_MM - aside, ahead) >= RADIUS_MM - tolerance_mm)
 
 
 target = draw_targets(TARGETS, SHARE_MAX, np.random.default_rng(1))
-for depth_mm in (4, 6, 8, 10, 12, 14, 16):
-    angle = depth_mm / RADIUS_MM
-    arc_end = RADIUS_MM * np.array([0, 1 - math.cos(angle), math.sin(angle)])
-    bent, straight = reached(target, arc_end, angle), reached(target, [0, 0, depth_mm], 0.0)
-    uniform, gaussian = (roll_rms_deg(depth_mm, kind, np.random.default_rng(2)) for kind in (True, False))
-    print(
-        f"{depth_mm} mm: roll to {uniform:.0f} degrees (Gaussian noise: {gaussian:.0f}); "
-        f"{bent:.1%} after a bend, {straight:.1%} straight",
-        flush=True,
-    )
+aside = np.linalg.norm(target[:, :2], axis=1)
+target = np.column_stack([np.zeros(TARGETS), aside, target[:, 2]])
+for noise in (Uniform(), Gaussian()):
+    random = np.random.default_rng(2)
+    draws = [posterior_means(noise, random) for _ in range(DRAWS)]
+    rms = np.sqrt(np.mean(np.angle(np.array(draws)) ** 2, axis=0))
+    for mm in range(4, REVEALED_MM + 1, 2):
+        print(f"{type(noise).__name__}: after {mm} mm the roll is known to {math.degrees(rms[mm - 1]):.0f} degrees")
+    best = {}
+    for resultant_min in (0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9):
+        ends = [path_end(means, resultant_min) for means in draws]
+        for tolerance_mm in (1.0, 0.4):
+            shares = [reached(target, *end, tolerance_mm) for end in ends]
+            mean, error = np.mean(shares), np.std(shares) / math.sqrt(DRAWS)
+            best[tolerance_mm] = max(best.get(tolerance_mm, (0.0, 0.0, 0.0)), (mean, error, resultant_min))
+    for tolerance_mm, (mean, error, resultant_min) in best.items():
+        print(
+            f"{type(noise).__name__}: {mean:.1%} (standard error {error:.1%}) within {tolerance_mm} mm, "
+            f"straight under a resultant length of {resultant_min}",
+            flush=True,
+        )

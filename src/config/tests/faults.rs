@@ -44,7 +44,7 @@ fn every_kind_is_taken_with_what_it_needs() {
         "kind = \"delay\", delay_ms = 1",
         "kind = \"duplicate\"",
         "kind = \"reorder\"",
-        "kind = \"corrupt\", byte = 2",
+        "kind = \"corrupt\", byte = 1, mask = 2",
         "kind = \"resize\", length = 5",
         "kind = \"silent\"",
         "kind = \"restart\"",

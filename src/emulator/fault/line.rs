@@ -94,15 +94,15 @@ impl FaultyLine {
 }
 
 impl Fault {
-    /// `frame` with a byte inverted, or of another length: cut off, or filled up with zeros.
+    /// `frame` with bits of a byte inverted, or of another length: cut off, or filled up with zeros.
     fn applied_to(&self, frame: &Frame) -> Frame {
         let (mut data, mut len) = ([0; 8], frame.data().len());
         data[..len].copy_from_slice(frame.data());
         match self.kind {
             FaultKind::Resize => len = usize::from(self.length.unwrap_or(0).min(8)),
             _ => {
-                let byte = usize::from(self.byte.unwrap_or(0));
-                data[..len].iter_mut().skip(byte).take(1).for_each(|byte| *byte = !*byte);
+                let (byte, mask) = (self.byte.unwrap_or(0), self.mask.unwrap_or(u8::MAX));
+                data[..len].iter_mut().skip(byte.into()).take(1).for_each(|byte| *byte ^= mask);
             }
         }
         Frame::from_parts(frame.id(), frame.is_remote(), &data[..len]).unwrap_or(*frame)
@@ -173,6 +173,8 @@ mod tests {
         assert_eq!(second(corrupt(None)), [0xFE, 0xFF]);
         assert_eq!(second(corrupt(Some(1))), [1, 0x00]);
         assert_eq!(second(corrupt(Some(2))), [1, 0xFF]);
+        let bit_9 = Fault { mask: Some(0x02), ..corrupt(Some(1)) };
+        assert_eq!(second(bit_9), [1, 0xFD]);
         assert_eq!(second(resize(Some(1))), [1]);
         assert_eq!(second(resize(Some(8))), [1, 0xFF, 0, 0, 0, 0, 0, 0]);
     }

@@ -37,8 +37,11 @@ section! {
         count: Option<u32> [within(1.0, u32::MAX as f64)];
         /// Of "delay": how late the frames are; with frames = "sdo" a slow server.
         delay as "delay_ms": Option<Duration> [over(0.0, 60_000.0)];
-        /// Of "corrupt": the byte that is inverted, from 0; left out, the first.
+        /// Of "corrupt": the byte that is changed, from 0; left out, the first.
         byte: Option<u8> [within(0.0, 7.0)];
+        /// Of "corrupt": the bits of that byte that are inverted; left out, all. With frames = "pdo", byte = 1 and
+        /// mask = 2 a drive shows bit 9 of its statusword inverted.
+        mask: Option<u8> [within(1.0, 255.0)];
         /// Of "resize": bytes.
         length: Option<u8> [within(0.0, 8.0)];
         /// Of "drive-fault": its emergency code.
@@ -65,7 +68,7 @@ choice! {
         Duplicate = "duplicate",
         /// Frames come after the next.
         Reorder = "reorder",
-        /// A byte of frames is inverted.
+        /// A byte of frames is changed.
         Corrupt = "corrupt",
         /// Frames have another length.
         Resize = "resize",
@@ -287,7 +290,7 @@ impl FaultKind {
                 &["axis", "frames", "toward", "count"]
             }
             FaultKind::Delay => &["axis", "frames", "toward", "count", "delay_ms"],
-            FaultKind::Corrupt => &["axis", "frames", "toward", "count", "byte"],
+            FaultKind::Corrupt => &["axis", "frames", "toward", "count", "byte", "mask"],
             FaultKind::Resize => &["axis", "frames", "toward", "count", "length"],
             FaultKind::DriveFault => &["axis", "code"],
             FaultKind::Foreign => &["frame", "period_ms"],
