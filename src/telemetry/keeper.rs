@@ -9,17 +9,18 @@ use super::TelemetryError;
 use super::folder::{self, Identity, check_not_full};
 use super::worker::{Backpressure, Left, Sink, Worker};
 use crate::archive::{Manifest, file};
+use rtrb::{Consumer, Producer, RingBuffer};
 use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io;
 use std::path::PathBuf;
-use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
 
 /// The keeper's name in messages.
 pub(super) const KEEPER: &str = "run folder";
 /// Manifests that wait to be written: one when the drives are known.
 const QUEUE_MANIFESTS: usize = 8;
+const QUEUE_TROUBLES: usize = 64;
 
 /// A file of the folder by its name, to check while the writer writes to it.
 pub(super) type Kept = (&'static str, File);
@@ -32,8 +33,8 @@ pub(super) type Kept = (&'static str, File);
 pub(super) fn keep(
     dir: PathBuf,
     files: Vec<Kept>,
-) -> Result<(Worker<Box<Manifest>>, Receiver<String>), TelemetryError> {
-    let (told, troubles) = channel();
+) -> Result<(Worker<Box<Manifest>>, Consumer<String>), TelemetryError> {
+    let (told, troubles) = RingBuffer::new(QUEUE_TROUBLES);
     let folder = Folder::open(dir, files, told)?;
     let worker = Worker::start(KEEPER, QUEUE_MANIFESTS, Backpressure::DropAndCount, || Ok(folder))?;
     Ok((worker, troubles))
@@ -48,13 +49,17 @@ struct Folder {
     checks: usize,
     /// Troubles so far.
     known: BTreeSet<String>,
-    told: Sender<String>,
+    told: Producer<String>,
     /// Those that the last manifest did not have.
     added: Vec<String>,
 }
 
 impl Folder {
-    fn open(dir: PathBuf, files: Vec<Kept>, told: Sender<String>) -> Result<Self, TelemetryError> {
+    fn open(
+        dir: PathBuf,
+        files: Vec<Kept>,
+        told: Producer<String>,
+    ) -> Result<Self, TelemetryError> {
         let found = fs::metadata(&dir).map_err(TelemetryError::file(&dir))?;
         let (identity, known, added) = (Identity::of(&found), BTreeSet::new(), Vec::new());
         Ok(Folder { dir, identity, files, checks: 0, known, told, added })
@@ -81,7 +86,7 @@ impl Folder {
     fn tell(&mut self, troubles: impl IntoIterator<Item = TelemetryError>) {
         for trouble in troubles.into_iter().map(|trouble| trouble.to_string()) {
             if self.known.insert(trouble.clone()) {
-                let _ = self.told.send(trouble);
+                let _ = self.told.push(trouble);
             }
         }
     }
@@ -153,10 +158,11 @@ mod tests {
     use crate::telemetry::tests::Scratch;
     use std::path::Path;
     use std::thread;
+    use std::time::Instant;
 
     fn folder(dir: &Path) -> Folder {
         let files = vec![(file::STEPS, File::create(dir.join(file::STEPS)).unwrap())];
-        Folder::open(dir.to_path_buf(), files, channel().0).unwrap()
+        Folder::open(dir.to_path_buf(), files, RingBuffer::new(1).0).unwrap()
     }
 
     fn said(folder: &mut Folder) -> Vec<String> {
@@ -215,8 +221,17 @@ mod tests {
         let dir = scratch.0.join("run");
         fs::create_dir(&dir).unwrap();
         let file = File::create(dir.join(file::STEPS)).unwrap();
-        let (keeper, troubles) = keep(dir.clone(), vec![(file::STEPS, file)]).unwrap();
-        let next = || troubles.recv_timeout(Duration::from_secs(60)).unwrap();
+        let (keeper, mut troubles) = keep(dir.clone(), vec![(file::STEPS, file)]).unwrap();
+        let mut next = || {
+            let end = Instant::now() + Duration::from_secs(60);
+            loop {
+                match troubles.pop() {
+                    Ok(trouble) => break trouble,
+                    Err(_) => assert!(Instant::now() < end, "no trouble"),
+                }
+                thread::yield_now();
+            }
+        };
         fs::remove_file(dir.join(file::STEPS)).unwrap();
         assert!(next().contains("steps.csv: No such file"));
         fs::rename(&dir, scratch.0.join("moved")).unwrap();
@@ -225,6 +240,6 @@ mod tests {
         while keeper.vitals.beats() < beats + 3 {
             thread::yield_now();
         }
-        assert!(troubles.try_recv().is_err());
+        assert!(troubles.is_empty());
     }
 }

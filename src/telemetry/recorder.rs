@@ -9,10 +9,10 @@ use super::{Entry, Scene, TelemetryError, folder, utc_text};
 use crate::archive::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex, unix_us_of,
 };
+use rtrb::Consumer;
 use std::fs::{self, File};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant, SystemTime};
 
 /// Entries the queue holds: about half a minute of a run at 10 ms SYNC, 3 s at 1 ms.
@@ -44,7 +44,7 @@ pub struct Recorder {
     live: Option<Worker<Entry>>,
     keeper: Worker<Box<Manifest>>,
     /// Troubles that the keeper found.
-    troubles: Receiver<String>,
+    troubles: Consumer<String>,
     watches: [Watch; 2],
     faults: Vec<String>,
     /// Tells other processes that the folder is being written.
@@ -145,7 +145,7 @@ impl Recorder {
             .look(&self.text.vitals, self.text.dropped(), now)
             .or_else(|| keeper.look(&self.keeper.vitals, 0, now))
             .or_else(|| {
-                let trouble = format!("{KEEPER}: {}", self.troubles.try_recv().ok()?);
+                let trouble = format!("{KEEPER}: {}", self.troubles.pop().ok()?);
                 Some(RecordNews::Failed(TelemetryError::Recording(trouble)))
             })?;
         if let RecordNews::Failed(error) = &news {

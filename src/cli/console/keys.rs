@@ -3,9 +3,9 @@
 use super::screen::Setup;
 use super::{Shared, lock};
 use crate::session::OperatorCommand;
+use rtrb::Producer;
 use std::mem;
 use std::sync::atomic::Ordering;
-use std::sync::mpsc::SyncSender;
 
 const CTRL_C: u8 = 3;
 const ESCAPE: u8 = 27;
@@ -27,7 +27,7 @@ impl Keys {
         &mut self,
         pressed: &[u8],
         shared: &Shared,
-        commands: &SyncSender<OperatorCommand>,
+        commands: &mut Producer<OperatorCommand>,
     ) {
         self.pending.extend(pressed);
         // Of the keys + and − that came together.
@@ -48,7 +48,7 @@ impl Keys {
         &self,
         key: u8,
         shared: &Shared,
-        commands: &SyncSender<OperatorCommand>,
+        commands: &mut Producer<OperatorCommand>,
         speed_mm_per_s: &mut Option<f64>,
     ) {
         let is_over = shared.is_over.load(Ordering::Relaxed);
@@ -65,7 +65,7 @@ impl Keys {
             key if is_over => press_at_end(key, shared),
             key => {
                 let Some(command) = command(key, shared, speed_mm_per_s) else { return };
-                if commands.try_send(command).is_err() {
+                if commands.push(command).is_err() {
                     shared.dropped.fetch_add(1, Ordering::Relaxed);
                 }
             }

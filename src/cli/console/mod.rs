@@ -29,6 +29,7 @@ use ratatui::crossterm::terminal::{
     EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
 };
 use ratatui::layout::Rect;
+use rtrb::{Consumer, Producer, RingBuffer};
 use std::fs::File;
 use std::io::{BufWriter, IsTerminal, Read, Stderr, Write, stderr};
 use std::os::fd::AsFd;
@@ -102,7 +103,8 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 pub(super) struct Console {
     shared: Arc<Shared>,
     messages: SyncSender<Message>,
-    commands: Receiver<OperatorCommand>,
+    /// A preempted writer of this ring never makes its reader wait (docs/decisions/0018-tracker-queue.md).
+    commands: Consumer<OperatorCommand>,
     /// Closed when the terminal is given back.
     drawn: Receiver<()>,
 }
@@ -127,7 +129,7 @@ impl Console {
         let shared = Arc::new(Shared::new(Setup::of(config), interrupt));
         let terminal = take_terminal()?;
         let (messages, queue) = sync_channel(QUEUE);
-        let (orders, commands) = sync_channel(COMMANDS);
+        let (mut orders, commands) = RingBuffer::new(COMMANDS);
         let (drawing, drawn) = sync_channel::<()>(0);
         let (seen, shown) = (Arc::clone(&shared), Arc::clone(&shared));
         let spawn = |name: &str, serve: Box<dyn FnOnce() + Send>| {
@@ -144,7 +146,7 @@ impl Console {
                 drop(drawing);
             }),
         )?;
-        spawn("console-keys", Box::new(move || serve_keys(keys, &seen, &queue, &orders)))?;
+        spawn("console-keys", Box::new(move || serve_keys(keys, &seen, &queue, &mut orders)))?;
         Ok(Console { shared, messages, commands, drawn })
     }
 
@@ -214,11 +216,11 @@ impl Operator for Console {
     fn command(&mut self) -> Option<OperatorCommand> {
         if self.shared.hold.swap(false, Ordering::Relaxed) {
             // Commands from before the hold are dropped, and those that came together with it.
-            let void = self.commands.try_iter().count() as u64;
+            let void = std::iter::from_fn(|| self.commands.pop().ok()).count() as u64;
             self.shared.dropped.fetch_add(void, Ordering::Relaxed);
             return Some(OperatorCommand::Hold);
         }
-        self.commands.try_recv().ok()
+        self.commands.pop().ok()
     }
 }
 
@@ -307,7 +309,7 @@ fn serve_keys(
     mut keys: File,
     shared: &Shared,
     queue: &Receiver<Message>,
-    commands: &SyncSender<OperatorCommand>,
+    commands: &mut Producer<OperatorCommand>,
 ) {
     let mut pressed = [0; 64];
     let mut pending = Keys::default();

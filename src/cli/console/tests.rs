@@ -199,7 +199,7 @@ proptest! {
 fn a_console_that_stands_still_delays_nothing() {
     let shared = Arc::new(Shared::new(setup(), Interrupt::default()));
     let (messages, _queue) = sync_channel(2);
-    let (orders, commands) = sync_channel(COMMANDS);
+    let (mut orders, commands) = RingBuffer::new(COMMANDS);
     let (_, drawn) = sync_channel(0);
     let mut console = Console { shared: Arc::clone(&shared), messages, commands, drawn };
     let _held_by_another = lock(&shared.latest);
@@ -208,10 +208,10 @@ fn a_console_that_stands_still_delays_nothing() {
         console.progress(Progress::default());
     }
     assert_eq!(shared.dropped.load(Ordering::Relaxed), 3);
-    Keys::default().take(b"rrs++---rrrr", &shared, &orders);
+    Keys::default().take(b"rrs++---rrrr", &shared, &mut orders);
     assert_eq!(shared.dropped.load(Ordering::Relaxed), 3 + 4);
     assert_eq!(console.command(), Some(OperatorCommand::Resume));
-    Keys::default().take(b" ", &shared, &orders);
+    Keys::default().take(b" ", &shared, &mut orders);
     assert_eq!(console.command(), Some(OperatorCommand::Hold));
     assert_eq!(console.command(), None);
 }
@@ -219,12 +219,15 @@ fn a_console_that_stands_still_delays_nothing() {
 #[test]
 fn keys_are_commands_and_escape_sequences_are_none() {
     let shared = Shared::new(setup(), Interrupt::default());
-    let (orders, commands) = sync_channel(COMMANDS);
+    let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
     lock(&shared.screen).progress.speed_mm_per_s = 1.0;
     let mut keyboard = Keys::default();
     let mut asked = |keys: &[u8]| {
-        keyboard.take(keys, &shared, &orders);
-        commands.try_iter().map(|command| command.to_string()).collect::<Vec<_>>().join(", ")
+        keyboard.take(keys, &shared, &mut orders);
+        std::iter::from_fn(|| commands.pop().ok())
+            .map(|command| command.to_string())
+            .collect::<Vec<_>>()
+            .join(", ")
     };
     assert_eq!(asked(b"rs-"), "resume, step of 1 mm, speed 0.800 mm/s");
     // Those that come together add up.
@@ -254,12 +257,12 @@ fn keys_are_commands_and_escape_sequences_are_none() {
 #[test]
 fn a_paste_holds_and_stops_and_lets_nothing_go_on() {
     let shared = Shared::new(setup(), Interrupt::default());
-    let (orders, commands) = sync_channel(COMMANDS);
+    let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
     let mut keyboard = Keys::default();
     let mut asked = |keys: &[u8]| {
-        keyboard.take(keys, &shared, &orders);
+        keyboard.take(keys, &shared, &mut orders);
         let is_held = shared.hold.swap(false, Ordering::Relaxed);
-        (commands.try_iter().count(), is_held)
+        (std::iter::from_fn(|| commands.pop().ok()).count(), is_held)
     };
     assert_eq!(asked(b"\x1b[200~rs+"), (0, false));
     assert_eq!(asked(b"r\nr \x1b[20"), (0, true));
@@ -326,14 +329,14 @@ fn every_key_is_named_at_any_width() {
 #[test]
 fn a_speed_at_its_limit_is_refused_on_the_screen() {
     let shared = Shared::new(setup(), Interrupt::default());
-    let (orders, commands) = sync_channel(COMMANDS);
+    let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
     for (key, speed_mm_per_s, asked) in
         [(b"+", 2.0, "speed 2.200 mm/s"), (b"-", 0.2, "speed 0.000 mm/s")]
     {
         *lock(&shared.screen) = inserted();
         lock(&shared.screen).progress.speed_mm_per_s = speed_mm_per_s;
-        Keys::default().take(key, &shared, &orders);
-        assert_eq!(commands.try_recv().expect("a command").to_string(), asked);
+        Keys::default().take(key, &shared, &mut orders);
+        assert_eq!(commands.pop().expect("a command").to_string(), asked);
         let refused = format!("operator: {asked} refused: allowed: over 0 and up to 2 mm/s");
         lock(&shared.screen).event(at(20.0), Lane::Session, Severity::Warning, &refused);
         for size in [(80, 24), (120, 3)] {
@@ -347,11 +350,11 @@ fn a_speed_at_its_limit_is_refused_on_the_screen() {
 #[test]
 fn a_speed_asked_for_at_once_counts_from_the_highest() {
     let shared = Shared::new(setup(), Interrupt::default());
-    let (orders, commands) = sync_channel(COMMANDS);
+    let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
     *lock(&shared.screen) = inserted();
     lock(&shared.screen).progress.speed_mm_per_s = 0.0;
-    Keys::default().take(b"-", &shared, &orders);
-    assert_eq!(commands.try_recv().expect("a command").to_string(), "speed 1.800 mm/s");
+    Keys::default().take(b"-", &shared, &mut orders);
+    assert_eq!(commands.pop().expect("a command").to_string(), "speed 1.800 mm/s");
 }
 
 /// The bytes that a terminal gets.
@@ -508,10 +511,10 @@ fn the_needle_is_withdrawn_after_a_w_and_a_y() {
         let shared = Shared::new(setup(), Interrupt::default());
         let left = can_withdraw.then(|| "to depth 0".to_owned());
         lock(&shared.screen).left = Some(left.ok_or_else(|| "it is out".to_owned()));
-        let (orders, commands) = sync_channel(COMMANDS);
+        let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
         shared.is_over.store(true, Ordering::Relaxed);
-        Keys::default().take(keys, &shared, &orders);
-        assert_eq!(commands.try_recv().ok(), None, "nothing is left to command");
+        Keys::default().take(keys, &shared, &mut orders);
+        assert_eq!(commands.pop().ok(), None, "nothing is left to command");
         [&shared.wants_withdrawal, &shared.is_leaving].map(|flag| flag.load(Ordering::Relaxed))
     };
     assert_eq!(pressed(b"wy", true), [true, true]);
@@ -543,7 +546,7 @@ fn why_a_needle_is_not_withdrawn_is_on_the_screen() {
 fn a_drawing_thread_that_panics_gives_the_terminal_back() {
     let shared = Arc::new(Shared::new(setup(), Interrupt::default()));
     let (messages, queue) = sync_channel(2);
-    let (orders, commands) = sync_channel(COMMANDS);
+    let (mut orders, commands) = RingBuffer::new(COMMANDS);
     let (drawing, drawn) = sync_channel::<()>(0);
     let (keyboard, mut pressed) = {
         let (read, write) = nix::unistd::pipe().expect("a pipe");
@@ -558,7 +561,7 @@ fn a_drawing_thread_that_panics_gives_the_terminal_back() {
     assert!(died.join().is_err());
     assert!(!TAKEN.load(Ordering::Relaxed), "the terminal is given back");
     let seen = Arc::clone(&shared);
-    let keys = thread::spawn(move || serve_keys(keyboard, &seen, &queue, &orders));
+    let keys = thread::spawn(move || serve_keys(keyboard, &seen, &queue, &mut orders));
     let mut console = Console { shared: Arc::clone(&shared), messages, commands, drawn };
     pressed.write_all(b" ").expect("a key");
     let hold = std::iter::from_fn(|| {
