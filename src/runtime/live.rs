@@ -138,11 +138,15 @@ impl<'a, W: Witness> Live<'a, W> {
 
     /// Takes a portion of what the tracker's link says, and none of it once a deadline is due.
     fn take_events(&mut self) {
-        let Some(link) = &mut self.tracker else { return };
         let now = self.clock.now();
-        if now.since(self.looked) >= LOOK_PERIOD {
-            (self.looked, self.counted) = (now, link.messages());
-            if let Some(event) = link.passed_over() {
+        if let Some(link) = &mut self.tracker
+            && now.since(self.looked) >= LOOK_PERIOD
+        {
+            let (messages, passed_over) = (link.messages(), link.passed_over());
+            // What came during a gap is counted from the look before it.
+            self.check_gap(self.session.deadline());
+            (self.looked, self.counted) = (now, messages);
+            if let Some(event) = passed_over {
                 self.give(Input::Tracker(event));
             }
         }

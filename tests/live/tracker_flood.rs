@@ -4,8 +4,10 @@
 //! between those of the tracker, over TCP or, as NDJSON, into the bench's standard input.
 #![cfg(target_os = "linux")]
 
+use crate::support::peers::hold;
 use crate::support::programs::{self, Ended, Program, Scratch, alone};
 use crate::support::udp_stage::Stage;
+use crate::udp_run::assert_no_set_point_after_the_gap;
 use needle_bench::tracker::openigtlink::{Body, Message, Quaternion, Status, encode};
 use needle_bench::tracker::{Event, Protocol, Reader};
 use needle_bench::units::Time;
@@ -220,6 +222,32 @@ fn its_own_tool_at_five_thousand_a_second_delays_no_sync() {
     let events = programs::read(&run.1.run_dir().join("events.log"));
     let told = events.matches("samples dropped so far: they come faster").count();
     assert!((1..20).contains(&told), "told at the first, and when there are twice as many: {told}");
+}
+
+/// The control thread does not run for two seconds while the tracker floods, as on a machine that has nothing left
+/// for it: the run ends with the flood as its likely cause, and sends no set-point any more.
+#[test]
+fn a_bench_that_a_flood_holds_up_names_it() {
+    let _alone = alone();
+    let scratch = Scratch::new("flood-named");
+    let stage = Stage::start(&[]);
+    let (period, duration) = (Duration::from_millis(1), Duration::from_secs(20));
+    let flood = Flood::of(position("StylusToTracker"), 100, period, duration);
+    let address = format!("tracker.address=\"{}\"", relay(stage.tracker(), flood));
+    let mut bench = scratch.bench(&[], &stage.settings(&[&SLOW[..], &[&address]].concat()));
+    bench.wait_for("enabling both axes");
+    thread::sleep(BEGINS_AFTER);
+    let Some(holder) = hold(&bench, "needle-bench") else { return };
+    thread::sleep(Duration::from_millis(2500));
+    holder.signal("INT");
+    holder.end().assert_status(0);
+    let ended = bench.end();
+    ended.assert_status(1);
+    let reason = ended.last_line();
+    assert!(reason.starts_with("stopped: bench: was held up for 2"), "{reason}");
+    assert!(reason.contains("by a flood from the tracker? "), "{reason}\n{}", ended.stderr);
+    stage.assert_it_stands();
+    assert_no_set_point_after_the_gap(&scratch.run_dir());
 }
 
 /// A name and a text that clear the screen and begin a line of their own.

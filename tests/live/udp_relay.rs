@@ -25,8 +25,13 @@ struct Seen {
 
 /// Runs 6 mm with `rules` and with `settings`; none without the peer.
 fn run(test: &str, rules: &[&str], settings: &[&str]) -> Option<Relayed> {
+    run_on(&[], test, rules, settings)
+}
+
+/// The same on a virtual stage with these arguments.
+fn run_on(stage: &[&str], test: &str, rules: &[&str], settings: &[&str]) -> Option<Relayed> {
     let _machine = beside_others();
-    let stage = Stage::start(&[]);
+    let stage = Stage::start(stage);
     // The group is this process's own, and so is the next port of it.
     let bench_side = SocketAddrV4::new(*stage.group.ip(), stage.group.port() + 1);
     let (bench_side, drives_side) = (bench_side.to_string(), stage.group.to_string());
@@ -90,6 +95,23 @@ fn an_emergency_of_a_drive_that_was_found_in_fault() {
         "emergency 0x8611",
         "stage: insertion: emergency 0x8611 following error (register 0x21)",
     );
+}
+
+/// A drive faults by itself. Its emergency message says why; where that is lost, its statusword says that it did.
+#[test]
+fn an_emergency_message_that_is_changed_or_lost_on_the_way() {
+    let fault = r#"emulator.fault=[{ at_mm = 4, kind = "drive-fault", axis = "insertion", code = 0x4210 }]"#;
+    for (rule, struck, reason) in [
+        ("node=1 edit=0x8611", "becomes", "stage: insertion: emergency 0x8611 following error"),
+        ("node=1 drop=emcy", "lost", "stage: insertion: drive in fault (statusword 0x021F"),
+    ] {
+        let Some(run) = run_on(&["--set", fault], "relay-edit", &[rule], &[]) else { return };
+        run.bench.assert_status(1);
+        let stop_reason = run.bench.json()["stop_reason"].as_str().unwrap().to_owned();
+        assert!(stop_reason.starts_with(reason), "{stop_reason}");
+        let then_mm = run.stands_at_mm - run.first(struck).depth_mm;
+        assert!((0.0..0.1).contains(&then_mm), "{then_mm}");
+    }
 }
 
 #[test]

@@ -13,6 +13,7 @@ use needle_bench::transport::udp::UdpBus;
 use serde_json::Value;
 use std::f64::consts::TAU;
 use std::io::Write;
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -200,24 +201,10 @@ fn wait_until_inserting(scratch: &Scratch) {
     }
 }
 
-/// The bench is suspended for longer than the drives bear: when it goes on no set-point leaves, only
-/// the stop, and the record of it replays.
-#[test]
-fn a_bench_that_was_suspended_sends_no_set_point_when_it_goes_on() {
-    let _machine = beside_others();
-    let scratch = Scratch::new("udp-suspended");
-    let stage = Stage::start(&[]);
-    let bench = scratch.bench(&[], &stage.settings(&["insertion.depth_mm=100", SLOW]));
-    wait_until_inserting(&scratch);
-    std::thread::sleep(Duration::from_secs(2));
-    bench.signal("STOP");
-    std::thread::sleep(Duration::from_millis(2500));
-    bench.signal("CONT");
-    let ended = bench.end();
-    ended.assert_status(1);
-    let reason = ended.last_line();
-    assert!(reason.starts_with("stopped: bench: was held up for 2"), "{reason}");
-    let can_log = programs::read(&scratch.run_dir().join("can.log"));
+/// The bench sent nothing for 2 s, and no set-point after that.
+#[track_caller]
+pub(crate) fn assert_no_set_point_after_the_gap(run_dir: &Path) {
+    let can_log = programs::read(&run_dir.join("can.log"));
     let sent: Vec<(f64, &str)> = can_log
         .lines()
         .filter(|line| line.ends_with('T'))
@@ -240,6 +227,26 @@ fn a_bench_that_was_suspended_sends_no_set_point_when_it_goes_on() {
             assert_eq!(controlword & (1 << 3), 0, "enabled after the gap: {frame}");
         }
     }
+}
+
+/// The bench is suspended for longer than the drives bear: when it goes on no set-point leaves, only
+/// the stop, and the record of it replays.
+#[test]
+fn a_bench_that_was_suspended_sends_no_set_point_when_it_goes_on() {
+    let _machine = beside_others();
+    let scratch = Scratch::new("udp-suspended");
+    let stage = Stage::start(&[]);
+    let bench = scratch.bench(&[], &stage.settings(&["insertion.depth_mm=100", SLOW]));
+    wait_until_inserting(&scratch);
+    std::thread::sleep(Duration::from_secs(2));
+    bench.signal("STOP");
+    std::thread::sleep(Duration::from_millis(2500));
+    bench.signal("CONT");
+    let ended = bench.end();
+    ended.assert_status(1);
+    let reason = ended.last_line();
+    assert!(reason.starts_with("stopped: bench: was held up for 2"), "{reason}");
+    assert_no_set_point_after_the_gap(&scratch.run_dir());
     stage.assert_it_stands();
     assert_it_replays(&scratch.run_dir());
 }
@@ -416,4 +423,51 @@ fn a_signal_during_the_preflight_lets_nothing_begin() {
     let said = ended.stderr.trim_end();
     assert!(said.ends_with("stopped: operator: interrupted; nothing has moved"), "{said}");
     assert!(!scratch.path("runs").exists(), "no record of a run that did not begin");
+}
+
+/// Ctrl-C at ten moments, from listening to inserting: the axes stand without power.
+#[test]
+fn ctrl_c_at_ten_moments() {
+    let _machine = beside_others();
+    let blind = ["tracker.tool=Another", "tracker.timeout_s=60"];
+    let moments = [
+        ("listening for another master", &blind[..], 0.0),
+        ("looking for the drive", &blind, 0.0),
+        ("checking its identity", &blind, 0.0),
+        ("writing the configured objects", &blind, 0.0),
+        ("mapping PDOs", &blind, 0.0),
+        ("setting its limits", &blind, 0.0),
+        ("configured, without power", &blind, 0.0),
+        ("enabling both axes", &[], 0.0),
+        ("enabling both axes", &[], 0.5),
+        ("enabling both axes", &[], 3.0),
+    ];
+    for (number, (said, settings, depth_mm)) in moments.into_iter().enumerate() {
+        let scratch = Scratch::new(&format!("udp-ctrl-c-{number}"));
+        let stage = Stage::start(&[]);
+        let mut witness = UdpBus::join(stage.group).unwrap();
+        let settings = [&[SLOW], settings].concat();
+        let mut bench = scratch.bench(&[], &stage.settings(&settings));
+        bench.wait_for(said);
+        let (mut reported_mm, end) = (0.0, Instant::now() + LONG);
+        while reported_mm < depth_mm {
+            assert!(Instant::now() < end, "{reported_mm} mm in, and no more");
+            if let Some(BusEvent::Frame(frame)) = witness.receive(LONG).unwrap()
+                && let (Some(0x181), &[_, _, a, b, c, d]) = (frame.cob_id(), frame.data())
+            {
+                reported_mm = f64::from(i32::from_le_bytes([a, b, c, d])) / COUNTS_PER_MM;
+            }
+        }
+        bench.signal("INT");
+        let bench = bench.end();
+        bench.assert_status(1);
+        assert_eq!(bench.last_line(), "stopped: operator: interrupted", "{said} {depth_mm}");
+        let stands_at_mm = stage.assert_it_stands();
+        println!("{said}, {depth_mm} mm: stands at {stands_at_mm:.3} mm");
+        let was_enabled = settings.len() == 1;
+        assert!(was_enabled || stands_at_mm.abs() < 0.001, "{said}: {stands_at_mm} mm");
+        assert_eq!(bench.stderr.contains("enabling both axes"), was_enabled, "{}", bench.stderr);
+        let manifest = programs::manifest(&scratch.run_dir());
+        assert_eq!(manifest["stop_reason"], "operator: interrupted");
+    }
 }

@@ -9,6 +9,7 @@ A rule is a list of KEY=VALUE: node, from and until, and one thing to do.
                    the relay began) or a number of SYNCs (1sync); always, where they are left out
     set, clear     these bits of the statusword, in TPDO1 and where it is read by SDO
     emcy           the node sends an emergency message with this code, once
+    edit           its emergency messages have this code instead of theirs
     drop=emcy      its emergency messages are lost
     hold           the drive is given this controlword, whatever it is sent; what is written by SDO is
                    confirmed and lost
@@ -121,6 +122,7 @@ class Rule:
     set: int = 0
     clear: int = 0
     emcy: int | None = None
+    edit: int | None = None
     drop: bool = False
     hold: int | None = None
     struck: bool = field(default=False, init=False)
@@ -134,6 +136,7 @@ class Rule:
             "set": ("set", number),
             "clear": ("clear", number),
             "emcy": ("emcy", number),
+            "edit": ("edit", number),
             "drop": ("drop", ["emcy"].index),
             "hold": ("hold", number),
         }
@@ -190,8 +193,13 @@ class Relay:
             (statusword,) = struct.unpack_from("<H", data, 4)
             word = struct.pack("<H", self.edited(node, statusword))
             return self.bench.send_frame(cob_id, data[:4] + word + data[6:])
-        elif kind == EMCY and node != 0 and any(rule.drop for rule in self.rules_of(node)):
-            return self.moment.say(node, f"emergency lost: {data.hex()}")
+        elif kind == EMCY and node != 0 and len(data) == 8:
+            rules = self.rules_of(node)
+            if any(rule.drop for rule in rules):
+                return self.moment.say(node, f"emergency lost: {data.hex()}")
+            for code in [rule.edit for rule in rules if rule.edit is not None][-1:]:
+                self.moment.say(node, f"emergency {data.hex()} becomes {code:#06x}")
+                return self.bench.send_frame(cob_id, struct.pack("<H", code) + data[2:])
         self.bench.send(datagram)
 
     def to_drives(self, datagram):

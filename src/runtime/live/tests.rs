@@ -335,6 +335,21 @@ fn a_flood_is_named() {
     assert_eq!(flood(20_000, Duration::from_secs(10)), None);
 }
 
+/// Also where the thread goes on with a look at what the tracker's link counts.
+#[test]
+fn a_flood_during_a_gap_is_named_by_the_look_after_it() {
+    let mut link = stream("Stylus", 60_000);
+    while link.messages() < 60_000 {
+        std::thread::yield_now();
+    }
+    let (mut late, mut bus) = (Late(None, Vec::new()), Waiting(None));
+    let mut run = Live::new(&mut late, &mut bus, Some(&mut link), Clock::start(), |_, _| {});
+    (run.looked, run.counted) = (run.last - Duration::from_secs(1), 0);
+    run.take_events();
+    let reason = late.0.as_ref().and_then(Outcome::stop_reason).unwrap();
+    assert!(reason.contains("by a flood from the tracker? 60000 messages, "), "{reason}");
+}
+
 /// The kernel stamps frames by CLOCK_REALTIME, which may be set either way in a run.
 #[test]
 fn a_system_clock_that_is_set_moves_no_frame_out_of_order() {

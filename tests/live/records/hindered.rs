@@ -4,8 +4,7 @@ use super::disk::Disk;
 use super::viewer::{free_address, frozen_viewer};
 use super::witness::Witness;
 use super::{SLOW, assert_they_agree, closed, repair};
-use crate::support::needed::skip;
-use crate::support::peers::peer;
+use crate::support::peers::hold;
 use crate::support::programs::{self, Ended, Program, Scratch, beside_others};
 use crate::support::udp_stage::Stage;
 use needle_bench::archive::{Manifest, file};
@@ -62,17 +61,6 @@ impl Hindered {
         assert_eq!(timing["syncs"], syncs);
         manifest
     }
-}
-
-/// Holds the bench's thread of that name; none where that is not possible here.
-fn hold(bench: &Program, thread: &str) -> Option<Program> {
-    let mut holder = peer("hold_thread.py", &[&bench.id().to_string(), thread])?;
-    holder.wait_for("\n");
-    let is_allowed = !holder.said().starts_with("not allowed");
-    if !is_allowed {
-        skip("permission to trace a process", "run the tests as root");
-    }
-    is_allowed.then_some(holder)
 }
 
 #[test]
