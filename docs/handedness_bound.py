@@ -6,7 +6,8 @@ programs of turning the base: small angles, Gaussian noise of the variance of +-
 positions a mm (40 Hz at 2 mm/s) and 40 (at 1 mm/s); position, heading and roll at the start are not known, curvature and torsion are.
 With a file that NEEDLE_ROTATIONS made (tests/pure/faults/contradictions.rs) it prints the depths at which
 the rotations that the bench commanded reach the log odds that a decision needs; the heading at the start is
-then known as the bench is told by default.
+then known as the bench is told by default. Then follows when a registration that is turned by 90 degrees about z
+is decided, the roll at the start being told.
 Needs numpy. decisions/0010-believing-the-tracker.md has what follows from it.
 """
 import csv
@@ -71,6 +72,18 @@ def largest(depth_mm, positions_per_mm, rng):
     return best
 
 
+def turned(depth_mm, positions_per_mm):
+    """Expected log odds that a registration is turned by 90 degrees about z, where the roll at the start is told: the
+    two paths bend by the same curvature across each other."""
+    grid = np.linspace(0, depth_mm, POINTS)
+    weight = math.sqrt(positions_per_mm * depth_mm / POINTS) / SD_MM
+    rows = np.vstack([weight * np.stack([np.ones(POINTS), grid], 1), [0, 1 / HEADING_SD]])
+    base, _ = np.linalg.qr(rows)
+    bend = np.append(weight * CURVATURE_PER_MM * grid**2 / 2, 0)
+    # Of each of the two axes half the squared distance.
+    return np.sum((bend - base @ (base.T @ bend)) ** 2)
+
+
 def decided_mm(depth_mm, rotation_rad, positions_per_mm):
     """The first depth at which this course of rotation decides, or infinity."""
     for end_mm in np.arange(10, depth_mm[-1]):
@@ -93,3 +106,5 @@ else:
     for positions_per_mm in (20, 40):
         for depth_mm in (15, 18, 19, 20, 22, 25):
             print(f"{positions_per_mm} a mm, {depth_mm} mm: {largest(depth_mm, positions_per_mm, rng):.1f}")
+        decides = next(mm for mm in np.arange(5, 60, 0.5) if turned(mm, positions_per_mm) >= DECIDES)
+        print(f"{positions_per_mm} a mm: a registration turned by 90 degrees is decided after {decides:.1f} mm")

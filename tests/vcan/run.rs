@@ -3,11 +3,12 @@
 
 use std::fs;
 use std::path::Path;
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use crate::support::drives::{assert_the_drives_stand, drives};
 use crate::support::link::ip;
-use crate::support::programs::{self, LONG, Scratch, stage};
+use crate::support::programs::{self, LONG, Program, Scratch, stage};
 use crate::support::replays::assert_it_replays;
 use crate::support::vcan;
 use needle_bench::canopen::Frame;
@@ -300,15 +301,67 @@ fn an_interface_that_goes_down_ends_the_run_for_good() {
     assert_the_drives_stand(&[]);
 }
 
+/// The kernel stamps frames by a clock that may be set in a run, either way.
+#[test]
+fn a_clock_that_is_set_in_a_run_changes_nothing() {
+    let Some(_alone) = vcan::alone_on_it() else { return };
+    if std::env::var("NEEDLE_CAN").is_err() {
+        println!("not the emulated machine: the clock of this one is not set");
+        return;
+    }
+    let scratch = Scratch::new("clock");
+    let (mut witness, _stage) = (Witness::new(), stage(&[]));
+    let bench = scratch.bench(&["--json"], &["insertion.depth_mm=40"]);
+    for (depth_mm, by_s) in [(5.0, 3600), (12.0, -7200), (20.0, 3600)] {
+        witness.wait_until_inserted(depth_mm);
+        let set = format!("date -s @$(($(date +%s) + {by_s}))");
+        let status = Command::new("sh").args(["-c", &set]).status().unwrap();
+        assert!(status.success(), "{set}: {status}");
+    }
+    let bench = bench.end();
+    bench.assert_status(0);
+    assert_eq!(bench.json()["outcome"], "completed");
+    assert_the_drives_stand(&[]);
+    assert_it_replays(&scratch.run_dir());
+}
+
+/// From another process, as an operator in a hurry does.
+#[test]
+fn a_stop_ends_a_run_on_the_bus() {
+    let Some(_alone) = vcan::alone_on_it() else { return };
+    let scratch = Scratch::new("stopped");
+    let (mut witness, _stage) = (Witness::new(), stage(&[]));
+    let bench = scratch.bench(&[], &[]);
+    witness.wait_until_inserted(5.0);
+    let mut stop = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+    stop.current_dir(env!("CARGO_MANIFEST_DIR"));
+    let stop = Program::start(stop.args(["stop", "--config", "bench-config/vcan.toml"])).end();
+    stop.assert_status(0);
+    let bench = bench.end();
+    bench.assert_status(1);
+    let reason = bench.last_line();
+    assert!(reason.starts_with("stopped: stage: another master on the bus: "), "{reason}");
+    assert_the_drives_stand(&[]);
+}
+
 /// The same script as in virtual time, struck by the stage's own process on a real bus.
 #[test]
 fn scripted_faults_end_the_run_by_name() {
     let Some(_alone) = vcan::alone_on_it() else { return };
+    let [bit_9, bit_4, bit_12] = [
+        r#"kind = "corrupt", frames = "pdo", axis = "insertion", byte = 1, mask = 0x02"#,
+        r#"kind = "corrupt", frames = "pdo", axis = "rotation", byte = 0, mask = 0x10"#,
+        r#"kind = "corrupt", frames = "pdo", axis = "insertion", byte = 1, mask = 0x10"#,
+    ];
     for (fault, reason) in [
         (r#"kind = "bus-off", duration_s = 2"#, "stopped: can: bus off"),
         (r#"kind = "restart", axis = "rotation""#, "stopped: stage: rotation: boot-up message"),
         (r#"kind = "emergency-stop""#, "stopped: stage: insertion: emergency 0x9000"),
         (r#"kind = "silent", axis = "rotation""#, "stopped: stage: rotation: no "),
+        // Statusword bits 9, 4 and 12: remote, voltage enabled, follows the command.
+        (bit_9, "stopped: stage: insertion: the drive no longer obeys the bus (statusword 0x1037"),
+        (bit_4, "stopped: stage: rotation: the drive has lost its supply (statusword 0x1227"),
+        (bit_12, "stopped: stage: insertion: the drive ignores its targets (statusword 0x0237"),
     ] {
         let scratch = Scratch::new("scripted");
         let script = format!("emulator.fault=[{{ at_mm = 5, {fault} }}]");

@@ -3,14 +3,19 @@
 use super::*;
 use crate::canopen::cia402::DriveState;
 
-/// When power is taken off an insertion of 100 counts/mm that moves at `mm_per_s` until `stops`.
-fn power_off_of_a_coarse_axis(mm_per_s: f64, stops: Duration) -> Duration {
+/// When an insertion of 100 counts/mm that moves at `mm_per_s` until `stops` is said to stand, and when power is
+/// taken off it.
+fn coarse_axis(
+    halt: fn(&StageConfig, Time) -> Halt,
+    mm_per_s: f64,
+    stops: Duration,
+) -> (Duration, Option<Duration>) {
     let mut config = config();
     config.insertion.ratio = CountsRatio::new(100, 1).expect("not zero");
     let begun = Time::from_secs_f64(1.0);
     let mut drives = [TestDrive::new(node(1), 1000), TestDrive::new(node(2), 0)];
     drives.iter_mut().for_each(|drive| drive.state = DriveState::SwitchedOn);
-    let (mut halt, mut now, mut off) = (Halt::new(&config, begun), begun, None);
+    let (mut halt, mut now, mut off) = (halt(&config, begun), begun, None);
     while !halt.is_over() {
         let gone_s = now.since(begun).min(stops).as_secs_f64();
         drives[0].counts = 1000 + (gone_s * mm_per_s * 100.0) as i32;
@@ -26,19 +31,22 @@ fn power_off_of_a_coarse_axis(mm_per_s: f64, stops: Duration) -> Duration {
         now = now.max(halt.deadline().min(now + Duration::from_millis(20)));
         halt.handle_timeout(now);
     }
-    off.expect("it always is")
+    (now.since(begun), off)
 }
 
 #[test]
 fn a_moving_coarse_axis_is_not_taken_for_standing() {
     // Half a second for two counts at 0.04 mm/s.
     let stops = Duration::from_millis(700);
-    let off = power_off_of_a_coarse_axis(4.9, stops);
-    assert!((1.1..1.3).contains(&off.as_secs_f64()), "{off:?}");
-    let off = power_off_of_a_coarse_axis(0.5, stops);
-    assert!((1.1..1.3).contains(&off.as_secs_f64()), "{off:?}");
-    let off = power_off_of_a_coarse_axis(0.0, stops);
-    assert!((0.5..0.6).contains(&off.as_secs_f64()), "{off:?}");
+    let watch = |config: &StageConfig, now| Halt::watch(config, now, now + Duration::from_secs(5));
+    for (mm_per_s, stands) in [(4.9, 1.1..1.3), (0.5, 1.1..1.3), (0.0, 0.5..0.6)] {
+        let (_, off) = coarse_axis(Halt::new, mm_per_s, stops);
+        assert!(stands.contains(&off.expect("it always is").as_secs_f64()), "{off:?}");
+        // As `stage prove` watches it.
+        let (seen, off) = coarse_axis(watch, mm_per_s, stops);
+        assert!(stands.contains(&seen.as_secs_f64()), "{seen:?}");
+        assert_eq!(off, None);
+    }
 }
 
 /// What is said of an insertion drive that obeys no controlword before `obeys`.

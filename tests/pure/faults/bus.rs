@@ -5,7 +5,7 @@ use crate::support::stop::{Measured, Stop, documented, stopped};
 use needle_bench::canopen::cia402::DriveState;
 use needle_bench::canopen::{CanId, Frame};
 use needle_bench::emulator::StageOutput;
-use needle_bench::session::{Input, Machine, Output};
+use needle_bench::session::{Input, Lane, Machine, Output, Record};
 use needle_bench::tracker::Event;
 use std::time::Duration;
 
@@ -100,12 +100,18 @@ fn an_operator_who_stops() {
 /// From listening over bring-up, standby and enabling to the insertion.
 #[test]
 fn an_operator_who_stops_at_any_moment() {
-    let listening = Duration::from_millis(100);
+    let listens = Duration::from_millis(100);
+    let mut states = Vec::new();
     for ms in [0, 50, 99, 101, 120, 150, 200, 260, 400, 3000] {
         let (mut session, stage) = configured(&["insertion.depth_mm=30"]);
-        session.stage.listen_first = listening;
+        session.stage.listen_first = listens;
         let mut bench = Bench::new((session, stage));
         bench.run_for(Duration::from_millis(ms));
+        let said = bench.records.iter().rev().find_map(|record| match record {
+            Record::Event { lane: Lane::Stage, text, .. } => Some(text.clone()),
+            _ => None,
+        });
+        states.push(said.unwrap_or_default());
         let stop = Stop::of(bench, |bench| {
             bench.hand(Input::Stop("operator: interrupted".to_owned()));
         });
@@ -115,6 +121,10 @@ fn an_operator_who_stops_at_any_moment() {
             assert_eq!(stop.travel(), [(0.0, 0.0); 2], "after {ms} ms");
         }
     }
+    let listening = "listening for another master";
+    let configured = "both drives are configured, without power";
+    assert_eq!(states[..4], ["", listening, listening, configured]);
+    assert_eq!(states[4..], ["enabling both axes"; 6]);
 }
 
 #[test]
