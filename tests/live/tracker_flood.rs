@@ -113,7 +113,7 @@ fn position(tool: &str) -> Vec<u8> {
     encode(&Message::new(tool, None, body))
 }
 
-/// A run of 10 mm at 1.5 mm/s with a flooded tracker.
+/// A run of 7 mm at 1 mm/s with a flooded tracker.
 fn flooded(name: &str, flood: Flood) -> (Ended, Scratch) {
     let _alone = alone();
     let scratch = Scratch::new(name);
@@ -123,10 +123,8 @@ fn flooded(name: &str, flood: Flood) -> (Ended, Scratch) {
     (timed(name, &scratch, bench.end()), scratch)
 }
 
-const SLOW: [&str; 2] = [
-    "insertion={ depth_mm = 10, plane_out_of_reach = \"insert\" }",
-    "insertion.speed_mm_per_s=1.5",
-];
+const SLOW: [&str; 2] =
+    ["insertion={ depth_mm = 7, plane_out_of_reach = \"insert\" }", "insertion.speed_mm_per_s=1"];
 
 /// Prints how late SYNCs were.
 fn timed(name: &str, scratch: &Scratch, bench: Ended) -> Ended {

@@ -132,9 +132,11 @@ fn the_wrong_hand_is_found_whatever_the_noise() {
             });
             found_mm.collect()
         };
-        let mirrored = found_mm(|_| {}, |sample| sample.position_mm.x *= -1.0);
+        let x_mirrored = found_mm(|_| {}, |sample| sample.position_mm.x *= -1.0);
+        let y_mirrored = found_mm(|_| {}, |sample| sample.position_mm.y *= -1.0);
         let reversed = found_mm(|session| session.stage.rotation.sign = Sign::Negative, |_| {});
-        are_found(&format!("{speed} mm/s, x mirrored"), mirrored);
+        are_found(&format!("{speed} mm/s, x mirrored"), x_mirrored);
+        are_found(&format!("{speed} mm/s, y mirrored"), y_mirrored);
         are_found(&format!("{speed} mm/s, sign reversed"), reversed);
     }
 }

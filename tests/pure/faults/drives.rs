@@ -286,8 +286,11 @@ fn a_drive_that_keeps_its_power_at_the_end() {
 /// begins with the target that is held, and depth counts from where the axis was seen.
 #[test]
 fn a_drive_that_stands_off_its_target() {
-    for offset_counts in [302, -302, 139, -139] {
-        let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+    // 1 mm/s are 46.46 counts in 10 ms.
+    let cases = [302, -302, 139, -139].map(|counts| [(counts, "1", 47), (counts, "2", 93)]);
+    for (offset_counts, mm_per_s, step_counts) in cases.into_iter().flatten() {
+        let speed = format!("insertion.speed_mm_per_s={mm_per_s}");
+        let mut bench = Bench::new(configured(&["insertion.depth_mm=30", &speed]));
         bench.change_tpdo(move |word, counts| {
             let enabled = Statusword(word).state() == Some(DriveState::OperationEnabled);
             (word, counts - if enabled { offset_counts } else { 0 })
@@ -305,8 +308,7 @@ fn a_drive_that_stands_off_its_target() {
         let targets: Vec<i32> = bench.sent.iter().filter_map(target).collect();
         let steps = targets.windows(2).map(|pair| pair[1] - pair[0]);
         let (least, most) = steps.fold((0, 0), |(a, b), step| (a.min(step), b.max(step)));
-        // 2 mm/s are 92.92 counts in 10 ms.
-        assert_eq!((least, most), (0, 93), "{offset_counts} counts");
+        assert_eq!((least, most), (0, step_counts), "{offset_counts} counts at {mm_per_s} mm/s");
         let last = bench.steps().last().expect("steps");
         assert_eq!(last.step, 30);
         assert!((last.insertion_meas_mm - 30.0).abs() < 0.01, "{}", last.insertion_meas_mm);
