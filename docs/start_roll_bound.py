@@ -6,9 +6,12 @@ A method knows where the needle starts, its curvature, its yaw to 12 degrees and
 
 - It learns of the roll what a needle shows that bends one way all the time, which shows most, and yet it may bend as
   it likes; its turns cost nothing and show nothing.
-- It knows the exact posterior of the roll, bends by the full curvature to where the posterior's mean has the target,
-  and goes straight while the posterior's resultant length is under a limit; the best of several limits counts.
+- It knows the exact posterior of the roll, 1 mm ahead of the positions. It bends by the full curvature to where the
+  posterior's mean has the target, and goes straight while the posterior's resultant length is under a limit; for each
+  target the best of several limits counts.
 - After REVEALED_MM the roll is told to it, and one arc of the full curvature leads to the target.
+
+This is the best of a family of methods, not a proof for all of them.
 
 Prints how well the positions tell the roll (RMS error of the posterior's mean), and the share of the targets that
 are then reached within 1 mm and within 0.4 mm, for uniform noise of +-1 mm and for Gaussian noise of the same
@@ -81,8 +84,8 @@ def posterior_means(noise, random):
 def path_end(means, resultant_min):
     """Tip and heading where the roll is told, for a target in the direction of y."""
     tip, heading, ds = np.zeros(3), np.array([0.0, 0.0, 1.0]), 1.0 / SUBSTEPS
-    # Nothing is known over the first mm; what the nth mm tells is used over the next one.
-    for mean in np.concatenate([[0.0], means[:-1]]):
+    # What the nth mm tells is used over the whole of it.
+    for mean in means:
         for _ in range(SUBSTEPS if abs(mean) > resultant_min else 0):
             bend = np.array([mean.imag, mean.real, 0.0]) / abs(mean)
             bend -= heading * (bend @ heading)
@@ -95,11 +98,11 @@ def path_end(means, resultant_min):
 
 
 def reached(target, tip, heading, tolerance_mm):
-    """Share of the targets that one arc and a straight from there reach."""
+    """Which targets one arc and a straight from there reach."""
     apart = target - tip
     ahead = apart @ heading
     aside = np.linalg.norm(apart - ahead[:, None] * heading, axis=1)
-    return np.mean(np.hypot(RADIUS_MM - aside, ahead) >= RADIUS_MM - tolerance_mm)
+    return np.hypot(RADIUS_MM - aside, ahead) >= RADIUS_MM - tolerance_mm
 
 
 target = draw_targets(TARGETS, SHARE_MAX, np.random.default_rng(1))
@@ -111,16 +114,15 @@ for noise in (Uniform(), Gaussian()):
     rms = np.sqrt(np.mean(np.angle(np.array(draws)) ** 2, axis=0))
     for mm in range(4, REVEALED_MM + 1, 2):
         print(f"{type(noise).__name__}: after {mm} mm the roll is known to {math.degrees(rms[mm - 1]):.0f} degrees")
-    best = {}
-    for resultant_min in (0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9):
-        ends = [path_end(means, resultant_min) for means in draws]
-        for tolerance_mm in (1.0, 0.4):
-            shares = [reached(target, *end, tolerance_mm) for end in ends]
-            mean, error = np.mean(shares), np.std(shares) / math.sqrt(DRAWS)
-            best[tolerance_mm] = max(best.get(tolerance_mm, (0.0, 0.0, 0.0)), (mean, error, resultant_min))
-    for tolerance_mm, (mean, error, resultant_min) in best.items():
+    limits = (0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9)
+    ends = [[path_end(means, limit) for means in draws] for limit in limits]
+    for tolerance_mm in (1.0, 0.4):
+        # By limit, draw and target.
+        are_reached = np.array([[reached(target, *end, tolerance_mm) for end in of_limit] for of_limit in ends])
+        best = are_reached.mean(axis=1).argmax(axis=0)
+        shares = are_reached[best, :, np.arange(TARGETS)].mean(axis=0)
         print(
-            f"{type(noise).__name__}: {mean:.1%} (standard error {error:.1%}) within {tolerance_mm} mm, "
-            f"straight under a resultant length of {resultant_min}",
+            f"{type(noise).__name__}: {shares.mean():.1%} (standard error {shares.std() / math.sqrt(DRAWS):.1%}) "
+            f"within {tolerance_mm} mm",
             flush=True,
         )

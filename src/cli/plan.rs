@@ -49,6 +49,7 @@ pub(super) fn plan(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let reserve_mm = roomy.as_ref().ok().filter(|_| !world.obstacles.is_empty());
     object["run_reserve_mm"] = json!(reserve_mm.map(|roomy| roomy.reserve_mm));
     object["run_refusal"] = json!(roomy.err());
+    object["curvature_margin"] = json!(config.goal.curvature_margin());
     if let Some(path) = &arguments.out {
         write_new(path, &picture(&world, &problem, &answer)?)?;
     }

@@ -81,7 +81,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     // A replay finds the masks again, and sees whether they are the same.
     if let Some(file) = configured.path() {
         let file = std::path::absolute(file)?;
-        config = config.with_masks_beside(&file, |mask| file_crc32(mask).ok());
+        config = config.recorded_beside(&file, |mask| file_crc32(mask).ok());
     }
     let session = config.session_reading(&mask_reader(None))?;
     session.check().map_err(Failure::configuration)?;

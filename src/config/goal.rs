@@ -37,8 +37,8 @@ section! {
         /// The tip never leaves it; no clearance to its walls, mm.
         workspace_mm: WorkspaceConfig =>
             "{ min = [-50.0, -75.0, 0.0], max = [50.0, 75.0, 150.0] }";
-        /// The share of the needle's curvature that a plan leaves unused, for what is not known of it. Not
-        /// given, it is 0.15 with obstacles, and 0 without.
+        /// The share of the needle's curvature that a plan leaves unused, for what is not known of it. If it
+        /// is not given, it is 0.15 with obstacles and 0 without.
         curvature_margin: Option<f64> [within(0.0, 0.9)];
         /// How many steps of the search a plan may take.
         expansions_max: u32 [within(1.0, 1e8)] = 2000000;
@@ -179,10 +179,20 @@ fn is_box(min_mm: &Vector3<f64>, max_mm: &Vector3<f64>) -> bool {
 
 impl GoalConfig {
     /// The share of the needle's curvature that a plan leaves unused. Around obstacles a path that needs all of
-    /// it cannot be mended: 6% of such runs are lost (docs/targets.md).
-    fn curvature_margin(&self) -> f64 {
+    /// it cannot be mended: without a margin 6% of the runs are lost (docs/targets.md).
+    pub(crate) fn curvature_margin(&self) -> f64 {
         let usual = if self.obstacle.is_empty() { 0.0 } else { 0.15 };
         self.curvature_margin.unwrap_or(usual)
+    }
+
+    /// What a refusal adds where some of the curvature is left unused.
+    fn unused(&self) -> String {
+        match self.curvature_margin() {
+            0.0 => String::new(),
+            margin => {
+                format!("; {margin} of the curvature is left unused, see goal.curvature_margin")
+            }
+        }
     }
 }
 
@@ -203,6 +213,7 @@ impl Config {
         let curvature_margin = self.goal.curvature_margin();
         let tool = self.target_tool(problem.target_mm)?;
         let goal = Goal::new(world, problem, reserve_mm, curvature_margin, step_expansions_max);
+        let goal = goal.map_err(|reason| reason + &self.goal.unused());
         Ok(goal.map(|goal| Some(Goal { tool, ..goal })))
     }
 
@@ -220,10 +231,13 @@ impl Config {
         Ok(Some(TargetTool { gate, expected_mm, range_mm, average }))
     }
 
-    /// The same with the path of each mask complete, relative to the folder of `file`, the configuration, and
-    /// with its `crc32` where that can be had.
-    pub fn with_masks_beside(&self, file: &Path, crc32: impl Fn(&Path) -> Option<u32>) -> Config {
+    /// The same as a run records it: with the margin of the curvature, and with the path of each mask complete,
+    /// relative to the folder of `file`, the configuration, and with its `crc32` where that can be had.
+    pub fn recorded_beside(&self, file: &Path, crc32: impl Fn(&Path) -> Option<u32>) -> Config {
         let mut written = self.written.clone();
+        if let (GoalKind::Target, Some(goal)) = (self.goal.kind, written["goal"].as_table_mut()) {
+            goal.insert("curvature_margin".to_owned(), self.goal.curvature_margin().into());
+        }
         let obstacles = written["goal"]["obstacle"].as_array_mut();
         for obstacle in obstacles.into_iter().flatten() {
             let Some(obstacle) = obstacle.as_table_mut() else { continue };

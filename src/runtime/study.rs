@@ -6,6 +6,7 @@ use crate::geometry::Pose;
 use crate::session::{Goal, Outcome, Record, Session, SessionConfig};
 use crate::study::{Prior, Timetable, TimetableBuilder, TrialResult, TrialScore, insert};
 use crate::units::Time;
+use nalgebra::Vector3;
 use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
 
 /// Noise of the insertion that is the timetable's: as good as none, and no two positions alike,
@@ -119,7 +120,10 @@ impl Study<'_> {
         let stage = VirtualStageConfig {
             needle: self.session.needle,
             torsion: self.session.needle_torsion,
-            start: Pose::identity(),
+            start: Pose {
+                rotation: self.session.handedness.start.to_rotation(),
+                translation: Vector3::zeros(),
+            },
             target: None,
             tracker,
             ..stage
@@ -130,7 +134,7 @@ impl Study<'_> {
         match outcome {
             Outcome::Completed => Ok(builder.finish()),
             Outcome::Stopped(reason) => {
-                Err(format!("an insertion in the plane, without noise, was stopped: {reason}"))
+                Err(format!("an insertion from the plane, without noise, was stopped: {reason}"))
             }
         }
     }

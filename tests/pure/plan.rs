@@ -104,6 +104,39 @@ fn the_reserve_of_a_run_is_said() {
     assert_eq!([&json["run_reserve_mm"], &json["run_refusal"]], [&Value::Null; 2]);
 }
 
+/// Around obstacles 15% of the curvature are left unused, unless another margin is given; what is refused for it
+/// says so, and a run records it.
+#[test]
+fn the_margin_of_the_curvature_is_said_and_recorded() {
+    let scratch = Scratch::new();
+    let far = BALL.replace("[0.0, 0.0, 120.0]", "[0.0, 44.0, 100.0]");
+    let far = far.replace("[0.0, 1.0, 60.0]", "[0.0, -60.0, 20.0]");
+    let margin = |text: &str, more: &[&str]| {
+        let (status, json) = plan(&scratch, text, more);
+        (status, json["curvature_margin"].as_f64().unwrap())
+    };
+    assert_eq!(margin(far.split("[[goal").next().unwrap(), &[]), (0, 0.0));
+    assert_eq!(margin(&far, &[]), (1, 0.15));
+    let said = needle_bench(&scratch, &["plan", "goal.toml"]);
+    let line =
+        "\nmargin      0.15 of the needle's curvature is left unused (goal.curvature_margin)\n";
+    assert!(said.stdout.contains(line), "{}", said.stdout);
+    let run = needle_bench(&scratch, &["run", "goal.toml", "--json"]);
+    let refusal = run.json()["error"].to_string();
+    assert!(run.status == 2 && refusal.contains("see goal.curvature_margin"), "{refusal}");
+    let none = ["--set", "goal.curvature_margin=0"];
+    assert_eq!(margin(&far, &none), (0, 0.0));
+    let near = far.replace("[0.0, 44.0, 100.0]", "[0.0, 0.0, 8.0]");
+    scratch.write("goal.toml", &near);
+    let run =
+        needle_bench(&scratch, &["run", "goal.toml", "--json", "--set", "emulator.start.x_mm=0"]);
+    assert_eq!(run.status, 0, "{}{}", run.stdout, run.stderr);
+    let run_dir = run.json()["run_dir"].as_str().unwrap().to_owned();
+    let recorded =
+        std::fs::read_to_string(scratch.path().join(run_dir).join("config.toml")).unwrap();
+    assert!(recorded.contains("\ncurvature_margin = 0.15\n"), "{recorded}");
+}
+
 #[test]
 fn the_example_has_a_plan_and_a_picture() {
     let scratch = Scratch::new();

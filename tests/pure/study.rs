@@ -176,3 +176,19 @@ fn what_cannot_be_studied_is_refused() {
     ];
     insta::assert_snapshot!(refusals(&scratch, commands));
 }
+
+/// The bench is told the roll at the start, which the needle of the timetable then has too.
+#[test]
+fn a_roll_that_is_told_can_be_studied() {
+    let scratch = Scratch::new();
+    let told = [
+        "insertion.depth_mm=100",
+        "observer.start.roll_deg=137",
+        "observer.invariant.start_sd.roll_deg=5",
+        "study.roll_deg=[137, 137]",
+    ];
+    let sets: Vec<&str> = told.iter().flat_map(|set| ["--set", set]).collect();
+    let said = needle_bench(&scratch, &[&["study", "--trials", "2", "--json"], &sets[..]].concat());
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    assert_eq!(said.json()["failed"], serde_json::json!([]));
+}
