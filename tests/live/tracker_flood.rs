@@ -142,14 +142,16 @@ fn timed(name: &str, scratch: &Scratch, bench: Ended) -> Ended {
     bench
 }
 
-/// The run was completed, and little of the flood reached the session. A machine that others work on skips
-/// SYNCs without any flood: of three runs, one skips less than one in twenty.
+/// The run was completed, and little of the flood reached the session. A machine that others work on delays
+/// SYNCs without any flood: in one of three runs less than one in twenty is skipped, and none is late by 40 ms.
+/// Where the flood went before the deadlines, they were late by 56 to 85 ms.
 #[track_caller]
 fn assert_it_goes_on(run: impl Fn() -> (Ended, Scratch)) -> (Ended, Scratch) {
-    let skips_few = |(_, scratch): &(Ended, Scratch)| {
+    let is_on_time = |(_, scratch): &(Ended, Scratch)| {
         let timing = &programs::manifest(&scratch.run_dir())["timing"];
         let count = |key: &str| timing[key].as_u64().unwrap();
-        count("syncs_skipped") * 20 < count("syncs")
+        let late_ms = timing["sync_late_us_max"].as_f64().unwrap() * 1e-3;
+        count("syncs_skipped") * 20 < count("syncs") && late_ms < 40.0
     };
     let runs = std::iter::repeat_with(|| {
         let run = run();
@@ -157,7 +159,7 @@ fn assert_it_goes_on(run: impl Fn() -> (Ended, Scratch)) -> (Ended, Scratch) {
         run
     });
     let (bench, scratch) =
-        runs.take(3).find(skips_few).expect("few SYNCs skipped in one of three runs");
+        runs.take(3).find(is_on_time).expect("SYNC on time in one of three runs");
     let samples = programs::read(&scratch.run_dir().join("tracker.ndjson"));
     assert!(!samples.contains("StylusToTracker"), "another tool's samples were handed on");
     let inputs = programs::read(&scratch.run_dir().join("inputs.log"));

@@ -97,7 +97,7 @@ fn an_operator_who_stops() {
     documented(&stops, "an_operator_who_stops", 0.0, "operator: interrupted");
 }
 
-/// From listening over bring-up, standby and enabling to the insertion.
+/// From listening over standby and enabling to the insertion; these drives are brought up in no time.
 #[test]
 fn an_operator_who_stops_at_any_moment() {
     let listens = Duration::from_millis(100);
