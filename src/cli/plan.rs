@@ -119,8 +119,8 @@ fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, 
     Mask::new(size, spacing_mm, &occupied, &pose.to_pose()).map(Obstacle::Mask)
 }
 
-/// Refuses an image with bytes after its voxels, since its header may belong to another image, and one whose
-/// compressed bytes are damaged.
+/// Refuses an image with bytes after its voxels: its header may belong to another image. A compressed image is
+/// refused if its bytes are damaged.
 fn check_length(path: &Path, header: &NiftiHeader, voxels: usize) -> Result<(), String> {
     let unreadable = |error: io::Error| reason(&NiftiError::Io(error));
     let file = File::open(path).map_err(unreadable)?;

@@ -177,7 +177,7 @@ fn what_cannot_be_studied_is_refused() {
     insta::assert_snapshot!(refusals(&scratch, commands));
 }
 
-/// The bench is told the roll at the start, which the needle of the timetable then has too.
+/// A study first records the times of one insertion. Its needle starts at the roll that is configured.
 #[test]
 fn a_roll_that_is_told_can_be_studied() {
     let scratch = Scratch::new();
