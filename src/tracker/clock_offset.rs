@@ -19,14 +19,16 @@ const SETTLING_FALL_NS: i64 = 20_000_000;
 const SETTLING_RISE_NS: i64 = 1_000_000_000;
 
 /// If a stamp trails the quickest delivery by more than this, it is late, or the sender's clock was
-/// set back.
-const BEHIND_MIN_NS: i64 = 40_000_000;
+/// set back …
+const BEHIND_MIN_NS: i64 = 10_000_000;
+/// … and by more than this, it is not dated by the old offset while a new one is learnt.
+const DATED_BEHIND_MAX_NS: i64 = 40_000_000;
 /// A clock that goes back by this much or more is another clock, not a corrected one …
 const ANOTHER_CLOCK_NS: i64 = 500_000_000;
 /// … and its offset is learnt over this time instead.
 const ANOTHER_CLOCK_TIME: Duration = Duration::from_secs(1);
 /// The operator is told of late stamps once all were late over this time …
-const LATE_TIME: Duration = Duration::from_secs(1);
+const LATE_TIME: Duration = Duration::from_secs(5);
 /// … and at least this many.
 const LATE_SAMPLES: u32 = 10;
 
@@ -39,6 +41,7 @@ const LATE_SAMPLES: u32 = 10;
 ///   it agree with it, the sender's clock was set, and the offset is learnt again.
 /// - If a stamp goes back and the next ones go on from there, the sender's clock was set back: a
 ///   connection keeps its order, so a queue never makes a stamp go back. The offset is learnt again.
+///   Meanwhile stamps that are a little late are dated by the old offset, and others are refused.
 /// - Stamps that are later than before but never went back may have waited. They are dated by the
 ///   old offset. If it was the clock after all, they are dated too old, never too young. The
 ///   operator is told.
@@ -82,8 +85,19 @@ impl ClockOffset {
         let goes_on = self.went_back && self.candidate.goes_on(source_ns, offset_ns);
         self.went_back = is_behind && (goes_on || has_gone_back);
         let is_ahead = behind_ns.is_some_and(|behind_ns| behind_ns < -AHEAD_MAX_NS);
-        if let Some(known) = self.known.as_mut().filter(|_| !is_ahead && !self.went_back) {
+        let is_far_behind = behind_ns.is_some_and(|behind_ns| behind_ns > DATED_BEHIND_MAX_NS);
+        let settled = if is_ahead || self.went_back || self.known.is_none() {
+            let time = match behind_ns {
+                Some(ANOTHER_CLOCK_NS..) => ANOTHER_CLOCK_TIME,
+                _ => SETTLING_TIME,
+            };
+            self.candidate.take(receive, source_ns, offset_ns, time)
+        } else {
             self.candidate = Settling::default();
+            Err(0)
+        };
+        let is_dated = !is_ahead && !(self.went_back && is_far_behind);
+        if let Some(known) = self.known.as_mut().filter(|_| settled.is_err() && is_dated) {
             if let Some(by_ns) = back_ns.filter(|_| has_gone_back) {
                 return Err(went_back(by_ns));
             }
@@ -92,18 +106,14 @@ impl ClockOffset {
             self.note_late(receive, offset_ns.saturating_sub(dated_by_ns));
             return Ok(dated_by_ns);
         }
-        let time = match behind_ns {
-            Some(ANOTHER_CLOCK_NS..) => ANOTHER_CLOCK_TIME,
-            _ => SETTLING_TIME,
-        };
-        match self.candidate.take(receive, source_ns, offset_ns, time) {
+        match settled {
             Ok(settled) => {
                 let settled_ns = settled.ns();
                 let set_back_ns = known_ns.filter(|_| self.went_back);
                 let news = set_back_ns.map(|known_ns| {
                     let by_s = seconds(settled_ns.saturating_sub(known_ns));
                     format!(
-                        "the sender's clock was set back by {by_s:.2} s; its offset was learnt again"
+                        "the sender's clock was set back by {by_s:.3} s; its offset was learnt again"
                     )
                 });
                 let (known, last_source_ns) = (Some(settled), Some(source_ns));
@@ -146,7 +156,7 @@ impl ClockOffset {
         let lasts = late.samples >= LATE_SAMPLES && receive.since(late.since) >= LATE_TIME;
         if lasts && !std::mem::replace(&mut late.is_told, lasts) {
             self.news = Some(format!(
-                "by their stamps, positions come {:.2} s later than before: delayed, or the sender's \
+                "by their stamps, positions come {:.3} s later than before: delayed, or the sender's \
                  clock was set back; they are dated as delayed; if it was the clock, reconnect the \
                  tracker",
                 seconds(late.least_ns)
@@ -324,10 +334,53 @@ mod tests {
             assert_eq!(
                 told,
                 format!(
-                    "the sender's clock was set back by {by_s:.2} s; its offset was learnt again"
+                    "the sender's clock was set back by {by_s:.3} s; its offset was learnt again"
                 )
             );
             assert_eq!(offset.news(), None);
+        }
+    }
+
+    /// By little more than a period: only the stamp that goes back is refused, and those after it are
+    /// dated by the old offset until the new one is learnt.
+    #[test]
+    fn a_clock_that_was_set_back_a_little_is_followed_beside() {
+        for by_ms in [26, 30, 39] {
+            let mut offset = ClockOffset::default();
+            listen(&mut offset, 0, 0);
+            let after = listen(&mut offset, 300, -by_ms);
+            assert!(after[0].is_err(), "{by_ms}: {after:?}");
+            assert_eq!(after[1..8], vec![Ok(0); 7], "{by_ms}");
+            assert_eq!(after[8..], vec![Ok(by_ms); 4], "{by_ms}");
+            assert!(offset.news().unwrap().contains(&format!(" set back by 0.0{by_ms} s; ")));
+        }
+    }
+
+    /// By less than a period no stamp goes back: it may be a delay. It is told of.
+    #[test]
+    fn a_clock_that_was_set_back_by_less_than_a_period_is_told_of() {
+        let mut offset = ClockOffset::default();
+        listen(&mut offset, 0, 0);
+        let mut told = Vec::new();
+        for n in 12..260 {
+            assert_eq!(update(&mut offset, 25 * n, 25 * n - 15), Ok(0), "{n}");
+            told.extend(offset.news().map(|text| (25 * (n - 12), text)));
+        }
+        let (at_ms, text) = &told[0];
+        assert!(told.len() == 1 && text.contains(" come 0.015 s later than before: "), "{told:?}");
+        assert_eq!(*at_ms, 5000);
+    }
+
+    /// A network that delays each position by up to 60 ms, in order.
+    #[test]
+    fn a_network_that_jitters_is_no_clock_that_was_set() {
+        let mut offset = ClockOffset::default();
+        listen(&mut offset, 0, 0);
+        let mut receive_ms = 300;
+        for n in 12..4000_i64 {
+            receive_ms = receive_ms.max(25 * n + (n * 7919) % 61);
+            assert_eq!(update(&mut offset, receive_ms, 25 * n), Ok(0), "{n}");
+            assert_eq!(offset.news(), None, "{n}");
         }
     }
 
@@ -348,11 +401,11 @@ mod tests {
         let mut offset = ClockOffset::default();
         listen(&mut offset, 0, 0);
         let mut told = Vec::new();
-        for n in 12..200 {
+        for n in 12..400 {
             assert_eq!(update(&mut offset, 25 * n + 300, 25 * n), Ok(0), "{n}");
             told.extend(offset.news());
         }
-        let late = "by their stamps, positions come 0.30 s later than before: ";
+        let late = "by their stamps, positions come 0.300 s later than before: ";
         assert!(told.len() == 1 && told[0].starts_with(late), "{told:?}");
     }
 
