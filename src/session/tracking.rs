@@ -223,7 +223,8 @@ impl Tracking {
         let insertion_mm = stage.insertion_mm;
         let prediction = estimation.prediction(acquisition_time, history)?;
         let fix = fix(record, acquisition_time, tip_meas, Some(insertion_mm));
-        self.track.judge(fix, prediction.as_ref())?;
+        let judged = self.track.judge(fix, prediction.as_ref());
+        judged.map_err(|refusal| self.travel.explain(refusal))?;
         Ok(insertion_mm)
     }
 

@@ -343,18 +343,15 @@ impl Track {
         let noise_mm2 = self.settings.noise_sd_mm.powi(2) / independent;
         let lag = prediction.heading * mean.dot(&prediction.heading).min(0.0);
         let lag_limit = LAG_CHI2_SHARE * limit;
-        let tests = [
-            (mean, limit, "off the model", "a jump, a drift, or frozen"),
-            (lag, lag_limit, "behind the model", "frozen, or of too small a scale"),
-        ];
-        for (off, limit, how, what) in tests {
+        let tests = [(mean, limit, "off the model"), (lag, lag_limit, "behind the model")];
+        for (off, limit, how) in tests {
             let chi2 = self.chi2(&off, prediction, noise_mm2 + JUMP_MODEL_SD_MM.powi(2));
             // Written so that NaN is refused.
             if chi2 <= limit {
                 continue;
             }
             let why = format!(
-                "the mean of {positions} is {} mm {how}, chi2 {} (limit {limit:.1}): {what}",
+                "the mean of {positions} is {} mm {how}, chi2 {} (limit {limit:.1})",
                 short(off.norm()),
                 short(chi2)
             );

@@ -5,6 +5,10 @@
 //! vector, therefore has a length near 1, whatever the needle, the start and the turns of the base.
 //! A stream that is frozen but for noise has 0, one of wrong scale its scale, one that jumped more.
 
+mod change;
+
+use super::refusal::{Effect, Refusal};
+use change::{Change, FASTER, SLOWER, Tenths};
 use nalgebra::Vector3;
 use std::collections::VecDeque;
 
@@ -18,6 +22,8 @@ const POSITIONS_MIN: f64 = 6.0;
 const INDEPENDENT_PER_MM: f64 = 10.0;
 /// Standard deviations of the slope's length that noise is given, on top of the tolerance.
 const SDS: f64 = 5.5;
+/// Bins over which positions that contradict the model are explained: 8 mm.
+const EXPLAINED: usize = 32;
 /// What is tolerated besides noise: a share of the way, and a length over the whole stretch, mm.
 /// 59 recorded insertions of a real needle (docs/decisions/0013) stay inside with every stretch:
 /// 0.70 to 1.22 over 2.5 mm, 0.89 to 1.05 over 10 mm, 0.93 to 1.02 over 30 mm.
@@ -51,6 +57,18 @@ struct Bin {
 }
 
 impl Bin {
+    /// The sums of one position.
+    fn of(insertion_mm: f64, position_mm: &Vector3<f64>) -> Self {
+        Bin {
+            count: 1.0,
+            depth_mm: insertion_mm,
+            depth_mm2: insertion_mm * insertion_mm,
+            position_mm: *position_mm,
+            product_mm2: insertion_mm * position_mm,
+            square_mm2: position_mm.norm_squared(),
+        }
+    }
+
     fn add(&mut self, other: &Bin) {
         self.count += other.count;
         self.depth_mm += other.depth_mm;
@@ -85,14 +103,7 @@ impl TravelCheck {
         }
         // An encoder's step back belongs to the newest bin.
         if let Some(bin) = self.bins.back_mut() {
-            bin.add(&Bin {
-                count: 1.0,
-                depth_mm: insertion_mm,
-                depth_mm2: insertion_mm * insertion_mm,
-                position_mm: *position_mm,
-                product_mm2: insertion_mm * position_mm,
-                square_mm2: position_mm.norm_squared(),
-            });
+            bin.add(&Bin::of(insertion_mm, position_mm));
         }
     }
 
@@ -113,15 +124,32 @@ impl TravelCheck {
             sum.add(bin);
             if next == Some(&bins) {
                 next = stretches.next();
-                let error = self.contradiction(&sum, bins as f64 * BIN_MM);
+                let error = self.contradiction(&sum, bins);
                 self.error = self.error.take().or(error);
             }
         }
     }
 
-    /// What the sums over a stretch say against the insertion.
-    fn contradiction(&self, sum: &Bin, stretch_mm: f64) -> Option<String> {
-        let n = sum.count;
+    /// Adds to the refusal of positions that contradict the model what they are: frozen or of too small a
+    /// scale, where the travel shows it.
+    pub fn explain(&self, mut refusal: Refusal) -> Refusal {
+        if refusal.effect == Effect::Loses {
+            let change = self.change_over(EXPLAINED, SLOWER);
+            let what = change.map_or("a jump, or a drift".to_owned(), |change| change.to_string());
+            refusal.why += &format!(": {what}");
+        }
+        refusal
+    }
+
+    /// What changed over the last bins, to a scale in this range.
+    fn change_over(&self, bins: usize, tenths: Tenths) -> Option<Change> {
+        let bins = self.bins.iter().rev().take(bins);
+        Change::fitted(bins, tenths, self.noise_sd_mm.powi(2))
+    }
+
+    /// What the sums over a stretch of so many bins say against the insertion.
+    fn contradiction(&self, sum: &Bin, bins: usize) -> Option<String> {
+        let (n, stretch_mm) = (sum.count, bins as f64 * BIN_MM);
         if n < POSITIONS_MIN {
             return None;
         }
@@ -144,10 +172,11 @@ impl TravelCheck {
         let max = (1.0 + 2.0 * sd * sd).sqrt() + LONG.0 + LONG.1 / filled_mm + SDS * sd;
         // Written so that NaN is no contradiction: the positions are finite, and so is the slope.
         (ratio < min || ratio > max).then(|| {
+            let change = self.change_over(bins, if ratio < min { SLOWER } else { FASTER });
+            let what = change.map_or("of wrong scale".to_owned(), |change| change.to_string());
             format!(
                 "over the last {stretch_mm:.1} mm the tip travelled {ratio:.3} mm per mm inserted \
-                 (expected {min:.3} to {max:.3}): is the stream frozen or of wrong scale, or \
-                 needle.radius_mm wrong?"
+                 (expected {min:.3} to {max:.3}): the stream is {what}, or needle.radius_mm wrong"
             )
         })
     }

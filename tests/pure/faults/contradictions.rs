@@ -265,6 +265,7 @@ fn all_held(mut held_mm: Vec<f64>, within_mm: f64) {
 #[test]
 fn a_frozen_position_is_held_whatever_the_noise() {
     for (speed, rate_hz, within_mm) in [(1.0, 40.0, 4.2), (2.0, 40.0, 4.2), (2.0, 10.0, 6.0)] {
+        let mut named = 0;
         let held_mm = frozen_tries().map(|(struck_mm, seed)| {
             let sets = [
                 format!("insertion.speed_mm_per_s={speed}"),
@@ -275,10 +276,13 @@ fn a_frozen_position_is_held_whatever_the_noise() {
             let noise = frozen_with_noise(Noise::Gaussian(0.6), seed);
             let (bench, held_mm) = contradicted(run, struck_mm, noise);
             assert!(bench.reason().contains("; held and stopped; "), "{}", bench.reason());
+            named += usize::from(bench.reason().contains(": frozen for the last "));
             held_mm
         });
-        print!("{speed} mm/s, {rate_hz} Hz: ");
-        all_held(held_mm.collect(), within_mm);
+        let held_mm: Vec<f64> = held_mm.collect();
+        print!("{speed} mm/s, {rate_hz} Hz, {named} called frozen: ");
+        assert!(named as f64 >= 0.6 * held_mm.len() as f64, "{named} of {}", held_mm.len());
+        all_held(held_mm, within_mm);
     }
 }
 
@@ -310,7 +314,7 @@ fn a_jump_is_held_whatever_the_noise() {
                 let run = steered(&["emulator.noise={ sd_mm = 0.6 }", &seed]);
                 let jump = move |sample: &mut Sample| sample.position_mm.x += jump_mm;
                 let (bench, held_mm) = contradicted(run, struck_mm, jump);
-                assert!(bench.reason().contains(": a jump, a drift"), "{}", bench.reason());
+                assert!(bench.reason().contains(": a jump, or a drift; "), "{}", bench.reason());
                 held_mm
             });
             print!("{jump_mm} mm at {struck_mm} mm: ");
@@ -364,6 +368,32 @@ fn a_stream_at_half_speed() {
     is_documented(&stop, "a_stream_at_half_speed", 8.0);
 }
 
+/// The reason names the scale and not a frozen stream, but for some draws of the noise.
+/// `NEEDLE_STARTS=30` makes the figures of `docs/hazards.md`.
+#[test]
+fn a_stream_at_half_speed_is_named() {
+    for speed in [1.0, 2.0] {
+        let mut named = 0;
+        let held_mm = frozen_tries().map(|(struck_mm, seed)| {
+            let sets =
+                [format!("insertion.speed_mm_per_s={speed}"), format!("emulator.seed={seed}")];
+            let run = steered(&sets.each_ref().map(String::as_str));
+            let mut from = None;
+            let (bench, held_mm) = contradicted(run, struck_mm, move |sample| {
+                let at = *from.get_or_insert(sample.position_mm);
+                sample.position_mm = at + (sample.position_mm - at) * 0.5;
+            });
+            let scales = ["of scale 0.3", "of scale 0.4", "of scale 0.5", "of scale 0.6"];
+            named += usize::from(scales.iter().any(|scale| bench.reason().contains(scale)));
+            held_mm
+        });
+        let held_mm: Vec<f64> = held_mm.collect();
+        print!("{speed} mm/s, {named} called of scale 0.3 to 0.6: ");
+        assert!(named as f64 >= 0.9 * held_mm.len() as f64, "{named} of {}", held_mm.len());
+        all_held(held_mm, 10.0);
+    }
+}
+
 /// Three millimetres to the side, at a depth at which the observer knows where the tip is.
 #[test]
 fn a_jump_that_noise_hides() {
@@ -374,5 +404,5 @@ fn a_jump_that_noise_hides() {
         _ => None,
     });
     let text = warned.expect("it is told at once");
-    assert!(text.ends_with(": a jump, a drift, or frozen"), "{text}");
+    assert!(text.ends_with(": a jump, or a drift"), "{text}");
 }
