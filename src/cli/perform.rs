@@ -25,7 +25,7 @@ use crate::session::Done;
 use crate::telemetry::{Backpressure, Recorder, Scene, check_room, utc_text};
 use crate::transport::can::CanBus;
 use crate::transport::link::Link;
-use crate::transport::socketcan::SocketCan;
+use crate::transport::socketcan::{SocketCan, has_device};
 use crate::transport::udp::UdpBus;
 use crate::units::Time;
 use serde_json::{Value, json};
@@ -271,6 +271,12 @@ pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
 /// must be seen to leave.
 pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure> {
     let CanInterface::Socket(name) = config.bus() else { return open_bus(config.bus()) };
+    if !config.stage.hardware && has_device(name) {
+        return Err(Failure::configuration(format_args!(
+            "stage.hardware = false, and {name} has a device behind it: by that the drives may move; \
+             set stage.hardware = true"
+        )));
+    }
     let mut bus = SocketCan::open(name)?;
     // As many as may go unanswered, and the one under way.
     let syncs_max = usize::from(config.can.bus.missed_feedback_max) + 1;

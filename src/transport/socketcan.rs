@@ -237,6 +237,11 @@ fn errno(error: &io::Error) -> Option<Errno> {
     error.raw_os_error().map(Errno::from_raw)
 }
 
+/// True if `interface` has a device behind it, whatever it is named. vcan and vxcan have none.
+pub fn has_device(interface: &str) -> bool {
+    Path::new("/sys/class/net").join(interface).join("device").exists()
+}
+
 /// True when there is no frame yet, or a signal interrupted the call.
 fn nothing_there(error: &io::Error) -> bool {
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted)

@@ -1,7 +1,7 @@
 //! What the preflight says of a real CAN controller: the one that vcan/guest/run.sh puts into its machine.
 
 use crate::support::link::ip;
-use crate::support::programs::Program;
+use crate::support::programs::{Program, Scratch};
 use crate::support::vcan;
 use serde_json::Value;
 use std::process::Command;
@@ -63,4 +63,26 @@ fn a_controller_is_judged_by_what_the_kernel_says() {
     assert_eq!(rows[1].1, "1000 kbit/s, 6% load by SYNC");
     ip(&format!("link set {can} down"));
     assert_eq!(bus(&can)[0], row("FAIL", &format!("{can} down, stopped")));
+}
+
+/// A name does not make an interface virtual.
+#[test]
+fn a_controller_that_is_named_as_a_virtual_one_is_no_virtual_stage() {
+    let Some(_alone) = vcan::alone_on_it() else { return };
+    let Ok(can) = std::env::var("NEEDLE_CAN") else {
+        println!("no controller of the emulated machine: VCAN_GUEST=1 vcan/run.sh has one");
+        return;
+    };
+    ip(&format!("link set {can} down"));
+    ip(&format!("link set {can} type can bitrate 1000000"));
+    ip(&format!("link set {can} name vcan9"));
+    ip("link set vcan9 up");
+    let scratch = Scratch::new("named");
+    let bench = scratch.bench(&[], &["can.interface=\"vcan9\""]).end();
+    ip("link set vcan9 down");
+    ip(&format!("link set vcan9 name {can}"));
+    bench.assert_status(2);
+    let refused = "stage.hardware = false, and vcan9 has a device behind it: ";
+    assert!(bench.stderr.contains(refused), "{}", bench.stderr);
+    assert!(!scratch.path("runs").exists());
 }
