@@ -1,7 +1,7 @@
-"""Stands between a bench and its drives, each on a udp_multicast bus of its own, and changes what the
-drives say and what they are told.
+"""Stands between a bench and its drives, each on a bus of its own, and changes what the drives say and what
+they are told. A bus is a SocketCAN interface, or the udp_multicast of python-can.
 
-    can_relay.py --bench 239.75.1.1:43114 --drives 239.75.1.1:43113 \
+    can_relay.py --bench udp:239.75.1.1:43114 --drives udp:239.75.1.1:43113 \
         --rule 'node=1 from=4mm clear=0x0200' --rule 'node=2 from=4mm emcy=0x8611'
 
 A rule is a list of KEY=VALUE: node, from and until, and one thing to do.
@@ -16,7 +16,7 @@ A rule is a list of KEY=VALUE: node, from and until, and one thing to do.
 
 Every other frame passes as it is. What the rules do, and each new controlword on its way to a drive, is
 printed with time and depth: "12.345 s 4.003 mm node 1: controlword 0x0002 by SDO". Ends on SIGINT. Messages
-are python-can's (4.6.1), packed and unpacked by its own functions.
+over UDP are python-can's (4.6.1), packed and unpacked by its own functions.
 """
 
 import argparse
@@ -28,9 +28,6 @@ import sys
 import time
 from dataclasses import dataclass, field
 
-import can
-from can.interfaces.udp_multicast.utils import pack_message, unpack_message
-
 SYNC = 0x080
 EMCY, TPDO1, RPDO1, SDO_ANSWER, SDO_REQUEST = 0x080, 0x180, 0x200, 0x580, 0x600
 # Expedited SDO: command and object, two bytes of data.
@@ -40,10 +37,15 @@ CONTROLWORD_CONFIRMED = bytes([0x60, 0x40, 0x60, 0x00, 0, 0, 0, 0])
 EMCY_REGISTER = 0x21
 
 
-class Bus:
-    """One side: a socket that hears the group, and one of its own port to send from."""
+class UdpBus:
+    """One side over UDP: a socket that hears the group, and one of its own port to send from."""
 
     def __init__(self, address):
+        # Not needed over SocketCAN, and slow to load in an emulated machine.
+        import can
+        from can.interfaces.udp_multicast import utils
+
+        self.message, self.pack, self.unpack = can.Message, utils.pack_message, utils.unpack_message
         group, port = address.split(":")
         self.destination = (group, int(port))
         self.receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -57,19 +59,55 @@ class Bus:
         self.sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
         self.own_port = self.sender.getsockname()[1]
 
+    def fileno(self):
+        return self.receiver.fileno()
+
     def receive(self):
-        """The next datagram; None for one that this relay sent."""
+        """The next frame: identifier, data, and as it came; None for one that this relay sent."""
         datagram, (_, port) = self.receiver.recvfrom(4096)
-        return None if port == self.own_port else datagram
+        if port == self.own_port:
+            return None
+        frame = self.unpack(datagram)
+        return frame.arbitration_id, bytes(frame.data), datagram
 
     def send(self, datagram):
         self.sender.sendto(datagram, self.destination)
 
     def send_frame(self, cob_id, data):
-        frame = can.Message(
+        frame = self.message(
             timestamp=time.time(), arbitration_id=cob_id, is_extended_id=False, data=data
         )
-        self.send(pack_message(frame))
+        self.send(self.pack(frame))
+
+
+class CanBus:
+    """One side over SocketCAN, which does not hear what this relay sends. Its frames are struct can_frame, not
+    python-can's messages: an emulated machine has no time for those."""
+
+    FRAME = struct.Struct("=IB3x8s")
+
+    def __init__(self, interface):
+        self.socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        self.socket.bind((interface,))
+
+    def fileno(self):
+        return self.socket.fileno()
+
+    def receive(self):
+        """The next frame: identifier, data, and as it came."""
+        raw = self.socket.recv(CanBus.FRAME.size)
+        cob_id, length, data = CanBus.FRAME.unpack(raw)
+        return cob_id, data[:length], raw
+
+    def send(self, raw):
+        self.socket.send(raw)
+
+    def send_frame(self, cob_id, data):
+        self.send(CanBus.FRAME.pack(cob_id, len(data), data))
+
+
+def open_bus(name):
+    return UdpBus(name.removeprefix("udp:")) if name.startswith("udp:") else CanBus(name)
 
 
 @dataclass
@@ -178,9 +216,7 @@ class Relay:
             statusword = word
         return statusword
 
-    def from_drives(self, datagram):
-        frame = unpack_message(datagram)
-        cob_id, data = frame.arbitration_id, bytes(frame.data)
+    def from_drives(self, cob_id, data, raw):
         node, kind = cob_id & 0x7F, cob_id & 0x780
         if kind == TPDO1 and len(data) == 6:
             statusword, counts = struct.unpack("<Hi", data)
@@ -200,11 +236,9 @@ class Relay:
             for code in [rule.edit for rule in rules if rule.edit is not None][-1:]:
                 self.moment.say(node, f"emergency {data.hex()} becomes {code:#06x}")
                 return self.bench.send_frame(cob_id, struct.pack("<H", code) + data[2:])
-        self.bench.send(datagram)
+        self.bench.send(raw)
 
-    def to_drives(self, datagram):
-        frame = unpack_message(datagram)
-        cob_id, data = frame.arbitration_id, bytes(frame.data)
+    def to_drives(self, cob_id, data, raw):
         node, kind = cob_id & 0x7F, cob_id & 0x780
         held = [rule.hold for rule in self.rules_of(node) if rule.hold is not None]
         if cob_id == SYNC:
@@ -219,7 +253,7 @@ class Relay:
             self.tell_controlword(node, data[4:6], "SDO", held)
             if held:
                 return self.bench.send_frame(SDO_ANSWER + node, CONTROLWORD_CONFIRMED)
-        self.drives.send(datagram)
+        self.drives.send(raw)
 
     def tell_controlword(self, node, data, way, held):
         (word,) = struct.unpack_from("<H", data)
@@ -241,26 +275,25 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--bench", required=True, metavar="GROUP:PORT")
-    parser.add_argument("--drives", required=True, metavar="GROUP:PORT")
+    parser.add_argument("--bench", required=True, metavar="BUS")
+    parser.add_argument("--drives", required=True, metavar="BUS")
     parser.add_argument("--rule", type=Rule.parse, action="append", default=[], metavar="RULE")
     parser.add_argument("--counts-per-mm", type=float, default=4646.0)
     args = parser.parse_args()
 
     ended = []
     signal.signal(signal.SIGINT, lambda *_: ended.append(True))
-    bench, drives = Bus(args.bench), Bus(args.drives)
+    bench, drives = open_bus(args.bench), open_bus(args.drives)
     moment = Moment(time.monotonic(), args.counts_per_mm)
     relay = Relay(bench, drives, args.rule, moment)
-    ways = {bench.receiver: (bench, relay.to_drives), drives.receiver: (drives, relay.from_drives)}
+    ways = {bench: relay.to_drives, drives: relay.from_drives}
     print("relaying", flush=True)
     while not ended:
         ready, _, _ = select.select(list(ways), [], [], 0.1)
-        for receiver in ready:
-            bus, hand_on = ways[receiver]
-            datagram = bus.receive()
-            if datagram is not None:
-                hand_on(datagram)
+        for bus in ready:
+            frame = bus.receive()
+            if frame is not None:
+                ways[bus](*frame)
             relay.strike()
     return 0
 

@@ -12,6 +12,7 @@ pub(crate) mod protocol;
 pub(crate) mod python_drives;
 pub(crate) mod recorded;
 pub(crate) mod recording;
+pub(crate) mod relay;
 pub(crate) mod replays;
 pub(crate) mod stop;
 pub(crate) mod terminal;

@@ -1,4 +1,4 @@
-//! The virtual stage as a process of its own, on a bus over UDP.
+//! The virtual stage as a process of its own, on a bus over UDP or on vcan.
 
 use super::drives::assert_the_drives_stand;
 use super::programs::{self, Program};
@@ -20,6 +20,7 @@ pub(crate) fn group() -> SocketAddrV4 {
 /// A bus, and the stage on it.
 pub(crate) struct Stage {
     pub(crate) program: Program,
+    /// Where the bus is, if it is over UDP.
     pub(crate) group: SocketAddrV4,
     tracker: SocketAddr,
     /// What the bench has to be told to find it.
@@ -29,7 +30,12 @@ pub(crate) struct Stage {
 impl Stage {
     pub(crate) fn start(arguments: &[&str]) -> Self {
         let group = group();
-        let bus = format!("can.interface=\"udp:{group}\"");
+        Stage { group, ..Stage::start_on(&format!("udp:{group}"), arguments) }
+    }
+
+    /// The same on another interface.
+    pub(crate) fn start_on(interface: &str, arguments: &[&str]) -> Self {
+        let bus = format!("can.interface=\"{interface}\"");
         let free = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
         let address = free.local_addr().expect("an address");
         drop(free);
@@ -37,6 +43,7 @@ impl Stage {
         let there = ["--set", &bus, "--set", &tracker];
         let program = programs::stage(&[&there[..], arguments].concat());
         let settings = [bus, tracker];
+        let group = SocketAddrV4::new(Ipv4Addr::UNSPECIFIED, 0);
         Stage { program, group, tracker: address, settings }
     }
 

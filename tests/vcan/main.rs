@@ -5,6 +5,7 @@
 mod peers;
 mod preflight;
 mod protocol;
+mod relay;
 mod run;
 mod smoke;
 #[path = "../support/mod.rs"]

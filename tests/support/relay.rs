@@ -1,0 +1,226 @@
+//! Runs at 1 mm/s and 10 ms SYNC through a relay between bench and drives, which changes what the
+//! drives say and what they are told: tests/peers/can_relay.py, for whoever wants to try more.
+
+use super::peers::peer;
+use super::programs::{Ended, Scratch};
+use super::udp_stage::Stage;
+use std::net::SocketAddrV4;
+
+/// The two buses that the relay stands between.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Buses {
+    Udp,
+    /// The bench on vcan0, the drives on vcan1.
+    Vcan,
+}
+
+impl Buses {
+    /// How far a needle at 1 mm/s goes while the machine holds the programs up, mm: an emulated one for up to
+    /// half a second.
+    fn held_up_mm(self) -> f64 {
+        match self {
+            Buses::Udp => 0.0,
+            Buses::Vcan => 0.5,
+        }
+    }
+}
+
+/// A run through the relay, and what the relay saw.
+struct Relayed {
+    buses: Buses,
+    bench: Ended,
+    relay: Vec<Seen>,
+    /// Where the insertion drive stands in the end, mm.
+    stands_at_mm: f64,
+}
+
+/// A line of the relay's.
+#[derive(Debug, Clone)]
+struct Seen {
+    time_s: f64,
+    depth_mm: f64,
+    what: String,
+}
+
+/// Runs 3 mm with `rules` and with `settings`; none without the peer.
+fn run(buses: Buses, test: &str, rules: &[&str], settings: &[&str]) -> Option<Relayed> {
+    run_on(buses, &[], test, rules, settings)
+}
+
+/// The same on a virtual stage with these arguments.
+fn run_on(
+    buses: Buses,
+    stage: &[&str],
+    test: &str,
+    rules: &[&str],
+    settings: &[&str],
+) -> Option<Relayed> {
+    let (stage, bench_side, drives_side) = match buses {
+        Buses::Udp => {
+            let stage = Stage::start(stage);
+            // The group is this process's own, and so is the next port of it.
+            let bench_side = SocketAddrV4::new(*stage.group.ip(), stage.group.port() + 1);
+            let drives_side = format!("udp:{}", stage.group);
+            (stage, format!("udp:{bench_side}"), drives_side)
+        }
+        Buses::Vcan => (Stage::start_on("vcan1", stage), "vcan0".to_owned(), "vcan1".to_owned()),
+    };
+    let mut arguments = vec!["--bench", &bench_side, "--drives", &drives_side];
+    rules.iter().for_each(|rule| arguments.extend(["--rule", rule]));
+    let mut relay = peer("can_relay.py", &arguments)?;
+    relay.wait_for("relaying");
+    let scratch = Scratch::new(test);
+    let bus = format!("can.interface=\"{bench_side}\"");
+    let own = [
+        "insertion={ depth_mm = 3, plane_out_of_reach = \"insert\" }",
+        "insertion.speed_mm_per_s=1",
+        // An emulated machine may be held up for longer than a second.
+        "tracker.hold_after_s=2",
+        "can.heartbeat_timeout_ms=2000",
+        &bus,
+    ];
+    let bench = scratch.bench(&["--json"], &stage.settings(&[&own[..], settings].concat())).end();
+    relay.signal("INT");
+    let relay = relay.end();
+    relay.assert_status(0);
+    println!("{}{}{}", relay.stdout, bench.stderr, bench.stdout);
+    let seen = |line: &str| {
+        let mut words = line.splitn(5, ' ');
+        let time_s = words.next()?.parse().ok()?;
+        let depth_mm = words.nth(1)?.parse().ok()?;
+        Some(Seen { time_s, depth_mm, what: words.nth(1)?.to_owned() })
+    };
+    let relay = relay.stdout.lines().filter_map(seen).collect();
+    Some(Relayed { buses, bench, relay, stands_at_mm: stage.assert_it_stands() })
+}
+
+impl Relayed {
+    #[track_caller]
+    fn first(&self, what: &str) -> &Seen {
+        let found = self.relay.iter().find(|seen| seen.what.contains(what));
+        found.unwrap_or_else(|| panic!("{what}: not among {:?}", self.relay))
+    }
+
+    /// It was stopped for `reason`, and the insertion was told to by SDO soon after the relay did
+    /// `what`, and to stand.
+    #[track_caller]
+    fn was_stopped(&self, what: &str, reason: &str) {
+        self.bench.assert_status(1);
+        assert_eq!(self.bench.json()["stop_reason"], reason);
+        let (struck, stop) = (self.first(what), self.first("controlword 0x0002 by SDO"));
+        let after_ms = (stop.time_s - struck.time_s) * 1e3;
+        let until_mm = stop.depth_mm - struck.depth_mm;
+        let then_mm = self.stands_at_mm - stop.depth_mm;
+        println!("{after_ms:.1} ms, {until_mm:.3} mm until, {then_mm:.3} mm then");
+        // A busy machine may hold the bench up, and its SYNCs with it: the axes do not go on then.
+        let until_max_mm = 0.05 + self.buses.held_up_mm();
+        assert!(
+            (0.0..500.0).contains(&after_ms) && until_mm < until_max_mm,
+            "{after_ms} {until_mm}"
+        );
+        self.stood_after(stop);
+    }
+
+    /// The insertion stands soon after this was seen.
+    #[track_caller]
+    fn stood_after(&self, seen: &Seen) {
+        let then_mm = self.stands_at_mm - seen.depth_mm;
+        assert!((-0.001..0.1 + self.buses.held_up_mm()).contains(&then_mm), "{then_mm}");
+    }
+}
+
+/// Found in Fault, which is gone before it is enabled: what it says later is of now.
+pub(crate) fn an_emergency_of_a_drive_that_was_found_in_fault(buses: Buses) {
+    let rules = ["node=1 until=1sync set=0x0008 clear=0x0067", "node=1 from=2mm emcy=0x8611"];
+    let settings = ["stage.fault_reset_on_start=true"];
+    let Some(run) = run(buses, "relay-emcy", &rules, &settings) else { return };
+    run.was_stopped(
+        "emergency 0x8611",
+        "stage: insertion: emergency 0x8611 following error (register 0x21)",
+    );
+}
+
+/// A drive faults by itself. Its emergency message says why; where that is lost, its statusword says that it did.
+pub(crate) fn an_emergency_message_that_is_changed_or_lost_on_the_way(buses: Buses) {
+    let fault = r#"emulator.fault=[{ at_mm = 2, kind = "drive-fault", axis = "insertion", code = 0x4210 }]"#;
+    for (rule, struck, reason) in [
+        ("node=1 edit=0x8611", "becomes", "stage: insertion: emergency 0x8611 following error"),
+        ("node=1 drop=emcy", "lost", "stage: insertion: drive in fault (statusword 0x021"),
+    ] {
+        let Some(run) = run_on(buses, &["--set", fault], "relay-edit", &[rule], &[]) else {
+            return;
+        };
+        run.bench.assert_status(1);
+        let stop_reason = run.bench.json()["stop_reason"].as_str().unwrap().to_owned();
+        assert!(stop_reason.starts_with(reason), "{stop_reason}");
+        run.stood_after(run.first(struck));
+    }
+}
+
+/// It still has power: said, with what was tried.
+pub(crate) fn a_drive_that_takes_no_command_at_the_end(buses: Buses) {
+    let rules = ["node=1 from=2mm hold=0x000f"];
+    let Some(run) = run(buses, "relay-hold", &rules, &[]) else { return };
+    run.bench.assert_status(1);
+    assert_eq!(
+        run.bench.json()["stop_reason"],
+        "stage: insertion: the drive still has power 2000 ms after shutdown (statusword 0x1237 \
+         operation enabled); if it does not stop now, press the emergency stop"
+    );
+    let told = "off: press the emergency stop, then look at the stage";
+    assert!(run.bench.stderr.contains(told), "{}", run.bench.stderr);
+    assert!((run.stands_at_mm - 3.0).abs() < 0.01, "{}", run.stands_at_mm);
+    let first = |what| run.first(what).time_s;
+    let shutdown_s = first("controlword 0x0006 by RPDO lost");
+    for (word, after_s) in [("0x0002", 2.0), ("0x0000", 4.0)] {
+        let what = format!("controlword {word} by SDO lost");
+        let told: Vec<f64> = run
+            .relay
+            .iter()
+            .filter(|seen| seen.what.ends_with(&what))
+            .map(|seen| seen.time_s)
+            .collect();
+        println!("{what}: {} times from {:.2} s after shutdown", told.len(), told[0] - shutdown_s);
+        let (late_max_s, least) = match buses {
+            Buses::Udp => (0.2, 15),
+            Buses::Vcan => (0.7, 10),
+        };
+        assert!((least..=20).contains(&told.len()), "{told:?}");
+        let late_s = told[0] - shutdown_s - after_s;
+        assert!((-0.2..late_max_s).contains(&late_s), "{told:?}");
+    }
+}
+
+/// Remote, voltage enabled, and drive follows command.
+pub(crate) fn statuswords_of_a_drive_that_no_longer_obeys_or_follows(buses: Buses) {
+    for (bit, reason) in [
+        (
+            "0x0200",
+            "stage: insertion: the drive no longer obeys the bus (statusword 0x1037 operation \
+             enabled, bit 9 clear): it will ignore a stop; press the emergency stop",
+        ),
+        (
+            "0x0010",
+            "stage: insertion: the drive has lost its supply (statusword 0x1227 operation enabled, \
+             bit 4 clear), is an emergency stop pressed, or a fuse blown?",
+        ),
+        (
+            "0x1000",
+            "stage: insertion: the drive ignores its targets (statusword 0x0237 operation enabled, \
+             bit 12 clear), does an input or another tool hold it?",
+        ),
+    ] {
+        let rule = format!("node=1 from=2mm until=2.5mm clear={bit}");
+        let Some(run) = run(buses, "relay-bit", &[&rule], &[]) else { return };
+        run.was_stopped("becomes", reason);
+    }
+}
+
+/// Bit 7.
+pub(crate) fn a_drive_that_warns_goes_on(buses: Buses) {
+    let rules = ["node=2 from=2mm until=2.5mm set=0x0080"];
+    let Some(run) = run(buses, "relay-warning", &rules, &[]) else { return };
+    run.bench.assert_status(0);
+    let said = "rotation: the drive warns (statusword 0x12B7 operation enabled, bit 7), 1 so far";
+    assert!(run.bench.stderr.contains(said), "{}", run.bench.stderr);
+}
