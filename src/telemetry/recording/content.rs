@@ -7,16 +7,13 @@ use super::scene::Reach;
 use super::space::Space;
 use super::states::{Meaning, States};
 use super::steps::Steps;
-use super::{can, document, layout, scene};
+use super::{Logged, can, document, layout, scene};
 use crate::archive::{Manifest, unix_us_of};
 use crate::session::{Record, Severity, StepRecord};
 use crate::telemetry::{Entry, Scene};
 use crate::units::Time;
 use rerun::time::TimeCell;
-use rerun::{
-    DynamicArchetype, RecordingStream, RecordingStreamBuilder, RecordingStreamResult, TextDocument,
-    TextLog,
-};
+use rerun::{DynamicArchetype, RecordingStream, RecordingStreamBuilder, TextDocument, TextLog};
 
 /// The application under which a viewer files our recordings and keeps their layout.
 pub(super) const APPLICATION: &str = "needle-bench";
@@ -66,7 +63,7 @@ impl Content {
         manifest: &Manifest,
         config_toml: &str,
         scene: &Scene,
-    ) -> RecordingStreamResult<Self> {
+    ) -> Logged<Self> {
         stream.set_log_time_enabled(false);
         layout::send(&stream, scene, &Reach::of(scene))?;
         scene::log(&stream, scene)?;
@@ -110,7 +107,7 @@ impl Content {
     }
 
     /// Logs a record.
-    pub(super) fn take(&mut self, Entry { record, truth }: Entry) -> RecordingStreamResult<()> {
+    pub(super) fn take(&mut self, Entry { record, truth }: Entry) -> Logged {
         match record {
             Record::Begun { .. } | Record::Input { .. } => Ok(()),
             Record::Can { time, direction, frame } => {
@@ -174,13 +171,7 @@ impl Content {
     }
 
     /// Logs that `lane` enters `state`.
-    fn enter(
-        &mut self,
-        time: Time,
-        lane: &str,
-        state: &str,
-        meaning: Meaning,
-    ) -> RecordingStreamResult<()> {
+    fn enter(&mut self, time: Time, lane: &str, state: &str, meaning: Meaning) -> Logged {
         self.states.log(&self.stream, lane, state, meaning)?;
         self.now.enter(time, lane, state);
         self.log_now(time)
@@ -188,14 +179,14 @@ impl Content {
 
     /// Logs the page of states. A record may be older than the page before it; its change then appears at
     /// the time of that page.
-    fn log_now(&mut self, time: Time) -> RecordingStreamResult<()> {
+    fn log_now(&mut self, time: Time) -> Logged {
         self.now_at = self.now_at.max(time);
         self.at(self.now_at);
         self.now.log(&self.stream)
     }
 
     /// Moves the plane and the view to a needle that starts outside of them.
-    fn find_needle(&mut self, step: &StepRecord) -> RecordingStreamResult<()> {
+    fn find_needle(&mut self, step: &StepRecord) -> Logged {
         let estimated_mm = step.estimate.as_ref().map(|estimate| estimate.x_pb.translation);
         let Some(start_mm) = step.tip_meas_mm.or(estimated_mm) else { return Ok(()) };
         let Some(scene) = self.unseen.take() else { return Ok(()) };
@@ -208,12 +199,12 @@ impl Content {
         }
     }
 
-    fn line(&self, path: &str, level: &'static str, text: String) -> RecordingStreamResult<()> {
+    fn line(&self, path: &str, level: &'static str, text: String) -> Logged {
         self.stream.log(path, &TextLog::new(text).with_level(level))
     }
 
     /// Logs that the run is over.
-    pub(super) fn end(&self) -> RecordingStreamResult<()> {
+    pub(super) fn end(&self) -> Logged {
         self.motion.end(&self.stream)
     }
 }
@@ -236,10 +227,7 @@ fn level(severity: Severity) -> &'static str {
 }
 
 /// Logs the manifest as a page, and the outcome as a property.
-pub(super) fn log_manifest(
-    stream: &RecordingStream,
-    manifest: &Manifest,
-) -> RecordingStreamResult<()> {
+pub(super) fn log_manifest(stream: &RecordingStream, manifest: &Manifest) -> Logged {
     let page = document::manifest(manifest);
     stream.log_static("manifest", &TextDocument::from_markdown(page))?;
     let outcome =

@@ -2,9 +2,9 @@
 //! which colours.
 
 use super::content::{APPLICATION, INSERTION_DEPTH, RUN_TIME, STEP};
-use super::palette;
 use super::scene::Reach;
 use super::space::TRAILS;
+use super::{Logged, palette};
 use crate::telemetry::Scene;
 use crate::text::screen;
 use minijinja::context;
@@ -17,9 +17,7 @@ use rerun::blueprint::{VisualizableArchetype as _, Visualizer, VisualizerCompone
 use rerun::datatypes::{self, TimeRangeBoundary, Uuid};
 use rerun::external::re_log_types::BlueprintActivationCommand;
 use rerun::external::re_sdk_types::blueprint::archetypes as blueprint;
-use rerun::{
-    RecordingStream, RecordingStreamBuilder, RecordingStreamResult, SeriesLines, SeriesPoints,
-};
+use rerun::{RecordingStream, RecordingStreamBuilder, SeriesLines, SeriesPoints};
 use serde::Deserialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::error::Error;
@@ -84,11 +82,7 @@ fn parts(scene: &Scene, reach: &Reach) -> Result<Part, Box<dyn Error>> {
 
 /// Embeds the layout in the recording and makes it the active one: a layout that the viewer kept
 /// from another recording would win otherwise.
-pub(super) fn send(
-    stream: &RecordingStream,
-    scene: &Scene,
-    reach: &Reach,
-) -> RecordingStreamResult<()> {
+pub(super) fn send(stream: &RecordingStream, scene: &Scene, reach: &Reach) -> Logged {
     let parts = match parts(scene, reach) {
         Ok(parts) => parts,
         Err(error) => {
@@ -114,7 +108,7 @@ pub(super) fn send(
 }
 
 /// Logs the whole layout.
-fn log(layout: &RecordingStream, parts: &Part) -> RecordingStreamResult<()> {
+fn log(layout: &RecordingStream, parts: &Part) -> Logged {
     layout.set_time_sequence("blueprint", 0);
     let root = Uuid::random();
     log_part(layout, parts, root)?;
@@ -138,7 +132,7 @@ fn log(layout: &RecordingStream, parts: &Part) -> RecordingStreamResult<()> {
 }
 
 /// Logs a part and what is inside of it, with this identity; gives its path.
-fn log_part(layout: &RecordingStream, part: &Part, id: Uuid) -> RecordingStreamResult<String> {
+fn log_part(layout: &RecordingStream, part: &Part, id: Uuid) -> Logged<String> {
     let class = match part.class.as_str() {
         "horizontal" => return log_container(layout, part, ContainerKind::Horizontal, id),
         "vertical" => return log_container(layout, part, ContainerKind::Vertical, id),
@@ -186,9 +180,9 @@ fn log_container(
     part: &Part,
     kind: ContainerKind,
     id: Uuid,
-) -> RecordingStreamResult<String> {
+) -> Logged<String> {
     let inside = part.inside.iter().map(|part| log_part(layout, part, Uuid::random()));
-    let inside = inside.collect::<RecordingStreamResult<Vec<_>>>()?;
+    let inside = inside.collect::<Logged<Vec<_>>>()?;
     let mut container = blueprint::ContainerBlueprint::new(kind).with_contents(inside);
     if !part.name.is_empty() {
         container = container.with_display_name(part.name.as_str());
@@ -205,7 +199,7 @@ fn log_container(
 }
 
 /// Logs how the columns of a plot are drawn.
-fn log_series(layout: &RecordingStream, part: &Part, path: &str) -> RecordingStreamResult<()> {
+fn log_series(layout: &RecordingStream, part: &Part, path: &str) -> Logged {
     let mut visualizers: BTreeMap<&str, Vec<Visualizer>> = BTreeMap::new();
     for Series { table, column, name, colour, width } in &part.series {
         let (names, colours) = ([name.as_str()], [palette::named(colour)]);
@@ -237,7 +231,7 @@ fn log_series(layout: &RecordingStream, part: &Part, path: &str) -> RecordingStr
 }
 
 /// Logs the properties of a 3-D view.
-fn log_space(layout: &RecordingStream, part: &Part, path: &str) -> RecordingStreamResult<()> {
+fn log_space(layout: &RecordingStream, part: &Part, path: &str) -> Logged {
     let [place, target] = part.eye;
     let eye = blueprint::EyeControls3D::new()
         .with_position(place)

@@ -1,10 +1,11 @@
 //! The run for viewers while it goes on: a lossy tap.
 
+use super::Logged;
 use super::content::{Content, builder, log_manifest};
 use crate::archive::Manifest;
 use crate::telemetry::worker::{Backpressure, Sink, Worker};
 use crate::telemetry::{Entry, Scene, TelemetryError};
-use rerun::{MemoryLimit, RecordingStreamResult, ServerOptions};
+use rerun::{MemoryLimit, ServerOptions};
 use std::net::{SocketAddr, TcpListener};
 use std::thread;
 use std::time::Duration;
@@ -47,7 +48,7 @@ fn open(
     manifest: &Manifest,
     config_toml: &str,
     scene: &Scene,
-) -> RecordingStreamResult<Content> {
+) -> Logged<Content> {
     let memory_limit = MemoryLimit::from_bytes(HISTORY_BYTES);
     let options = ServerOptions { memory_limit, ..ServerOptions::default() };
     let (ip, port) = (address.ip().to_string(), address.port());

@@ -29,6 +29,9 @@ use rerun::{
     RecordingStreamResult,
 };
 
+/// The result of logging, or of what logs on its way.
+type Logged<T = ()> = RecordingStreamResult<T>;
+
 /// A value in a row, with the name of its column. The name says the unit; the layout has the colours.
 type NamedValue<N> = (N, f64);
 
@@ -38,7 +41,7 @@ fn log_row<N: AsRef<str>>(
     stream: &RecordingStream,
     path: &str,
     row: impl IntoIterator<Item = NamedValue<N>>,
-) -> RecordingStreamResult<()> {
+) -> Logged {
     let cells = row.into_iter().filter_map(|(name, value)| {
         // Only an empty name is refused.
         let column = ComponentIdentifier::try_new(name.as_ref()).ok()?;

@@ -1,11 +1,11 @@
 //! The tables of the stage: positions at every SYNC, speeds and lags, and the limits. A lag is the
 //! following error: commanded minus measured position.
 
-use super::{NamedValue, log_row};
+use super::{Logged, NamedValue, log_row};
 use crate::stage::Feedback;
 use crate::telemetry::Scene;
 use crate::units::Time;
-use rerun::{RecordingStream, RecordingStreamResult};
+use rerun::RecordingStream;
 use std::time::Duration;
 
 /// Positions at every SYNC.
@@ -49,11 +49,7 @@ impl Motion {
         Motion { limits: limits(scene), limits_due: Time::ZERO, window: None }
     }
 
-    pub(super) fn log(
-        &mut self,
-        stream: &RecordingStream,
-        stage: &Feedback,
-    ) -> RecordingStreamResult<()> {
+    pub(super) fn log(&mut self, stream: &RecordingStream, stage: &Feedback) -> Logged {
         let columns =
             ["insertion_cmd_mm", "insertion_meas_mm", "rotation_cmd_deg", "rotation_meas_deg"];
         let positions = positions(stage);
@@ -90,7 +86,7 @@ impl Motion {
     }
 
     /// Call it when the run is over: logs the limits once more, so that their lines reach the end.
-    pub(super) fn end(&self, stream: &RecordingStream) -> RecordingStreamResult<()> {
+    pub(super) fn end(&self, stream: &RecordingStream) -> Logged {
         match self.window {
             Some(_) => log_row(stream, LIMITS, self.limits.iter().copied()),
             None => Ok(()),

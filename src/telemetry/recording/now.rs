@@ -1,10 +1,11 @@
 //! The states at the time cursor, as a page. The lanes of states stand still while the cursor moves.
 
+use super::Logged;
 use crate::canopen::emcy::Emcy;
 use crate::session::{Lane, Severity, State};
 use crate::stage::Axis;
 use crate::units::Time;
-use rerun::{RecordingStream, RecordingStreamResult, TextDocument};
+use rerun::{RecordingStream, TextDocument};
 use std::fmt::Write as _;
 use std::time::Duration;
 
@@ -78,7 +79,7 @@ impl Now {
     }
 
     /// Logs the page, as it is from here on.
-    pub(super) fn log(&self, stream: &RecordingStream) -> RecordingStreamResult<()> {
+    pub(super) fn log(&self, stream: &RecordingStream) -> Logged {
         stream.log(NOW, &TextDocument::from_markdown(self.page()))
     }
 

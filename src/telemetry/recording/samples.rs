@@ -1,11 +1,11 @@
 //! The tracker's samples: delays, rates, and refusals by each gate.
 
-use super::log_row;
 use super::states::{Meaning, States};
+use super::{Logged, log_row};
 use crate::session::SampleRecord;
 use crate::tracker::GateName;
 use crate::units::Time;
-use rerun::{RecordingStream, RecordingStreamResult, TextLog};
+use rerun::{RecordingStream, TextLog};
 use std::time::Duration;
 
 /// Every sample that has a time of acquisition.
@@ -34,7 +34,7 @@ impl Samples {
         stream: &RecordingStream,
         sample: &SampleRecord,
         states: &mut States,
-    ) -> RecordingStreamResult<()> {
+    ) -> Logged {
         if let Some(acquisition_time) = sample.acquisition_time {
             let delay_ms = sample.received.receive_time.seconds_after(acquisition_time) * 1e3;
             log_row(stream, SAMPLES, [("delay_ms", delay_ms)])?;
@@ -70,10 +70,7 @@ impl Samples {
 }
 
 /// Logs a line if the sample was refused.
-pub(super) fn log_refused(
-    stream: &RecordingStream,
-    sample: &SampleRecord,
-) -> RecordingStreamResult<()> {
+pub(super) fn log_refused(stream: &RecordingStream, sample: &SampleRecord) -> Logged {
     let Some(reason) = &sample.refused else { return Ok(()) };
     let text = format!("sample of {:?} refused: {reason}", sample.received.tool);
     stream.log("events/samples", &TextLog::new(text).with_level("WARN"))

@@ -1,13 +1,13 @@
 //! The fixed part of the 3-D view: the desired plane with its lines and axes.
 
-use super::palette;
+use super::{Logged, palette};
 use crate::geometry::Pose;
 use crate::plan::{Obstacle, Problem, Workspace, World};
 use crate::telemetry::Scene;
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 use rerun::{
     Arrows3D, Boxes3D, Cylinders3D, Ellipsoids3D, FillMode, LineStrips3D, Mesh3D, Points3D,
-    Quaternion, RecordingStream, RecordingStreamResult, Transform3D, ViewCoordinates,
+    Quaternion, RecordingStream, Transform3D, ViewCoordinates,
 };
 use std::f64::consts::{FRAC_PI_2, PI};
 
@@ -68,7 +68,7 @@ impl Reach {
 }
 
 /// Logs the plane, its axes with their names, and the goal.
-pub(super) fn log(stream: &RecordingStream, scene: &Scene) -> RecordingStreamResult<()> {
+pub(super) fn log(stream: &RecordingStream, scene: &Scene) -> Logged {
     // x, the distance from the plane, is up; the needle goes away from the eye.
     stream.log_static(PLANE, &ViewCoordinates::UBR())?;
     stream.log_static(PLANE, &transform(&scene.x_wp))?;
@@ -87,7 +87,7 @@ pub(super) fn log(stream: &RecordingStream, scene: &Scene) -> RecordingStreamRes
 }
 
 /// Logs the part of the plane within `reach`: a translucent sheet, a line every 10 mm, and depths.
-pub(super) fn log_sheet(stream: &RecordingStream, reach: &Reach) -> RecordingStreamResult<()> {
+pub(super) fn log_sheet(stream: &RecordingStream, reach: &Reach) -> Logged {
     let ([left, right], [near, far]) = (reach.y_mm, reach.z_mm);
     let corner = |y: f64, z: f64| [0.0, y as f32, z as f32];
     let sheet = [corner(left, near), corner(right, near), corner(right, far), corner(left, far)];
@@ -126,11 +126,7 @@ pub(super) fn log_sheet(stream: &RecordingStream, reach: &Reach) -> RecordingStr
 const MASK_STEP_MM: f64 = 3.0;
 
 /// Logs the target with its tolerance, and the obstacles.
-fn log_goal(
-    stream: &RecordingStream,
-    world: &World,
-    problem: &Problem,
-) -> RecordingStreamResult<()> {
+fn log_goal(stream: &RecordingStream, world: &World, problem: &Problem) -> Logged {
     let ball = |centre_mm: &Vector3<f64>, radius_mm: f64, colour| {
         Ellipsoids3D::from_centers_and_half_sizes([point(centre_mm)], [[radius_mm as f32; 3]])
             .with_colors([colour])

@@ -3,6 +3,7 @@
 //! Each step logs one segment of a trail and one measured point. The layout shows all of them up to the
 //! cursor, so no step logs the earlier ones again.
 
+use super::Logged;
 use super::palette::{
     COMMANDED, ESTIMATE, ESTIMATE_BOUND, GOOD, LIMIT, MEASURED, OUT_OF_REACH, TRUTH,
 };
@@ -16,7 +17,6 @@ use crate::telemetry::Scene;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use rerun::{
     Arrows3D, Color, Ellipsoids3D, FillMode, LineStrips3D, Points3D, Radius, RecordingStream,
-    RecordingStreamResult,
 };
 
 /// Length of the arrows at a tip, mm.
@@ -47,7 +47,7 @@ pub(super) struct Space {
 
 impl Space {
     /// Logs the colours and sizes, which do not change.
-    pub(super) fn open(stream: &RecordingStream, scene: &Scene) -> RecordingStreamResult<Self> {
+    pub(super) fn open(stream: &RecordingStream, scene: &Scene) -> Logged<Self> {
         let space = Space {
             estimate: Tip::new("estimate", ESTIMATE),
             truth: Tip::new("true", TRUTH),
@@ -74,7 +74,7 @@ impl Space {
         stream: &RecordingStream,
         step: &StepRecord,
         truth: Option<&Truth>,
-    ) -> RecordingStreamResult<()> {
+    ) -> Logged {
         if let Some(estimate) = &step.estimate {
             self.estimate.log(stream, &estimate.x_pb)?;
             log_ellipsoid(stream, estimate)?;
@@ -111,7 +111,7 @@ impl Space {
         stream: &RecordingStream,
         step: &StepRecord,
         target_mm: &Vector3<f64>,
-    ) -> RecordingStreamResult<()> {
+    ) -> Logged {
         let Some(((world, problem), estimate)) = self.goal.as_ref().zip(step.estimate) else {
             return Ok(());
         };
@@ -154,7 +154,7 @@ impl Tip {
         }
     }
 
-    fn log(&mut self, stream: &RecordingStream, x_pb: &Pose) -> RecordingStreamResult<()> {
+    fn log(&mut self, stream: &RecordingStream, x_pb: &Pose) -> Logged {
         if !x_pb.is_finite() {
             return Ok(());
         }
@@ -165,7 +165,7 @@ impl Tip {
     }
 
     /// The bevel bends the tip towards −y of its own frame (paper Eq. 1: `p'' = −κ R e₂`).
-    fn log_style(&self, stream: &RecordingStream) -> RecordingStreamResult<()> {
+    fn log_style(&self, stream: &RecordingStream) -> Logged {
         let arrows = [Vector3::z(), -Vector3::y() * 0.7]
             .map(|direction: Vector3<f32>| <[f32; 3]>::from(direction * ARROW_MM));
         let arrows = Arrows3D::from_vectors(arrows)
@@ -182,7 +182,7 @@ impl Tip {
 }
 
 /// Logs the 95 % ellipsoid of the estimated position, where the estimate has one.
-fn log_ellipsoid(stream: &RecordingStream, estimate: &Estimate) -> RecordingStreamResult<()> {
+fn log_ellipsoid(stream: &RecordingStream, estimate: &Estimate) -> Logged {
     let covariance_mm2 = estimate
         .position_covariance_mm2()
         .filter(|covariance_mm2| covariance_mm2.iter().all(|c| c.is_finite()));

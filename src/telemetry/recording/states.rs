@@ -1,9 +1,10 @@
 //! Changes of state, coloured by what they mean.
 
+use super::Logged;
 use super::palette::{COORDINATES, FAULT, GOOD, NEUTRAL, WARNING};
 use crate::canopen::cia402::DriveState;
 use crate::session::State;
-use rerun::{Color, RecordingStream, RecordingStreamResult, StateChange, StateConfiguration};
+use rerun::{Color, RecordingStream, StateChange, StateConfiguration};
 use std::collections::BTreeMap;
 
 /// The states that each lane was in so far, with their meanings.
@@ -18,7 +19,7 @@ impl States {
         lane: &str,
         state: &str,
         meaning: Meaning,
-    ) -> RecordingStreamResult<()> {
+    ) -> Logged {
         let path = format!("states/{lane}");
         let known = self.0.entry(lane.to_owned()).or_default();
         if known.iter().all(|(known, _)| known != state) {

@@ -1,6 +1,6 @@
 //! The tables of the steps: state, bounds, errors, command and measurement.
 
-use super::log_row;
+use super::{Logged, log_row};
 use crate::archive::{STEP_COLUMNS, StepCells, StepColumn, coordinates, is_of_truth};
 use crate::emulator::Truth;
 use crate::observer::Estimate;
@@ -8,7 +8,7 @@ use crate::plan::Path;
 use crate::session::StepRecord;
 use crate::telemetry::Scene;
 use crate::units::wrap_angle;
-use rerun::{RecordingStream, RecordingStreamResult};
+use rerun::RecordingStream;
 
 /// The table of the steps.
 pub(super) const STEPS: &str = "steps";
@@ -62,7 +62,7 @@ impl Steps {
         stream: &RecordingStream,
         step: &StepRecord,
         known_truth: Option<&Truth>,
-    ) -> RecordingStreamResult<()> {
+    ) -> Logged {
         let truth = known_truth.map_or(UNKNOWN, |t| coordinates(t.x_pb()));
         let has_truth = self.has_truth;
         let errors = |estimate: [f64; 6]| {
