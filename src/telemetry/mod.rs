@@ -33,7 +33,7 @@ pub use folder::{check_room, free_mb, is_being_written, lock, write_manifest};
 pub use recorder::{Finished, Recorder};
 pub use recording::Recording;
 pub use repair::{Repaired, note_recording, repair};
-pub use run_folder::{RunFolder, seal_file};
+pub use run_folder::RunFolder;
 pub use vitals::RecordNews;
 pub use worker::Backpressure;
 

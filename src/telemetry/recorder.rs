@@ -77,13 +77,12 @@ impl Recorder {
         config_toml: String,
         backpressure: Backpressure,
     ) -> Result<Recorder, TelemetryError> {
-        let started_unix_us = unix_us_of(&manifest.started_utc).unwrap_or_default();
         let path = run_dir.join(file::CONFIG);
         fs::write(&path, &config_toml).map_err(TelemetryError::file(&path))?;
         let lock = folder::lock(&run_dir)?;
         folder::write_manifest(&run_dir, &manifest)?;
         folder::reserve_manifest(&run_dir)?;
-        let (files, mut kept) = TextFiles::create(&run_dir, &manifest.bus, started_unix_us)?;
+        let (files, mut kept) = TextFiles::create(&run_dir, &manifest)?;
         kept.push((file::CONFIG, File::open(&path).map_err(TelemetryError::file(&path))?));
         let text = Worker::start(TEXT_FILES, QUEUE_ENTRIES, backpressure, || Ok(files))?;
         let (keeper, troubles) = keep(run_dir.clone(), kept)?;
@@ -142,7 +141,7 @@ impl Recorder {
         let now = Instant::now();
         let [text, keeper] = &mut self.watches;
         let news = text
-            .look(&self.text.vitals, self.text.dropped(), now)
+            .look(&self.text.vitals, self.text.dropped, now)
             .or_else(|| keeper.look(&self.keeper.vitals, 0, now))
             .or_else(|| {
                 let trouble = format!("{KEEPER}: {}", self.troubles.pop().ok()?);
@@ -184,7 +183,7 @@ impl Recorder {
             Ok((left, fault)) => (left, fault),
             Err(silent) => {
                 // The manifest as it was, if it can be written.
-                let dropped = Some(self.dropped(self.text.dropped()));
+                let dropped = Some(self.dropped(self.text.dropped));
                 self.note(&silent);
                 let faults = self.faults.clone();
                 let open = Manifest { faults, dropped, ..open };
@@ -195,7 +194,7 @@ impl Recorder {
         };
         fault.iter().for_each(|fault| self.note(fault));
         // An entry that is not in the files is lost, for whatever reason.
-        let dropped = self.dropped(self.text.given().saturating_sub(left.entries));
+        let dropped = self.dropped(self.text.given.saturating_sub(left.entries));
         self.manifest.counts = Some(left.counts);
         self.manifest.dropped = Some(dropped);
         self.manifest.faults.clone_from(&self.faults);
@@ -214,7 +213,11 @@ impl Recorder {
     }
 
     fn dropped(&self, text_files: u64) -> Dropped {
-        Dropped { text_files, recording: 0, live: self.live.as_ref().map_or(0, Worker::dropped) }
+        Dropped {
+            text_files,
+            recording: 0,
+            live: self.live.as_ref().map_or(0, |live| live.dropped),
+        }
     }
 
     /// Adds a fault, unless it is known.

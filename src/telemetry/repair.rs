@@ -1,6 +1,7 @@
 //! Closes a record that its bench left open, for example because it was killed.
 
-use super::{RunFolder, TelemetryError, folder, seal_file, utc_text};
+use super::run_folder::seal_of;
+use super::{RunFolder, TelemetryError, folder, utc_text};
 use crate::archive::{Counts, RecordedColumns, file};
 use crate::session::Outcome;
 use std::fmt;
@@ -91,11 +92,7 @@ pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
     manifest.repaired_utc = Some(utc_text(SystemTime::now()));
     let names = [file::CONFIG].into_iter().chain(file::LINES);
     for name in names.map(str::to_owned).chain(cuts.iter().map(|(name, _)| cut_name(name))) {
-        match seal_file(&dir.join(&name)) {
-            Ok(seal) => manifest.files.extend([(name, seal)]),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-            Err(error) => return Err(TelemetryError::file(&dir.join(name))(error)),
-        }
+        manifest.files.extend(seal_of(dir, &name)?.map(|seal| (name, seal)));
     }
     folder::write_manifest(dir, &manifest)?;
     Ok(Repaired { stop_reason, counts, cuts })
@@ -110,13 +107,9 @@ pub fn note_recording(dir: &Path, fault: Option<String>) -> Result<(), Telemetry
     let mut manifest = RunFolder::open(dir)?.manifest().clone();
     manifest.faults.retain(|known| !known.starts_with(file::RECORDING));
     manifest.faults.extend(fault);
-    match seal_file(&dir.join(file::RECORDING)) {
-        Ok(seal) => _ = manifest.files.insert(file::RECORDING.to_owned(), seal),
-        Err(error) if error.kind() == io::ErrorKind::NotFound => {
-            manifest.files.remove(file::RECORDING);
-        }
-        Err(error) => return Err(TelemetryError::file(&dir.join(file::RECORDING))(error)),
-    }
+    manifest.files.remove(file::RECORDING);
+    let seal = seal_of(dir, file::RECORDING)?;
+    manifest.files.extend(seal.map(|seal| (file::RECORDING.to_owned(), seal)));
     folder::write_manifest(dir, &manifest)
 }
 

@@ -65,10 +65,8 @@ impl RunFolder {
             changes.extend(there.map(|name| format!("{name} has no seal in the closed record")));
         }
         if !self.manifest.files.contains_key(file::CONFIG) {
-            let is_same = match seal_file(&self.dir.join(file::CONFIG)) {
-                Ok(seal) => seal.sha256 == self.manifest.config_sha256,
-                Err(_) => false,
-            };
+            let seal = seal_of(&self.dir, file::CONFIG).ok().flatten();
+            let is_same = seal.is_some_and(|seal| seal.sha256 == self.manifest.config_sha256);
             changes.extend((!is_same).then(|| edited(file::CONFIG)));
         }
         if changes.is_empty() {
@@ -81,17 +79,17 @@ impl RunFolder {
 
     /// The change of the file `name` since it was sealed.
     fn change(&self, name: &str, then: &FileSeal) -> Result<Option<String>, TelemetryError> {
-        let path = self.dir.join(name);
-        Ok(Some(match seal_file(&path) {
-            Ok(now) if now == *then => return Ok(None),
-            Ok(now) if now.bytes != then.bytes => {
-                let (then, now) = (then.bytes, now.bytes);
-                format!("{name} had {then} bytes when the record was closed and has {now} now")
+        Ok(match seal_of(&self.dir, name)? {
+            Some(now) if now == *then => None,
+            Some(FileSeal { bytes, .. }) if bytes != then.bytes => {
+                let then = then.bytes;
+                Some(format!(
+                    "{name} had {then} bytes when the record was closed and has {bytes} now"
+                ))
             }
-            Ok(_) => edited(name),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => format!("{name} is gone"),
-            Err(error) => return Err(TelemetryError::file(&path)(error)),
-        }))
+            Some(_) => Some(edited(name)),
+            None => Some(format!("{name} is gone")),
+        })
     }
 
     /// The lines of the file `name`, read as they are asked for.
@@ -131,11 +129,19 @@ fn read_text(path: &Path) -> io::Result<String> {
     Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
-/// Size and SHA-256 of the file `path` as it is now.
+/// Size and SHA-256 of the file `name` in `dir` as it is now; `None` where there is none.
 ///
 /// # Errors
-/// It cannot be read.
-pub fn seal_file(path: &Path) -> io::Result<FileSeal> {
+/// [`TelemetryError::File`].
+pub(super) fn seal_of(dir: &Path, name: &str) -> Result<Option<FileSeal>, TelemetryError> {
+    let path = dir.join(name);
+    match seal_file(&path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        sealed => sealed.map(Some).map_err(TelemetryError::file(&path)),
+    }
+}
+
+fn seal_file(path: &Path) -> io::Result<FileSeal> {
     let mut file = BufReader::with_capacity(1 << 16, open_regular(path)?);
     let (mut hash, mut bytes) = (Sha256::new(), 0);
     let mut buffer = [0; 1 << 14];

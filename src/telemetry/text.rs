@@ -6,7 +6,7 @@ use super::worker::{Left, Sink};
 use super::{Entry, TelemetryError};
 use crate::archive::{
     CandumpLine, Counts, EventLine, FileSeal, Manifest, StepRow, file, hex, input_line,
-    inputs_header, interface_name, steps_csv_header, tracker_line,
+    inputs_header, interface_name, steps_csv_header, tracker_line, unix_us_of,
 };
 use crate::session::Record;
 use sha2::{Digest, Sha256};
@@ -31,8 +31,7 @@ impl TextFiles {
     /// Makes the files in `dir`; gives them, and their handles by name for the keeper.
     pub(super) fn create(
         dir: &Path,
-        bus: &str,
-        started_unix_us: i64,
+        manifest: &Manifest,
     ) -> Result<(Self, Vec<Kept>), TelemetryError> {
         let (mut files, mut kept) = (Vec::new(), Vec::new());
         for name in file::LINES {
@@ -42,7 +41,11 @@ impl TextFiles {
             kept.push((name, storage.try_clone().map_err(TelemetryError::file(&path))?));
             files.push(TextFile::new(path, storage));
         }
-        let mut files = TextFiles { files, interface: interface_name(bus), started_unix_us };
+        let mut files = TextFiles {
+            files,
+            interface: interface_name(&manifest.bus),
+            started_unix_us: unix_us_of(&manifest.started_utc).unwrap_or_default(),
+        };
         files.line(file::STEPS, &steps_csv_header());
         match files.tick() {
             Ok(()) => Ok((files, kept)),

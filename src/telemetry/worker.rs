@@ -71,8 +71,10 @@ pub(super) struct Worker<T> {
     writer: &'static str,
     queue: SyncSender<Message<T>>,
     backpressure: Backpressure,
-    given: u64,
-    dropped: u64,
+    /// Items given so far, taken or not.
+    pub(super) given: u64,
+    /// Items that did not reach the writer.
+    pub(super) dropped: u64,
     pub(super) vitals: Arc<Vitals>,
     done: Receiver<(Left, Result<(), String>)>,
 }
@@ -141,16 +143,6 @@ impl<T: Send + 'static> Worker<T> {
             thread::sleep(RETRY);
         }
         self.vitals.fault().is_none()
-    }
-
-    /// Items given so far, taken or not.
-    pub(super) fn given(&self) -> u64 {
-        self.given
-    }
-
-    /// Items that did not reach the writer.
-    pub(super) fn dropped(&self) -> u64 {
-        self.dropped
     }
 
     /// Tells the thread how the run ended, and waits for it no longer than `limit`, whatever it has left to
@@ -287,7 +279,7 @@ mod tests {
         // The writer holds one and its queue four: of ten more, six are lost. Were `give` to
         // block, this test would not end.
         (0..10).for_each(|_| worker.give(entry()));
-        assert_eq!(worker.dropped(), 6);
+        assert_eq!(worker.dropped, 6);
         drop(let_go);
         assert_eq!(entries_left(&worker), 5);
     }
@@ -298,7 +290,7 @@ mod tests {
         let lets_go = thread::spawn(move || (0..50).for_each(|_| let_go.send(()).unwrap()));
         (0..50).for_each(|_| worker.give(entry()));
         lets_go.join().unwrap();
-        assert_eq!((entries_left(&worker), worker.dropped()), (50, 0));
+        assert_eq!((entries_left(&worker), worker.dropped), (50, 0));
     }
 
     #[test]
@@ -314,7 +306,7 @@ mod tests {
             assert_eq!(left.entries, 2, "what it left is told all the same");
             assert_eq!(worker.vitals.fault(), Some("no space left"));
             (0..10).for_each(|_| worker.give(entry()));
-            assert_eq!(worker.dropped(), 10);
+            assert_eq!(worker.dropped, 10);
         }
     }
 
