@@ -10,6 +10,7 @@ use crate::plan::{
 };
 use crate::text::screen;
 use clap::Args;
+use flate2::CrcReader;
 use flate2::read::MultiGzDecoder;
 use minijinja::context;
 use nalgebra::{Matrix3, Rotation3, Vector3};
@@ -141,14 +142,9 @@ fn check_length(path: &Path, header: &NiftiHeader, voxels: usize) -> Result<(), 
 
 /// The CRC-32 of the file in `path`, read in pieces: a file that is no mask may be of any size.
 pub(super) fn file_crc32(path: &Path) -> io::Result<u32> {
-    let (mut file, mut hasher) = (File::open(path)?, crc32fast::Hasher::new());
-    let mut piece = vec![0; 1 << 16];
-    loop {
-        match file.read(&mut piece)? {
-            0 => return Ok(hasher.finalize()),
-            count => hasher.update(&piece[..count]),
-        }
-    }
+    let mut file = CrcReader::new(File::open(path)?);
+    io::copy(&mut file, &mut io::sink())?;
+    Ok(file.crc().sum())
 }
 
 /// Why an image cannot be read.
