@@ -4,7 +4,7 @@ use super::Failure;
 use crate::text::{is_unprintable, wrapped};
 use serde::Serialize;
 use serde_json::Value;
-use std::fmt::{Display, Write as _};
+use std::fmt::Display;
 use std::fs::File;
 use std::io::{self, ErrorKind, Write};
 use std::path::Path;
@@ -87,15 +87,11 @@ pub(super) fn plain(text: impl Display, kept: &str) -> String {
     if !text.contains(is_acted_upon) {
         return text;
     }
-    let mut shown = String::with_capacity(text.len() + 8);
-    for c in text.chars() {
-        // Writing to a string cannot fail.
-        let _ = match is_acted_upon(c) {
-            true => write!(shown, "\\u{:04x}", u32::from(c)),
-            false => write!(shown, "{c}"),
-        };
-    }
-    shown
+    let shown = text.chars().map(|c| match is_acted_upon(c) {
+        true => format!("\\u{:04x}", u32::from(c)),
+        false => c.to_string(),
+    });
+    shown.collect()
 }
 
 #[cfg(test)]

@@ -41,8 +41,15 @@ pub(super) struct Arguments {
     /// In a campaign: totals for each value of this configuration key, instead of each name.
     #[arg(long, value_name = "KEY")]
     by: Option<String>,
-    #[command(flatten)]
-    judgement: Judgement,
+    /// Record whether the run counts. The manifest keeps earlier verdicts.
+    #[arg(long, requires = "reason", value_parser = verdict())]
+    verdict: Option<VerdictKind>,
+    /// The reason for the verdict.
+    #[arg(long, value_name = "TEXT", requires = "verdict")]
+    reason: Option<String>,
+    /// Close the record of a run whose bench was ended before it could: killed, or without power.
+    #[arg(long, conflicts_with = "verdict")]
+    repair: bool,
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
@@ -55,7 +62,7 @@ pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
         let none = || Failure::configuration(format_args!("no run in {RUNS}: name a run folder"));
         paths.push(newest.ok_or_else(none)?.dir().to_path_buf());
     }
-    let is_judged = arguments.judgement.is_asked();
+    let is_judged = arguments.verdict.is_some() || arguments.repair;
     let (is_one, is_campaign) = match &paths[..] {
         _ if is_judged => (false, false),
         [path] => (!read::is_folder_of_runs(path), read::is_folder_of_runs(path)),
@@ -72,7 +79,10 @@ pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
     }
     match &paths[..] {
         [path] if is_judged => {
-            arguments.judgement.give(path, arguments.json)?;
+            match (arguments.verdict, &arguments.reason) {
+                (Some(verdict), Some(reason)) => judge(path, verdict, reason, arguments.json)?,
+                _ => close(path, arguments.json)?,
+            }
             Ok(ExitCode::SUCCESS)
         }
         _ if is_judged => Err(Failure::configuration(
@@ -170,40 +180,12 @@ fn status(runs: &[&Run]) -> ExitCode {
     }
 }
 
-#[derive(Debug, Args)]
-pub(super) struct Judgement {
-    /// Record whether the run counts. The manifest keeps earlier verdicts.
-    #[arg(long, requires = "reason", value_parser = verdict())]
-    verdict: Option<VerdictKind>,
-    /// The reason for the verdict.
-    #[arg(long, value_name = "TEXT", requires = "verdict")]
-    reason: Option<String>,
-    /// Close the record of a run whose bench was ended before it could: killed, or without power.
-    #[arg(long, conflicts_with = "verdict")]
-    repair: bool,
-}
-
 /// A parser of a verdict's name, for clap.
 fn verdict() -> impl TypedValueParser<Value = VerdictKind> {
     PossibleValuesParser::new(["valid", "invalid"]).map(|name| match name.as_str() {
         "valid" => VerdictKind::Valid,
         _ => VerdictKind::Invalid,
     })
-}
-
-impl Judgement {
-    /// Whether the command line asks for a verdict or a repair.
-    pub(super) fn is_asked(&self) -> bool {
-        self.verdict.is_some() || self.repair
-    }
-
-    /// Applies it to the run in `path` and prints the result.
-    pub(super) fn give(&self, path: &Path, json: bool) -> Result<(), Failure> {
-        match (self.verdict, &self.reason) {
-            (Some(verdict), Some(reason)) => judge(path, verdict, reason, json),
-            _ => close(path, json),
-        }
-    }
 }
 
 /// Closes a record that was left open.
