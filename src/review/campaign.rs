@@ -12,7 +12,6 @@ use minijinja::value::Serde;
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
-use thiserror::Error;
 
 /// Why a run does not count in the totals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -60,14 +59,6 @@ impl Line {
     }
 }
 
-/// No run of a campaign has the key by which to group.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("--by {key}: no configuration of these runs has that key; {hint}")]
-pub struct NoSuchKey {
-    key: String,
-    hint: String,
-}
-
 /// A campaign.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Campaign {
@@ -82,8 +73,8 @@ impl Campaign {
     /// key `by`.
     ///
     /// # Errors
-    /// [`NoSuchKey`] if none of the runs that count has the key `by`.
-    pub fn of(mut lines: Vec<Line>, by: Option<&str>) -> Result<Self, NoSuchKey> {
+    /// In words, if none of the runs that count has the key `by`.
+    pub fn of(mut lines: Vec<Line>, by: Option<&str>) -> Result<Self, String> {
         lines.sort_by(|a, b| when(a).cmp(&when(b)));
         exclude_copies(&mut lines);
         exclude_repeats(&mut lines, by);
@@ -105,7 +96,7 @@ impl Campaign {
         }
         if let Some(key) = by.filter(|key| !known.is_empty() && !known.contains(*key)) {
             let hint = nearest_key(key, known.iter().map(String::as_str));
-            return Err(NoSuchKey { key: key.to_owned(), hint });
+            return Err(format!("--by {key}: no configuration of these runs has that key; {hint}"));
         }
         let kinds = groups.keys().cloned().collect::<BTreeSet<_>>();
         let groups = groups.into_iter().map(|((label, is_true), runs)| {

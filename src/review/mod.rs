@@ -12,7 +12,7 @@ mod report;
 mod run;
 mod summary;
 
-pub use campaign::{Campaign, Exclusion, Line, NoSuchKey};
+pub use campaign::{Campaign, Exclusion, Line};
 pub use compare::{Comparison, Difference, Differences, Keys, differences, keys};
 pub use figures::{Figure, Limits, figures, figures_of_steps};
 pub use group::{Group, MedianInterval, Proportion};

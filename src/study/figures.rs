@@ -82,22 +82,16 @@ impl From<[f64; 6]> for TipError {
     }
 }
 
-/// Values at depths.
-#[derive(Debug, Clone)]
-pub(super) struct ByDepth<T>(pub(super) Vec<(f64, T)>);
+/// Values at depths, mm.
+pub(super) type ByDepth<T> = Vec<(f64, T)>;
 
-impl<T> Default for ByDepth<T> {
-    fn default() -> Self {
-        ByDepth(Vec::new())
-    }
-}
-
-impl<T: Copy> ByDepth<T> {
-    /// The values in the last third of `insertion_mm`.
-    pub(super) fn last_third(&self, insertion_mm: f64) -> impl Iterator<Item = T> {
-        let from_mm = insertion_mm * 2.0 / 3.0;
-        self.0.iter().filter(move |(depth_mm, _)| *depth_mm > from_mm).map(|(_, value)| *value)
-    }
+/// The values in the last third of `insertion_mm`.
+pub(super) fn last_third<T: Copy>(
+    values: &ByDepth<T>,
+    insertion_mm: f64,
+) -> impl Iterator<Item = T> {
+    let from_mm = insertion_mm * 2.0 / 3.0;
+    values.iter().filter(move |(depth_mm, _)| *depth_mm > from_mm).map(|(_, value)| *value)
 }
 
 /// The figures of a run, collected step by step.
@@ -212,7 +206,7 @@ impl RunFigures {
     /// Adds one step.
     pub fn take(&mut self, step: &StepRecord, truth: Option<&Truth>) {
         let x_est_mm = step.estimate.as_ref().map(|estimate| estimate.x_pb.translation.x);
-        self.estimated.0.extend(x_est_mm.map(|x_mm| (step.insertion_meas_mm, x_mm)));
+        self.estimated.extend(x_est_mm.map(|x_mm| (step.insertion_meas_mm, x_mm)));
         let x_mm = truth.map(|truth| truth.x_pb().translation.x).or(x_est_mm);
         let error = truth.and_then(|truth| TipError::of(step, truth));
         self.take_scored(step.insertion_meas_mm, x_mm, error);
@@ -236,7 +230,7 @@ impl RunFigures {
     /// Takes a step from a row of `steps.csv`: its depth, its distance from the plane (true where
     /// known, else estimated), and the estimate's error.
     pub fn take_scored(&mut self, insertion_mm: f64, x_mm: Option<f64>, error: Option<TipError>) {
-        self.steps.0.push((insertion_mm, (x_mm, error)));
+        self.steps.push((insertion_mm, (x_mm, error)));
         self.insertion_mm = insertion_mm;
     }
 
@@ -265,16 +259,16 @@ impl RunFigures {
 
     /// All figures so far.
     pub fn report(&self) -> FigureReport {
-        let last_third = || self.steps.last_third(self.insertion_mm);
+        let last_third = || last_third(&self.steps, self.insertion_mm);
         let errors: Vec<TipError> = last_third().filter_map(|(_, error)| error).collect();
         FigureReport {
             insertion_mm: self.insertion_mm,
-            steps: self.steps.0.len(),
+            steps: self.steps.len(),
             steps_saturated: Some(self.saturated),
             off_plane_rms_mm: rms(last_third().filter_map(|(x_mm, _)| x_mm)),
             settling_mm: self.settling_mm(),
             estimate_rms: TipError::by_coordinate(&errors, rms),
-            final_error: self.steps.0.last().and_then(|(_, (_, error))| *error),
+            final_error: self.steps.last().and_then(|(_, (_, error))| *error),
             following_error_mm_max: self.following_error_mm.0,
             following_error_deg_max: self.following_error_deg.0,
             tip_age_s_max: self.tip_age_s.0,
@@ -294,15 +288,15 @@ impl RunFigures {
         if self.target.is_some() {
             return None;
         }
-        let missed_by_mm = rms(self.estimated.last_third(self.insertion_mm));
+        let missed_by_mm = rms(last_third(&self.estimated, self.insertion_mm));
         missed_by_mm.filter(|rms_mm| *rms_mm > OFF_PLANE_LIMIT_MM)
     }
 
     /// Depth after which the distance from the plane stays within 1 mm; `None` if it does not stay.
     fn settling_mm(&self) -> Option<f64> {
         let is_outside = |x_mm: Option<f64>| x_mm.is_none_or(|x| x.abs() > OFF_PLANE_LIMIT_MM);
-        let outside = self.steps.0.iter().rposition(|(_, (x_mm, _))| is_outside(*x_mm));
-        let settled = self.steps.0.get(outside.map_or(0, |last| last + 1));
+        let outside = self.steps.iter().rposition(|(_, (x_mm, _))| is_outside(*x_mm));
+        let settled = self.steps.get(outside.map_or(0, |last| last + 1));
         settled.map(|(depth_mm, _)| *depth_mm)
     }
 }

@@ -2,7 +2,7 @@
 
 use super::bound::{InformationBound, Prior};
 use super::consistency::{TrialNees, nees};
-use super::figures::{ByDepth, FigureReport, OFF_PLANE_LIMIT_MM, RunFigures, TipError};
+use super::figures::{ByDepth, FigureReport, OFF_PLANE_LIMIT_MM, RunFigures, TipError, last_third};
 use super::statistics::{mean, rms};
 use crate::emulator::{Truth, VirtualStageConfig};
 use crate::needle::{Reduced, shortest_into_plane_mm};
@@ -57,9 +57,7 @@ impl TrialResult {
         self.outcome == Outcome::Completed
             && self.figures.off_plane_rms_mm.is_some_and(|rms| rms < OFF_PLANE_LIMIT_MM)
     }
-}
 
-impl TrialResult {
     /// The result of a trial that was refused before the insertion.
     pub fn refused(seed: u64, stage: VirtualStageConfig, prior: &Prior, why: &str) -> Self {
         let target = TargetScore {
@@ -104,9 +102,9 @@ impl TrialScore {
             stage,
             figures: RunFigures::default(),
             bound,
-            bounds: ByDepth::default(),
-            nees: ByDepth::default(),
-            nis: ByDepth::default(),
+            bounds: ByDepth::new(),
+            nees: ByDepth::new(),
+            nis: ByDepth::new(),
             goal: goal.map(|goal| (goal.world.clone(), goal.problem.tolerance_mm, f64::INFINITY)),
         }
     }
@@ -125,15 +123,15 @@ impl TrialScore {
             }
             let mut bound = bound.standard_deviations();
             bound.iter_mut().skip(3).for_each(|angle| *angle = angle.to_degrees());
-            self.bounds.0.push((depth_mm, TipError::from(bound)));
+            self.bounds.push((depth_mm, TipError::from(bound)));
         }
         let estimate = step.estimate.as_ref();
         let nees = estimate.and_then(|estimate| nees(estimate, truth.x_pb()));
-        self.nees.0.extend(nees.map(|nees| (depth_mm, nees)));
+        self.nees.extend(nees.map(|nees| (depth_mm, nees)));
         if step.tip_meas_mm.is_some() {
             let belief = estimate.and_then(|estimate| estimate.belief);
             let nis = belief.and_then(|belief| belief.nis);
-            self.nis.0.extend(nis.map(|nis| (depth_mm, nis)));
+            self.nis.extend(nis.map(|nis| (depth_mm, nis)));
         }
     }
 
@@ -148,15 +146,15 @@ impl TrialScore {
             is_reached: error_mm.is_some_and(|error_mm| error_mm <= *tolerance_mm),
             clearance_mm: *clearance_mm,
         });
-        let bounds: Vec<TipError> = self.bounds.last_third(insertion_mm).collect();
+        let bounds: Vec<TipError> = last_third(&self.bounds, insertion_mm).collect();
         let (start, _) = Reduced::split(&self.stage.start);
         TrialResult {
             seed: self.seed,
             outcome,
             shortest_settling_mm: shortest_into_plane_mm(&self.stage.needle, &start),
             bound_rms: TipError::by_coordinate(&bounds, rms),
-            nees: TrialNees::of(self.nees.last_third(insertion_mm)),
-            nis: mean(self.nis.last_third(insertion_mm)),
+            nees: TrialNees::of(last_third(&self.nees, insertion_mm)),
+            nis: mean(last_third(&self.nis, insertion_mm)),
             figures,
             target,
             stage: self.stage,

@@ -36,7 +36,7 @@ pub(super) struct StepDue {
 /// the needle but do not change the insertion, so one session gives the times of all trials.
 #[derive(Debug, Clone, Default)]
 pub struct Timetable {
-    steps: Vec<StepDue>,
+    pub(super) steps: Vec<StepDue>,
 }
 
 /// Builds a [`Timetable`] from a session's records.
@@ -55,12 +55,6 @@ pub struct TimetableBuilder {
     stage: Vec<(Time, f64)>,
     command_mm: f64,
     steps: Vec<StepDue>,
-}
-
-impl Timetable {
-    pub(super) fn steps(&self) -> &[StepDue] {
-        &self.steps
-    }
 }
 
 impl TimetableBuilder {

@@ -33,7 +33,7 @@ pub fn insert(
     let (mut seen_mm, mut watched_mm) = (0.0, 0.0);
     let interval_s = stage.tracker.interval().as_secs_f64();
     let mut corrected: Option<u64> = None;
-    for (step, due) in timetable.steps().iter().enumerate() {
+    for (step, due) in timetable.steps.iter().enumerate() {
         needle.insert_to(due.insertion_mm);
         let (mut measured, mut innovation_mm, mut tip_positions) = (None, None, 0);
         for sample in &due.samples {
@@ -62,7 +62,7 @@ pub fn insert(
         }
         needle.see_target(stage, session, &due.samples);
         needle.seen_target_mm().into_iter().for_each(|target_mm| steering.set_target(target_mm));
-        let is_last = step + 1 == timetable.steps().len();
+        let is_last = step + 1 == timetable.steps.len();
         let ahead = needle.base.between(seen_mm, due.insertion_mm);
         let decision = steering.decide(&ahead, is_last);
         let command = decision.rotation_cmd_rad_per_mm;
@@ -92,7 +92,7 @@ pub fn insert(
         if command.is_none() {
             break;
         }
-        let next_mm = timetable.steps().get(step + 1).map(|next| next.insertion_mm);
+        let next_mm = timetable.steps.get(step + 1).map(|next| next.insertion_mm);
         if let Some(end_mm) = end_mm.filter(|end_mm| next_mm.is_some_and(|next| *end_mm < next)) {
             let due = StepDue { insertion_mm: end_mm, command_mm: end_mm, ..StepDue::default() };
             needle.insert_to(end_mm);

@@ -120,7 +120,7 @@ impl TrackerFit {
         if points.len() < POSITIONS_MIN || duration_s < DURATION_MIN_S {
             let repeated =
                 if repeats == 0 { String::new() } else { format!(" ({repeats} repeats)") };
-            return Err(refused(format!(
+            return Err(CalibrationError(format!(
                 "{} new positions in {duration_s:.1} s{repeated}, at least {POSITIONS_MIN} in \
                  {DURATION_MIN_S:.0} s are needed; record longer",
                 points.len()
@@ -169,14 +169,14 @@ impl TrackerFit {
         let drifted_mm = drift_mm_per_min.value * minutes;
         let limit_mm = DRIFT_MAX_MM.max(DRIFT_ERRORS * drift_mm_per_min.error * minutes);
         if drifted_mm > limit_mm {
-            return Err(refused(format!(
+            return Err(CalibrationError(format!(
                 "the sensor moves by {drifted_mm:.2} mm in {duration_s:.0} s (limit {limit_mm:.2} mm); hold \
                  it still and record again"
             )));
         }
         let refused_s = TIME_PART_REFUSED * duration_s;
         if together.correlation_time_s.value > refused_s && wander_mm > WANDER_MAX_MM {
-            return Err(refused(format!(
+            return Err(CalibrationError(format!(
                 "the positions wander by {wander_mm:.3} mm (limit {WANDER_MAX_MM}) over more than \
                  {refused_s:.1} s of {duration_s:.0} s; the sensor moved, or record longer"
             )));
@@ -197,10 +197,6 @@ impl TrackerFit {
             latency_p99_ms,
         })
     }
-}
-
-fn refused(message: String) -> CalibrationError {
-    CalibrationError(message)
 }
 
 /// The middle one; 0 of none.
@@ -251,7 +247,7 @@ fn without_outliers(
     let kept: Vec<_> = points.into_iter().filter(is_near).collect();
     let outliers = total - kept.len();
     if outliers as f64 > OUTLIERS_MAX * total as f64 {
-        return Err(refused(format!(
+        return Err(CalibrationError(format!(
             "{outliers} of {total} positions are over {OUTLIER_SDS:.0} standard deviations from the median \
              (limit {:.0}%); the sensor moved, or another tool is in the recording",
             100.0 * OUTLIERS_MAX
@@ -314,7 +310,7 @@ impl Axes {
             return Ok(());
         };
         if correlation < SWING {
-            return Err(refused(format!(
+            return Err(CalibrationError(format!(
                 "the sensor swings by {:.2} mm with a period of {:.1} s (correlation {correlation:.2} after \
                  half of it, limit {SWING}); hold it still and record again",
                 square_mm2.sqrt(),
