@@ -23,10 +23,6 @@ impl Problem {
         Problem { message: format!("{place}{message}"), origin }
     }
 
-    pub(super) fn syntax(origin: Origin, message: String) -> Self {
-        Problem { origin: Some(origin), message }
-    }
-
     pub(super) fn unknown_key(origin: Origin, key: &str, hint: &str) -> Self {
         let message = match origin {
             Origin::File { .. } => format!("{origin}unknown key \"{key}\"; {hint}"),

@@ -51,7 +51,7 @@ impl StopConfig {
             Some(Err(syntax)) => {
                 problems = syntax;
                 let kept = source.map(|source| salvaged(source.text)).unwrap_or_default();
-                layers.push(value::parse_what_can_be("salvaged", &kept, 1));
+                layers.push(value::recover_file("salvaged", &kept, 1).0);
             }
             None => {}
         }

@@ -66,7 +66,8 @@ pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries
             };
             let at = Origin::File { name: name.to_owned(), line };
             if problems.last().is_none_or(|last| last.origin.as_ref() != Some(&at)) {
-                problems.push(Problem::syntax(at, format!("{name}:{line}:{column}: {message}")));
+                let message = format!("{name}:{line}:{column}: {message}");
+                problems.push(Problem { origin: Some(at), message });
             }
         }
         return Err(problems);
@@ -74,12 +75,12 @@ pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries
     Ok(entries)
 }
 
-/// The part of a TOML file with errors that can be read. If a key is given twice, the first one counts.
-pub(super) fn parse_what_can_be(name: &str, text: &str, layer: usize) -> Entries {
-    recover_file(name, text, layer).0
-}
-
-fn recover_file(name: &str, text: &str, layer: usize) -> (Entries, Vec<toml::de::Error>) {
+/// The part of a TOML file that can be read, and its errors. If a key is given twice, the first one counts.
+pub(super) fn recover_file(
+    name: &str,
+    text: &str,
+    layer: usize,
+) -> (Entries, Vec<toml::de::Error>) {
     let (table, errors) = DeTable::parse_recoverable(text);
     let origin = |offset| Origin::File { name: name.to_owned(), line: position(text, offset).0 };
     let mut flat = Flattener { text, layer, origin: &origin, entries: Vec::new() };
@@ -138,7 +139,7 @@ fn number_with_unit(text: &str, line: usize) -> Option<String> {
 /// If the key or the value is missing, or if the value begins like a TOML string, array or table but is
 /// not valid.
 pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, Vec<Problem>> {
-    let syntax = |message: String| vec![Problem::syntax(Origin::Set, message)];
+    let syntax = |message: String| vec![Problem { origin: Some(Origin::Set), message }];
     let (key, written) =
         text.split_once('=').map(|(k, v)| (k.trim(), v.trim())).unwrap_or_default();
     if key.is_empty() || written.is_empty() || key.split('.').any(str::is_empty) {
