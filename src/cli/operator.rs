@@ -7,16 +7,17 @@ use crate::session::{Lane, Progress, Severity, State};
 use crate::text::wrapped;
 use crate::units::Time;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use rtrb::{Consumer, Producer, RingBuffer};
 use std::io::IsTerminal;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
 /// Capacity of the queue of events.
 const QUEUE: usize = 1024;
-/// Refresh interval of the line of progress.
+/// Interval at which the queue is emptied and the line of progress refreshed.
 const REFRESH: Duration = Duration::from_millis(100);
 /// Depth between two lines of progress where there is no terminal, mm.
 const LINE_MM: f64 = 10.0;
@@ -29,7 +30,8 @@ const FINISH: Duration = Duration::from_secs(1);
 /// A separate thread prints, so a blocked stderr never delays the control thread. Events that find
 /// the queue full are dropped and counted.
 pub(super) struct Terminal {
-    events: SyncSender<String>,
+    /// A preempted printer never makes its sender wait (docs/decisions/0018-tracker-queue.md).
+    events: Producer<String>,
     /// Closed when everything is printed; nothing is ever sent.
     done: Receiver<()>,
     latest: Arc<Latest>,
@@ -49,13 +51,13 @@ impl Terminal {
     /// Shows everything, or warnings and faults only when `quiet`; with its progress if `has_progress`.
     pub(super) fn new(quiet: bool, has_progress: bool) -> Self {
         let is_terminal = std::io::stderr().is_terminal();
-        let (events, queue) = sync_channel(QUEUE);
+        let (events, mut queue) = RingBuffer::new(QUEUE);
         let (printing, done) = sync_channel::<()>(0);
         let latest = Arc::new(Latest::default());
         let seen = Arc::clone(&latest);
         // If the thread cannot start, events are dropped; the run does not depend on them.
         let _ = thread::Builder::new().name("operator".to_owned()).spawn(move || {
-            print(&queue, &seen, &progress_line(has_progress && is_terminal));
+            print(&mut queue, &seen, &progress_line(has_progress && is_terminal));
             drop(printing);
         });
         let severity_min = if quiet { Severity::Warning } else { Severity::Info };
@@ -63,8 +65,8 @@ impl Terminal {
         Terminal { events, done, latest, severity_min, line_due_mm }
     }
 
-    fn print(&self, line: String) {
-        if self.events.try_send(line).is_err() {
+    fn print(&mut self, line: String) {
+        if self.events.push(line).is_err() {
             self.latest.dropped.fetch_add(1, Ordering::Relaxed);
         }
     }
@@ -115,18 +117,24 @@ fn progress_line(is_shown: bool) -> ProgressBar {
 }
 
 /// Prints until the run closes the queue.
-fn print(queue: &Receiver<String>, latest: &Latest, bar: &ProgressBar) {
+fn print(queue: &mut Consumer<String>, latest: &Latest, bar: &ProgressBar) {
     loop {
-        match queue.recv_timeout(REFRESH) {
-            Ok(line) if bar.is_hidden() => tell(line),
-            Ok(line) => bar.println(wrapped(&line)),
-            Err(RecvTimeoutError::Timeout) => {}
-            Err(RecvTimeoutError::Disconnected) => break,
+        // Asked before the queue is emptied: the last line may come just before its end.
+        let is_closed = queue.is_abandoned();
+        while let Ok(line) = queue.pop() {
+            match bar.is_hidden() {
+                true => tell(line),
+                false => bar.println(wrapped(&line)),
+            }
+        }
+        if is_closed {
+            break;
         }
         let progress = latest.progress.try_lock().map(|latest| *latest);
         if let Ok(progress) = progress {
             bar.set_message(line(&progress));
         }
+        thread::sleep(REFRESH);
     }
     bar.finish_and_clear();
     let dropped = latest.dropped.load(Ordering::Relaxed);
@@ -178,7 +186,7 @@ mod tests {
     /// does not block.
     #[test]
     fn a_terminal_that_prints_nothing_holds_nothing_up() {
-        let (events, _queue) = sync_channel(2);
+        let (events, _queue) = RingBuffer::new(2);
         let (printing, done) = sync_channel(0);
         drop(printing);
         let latest = Arc::new(Latest::default());

@@ -176,7 +176,7 @@ impl Recorder {
         sum_up(&mut self.manifest);
         self.manifest.ended_utc = Some(utc_text(SystemTime::now()));
         let closed = self.text.close(&self.manifest, CLOSING_LIMIT);
-        if let Some(live) = &self.live {
+        if let Some(live) = &mut self.live {
             live.leave(&self.manifest, live::FAREWELL_MAX);
         }
         let (left, fault) = match closed {

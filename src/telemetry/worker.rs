@@ -4,13 +4,12 @@
 use super::TelemetryError;
 use super::vitals::{SILENCE_LIMIT, Silence, Vitals};
 use crate::archive::{Counts, FileSeal, Manifest};
+use rtrb::{Consumer, Producer, PushError, RingBuffer};
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::mpsc::{
-    Receiver, RecvTimeoutError, SyncSender, TrySendError, channel, sync_channel,
-};
-use std::thread;
+use std::sync::mpsc::{Receiver, channel};
+use std::thread::{self, Thread};
 use std::time::{Duration, Instant};
 
 /// The treatment of an item when the queue is full.
@@ -66,10 +65,12 @@ enum Message<T> {
     Close(Box<Manifest>),
 }
 
-/// A handle to the writer's thread, for the session's thread.
+/// A handle to the writer's thread, for the session's thread. A preempted writer never makes it wait
+/// (docs/decisions/0018-tracker-queue.md).
 pub(super) struct Worker<T> {
     writer: &'static str,
-    queue: SyncSender<Message<T>>,
+    queue: Producer<Message<T>>,
+    thread: Thread,
     backpressure: Backpressure,
     /// Items given so far, taken or not.
     pub(super) given: u64,
@@ -91,7 +92,7 @@ impl<T: Send + 'static> Worker<T> {
         open: impl FnOnce() -> Result<S, String> + Send + 'static,
     ) -> Result<Self, TelemetryError> {
         let failed = |reason: String| TelemetryError::writer_failed(writer, reason);
-        let (queue, items) = sync_channel(capacity);
+        let (queue, items) = RingBuffer::new(capacity);
         let (opened_tx, opened) = channel();
         let (done_tx, done) = channel();
         let vitals = Arc::new(Vitals::default());
@@ -110,27 +111,36 @@ impl<T: Send + 'static> Worker<T> {
             let _ = done_tx.send((sink.left(), result));
         };
         let thread = thread::Builder::new().name(writer.replace(' ', "-")).spawn(run);
-        thread.map_err(|e| failed(e.to_string()))?;
+        let thread = thread.map_err(|e| failed(e.to_string()))?.thread().clone();
         opened.recv().unwrap_or_else(|_| Err("its thread panicked".to_owned())).map_err(failed)?;
-        Ok(Worker { writer, queue, backpressure, given: 0, dropped: 0, vitals, done })
+        Ok(Worker { writer, queue, thread, backpressure, given: 0, dropped: 0, vitals, done })
     }
 
     /// Gives `item` to the writer, or counts it as dropped.
     pub(super) fn give(&mut self, item: T) {
         self.given += 1;
-        let message = Message::Item(item);
         let taken = match self.backpressure {
-            Backpressure::DropAndCount => self.queue.try_send(message).is_ok(),
-            Backpressure::Block => self.wait_and_send(message),
+            Backpressure::DropAndCount => self.push(Message::Item(item)).is_ok(),
+            Backpressure::Block => self.wait_and_push(Message::Item(item)),
         };
         self.dropped += u64::from(!taken);
     }
 
+    /// Wakes the writer for `message`, which comes back if the queue is full or the writer has ended.
+    fn push(&mut self, message: Message<T>) -> Result<(), Message<T>> {
+        if self.queue.is_abandoned() {
+            return Err(message);
+        }
+        self.queue.push(message).map_err(|PushError::Full(message)| message)?;
+        self.thread.unpark();
+        Ok(())
+    }
+
     /// Waits for room in the queue, as long as the writer makes progress.
-    fn wait_and_send(&self, mut message: Message<T>) -> bool {
+    fn wait_and_push(&mut self, mut message: Message<T>) -> bool {
         let mut silence = Silence::new(self.vitals.beats(), Instant::now());
-        while let Err(TrySendError::Full(back)) = self.queue.try_send(message) {
-            if self.vitals.fault().is_some() {
+        while let Err(back) = self.push(message) {
+            if self.queue.is_abandoned() || self.vitals.fault().is_some() {
                 return false;
             }
             silence.look(self.vitals.beats(), Instant::now());
@@ -147,8 +157,8 @@ impl<T: Send + 'static> Worker<T> {
 
     /// Tells the thread how the run ended, and waits for it no longer than `limit`, whatever it has left to
     /// take. A full queue keeps it from being told.
-    pub(super) fn leave(&self, manifest: &Manifest, limit: Duration) {
-        if self.queue.try_send(Message::Close(Box::new(manifest.clone()))).is_ok() {
+    pub(super) fn leave(&mut self, manifest: &Manifest, limit: Duration) {
+        if self.push(Message::Close(Box::new(manifest.clone()))).is_ok() {
             let _ = self.done.recv_timeout(limit);
         }
     }
@@ -159,7 +169,7 @@ impl<T: Send + 'static> Worker<T> {
     /// # Errors
     /// The writer makes no progress for `limit`: it is given up, and what it wrote is unknown.
     pub(super) fn close(
-        &self,
+        &mut self,
         manifest: &Manifest,
         limit: Duration,
     ) -> Result<(Left, Option<TelemetryError>), TelemetryError> {
@@ -168,8 +178,7 @@ impl<T: Send + 'static> Worker<T> {
         let writer = self.writer;
         let failed = |reason| TelemetryError::writer_failed(writer, reason);
         loop {
-            let full = |sent| matches!(sent, Err(TrySendError::Full(_)));
-            knows = knows || !full(self.queue.try_send(Message::Close(Box::new(manifest.clone()))));
+            knows = knows || self.push(Message::Close(Box::new(manifest.clone()))).is_ok();
             if let Ok((left, result)) = self.done.recv_timeout(RETRY) {
                 return Ok((left, result.err().map(failed)));
             }
@@ -192,19 +201,20 @@ impl<T: Send + 'static> Worker<T> {
 /// waits for a writer that has ended.
 fn serve<S: Sink>(
     sink: &mut S,
-    queue: Receiver<Message<S::Item>>,
+    mut queue: Consumer<Message<S::Item>>,
     vitals: &Vitals,
 ) -> Result<(), String> {
     let mut next_tick = Instant::now() + S::TICK;
     loop {
-        match queue.recv_timeout(next_tick.saturating_duration_since(Instant::now())) {
+        match queue.pop() {
             Ok(Message::Item(item)) => sink.take(item)?,
             Ok(Message::Close(manifest)) => return sink.close(&manifest, &|| vitals.beat()),
-            Err(RecvTimeoutError::Timeout) => {}
-            Err(RecvTimeoutError::Disconnected) => {
+            // The last item may have come just before the run was dropped.
+            Err(_) if queue.is_abandoned() && queue.is_empty() => {
                 sink.tick()?;
                 return Err("the run was abandoned".to_owned());
             }
+            Err(_) => thread::park_timeout(next_tick.saturating_duration_since(Instant::now())),
         }
         if Instant::now() >= next_tick {
             sink.tick()?;
@@ -220,6 +230,7 @@ mod tests {
     use crate::session::{Lane, Record, Severity};
     use crate::telemetry::Entry;
     use crate::units::Time;
+    use std::sync::mpsc::{SyncSender, sync_channel};
 
     /// A sink that takes an entry only when the test allows it, and signals that it has begun to.
     struct Gated {
@@ -267,7 +278,7 @@ mod tests {
 
     const HOUR: Duration = Duration::from_secs(3600);
 
-    fn entries_left(worker: &Worker<Entry>) -> u64 {
+    fn entries_left(mut worker: Worker<Entry>) -> u64 {
         worker.close(&Manifest::default(), HOUR).unwrap().0.entries
     }
 
@@ -281,7 +292,7 @@ mod tests {
         (0..10).for_each(|_| worker.give(entry()));
         assert_eq!(worker.dropped, 6);
         drop(let_go);
-        assert_eq!(entries_left(&worker), 5);
+        assert_eq!(entries_left(worker), 5);
     }
 
     #[test]
@@ -290,7 +301,8 @@ mod tests {
         let lets_go = thread::spawn(move || (0..50).for_each(|_| let_go.send(()).unwrap()));
         (0..50).for_each(|_| worker.give(entry()));
         lets_go.join().unwrap();
-        assert_eq!((entries_left(&worker), worker.dropped), (50, 0));
+        assert_eq!(worker.dropped, 0);
+        assert_eq!(entries_left(worker), 50);
     }
 
     #[test]

@@ -36,7 +36,7 @@ use std::os::fd::AsFd;
 use std::panic;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::Duration;
@@ -102,8 +102,9 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 pub(super) struct Console {
     shared: Arc<Shared>,
-    messages: SyncSender<Message>,
-    /// A preempted writer of this ring never makes its reader wait (docs/decisions/0018-tracker-queue.md).
+    /// No preempted thread at the other end of these rings makes this one wait
+    /// (docs/decisions/0018-tracker-queue.md).
+    messages: Producer<Message>,
     commands: Consumer<OperatorCommand>,
     /// Closed when the terminal is given back.
     drawn: Receiver<()>,
@@ -128,7 +129,7 @@ impl Console {
         let keys = Console::keys()?;
         let shared = Arc::new(Shared::new(Setup::of(config), interrupt));
         let terminal = take_terminal()?;
-        let (messages, queue) = sync_channel(QUEUE);
+        let (messages, mut queue) = RingBuffer::new(QUEUE);
         let (mut orders, commands) = RingBuffer::new(COMMANDS);
         let (drawing, drawn) = sync_channel::<()>(0);
         let (seen, shown) = (Arc::clone(&shared), Arc::clone(&shared));
@@ -146,12 +147,12 @@ impl Console {
                 drop(drawing);
             }),
         )?;
-        spawn("console-keys", Box::new(move || serve_keys(keys, &seen, &queue, &mut orders)))?;
+        spawn("console-keys", Box::new(move || serve_keys(keys, &seen, &mut queue, &mut orders)))?;
         Ok(Console { shared, messages, commands, drawn })
     }
 
-    fn send(&self, message: Message) {
-        if self.messages.try_send(message).is_err() {
+    fn send(&mut self, message: Message) {
+        if self.messages.push(message).is_err() {
             self.shared.dropped.fetch_add(1, Ordering::Relaxed);
         }
     }
@@ -308,7 +309,7 @@ impl Drawn {
 fn serve_keys(
     mut keys: File,
     shared: &Shared,
-    queue: &Receiver<Message>,
+    queue: &mut Consumer<Message>,
     commands: &mut Producer<OperatorCommand>,
 ) {
     let mut pressed = [0; 64];
@@ -331,10 +332,10 @@ fn serve_keys(
     }
 }
 
-fn gather(shared: &Shared, queue: &Receiver<Message>) {
+fn gather(shared: &Shared, queue: &mut Consumer<Message>) {
     let mut screen = lock(&shared.screen);
     screen.is_interrupted = shared.interrupt.is_raised();
-    for message in queue.try_iter().take(QUEUE) {
+    for message in std::iter::from_fn(|| queue.pop().ok()).take(QUEUE) {
         match message {
             Message::Record(record) => screen.take(&record),
             Message::Event(time, lane, severity, text) => {

@@ -198,7 +198,7 @@ proptest! {
 #[test]
 fn a_console_that_stands_still_delays_nothing() {
     let shared = Arc::new(Shared::new(setup(), Interrupt::default()));
-    let (messages, _queue) = sync_channel(2);
+    let (messages, _queue) = RingBuffer::new(2);
     let (mut orders, commands) = RingBuffer::new(COMMANDS);
     let (_, drawn) = sync_channel(0);
     let mut console = Console { shared: Arc::clone(&shared), messages, commands, drawn };
@@ -378,7 +378,7 @@ fn bells(messages: Vec<Message>, is_interrupted: bool) -> usize {
     if is_interrupted {
         shared.interrupt.raise();
     }
-    let (sender, queue) = sync_channel(1);
+    let (mut sender, mut queue) = RingBuffer::new(1);
     let written = Written::default();
     let viewport = Viewport::Fixed(Rect::new(0, 0, 80, 24));
     let backend = CrosstermBackend::new(written.clone());
@@ -386,8 +386,8 @@ fn bells(messages: Vec<Message>, is_interrupted: bool) -> usize {
         Terminal::with_options(backend, TerminalOptions { viewport }).expect("a terminal");
     let mut drawn = Drawn::default();
     for message in messages {
-        sender.send(message).expect("a queue");
-        gather(&shared, &queue);
+        sender.push(message).expect("a queue");
+        gather(&shared, &mut queue);
         for _ in 0..2 {
             drawn.again(&mut terminal, &mut written.clone(), &shared);
         }
@@ -498,9 +498,9 @@ fn figures_are_not_read_from_the_text_of_events() {
     screen.progress.syncs_skipped = 24;
     assert!(panels(&screen).contains(", skip 24 "));
     let shared = Shared::new(setup(), Interrupt::default());
-    let (sender, queue) = sync_channel(1);
-    sender.send(Message::RecordTrouble("the disk is full".to_owned())).expect("a queue");
-    gather(&shared, &queue);
+    let (mut sender, mut queue) = RingBuffer::new(1);
+    sender.push(Message::RecordTrouble("the disk is full".to_owned())).expect("a queue");
+    gather(&shared, &mut queue);
     assert!(panels(&lock(&shared.screen)).contains(" MB the disk is full"));
 }
 
@@ -545,7 +545,7 @@ fn why_a_needle_is_not_withdrawn_is_on_the_screen() {
 #[test]
 fn a_drawing_thread_that_panics_gives_the_terminal_back() {
     let shared = Arc::new(Shared::new(setup(), Interrupt::default()));
-    let (messages, queue) = sync_channel(2);
+    let (messages, mut queue) = RingBuffer::new(2);
     let (mut orders, commands) = RingBuffer::new(COMMANDS);
     let (drawing, drawn) = sync_channel::<()>(0);
     let (keyboard, mut pressed) = {
@@ -561,7 +561,7 @@ fn a_drawing_thread_that_panics_gives_the_terminal_back() {
     assert!(died.join().is_err());
     assert!(!TAKEN.load(Ordering::Relaxed), "the terminal is given back");
     let seen = Arc::clone(&shared);
-    let keys = thread::spawn(move || serve_keys(keyboard, &seen, &queue, &mut orders));
+    let keys = thread::spawn(move || serve_keys(keyboard, &seen, &mut queue, &mut orders));
     let mut console = Console { shared: Arc::clone(&shared), messages, commands, drawn };
     pressed.write_all(b" ").expect("a key");
     let hold = std::iter::from_fn(|| {
