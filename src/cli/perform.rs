@@ -112,9 +112,9 @@ impl<'a> Job<'a> {
         runtime: &Runtime,
         interrupt: &Interrupt,
     ) -> Result<Performed, Failure> {
-        let mut performed = self.run(operator, runtime, interrupt)?;
-        complete_record(&mut performed.report, describe(self.config.clone()), operator);
-        Ok(performed)
+        let (mut report, done) = self.run(operator, runtime, interrupt)?;
+        complete_record(&mut report, describe(self.config.clone()), operator);
+        Ok(Performed { report, done, wants_withdrawal: false })
     }
 
     fn run(
@@ -122,7 +122,7 @@ impl<'a> Job<'a> {
         operator: &mut dyn Operator,
         runtime: &Runtime,
         interrupt: &Interrupt,
-    ) -> Result<Performed, Failure> {
+    ) -> Result<(RunReport, Vec<Done>), Failure> {
         let config = self.config;
         let stops_on_record_failure = config.record.on_failure == OnFailure::Stop;
         let begin = |now| self.plan.clone().begin(now).map_err(Failure::configuration);
@@ -140,11 +140,7 @@ impl<'a> Job<'a> {
             let mut session = begin(Time::ZERO)?;
             let pace = self.paced.then(Pace::begin);
             let report = run_virtual(&mut session, stage, tips, pace, sink);
-            return Ok(Performed {
-                report,
-                done: session.done().to_vec(),
-                wants_withdrawal: false,
-            });
+            return Ok((report, session.done().to_vec()));
         }
         self.realtime.try_out()?;
         let mut bus = open_stage_bus(config)?;
@@ -157,7 +153,7 @@ impl<'a> Job<'a> {
         let (bus, tips) = (bus.as_mut(), tracker.as_mut());
         let report = run_live(&mut session, bus, tips, clock, realtime, sink);
         drop(tracker);
-        Ok(Performed { report, done: session.done().to_vec(), wants_withdrawal: false })
+        Ok((report, session.done().to_vec()))
     }
 
     fn needs_tracker(&self) -> bool {
