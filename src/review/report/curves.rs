@@ -51,12 +51,7 @@ fn tip(run: &Run, name: &str, title: &'static str, y: &'static str) -> Chart {
     let of = |provenance| coordinate(run, name, provenance);
     let (estimate, jump) = (of("est"), jump(name));
     let layers = vec![
-        Layer::new(
-            "estimate ± 2 σ",
-            ESTIMATE,
-            Shape::Area,
-            band(&depth, &estimate, &of("sd"), jump),
-        ),
+        area("estimate ± 2 σ", ESTIMATE, band(&depth, &estimate, &of("sd"), jump)),
         dots("measured", MEASURED, points(&depth, &of("meas"))),
         Layer::new("estimate", ESTIMATE, Shape::Broad, pieces(&depth, &estimate, jump)),
         Layer::new("truth", TRUTH, Shape::Line, pieces(&depth, &of("true"), jump)),
@@ -89,12 +84,7 @@ fn target_error(run: &Run, limits: &Limits) -> Chart {
     let sd: Column =
         sd.map(|((mm, rad), left)| Some(math::hypot((*mm)?, (*rad)? * (*left)?))).collect();
     let mut layers = vec![
-        Layer::new(
-            "prediction ± 2 σ",
-            ESTIMATE,
-            Shape::Area,
-            band(&depth, &error, &sd, f64::INFINITY),
-        ),
+        area("prediction ± 2 σ", ESTIMATE, band(&depth, &error, &sd, f64::INFINITY)),
         line("prediction", ESTIMATE, points(&depth, &error)),
     ];
     layers.extend(limits.get("target_error_mm").map(|mm| Layer::level("goal.tolerance_mm", *mm)));
@@ -229,6 +219,10 @@ fn line(name: &'static str, colour: &'static str, points: Points) -> Layer {
 
 fn dots(name: &'static str, colour: &'static str, points: Points) -> Layer {
     Layer::new(name, colour, Shape::Points, vec![points])
+}
+
+fn area(name: &'static str, colour: &'static str, pieces: Vec<Points>) -> Layer {
+    Layer::new(name, colour, Shape::Area, pieces)
 }
 
 /// Outlines of the band of ± 2 standard deviations around the estimate, in the same pieces as its line.
