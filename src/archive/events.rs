@@ -78,9 +78,7 @@ const KINDS: [(EventKind, &str); 4] = [
 
 impl fmt::Display for EventLine<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let ms = self.time.as_nanos().div_euclid(1_000_000);
-        let sign = if ms < 0 { "-" } else { "" };
-        let time = format!("{sign}{}.{:03}", ms.unsigned_abs() / 1000, ms.unsigned_abs() % 1000);
+        let time = format!("{:.3}", self.time.as_secs_f64());
         let kind = KINDS.into_iter().find(|(kind, _)| *kind == self.kind).map_or("", |(_, n)| n);
         let lane = self.lane.to_string();
         write!(f, "{time:>9} s  {lane:<LANE_WIDTH$}  {kind:<KIND_WIDTH$}  {}", self.text)

@@ -294,9 +294,7 @@ impl FaultKind {
             FaultKind::Resize => &["axis", "frames", "toward", "count", "length"],
             FaultKind::DriveFault => &["axis", "code"],
             FaultKind::Foreign => &["frame", "period_ms"],
-            FaultKind::BusOff | FaultKind::BusDown | FaultKind::BusFull | FaultKind::BusStuck => {
-                &[]
-            }
+            kind if kind.is_of_bus() => &[],
             _ => &["axis"],
         };
         [&["at_mm", "at_s", "duration_s"], own].concat()
