@@ -140,8 +140,12 @@ fn check_length(path: &Path, header: &NiftiHeader, voxels: usize) -> Result<(), 
     }
 }
 
-/// The CRC-32 of the file in `path`, read in pieces: a file that is no mask may be of any size.
+/// The CRC-32 of the file in `path`, read in pieces: a file that is no mask may be of any size. A pipe or a
+/// device is refused, because reading it may never end.
 pub(super) fn file_crc32(path: &Path) -> io::Result<u32> {
+    if !path.is_file() {
+        return Err(io::Error::other("not a regular file"));
+    }
     let mut file = CrcReader::new(File::open(path)?);
     io::copy(&mut file, &mut io::sink())?;
     Ok(file.crc().sum())
@@ -339,4 +343,15 @@ fn hull(mut points: Vec<Vector3<f64>>, up: usize) -> Vec<Vector3<f64>> {
         }
     }
     hull
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_device_in_place_of_a_mask_holds_nobody_up() {
+        let error = file_crc32(Path::new("/dev/zero")).unwrap_err();
+        assert_eq!(error.to_string(), "not a regular file");
+    }
 }
