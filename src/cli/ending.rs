@@ -161,7 +161,7 @@ fn needed(config: &Config, left: &Left) -> Option<&'static str> {
 }
 
 fn is_in_fault(drive: &DriveReport) -> bool {
-    matches!(drive.state, Some(DriveState::Fault | DriveState::FaultReactionActive))
+    drive.state.is_some_and(DriveState::is_fault)
 }
 
 /// What the drives are doing.

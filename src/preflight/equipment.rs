@@ -134,7 +134,7 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
     let drive = stage.axis(axis);
     let AxisStatus { node, identity, statusword, .. } = status;
     let state = statusword.state();
-    let is_faulty = matches!(state, Some(DriveState::Fault | DriveState::FaultReactionActive));
+    let is_faulty = statusword.is_fault();
     let is_named = drive.vendor_id.is_some() && drive.product_code.is_some();
     let is_right = drive.vendor_id.is_none_or(|vendor| vendor == identity.vendor)
         && drive.product_code.is_none_or(|product| product == identity.product);

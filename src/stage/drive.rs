@@ -209,9 +209,7 @@ impl Drive {
     fn end_reset(&mut self, state: Option<DriveState>) {
         let same_fault = match self.reset {
             Reset::None => false,
-            Reset::Due(_) => {
-                matches!(state, Some(DriveState::Fault | DriveState::FaultReactionActive))
-            }
+            Reset::Due(_) => state.is_some_and(DriveState::is_fault),
             Reset::Sent(_) => state == Some(DriveState::Fault),
         };
         if !same_fault {

@@ -3,7 +3,7 @@
 use super::bring_up::{FoundFault, Identity, Object, Script, optional};
 use super::config::unsigned_counts;
 use super::{AxisConfig, HomingConfig, Reference, Sign, StageEvent};
-use crate::canopen::cia402::{Controlword, DriveState, Mode, Statusword, object as drive};
+use crate::canopen::cia402::{Controlword, Mode, Statusword, object as drive};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::object::communication::{
     COMMUNICATION_ERROR_BEHAVIOUR, DEVICE_TYPE, PRODUCER_HEARTBEAT, SYNC_COB_ID,
@@ -120,8 +120,7 @@ impl Script {
         self.command(drive::CONTROLWORD, Controlword::DISABLE_VOLTAGE.0.into()).await?;
         let statusword = self.read_statusword().await?;
         self.note(|so_far| so_far.disarmed = true);
-        if !matches!(statusword.state(), Some(DriveState::Fault | DriveState::FaultReactionActive))
-        {
+        if !statusword.is_fault() {
             return Ok(());
         }
         let mut fault = FoundFault { statusword, error_code: None };

@@ -155,7 +155,7 @@ async fn reset(sdo: Sdo) -> Result<Statusword, String> {
     }
     sdo.pause(SETTLE).await;
     let word = statusword().await?;
-    if matches!(word.state(), Some(DriveState::Fault | DriveState::FaultReactionActive)) {
+    if word.is_fault() {
         let code = sdo.read(object::ERROR_CODE).await.map(|code| EmcyCode(code.to_u32() as u16));
         let code = code.map(|code| format!(", error {code}")).unwrap_or_default();
         return Err(format!("node {node} stays in fault{code}: its cause is still there"));

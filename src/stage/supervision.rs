@@ -150,7 +150,7 @@ impl Stage {
             }
             _ => false,
         };
-        let faulty = matches!(state, Some(DriveState::Fault | DriveState::FaultReactionActive));
+        let faulty = state.is_some_and(DriveState::is_fault);
         use DriveState as S;
         let fell_back = enabling
             && matches!(

@@ -33,6 +33,13 @@ pub enum DriveState {
     Fault,
 }
 
+impl DriveState {
+    /// True in a fault, stopping or stopped.
+    pub fn is_fault(self) -> bool {
+        matches!(self, DriveState::Fault | DriveState::FaultReactionActive)
+    }
+}
+
 /// Object 0x6041.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Statusword(pub u16);
@@ -68,6 +75,11 @@ impl Statusword {
         (DriveState::OperationEnabled, 0x6f, 0x27),
         (DriveState::QuickStopActive, 0x6f, 0x07),
     ];
+
+    /// True in a fault, stopping or stopped.
+    pub fn is_fault(self) -> bool {
+        self.state().is_some_and(DriveState::is_fault)
+    }
 
     /// The drive's state; `None` for a pattern the profile does not define.
     pub fn state(self) -> Option<DriveState> {

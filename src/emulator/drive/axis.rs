@@ -168,7 +168,7 @@ impl Axis {
     /// Enters the fault reaction. During a fault, another one only sends its emergency message.
     pub(super) fn fault(&mut self, now: Time, code: EmcyCode, register: u8, device: &mut Device) {
         device.raise(code, register, [0; 5]);
-        if matches!(self.state, DriveState::Fault | DriveState::FaultReactionActive) {
+        if self.state.is_fault() {
             return;
         }
         device.objects.set(object::ERROR_CODE, code.0.into());
@@ -413,7 +413,7 @@ impl Axis {
     pub(super) fn heartbeat_returned(&mut self, device: &mut Device) {
         self.partner_lost = false;
         // During a fault the error stays active until the fault is reset.
-        if !matches!(self.state, DriveState::Fault | DriveState::FaultReactionActive) {
+        if !self.state.is_fault() {
             device.clear(EmcyCode::HEARTBEAT);
         }
     }

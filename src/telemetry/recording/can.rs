@@ -1,13 +1,11 @@
 //! Chooses the CAN frames that the viewer shows, and formats their lines.
 
-use crate::canopen::Frame;
 use crate::canopen::cia402::{DriveState, Statusword};
 use crate::canopen::emcy::{Emcy, parse_emcy};
+use crate::canopen::{Frame, NodeId, cob};
 use crate::session::Direction;
 use crate::stage::{Axis, PerAxis, StageConfig};
 use std::collections::HashMap;
-
-const SYNC: u16 = 0x080;
 
 /// Chooses the frames that a viewer gets.
 ///
@@ -18,7 +16,7 @@ const SYNC: u16 = 0x080;
 /// - all other frames: always shown.
 #[derive(Debug)]
 pub(super) struct Selection {
-    nodes: PerAxis<u8>,
+    nodes: PerAxis<NodeId>,
     states: PerAxis<Option<DriveState>>,
     /// The frame shown last, by COB-ID.
     shown: HashMap<u16, Shown>,
@@ -39,7 +37,7 @@ impl Selection {
     /// Chooses among the frames of this stage.
     pub(super) fn new(stage: &StageConfig) -> Self {
         Selection {
-            nodes: PerAxis::from_fn(|axis| stage.axis(axis).node.get()),
+            nodes: PerAxis::from_fn(|axis| stage.axis(axis).node),
             states: PerAxis::from_fn(|_| None),
             shown: HashMap::new(),
         }
@@ -47,7 +45,7 @@ impl Selection {
 
     /// If `frame` is a TPDO1 that reports a new drive state: the axis and that state.
     pub(super) fn entered(&mut self, frame: &Frame) -> Option<(Axis, DriveState)> {
-        let tpdo1 = |axis: &Axis| frame.cob_id() == Some(0x180 + u16::from(self.nodes[*axis]));
+        let tpdo1 = |axis: &Axis| frame.cob_id() == Some(cob::tpdo(self.nodes[*axis]));
         let axis = Axis::BOTH.into_iter().find(tpdo1)?;
         let state = Statusword(u16::from_le_bytes(*frame.data().first_chunk()?)).state()?;
         (self.states[axis].replace(state) != Some(state)).then_some((axis, state))
@@ -56,7 +54,7 @@ impl Selection {
     /// The emergency message that a drive of the stage sent, if `frame` is one.
     pub(super) fn emergency(&self, frame: &Frame) -> Option<(Axis, Emcy)> {
         let (node, emcy) = parse_emcy(frame)?;
-        let axis = Axis::BOTH.into_iter().find(|axis| self.nodes[*axis] == node.get())?;
+        let axis = Axis::BOTH.into_iter().find(|axis| self.nodes[*axis] == node)?;
         Some((axis, emcy))
     }
 
@@ -78,7 +76,7 @@ impl Selection {
         // With a step, repetitions of the same word within that step are omitted.
         let (level, step) = match (id, data) {
             // SYNC and PDOs.
-            (SYNC | 0x181..=0x57F, _) => ("TRACE", Some(step)),
+            (cob::SYNC | 0x181..=0x57F, _) => ("TRACE", Some(step)),
             // Heartbeats: their repetitions are omitted whatever the step.
             (0x701..=0x77F, _) => ("INFO", Some(0)),
             // EMCY. Error code 0 means that the error is gone.
