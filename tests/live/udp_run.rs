@@ -187,6 +187,24 @@ fn a_stop_needs_the_bus_and_the_nodes_alone() {
     assert!(unnamed.stderr.ends_with("-vcan/config.toml\n"), "{}", unnamed.stderr);
 }
 
+/// Without the tool, and without a tracker: nothing moves, and the record is closed.
+#[test]
+fn without_a_tip_nothing_moves() {
+    let _machine = beside_others();
+    let stage = Stage::start(&[]);
+    for setting in ["tracker.tool=\"Needle\"", "tracker.address=\"127.0.0.1:1\""] {
+        let scratch = Scratch::new("no-tip");
+        let bench = scratch.bench(&[], &stage.settings(&[setting])).end();
+        bench.assert_status(1);
+        let reason = "stopped: tracker: no tip within 5.0 s; ";
+        assert!(bench.last_line().starts_with(reason), "{}", bench.last_line());
+        let run_dir = scratch.run_dir();
+        assert_eq!(programs::manifest(&run_dir)["outcome"], "stopped");
+        assert!(programs::csv(&run_dir.join("steps.csv")).is_empty(), "{setting}: it has begun");
+    }
+    assert_eq!(stage.assert_it_stands(), 0.0);
+}
+
 /// Waits until the record of the only run says that the needle is being inserted.
 fn wait_until_inserting(scratch: &Scratch) {
     let begun = Instant::now();
