@@ -96,8 +96,8 @@ impl ClockOffset {
             self.candidate = Settling::default();
             Err(0)
         };
-        let is_dated = !is_ahead && !(self.went_back && is_far_behind);
-        if let Some(known) = self.known.as_mut().filter(|_| settled.is_err() && is_dated) {
+        let is_set_aside = is_ahead || (self.went_back && is_far_behind);
+        if let Some(known) = self.known.as_mut().filter(|_| settled.is_err() && !is_set_aside) {
             if let Some(by_ns) = back_ns.filter(|_| has_gone_back) {
                 return Err(went_back(by_ns));
             }
