@@ -66,7 +66,7 @@ impl Terminal {
     }
 
     fn print(&mut self, line: String) {
-        if self.events.push(line).is_err() {
+        if self.events.is_abandoned() || self.events.push(line).is_err() {
             self.latest.dropped.fetch_add(1, Ordering::Relaxed);
         }
     }

@@ -269,8 +269,8 @@ pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure
     let CanInterface::Socket(name) = config.bus() else { return open_bus(config.bus()) };
     if !config.stage.hardware && has_device(name) {
         return Err(Failure::configuration(format_args!(
-            "stage.hardware = false, and {name} has a device behind it: by that the drives may move; \
-             set stage.hardware = true"
+            "stage.hardware = false, but {name} has a device behind it: its drives can move; set \
+             stage.hardware = true"
         )));
     }
     let mut bus = SocketCan::open(name)?;

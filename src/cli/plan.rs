@@ -74,6 +74,7 @@ pub(super) fn mask_reader(
 
 /// The image in `path`, as an obstacle.
 fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, String> {
+    check_regular(path).map_err(|error| error.to_string())?;
     let header = NiftiHeader::from_file(path).map_err(|error| reason(&error))?;
     // A record has one checksum for a mask, so the mask must be one file.
     if &header.magic != b"n+1\0" {
@@ -140,12 +141,18 @@ fn check_length(path: &Path, header: &NiftiHeader, voxels: usize) -> Result<(), 
     }
 }
 
-/// The CRC-32 of the file in `path`, read in pieces: a file that is no mask may be of any size. A pipe or a
-/// device is refused, because reading it may never end.
-pub(super) fn file_crc32(path: &Path) -> io::Result<u32> {
-    if !path.is_file() {
-        return Err(io::Error::other("not a regular file"));
+/// Refuses a pipe or a device, because reading it may never end.
+fn check_regular(path: &Path) -> io::Result<()> {
+    match std::fs::metadata(path) {
+        Ok(found) if !found.is_file() => Err(io::Error::other("not a regular file")),
+        // Whoever opens it says what is wrong with it.
+        _ => Ok(()),
     }
+}
+
+/// The CRC-32 of the file in `path`, read in pieces: a file that is no mask may be of any size.
+pub(super) fn file_crc32(path: &Path) -> io::Result<u32> {
+    check_regular(path)?;
     let mut file = CrcReader::new(File::open(path)?);
     io::copy(&mut file, &mut io::sink())?;
     Ok(file.crc().sum())
@@ -350,8 +357,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_device_in_place_of_a_mask_holds_nobody_up() {
-        let error = file_crc32(Path::new("/dev/zero")).unwrap_err();
-        assert_eq!(error.to_string(), "not a regular file");
+    fn a_device_or_pipe_in_place_of_a_mask_is_refused() {
+        let pipe = std::env::temp_dir().join(format!("needle-mask-{}", std::process::id()));
+        nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRUSR).expect("a pipe");
+        for path in [Path::new("/dev/zero"), &pipe] {
+            assert_eq!(file_crc32(path).unwrap_err().to_string(), "not a regular file");
+            let read =
+                mask_reader(None)(path.to_str().expect("text"), None, &PoseConfig::default());
+            let error = read.expect_err("it is refused");
+            assert!(error.ends_with(": not a regular file"), "{error}");
+        }
+        std::fs::remove_file(&pipe).expect("the pipe");
     }
 }

@@ -10,7 +10,7 @@ pub(super) const TIP_PITCH: Rule = within(-85.0, 85.0);
 
 section! {
     /// A pose: position, then fixed-axis angles, `R = Rx(yaw) Ry(pitch) Rz(roll)`.
-    #[derive(Copy)]
+    #[derive(Copy, Default)]
     pub struct PoseConfig {
         /// Position, mm.
         x_mm: f64 [POSITION];

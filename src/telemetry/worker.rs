@@ -70,7 +70,8 @@ enum Message<T> {
 pub(super) struct Worker<T> {
     writer: &'static str,
     queue: Producer<Message<T>>,
-    thread: Thread,
+    /// Dropped after the queue, so that the writer sees at once that the run was abandoned.
+    thread: Waker,
     backpressure: Backpressure,
     /// Items given so far, taken or not.
     pub(super) given: u64,
@@ -78,6 +79,15 @@ pub(super) struct Worker<T> {
     pub(super) dropped: u64,
     pub(super) vitals: Arc<Vitals>,
     done: Receiver<(Left, Result<(), String>)>,
+}
+
+/// The thread to wake. It is woken a last time when this is dropped.
+struct Waker(Thread);
+
+impl Drop for Waker {
+    fn drop(&mut self) {
+        self.0.unpark();
+    }
 }
 
 impl<T: Send + 'static> Worker<T> {
@@ -111,7 +121,7 @@ impl<T: Send + 'static> Worker<T> {
             let _ = done_tx.send((sink.left(), result));
         };
         let thread = thread::Builder::new().name(writer.replace(' ', "-")).spawn(run);
-        let thread = thread.map_err(|e| failed(e.to_string()))?.thread().clone();
+        let thread = Waker(thread.map_err(|e| failed(e.to_string()))?.thread().clone());
         opened.recv().unwrap_or_else(|_| Err("its thread panicked".to_owned())).map_err(failed)?;
         Ok(Worker { writer, queue, thread, backpressure, given: 0, dropped: 0, vitals, done })
     }
@@ -132,7 +142,7 @@ impl<T: Send + 'static> Worker<T> {
             return Err(message);
         }
         self.queue.push(message).map_err(|PushError::Full(message)| message)?;
-        self.thread.unpark();
+        self.thread.0.unpark();
         Ok(())
     }
 

@@ -135,7 +135,10 @@ impl TravelCheck {
     pub fn explain(&self, mut refusal: Refusal) -> Refusal {
         if refusal.effect == Effect::Loses {
             let change = self.change_over(EXPLAINED, SLOWER);
-            let what = change.map_or("a jump, or a drift".to_owned(), |change| change.to_string());
+            let what = change
+                .map_or("a jump, a drift, or of too large a scale".to_owned(), |change| {
+                    change.to_string()
+                });
             refusal.why += &format!(": {what}");
         }
         refusal
@@ -173,10 +176,11 @@ impl TravelCheck {
         // Written so that NaN is no contradiction: the positions are finite, and so is the slope.
         (ratio < min || ratio > max).then(|| {
             let change = self.change_over(bins, if ratio < min { SLOWER } else { FASTER });
-            let what = change.map_or("of wrong scale".to_owned(), |change| change.to_string());
+            let what = change.map_or("a jump, or a drift".to_owned(), |change| change.to_string());
             format!(
                 "over the last {stretch_mm:.1} mm the tip travelled {ratio:.3} mm per mm inserted \
-                 (expected {min:.3} to {max:.3}): the stream is {what}, or needle.radius_mm wrong"
+                 (expected {min:.3} to {max:.3}): {what}; check the tracker, counts_per_mm and \
+                 needle.radius_mm"
             )
         })
     }

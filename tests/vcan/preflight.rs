@@ -82,7 +82,7 @@ fn a_controller_that_is_named_as_a_virtual_one_is_no_virtual_stage() {
     ip("link set vcan9 down");
     ip(&format!("link set vcan9 name {can}"));
     bench.assert_status(2);
-    let refused = "stage.hardware = false, and vcan9 has a device behind it: ";
+    let refused = "stage.hardware = false, but vcan9 has a device behind it: ";
     assert!(bench.stderr.contains(refused), "{}", bench.stderr);
     assert!(!scratch.path("runs").exists());
 }

@@ -152,7 +152,7 @@ impl Console {
     }
 
     fn send(&mut self, message: Message) {
-        if self.messages.push(message).is_err() {
+        if self.messages.is_abandoned() || self.messages.push(message).is_err() {
             self.shared.dropped.fetch_add(1, Ordering::Relaxed);
         }
     }

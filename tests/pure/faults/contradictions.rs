@@ -336,7 +336,11 @@ fn a_jump_is_held_whatever_the_noise() {
                 let run = steered(&["emulator.noise={ sd_mm = 0.6 }", &seed]);
                 let jump = move |sample: &mut Sample| sample.position_mm.x += jump_mm;
                 let (bench, held_mm) = contradicted(run, struck_mm, jump);
-                assert!(bench.reason().contains(": a jump, or a drift; "), "{}", bench.reason());
+                assert!(
+                    bench.reason().contains(": a jump, a drift, or of too large a scale; "),
+                    "{}",
+                    bench.reason()
+                );
                 held_mm
             });
             print!("{jump_mm} mm at {struck_mm} mm: ");
@@ -431,5 +435,5 @@ fn a_jump_that_noise_hides() {
         _ => None,
     });
     let text = warned.expect("it is told at once");
-    assert!(text.ends_with(": a jump, or a drift"), "{text}");
+    assert!(text.ends_with(": a jump, a drift, or of too large a scale"), "{text}");
 }
