@@ -342,6 +342,41 @@ mod tests {
         assert!(given_up.to_string().starts_with("gated: no sign of life for 0."), "{given_up}");
     }
 
+    /// A sink whose tick is not due before the test is over.
+    struct Unhurried(SyncSender<&'static str>);
+
+    impl Sink for Unhurried {
+        type Item = Entry;
+        const TICK: Duration = HOUR;
+        fn take(&mut self, _: Entry) -> Result<(), String> {
+            self.0.send("taken").map_err(|error| error.to_string())
+        }
+        fn tick(&mut self) -> Result<(), String> {
+            self.0.send("last tick").map_err(|error| error.to_string())
+        }
+        fn close(&mut self, _: &Manifest, _: &dyn Fn()) -> Result<(), String> {
+            Ok(())
+        }
+    }
+
+    /// An entry wakes the writer, and so does the end of a run that nobody closed.
+    #[test]
+    fn a_sleeping_writer_is_woken() {
+        let (said, heard) = sync_channel(10);
+        let backpressure = Backpressure::DropAndCount;
+        let mut worker =
+            Worker::start("unhurried", 4, backpressure, || Ok(Unhurried(said))).unwrap();
+        for _ in 0..3 {
+            // The writer sleeps by then.
+            thread::sleep(Duration::from_millis(20));
+            worker.give(entry());
+            assert_eq!(heard.recv_timeout(Duration::from_secs(60)), Ok("taken"));
+        }
+        thread::sleep(Duration::from_millis(20));
+        drop(worker);
+        assert_eq!(heard.recv_timeout(Duration::from_secs(60)), Ok("last tick"));
+    }
+
     /// A slow machine is not a stalled disk: the limit counts from the last sign of life.
     #[test]
     fn a_writer_that_shows_itself_is_waited_for() {
