@@ -105,24 +105,25 @@ def reached(target, tip, heading, tolerance_mm):
     return np.hypot(RADIUS_MM - aside, ahead) >= RADIUS_MM - tolerance_mm
 
 
-target = draw_targets(TARGETS, SHARE_MAX, np.random.default_rng(1))
-aside = np.linalg.norm(target[:, :2], axis=1)
-target = np.column_stack([np.zeros(TARGETS), aside, target[:, 2]])
-for noise in (Uniform(), Gaussian()):
-    random = np.random.default_rng(2)
-    draws = [posterior_means(noise, random) for _ in range(DRAWS)]
-    rms = np.sqrt(np.mean(np.angle(np.array(draws)) ** 2, axis=0))
-    for mm in range(4, REVEALED_MM + 1, 2):
-        print(f"{type(noise).__name__}: after {mm} mm the roll is known to {math.degrees(rms[mm - 1]):.0f} degrees")
-    limits = (0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9)
-    ends = [[path_end(means, limit) for means in draws] for limit in limits]
-    for tolerance_mm in (1.0, 0.4):
-        # By limit, draw and target.
-        are_reached = np.array([[reached(target, *end, tolerance_mm) for end in of_limit] for of_limit in ends])
-        best = are_reached.mean(axis=1).argmax(axis=0)
-        shares = are_reached[best, :, np.arange(TARGETS)].mean(axis=0)
-        print(
-            f"{type(noise).__name__}: {shares.mean():.1%} (standard error {shares.std() / math.sqrt(DRAWS):.1%}) "
-            f"within {tolerance_mm} mm",
-            flush=True,
-        )
+if __name__ == "__main__":
+    target = draw_targets(TARGETS, SHARE_MAX, np.random.default_rng(1))
+    aside = np.linalg.norm(target[:, :2], axis=1)
+    target = np.column_stack([np.zeros(TARGETS), aside, target[:, 2]])
+    for noise in (Uniform(), Gaussian()):
+        random = np.random.default_rng(2)
+        draws = [posterior_means(noise, random) for _ in range(DRAWS)]
+        rms = np.sqrt(np.mean(np.angle(np.array(draws)) ** 2, axis=0))
+        for mm in range(4, REVEALED_MM + 1, 2):
+            print(f"{type(noise).__name__}: after {mm} mm the roll is known to {math.degrees(rms[mm - 1]):.0f} degrees")
+        limits = (0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9)
+        ends = [[path_end(means, limit) for means in draws] for limit in limits]
+        for tolerance_mm in (1.0, 0.4):
+            # By limit, draw and target.
+            are_reached = np.array([[reached(target, *end, tolerance_mm) for end in of_limit] for of_limit in ends])
+            best = are_reached.mean(axis=1).argmax(axis=0)
+            shares = are_reached[best, :, np.arange(TARGETS)].mean(axis=0)
+            print(
+                f"{type(noise).__name__}: {shares.mean():.1%} (standard error {shares.std() / math.sqrt(DRAWS):.1%}) "
+                f"within {tolerance_mm} mm",
+                flush=True,
+            )
