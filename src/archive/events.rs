@@ -11,11 +11,11 @@ use std::fmt;
 pub enum EventKind {
     /// A part of the bench entered the state that is the line's text.
     State,
-    /// Something happened, that matters so much.
+    /// An event of this severity.
     Event(Severity),
 }
 
-/// A line of `events.log`, without its end: `   12.345 s  tracker   warning  connection lost`.
+/// A line of `events.log`, without its line feed: `   12.345 s  tracker   warning  connection lost`.
 ///
 /// Time to the millisecond, the part of the bench, how much it matters (`state`, `info`,
 /// `warning`, `fault`), and the text. Line ends and whatever else a terminal acts upon are
@@ -46,7 +46,7 @@ impl<'a> EventLine<'a> {
         Some(EventLine { time, lane, kind, text: escaped(text) })
     }
 
-    /// Reads a line; `None` if it is not an event. The last line of a killed run may be cut.
+    /// Reads a line; `None` if it is not an event. The last line of a killed run may be truncated.
     pub fn parse(line: &'a str) -> Option<Self> {
         let (time_s, rest) = line.trim_start().split_once(" s  ")?;
         let (lane, rest) = column(rest, LANE_WIDTH)?;

@@ -46,18 +46,20 @@ impl EmcyCode {
             let code = format!("{code:04x} ");
             NAMES.lines().find_map(|line| line.strip_prefix(code.as_str()))
         };
-        find(self.0).or_else(|| find(self.0 & 0xff00)).or_else(|| find(self.0 & 0xf000))
+        let class = (self.0 & 0xf000 != 0).then_some(self.0 & 0xf000);
+        find(self.0).or_else(|| find(self.0 & 0xff00)).or_else(|| find(class?))
     }
 
     /// The bits of the [`error_register`] that belong to the code's class.
-    pub const fn register(self) -> u8 {
+    pub const fn register_bits(self) -> u8 {
         match self.0 >> 8 {
             0x20..=0x2f => error_register::CURRENT,
             0x30..=0x3f => error_register::VOLTAGE,
             0x40..=0x4f => error_register::TEMPERATURE,
             0x81 | 0x82 => error_register::COMMUNICATION,
             0x83..=0x8f => error_register::PROFILE,
-            0xff => error_register::MANUFACTURER,
+            // An EPOS4's limit switches show the generic bit alone.
+            0xff if !matches!(self.0, 0xff06 | 0xff07) => error_register::MANUFACTURER,
             _ => error_register::GENERIC,
         }
     }
@@ -135,6 +137,7 @@ mod tests {
         assert_eq!(EmcyCode(0x5912).to_string(), "0x5912 device hardware");
         assert_eq!(EmcyCode(0xff01).to_string(), "0xFF01 manufacturer specific");
         assert_eq!(EmcyCode(0xa000).to_string(), "0xA000 unknown error code");
+        assert_eq!(EmcyCode(0x0500).to_string(), "0x0500 unknown error code");
         assert!(NAMES.lines().is_sorted());
     }
 

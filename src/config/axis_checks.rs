@@ -18,7 +18,7 @@ use crate::stage::{Axis, AxisConfig, Reference};
 ///
 /// The bring-up never insists on 1005, 1018:3, 1018:4, 605E, and PDOs beyond the first.
 const NEEDED: [(&[u16], &str); 7] = [
-    (&[0x1000, 0x1018], "by it the bench knows the drive"),
+    (&[0x1000, 0x1018], "it tells which drive this is"),
     (
         &[0x1016, 0x1017, 0x6007],
         "it stops the axis when the bench falls silent, or the bench when the drive does",
@@ -28,20 +28,23 @@ const NEEDED: [(&[u16], &str); 7] = [
         "without it set-points and positions are not where the bench takes them to be",
     ),
     (&[0x6040, 0x6041, 0x6060, 0x6061, 0x6064, 0x607A], "no drive is moved or watched without it"),
-    (&[0x6085], "a braking that is configured must hold; a drive without it is not to be told one"),
+    (
+        &[0x6085],
+        "a configured quick-stop deceleration must hold: omit it if the drive has no such object",
+    ),
     (&[0x6098, 0x607C], "the drive would home in a way, or to a place, that is not configured"),
     (&[SOFTWARE_LIMITS], "the drive keeps its limits itself, unless wraps is true"),
 ];
 /// The drive's own position limits.
 const SOFTWARE_LIMITS: u16 = 0x607D;
 
-/// By what a real drive brakes on quick stop, on its own faults and when the bench dies.
+/// Settings that make a real drive brake on quick stop, on its own faults and when the bench dies.
 const STOPPING: [(&str, &[i16], &str); 4] = [
     (
         "abort_connection_option",
         &[1, 2, 3],
-        "1 (fault), 2 (no power) or 3 (quick stop): by anything else the axis may go on when the bench \
-         dies (6007)",
+        "1 (fault), 2 (no power) or 3 (quick stop): with others the axis may go on when the bench dies \
+         (6007)",
     ),
     (
         "communication_error_behaviour",
@@ -64,128 +67,195 @@ const STOPPING: [(&str, &[i16], &str); 4] = [
 
 /// Notes every contradiction.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
-    axis(config, Axis::Insertion, &config.stage.insertion, reader);
-    axis(config, Axis::Rotation, &config.stage.rotation, reader);
+    for which in Axis::BOTH {
+        let axis = [&config.stage.insertion, &config.stage.rotation][which as usize];
+        let checks = Checks { config, which, axis };
+        checks.reference(reader);
+        checks.home(reader);
+        checks.homing_direction(reader);
+        checks.stopping(reader);
+        checks.optional_objects(reader);
+        checks.following_error_timeout(reader);
+        checks.raw_sdos(reader);
+    }
     accelerations(config, reader);
 }
 
-/// Those of one axis. Numbers in messages are in the unit of their key.
-fn axis(config: &Config, which: Axis, axis: &AxisConfig, reader: &mut Reader) {
-    let [name, unit, scale, per] = [
-        ["insertion", "mm", "counts_per_mm.counts", "counts_per_mm.mm"],
-        ["rotation", "deg", "counts_per_turn.counts", "counts_per_turn.turns"],
-    ][which as usize];
-    let key = |key: &str| format!("stage.{name}.{key}");
-    let hardware = config.stage.hardware;
-    let [reference, homing, zero] = ["reference", "homing", "zero"].map(key);
-    let [low, high] = ["min", "max"].map(|end| key(&format!("{end}_{unit}")));
-    let [min, max] = [&low, &high].map(|key| config.number(key));
-
-    let homed = axis.reference == Reference::Homing;
-    reader.check(&[&reference, &homing], homed && axis.homing.is_none(), || {
-        format!("{reference} is \"homing\", and there is no [{homing}] that says how")
-    });
-    reader.check(&[&zero, &reference], homed && axis.zero.is_none(), || {
-        format!(
-            "{zero} is \"start\", but {reference} is \"homing\": give the counts, 0 for the drive's \
-             zero"
-        )
-    });
-    // Limits of a real axis are what its screw, its needle or the sensor's cable bear. Counted from
-    // where each command begins they would bear nothing: three jogs go three times as far.
-    let drifts = hardware && axis.zero.is_none() && !axis.wraps;
-    reader.check(&[&zero, &high, "stage.hardware"], drifts, || {
-        format!(
-            "{zero} is \"start\": its limits of {min} to {max} {unit} would count anew from each start; \
-             give the counts at 0 {unit} (stage status), and {reference} = \"homing\" if power-off \
-             loses them"
-        )
-    });
-    // An axis that was homed stands at home, from which the drive's zero is a home offset (607C) away.
-    let offset_key = key(&format!("homing.offset_{unit}"));
-    let offset = config.number(&offset_key);
-    let zero_counts = axis.zero.map_or(f64::NAN, f64::from);
-    let counts_per_unit =
-        config.number(&key(scale)) / config.number(&key(per)) / [1.0, 360.0][which as usize];
-    let (sign_key, method_key) = (key("sign"), key("homing.method"));
-    let sign = config.number(&sign_key);
-    let home_at = |offset: f64| 0.0 - offset - sign * zero_counts / counts_per_unit;
-    let home = home_at(offset);
-    reader.check(&[&low, &high, &zero, &offset_key], home < min || home > max, || {
-        format!(
-            "{offset_key} is {offset}, which puts home at {home:.3} {unit} with {zero} = \
-             {zero_counts}, allowed: {low} to {high}, which are {min} and {max}"
-        )
-    });
-    // The needle's axis has its way on one side of its end switch, where home is.
-    let home = if offset.is_nan() { home_at(0.0) } else { home_at(offset) };
-    let method = axis.homing.filter(|_| which == Axis::Insertion).map_or(0, |homing| homing.method);
-    let (toward, other) = match method {
-        1 | 17 => (-sign, method + 1),
-        2 | 18 => (sign, method - 1),
-        _ => (0.0, 0),
-    };
-    let [beyond, before] =
-        if toward > 0.0 { [max - home, home - min] } else { [home - min, max - home] };
-    let keys = [&*method_key, &sign_key, &zero, &low, &high];
-    reader.check(&keys, toward != 0.0 && beyond > before, || {
-        let end = if toward > 0.0 { "deep" } else { "withdrawn" };
-        format!(
-            "{method_key} is {method}, which with sign = {sign} seeks the switch at the {end} end: home is \
-             {home:.3} {unit}, the limits of {min} to {max} {unit} go {beyond:.1} {unit} beyond it; is it \
-             {other}?"
-        )
-    });
-    for (name, stopping, allowed) in STOPPING {
-        let key = key(name);
-        let value = config.number(&key);
-        let stops = stopping.iter().any(|&option| f64::from(option) == value);
-        reader.check(&["stage.hardware", &key], hardware && !stops, || {
-            format!("{key} is {value}, allowed with stage.hardware = true: {allowed}")
-        });
-    }
-    for (n, index) in axis.optional_objects.iter().enumerate() {
-        let needed = NEEDED.iter().find(|(indexes, _)| indexes.contains(index));
-        let needed = needed.filter(|_| *index != SOFTWARE_LIMITS || !axis.wraps);
-        let key = key(&format!("optional_objects[{n}]"));
-        reader.check(&[&key], needed.is_some(), || {
-            let why = needed.map_or("", |(_, why)| why);
-            format!("{key} is 0x{index:04X}, which is not optional: {why}")
-        });
-    }
-    // The bench allows for what the target does in two SYNC periods beyond the drive's window: a drive
-    // that waits no longer than these notices no later than the bench.
-    let (timeout_key, sync_ms) = (key("following_error_timeout_ms"), config.can.bus.sync_ms);
-    let timeout_ms = axis.following_error_timeout_ms.unwrap_or_default();
-    reader.check(&["can.sync_ms", &timeout_key], timeout_ms > 2 * sync_ms, || {
-        format!(
-            "{timeout_key} is {timeout_ms}, allowed: up to twice can.sync_ms, which is {sync_ms}, so \
-             that the drive notices no later than the bench"
-        )
-    });
-    raw_sdos(axis, key, unit, reader);
+/// The checks of one axis. Numbers in messages are in the unit of their key.
+struct Checks<'a> {
+    config: &'a Config,
+    which: Axis,
+    axis: &'a AxisConfig,
 }
 
-/// Where the braking of a quick stop is not configured, its object may be written in the units that the
-/// drive has of its own.
-fn raw_sdos(axis: &AxisConfig, key: impl Fn(&str) -> String, unit: &str, reader: &mut Reader) {
-    for (n, sdo) in axis.sdo.iter().enumerate() {
-        let [index_key, value_key, bits_key] =
-            ["index", "value", "bits"].map(|name| key(&format!("sdo[{n}].{name}")));
-        let (low, high) = (-(1i64 << (sdo.bits.max(1) - 1)), (1i64 << sdo.bits) - 1);
-        let (index, value) = (sdo.index, sdo.value);
-        reader.check(&[&bits_key, &value_key], !(low..=high).contains(&value), || {
-            format!("{value_key} is {value}, allowed: {low} to {high}")
+impl Checks<'_> {
+    fn key(&self, key: &str) -> String {
+        format!("stage.{}.{key}", self.which)
+    }
+
+    fn number(&self, key: &str) -> f64 {
+        self.config.number(&self.key(key))
+    }
+
+    /// The keys of the soft limits, and the limits.
+    fn limits(&self) -> ([String; 2], [f64; 2]) {
+        let keys = ["min", "max"].map(|end| format!("{end}_{}", self.which.unit()));
+        let limits = [&keys[0], &keys[1]].map(|key| self.number(key));
+        (keys.map(|key| self.key(&key)), limits)
+    }
+
+    fn reference(&self, reader: &mut Reader) {
+        let Checks { axis, .. } = self;
+        let [reference, homing, zero] = ["reference", "homing", "zero"].map(|key| self.key(key));
+        let homed = axis.reference == Reference::Homing;
+        reader.check(&[&reference, &homing], homed && axis.homing.is_none(), || {
+            format!("{reference} is \"homing\", and there is no [{homing}] that says how")
         });
-        let why = match (index, axis.quick_stop_deceleration) {
-            (0x6085, Some(_)) => {
-                Some(format!("quick_stop_deceleration_{unit}_per_s2 sets it: give one of the two"))
+        reader.check(&[&zero, &reference], homed && axis.zero.is_none(), || {
+            format!(
+                "{zero} is \"start\", but {reference} is \"homing\": give the counts, 0 for the drive's \
+                 zero"
+            )
+        });
+        // Limits of a real axis are what its screw, its needle or the sensor's cable bear. Counted from
+        // where each command begins they would bear nothing: three jogs go three times as far.
+        let ([_, high], [min, max]) = self.limits();
+        let drifts = self.config.stage.hardware && axis.zero.is_none() && !axis.wraps;
+        reader.check(&[&zero, &high, "stage.hardware"], drifts, || {
+            let unit = self.which.unit();
+            format!(
+                "{zero} is \"start\": its limits of {min} to {max} {unit} would count anew from each start; \
+                 give the counts at 0 {unit} (stage status), and {reference} = \"homing\" if power-off \
+                 loses them"
+            )
+        });
+    }
+
+    fn offset_key(&self) -> String {
+        format!("homing.offset_{}", self.which.unit())
+    }
+
+    /// Where an axis that was homed stands, mm or deg: the drive's zero is a home offset (607C) away.
+    fn home_at(&self, offset: f64) -> f64 {
+        let zero_counts = self.axis.zero.map_or(f64::NAN, f64::from);
+        let counts_per_unit = match self.which {
+            Axis::Insertion => {
+                self.number("counts_per_mm.counts") / self.number("counts_per_mm.mm")
             }
-            _ => reserved(index).map(str::to_owned),
+            Axis::Rotation => {
+                self.number("counts_per_turn.counts") / self.number("counts_per_turn.turns") / 360.0
+            }
         };
-        reader.check(&[&index_key], why.is_some(), || {
-            format!("{index_key} is 0x{index:04X}, not for raw SDOs: {}", why.unwrap_or_default())
+        // Not -offset, which would print as -0.000.
+        0.0 - offset - self.number("sign") * zero_counts / counts_per_unit
+    }
+
+    fn home(&self, reader: &mut Reader) {
+        let ([low, high], [min, max]) = self.limits();
+        let (zero, offset_key) = (self.key("zero"), self.key(&self.offset_key()));
+        let offset = self.config.number(&offset_key);
+        let home = self.home_at(offset);
+        reader.check(&[&low, &high, &zero, &offset_key], home < min || home > max, || {
+            let (unit, zero_counts) = (self.which.unit(), self.axis.zero.unwrap_or_default());
+            format!(
+                "{offset_key} is {offset}, which puts home at {home:.3} {unit} with {zero} = \
+                 {zero_counts}, allowed: {low} to {high}, which are {min} and {max}"
+            )
         });
+    }
+
+    /// The needle's axis has its way on one side of its end switch, where home is.
+    fn homing_direction(&self, reader: &mut Reader) {
+        let Some(homing) = self.axis.homing.filter(|_| self.which == Axis::Insertion) else {
+            return;
+        };
+        let sign = self.number("sign");
+        let method = homing.method;
+        let (toward, other) = match method {
+            1 | 17 => (-sign, method + 1),
+            2 | 18 => (sign, method - 1),
+            _ => return,
+        };
+        let ([low, high], [min, max]) = self.limits();
+        let offset = self.number(&self.offset_key());
+        let home = self.home_at(if offset.is_nan() { 0.0 } else { offset });
+        let [beyond, before] =
+            if toward > 0.0 { [max - home, home - min] } else { [home - min, max - home] };
+        let [method_key, sign_key, zero] =
+            ["homing.method", "sign", "zero"].map(|key| self.key(key));
+        reader.check(&[&method_key, &sign_key, &zero, &low, &high], beyond > before, || {
+            let (unit, end) =
+                (self.which.unit(), if toward > 0.0 { "deep" } else { "withdrawn" });
+            format!(
+                "{method_key} is {method}, which with sign = {sign} seeks the switch at the {end} end: home \
+                 is {home:.3} {unit}, the limits of {min} to {max} {unit} go {beyond:.1} {unit} beyond it; \
+                 is it {other}?"
+            )
+        });
+    }
+
+    fn stopping(&self, reader: &mut Reader) {
+        for (name, stopping, allowed) in STOPPING {
+            let key = self.key(name);
+            let value = self.config.number(&key);
+            let stops = stopping.iter().any(|&option| f64::from(option) == value);
+            reader.check(&["stage.hardware", &key], self.config.stage.hardware && !stops, || {
+                format!("{key} is {value}, allowed with stage.hardware = true: {allowed}")
+            });
+        }
+    }
+
+    fn optional_objects(&self, reader: &mut Reader) {
+        for (n, index) in self.axis.optional_objects.iter().enumerate() {
+            let needed = NEEDED.iter().find(|(indexes, _)| indexes.contains(index));
+            let needed = needed.filter(|_| *index != SOFTWARE_LIMITS || !self.axis.wraps);
+            let key = self.key(&format!("optional_objects[{n}]"));
+            reader.check(&[&key], needed.is_some(), || {
+                let why = needed.map_or("", |(_, why)| why);
+                format!("{key} is 0x{index:04X}, which is not optional; remove it: {why}")
+            });
+        }
+    }
+
+    /// The bench's own limit is the drive's window plus the travel of two SYNC periods. A drive that waits no
+    /// longer than these notices no later than the bench.
+    fn following_error_timeout(&self, reader: &mut Reader) {
+        let key = self.key("following_error_timeout_ms");
+        let timeout_ms = self.axis.following_error_timeout_ms.unwrap_or_default();
+        let max_ms = 2 * self.config.can.bus.sync_ms;
+        reader.check(&["can.sync_ms", &key], timeout_ms > max_ms, || {
+            format!(
+                "{key} is {timeout_ms}, allowed: up to {max_ms} (twice can.sync_ms), so that the drive \
+                 notices no later than the bench"
+            )
+        });
+    }
+
+    /// Refuses raw SDOs whose value does not fit, and those to objects that the bench writes itself. 6085 may
+    /// be written where no deceleration of a quick stop is configured, in the drive's own unit.
+    fn raw_sdos(&self, reader: &mut Reader) {
+        for (n, sdo) in self.axis.sdo.iter().enumerate() {
+            let [index_key, value_key, bits_key] =
+                ["index", "value", "bits"].map(|name| self.key(&format!("sdo[{n}].{name}")));
+            let (low, high) = (-(1i64 << (sdo.bits.max(1) - 1)), (1i64 << sdo.bits) - 1);
+            let (index, value) = (sdo.index, sdo.value);
+            reader.check(&[&bits_key, &value_key], !(low..=high).contains(&value), || {
+                format!("{value_key} is {value}, allowed: {low} to {high}")
+            });
+            let why = match (index, self.axis.quick_stop_deceleration) {
+                (0x6085, Some(_)) => {
+                    let unit = self.which.unit();
+                    Some(format!(
+                        "quick_stop_deceleration_{unit}_per_s2 sets it: give one of the two"
+                    ))
+                }
+                _ => reserved(index).map(str::to_owned),
+            };
+            reader.check(&[&index_key], why.is_some(), || {
+                let why = why.unwrap_or_default();
+                format!("{index_key} is 0x{index:04X}, not for raw SDOs: {why}")
+            });
+        }
     }
 }
 
@@ -214,7 +284,7 @@ fn reserved(index: u16) -> Option<&'static str> {
 }
 
 /// Commanded accelerations are under the limits of their axis: a run must not end by a limit that it was
-/// bound to break.
+/// certain to exceed.
 fn accelerations(config: &Config, reader: &mut Reader) {
     let along = "stage.insertion.acceleration_max_mm_per_s2";
     for (key, max_key) in [

@@ -2,6 +2,7 @@
 
 use super::pose::{POSITION, PoseConfig};
 use super::reader::Reader;
+use super::tracker::FILE;
 use super::{Config, ControlKind, TrackerSource};
 use crate::keys::{Rule, choice, named, over, section, within};
 use crate::plan::{Obstacle, Problem, Tip, Workspace, World};
@@ -81,7 +82,7 @@ section! {
         max_mm: Option<Vector3<f64>> [POSITION];
         /// Mask: a NIfTI image, `.nii` or `.nii.gz`; a voxel that is not 0 is part of the obstacle.
         /// The path is relative to the configuration's folder.
-        file: Option<String> [named("the path of a file")];
+        file: Option<String> [FILE];
         /// CRC-32 of the mask's file; a file with another is refused. A run records it.
         crc32: Option<u32> [CRC32];
         /// Pose of the mask's voxels. Voxel (i, j, k) has its centre at i, j, k times the spacing

@@ -1,8 +1,9 @@
 //! `[needle]`: what the bench believes of the needle, and how it was calibrated.
 
+use super::tracker::FILE;
 use super::{Config, ConfigError};
 use crate::calibration::{NeedleRecord, PathNoise};
-use crate::keys::{Rule, named, over, section, within};
+use crate::keys::{Rule, over, section, within};
 use crate::needle::{Needle, Torsion, TorsionConfig};
 use crate::session::Samples;
 
@@ -18,10 +19,10 @@ section! {
         tip_ahead_mm: f64 [TIP_AHEAD] = 0.0;
         /// The play of the shaft: the tip's roll lags behind the base's.
         torsion: TorsionConfig;
-        /// How these were found, as `needle-bench calibrate needle` wrote it.
+        /// How the needle's values were found, as `needle-bench calibrate needle` wrote it.
         fit: Option<NeedleRecord>, whole;
-        /// In place of these: the file that `needle-bench calibrate needle` wrote.
-        needle_file: Option<String> [named("the path of a file")];
+        /// In place of the needle's values: the file that `needle-bench calibrate needle` wrote.
+        needle_file: Option<String> [FILE];
     }
 }
 
@@ -43,7 +44,7 @@ impl Arc {
         self.curvature_per_mm.unwrap_or_else(of_radius)
     }
 
-    /// A needle that cuts it, with its tip so far ahead; `section` is named where there is none.
+    /// A needle that cuts it, whose tip is `tip_ahead_mm` ahead; an error names the `section`.
     pub(super) fn to_needle(self, tip_ahead_mm: f64, section: &str) -> Result<Needle, ConfigError> {
         Needle::new(self.curvature_per_mm())
             .and_then(|needle| needle.with_tip_ahead(tip_ahead_mm))
@@ -51,7 +52,7 @@ impl Arc {
     }
 }
 
-/// The play of this `config`; an error names the `section`.
+/// The torsion of `config`; an error names the `section`.
 pub(super) fn torsion(config: TorsionConfig, section: &str) -> Result<Torsion, ConfigError> {
     Torsion::new(config).map_err(|error| ConfigError::of(format!("{section}.torsion: {error}")))
 }
@@ -60,7 +61,7 @@ impl Config {
     /// The needle as the bench believes it to be.
     ///
     /// # Errors
-    /// A curvature that no needle has.
+    /// Those of [`Needle::new`] and [`Needle::with_tip_ahead`].
     pub fn believed_needle(&self) -> Result<Needle, ConfigError> {
         self.needle.arc.to_needle(self.needle.tip_ahead_mm, "needle")
     }
@@ -68,7 +69,7 @@ impl Config {
     /// The torsion of its shaft as the bench believes it to be.
     ///
     /// # Errors
-    /// An offset outside the band.
+    /// Those of [`Torsion::new`].
     pub fn believed_torsion(&self) -> Result<Torsion, ConfigError> {
         torsion(self.needle.torsion, "needle")
     }

@@ -15,7 +15,7 @@ use crate::tracker::{
     TrackerKind, Workspace,
 };
 
-const FILE: Rule = named("the path of a file");
+pub(super) const FILE: Rule = named("the path of a file");
 const ADDRESS: Rule =
     Rule::Text("host:port, such as \"127.0.0.1:18944\", or \"-\" for standard input", |address| {
         address == STANDARD_INPUT || is_address(address)
@@ -44,8 +44,8 @@ section! {
         kind: TrackerKind = "electromagnetic";
         /// When the insertion is held.
         hold: HoldConfig, flat;
-        /// Least delay from the measurement of a position to its receipt. A sender's clock is learnt from what
-        /// comes soonest, so stamps show only what comes later than that.
+        /// Shortest delay from the measurement of a position to its receipt. The clock of a sender is learnt
+        /// from its soonest samples, so stamps show only delays beyond this one.
         latency as "latency_ms": Duration [within(0.0, 5000.0)] = 0.0;
         /// The stamp that dates a position.
         stamp: StampPolicy = "receive";
@@ -53,9 +53,9 @@ section! {
         tip_offset_mm: [f64; 3] [within(-1000.0, 1000.0)] = [0.0, 0.0, 0.0];
         /// Orientation of the tip in the sensor's frame.
         tip_tilt: FixedAngles => "{ yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }";
-        /// How the two were computed, as `needle-bench calibrate tip` wrote it.
+        /// How `tip_offset_mm` and `tip_tilt` were computed, as `needle-bench calibrate tip` wrote it.
         tip_fit: Option<TipRecord>;
-        /// In place of the three: the file that `needle-bench calibrate tip` wrote.
+        /// In place of `tip_offset_mm`, `tip_tilt` and `tip_fit`: the file that `needle-bench calibrate tip` wrote.
         tip_file: Option<String> [FILE];
         /// A box in the bench frame outside of which no tip position is believed.
         workspace: Option<Workspace>;
@@ -63,7 +63,7 @@ section! {
         /// one the bench does not move; only the emulated tracker has a default.
         registration: Option<RegistrationConfig> => "{ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, \
             yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }", whole, tracker_must_give;
-        /// In its place: the file that `needle-bench calibrate registration` wrote.
+        /// In place of `[tracker.registration]`: the file that `needle-bench calibrate registration` wrote.
         registration_file: Option<String> [FILE];
         /// The columns of a CSV file; the defaults are those of a run's steps.csv.
         csv: CsvMapping;
@@ -84,10 +84,10 @@ section! {
         zero: bool = true;
         /// Refuse what the tracker itself calls invalid.
         status: bool = true;
-        /// End the run where the stream as a whole contradicts the insertion: travel, handedness. False
-        /// is for streams of another needle, and refused with hardware.
+        /// End the run where the stream as a whole contradicts the insertion: travel, handedness. Set false
+        /// only for a stream that was recorded with another needle; refused with hardware.
         stream: bool = true;
-        /// Against the others, and the model.
+        /// The gate against the other positions, and the model.
         track: TrackSettings, flat;
     }
 }
@@ -132,7 +132,7 @@ impl TrackerConfig {
     /// The tracker settings of a session.
     ///
     /// # Errors
-    /// Without a registration.
+    /// Those of [`TrackerConfig::to_registration`].
     pub(super) fn to_session(&self) -> Result<session::TrackerConfig, ConfigError> {
         Ok(session::TrackerConfig {
             gate: self.to_gate()?,
@@ -148,7 +148,7 @@ impl TrackerConfig {
     /// Where the tracker stands on the bench and the tip on the sensor; without it nothing moves.
     ///
     /// # Errors
-    /// When there is none, the key to set; fiducials that determine none.
+    /// No registration is configured (the error names the key to set), or its fiducials determine none.
     pub fn to_registration(&self) -> Result<Registration, ConfigError> {
         let registration = self.registration.as_ref().ok_or_else(|| {
             ConfigError::of(format!(
@@ -169,7 +169,7 @@ impl TrackerConfig {
     /// The gate that a sample must pass by itself.
     ///
     /// # Errors
-    /// Without a registration.
+    /// Those of [`TrackerConfig::to_registration`].
     pub fn to_gate(&self) -> Result<Gate, ConfigError> {
         Ok(Gate {
             registration: self.to_registration()?,
@@ -198,7 +198,7 @@ impl TrackerConfig {
         TrackSettings { kind: self.kind, noise_sd_mm, ..self.gates.track }
     }
 
-    /// The protocol of the tracker's connection.
+    /// The protocol of the tracker's connection; without meaning for a source that has none.
     pub fn to_protocol(&self) -> Protocol {
         match self.source {
             TrackerSource::Ndjson => Protocol::Ndjson,

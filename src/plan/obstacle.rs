@@ -45,32 +45,32 @@ impl Obstacle {
                 let along_mm = to_point.dot(&axis);
                 let off_axis_mm = (to_point - axis * along_mm).norm();
                 // In the half plane of axis and point the cylinder is a rectangle.
-                outside([
+                signed_distance([
                     off_axis_mm - radius_mm,
                     (along_mm - 0.5 * length_mm).abs() - 0.5 * length_mm,
                 ])
             }
             Obstacle::Box { min_mm, max_mm } => {
                 let over = (min_mm - point_mm).sup(&(point_mm - max_mm));
-                outside(over.into())
+                signed_distance(over.into())
             }
             Obstacle::Mask(mask) => mask.distance_mm(point_mm),
         }
     }
 }
 
-/// Distance to the product of intervals that a point is outside of by `over` in each coordinate;
-/// negative is inside.
-fn outside<const N: usize>(over: [f64; N]) -> f64 {
+/// Signed distance to a box, an interval a coordinate; negative inside. `over` is how far the point is past
+/// the nearer end of each interval, negative within it.
+fn signed_distance<const N: usize>(over: [f64; N]) -> f64 {
     let squared: f64 = over.iter().map(|over| over.max(0.0).powi(2)).sum();
     if squared > 0.0 { squared.sqrt() } else { over.into_iter().fold(f64::NEG_INFINITY, f64::max) }
 }
 
-/// The tip may be so far from the start, outside the workspace too, mm: the first estimates are about the
-/// start, which may be on a wall.
+/// Within this distance of the start the tip may be outside the workspace, mm: the first estimates scatter
+/// about the start, which may lie on a wall.
 const START_ROOM_MM: f64 = 3.0;
 
-/// A box that the tip never leaves, but at the start of a run.
+/// A box that the tip never leaves, except near the start of a run.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Workspace {
     /// The corner with the smallest coordinates, mm.
@@ -82,7 +82,8 @@ pub struct Workspace {
 }
 
 impl Workspace {
-    /// A lower bound of how far `point_mm` is inside, mm; negative outside, by the distance.
+    /// How far `point_mm` is inside, mm: at most the distance to the boundary. Negative outside, where the
+    /// distance to the workspace may be larger.
     pub fn depth_mm(&self, point_mm: &Vector3<f64>) -> f64 {
         let depth_mm = (point_mm - self.min_mm).inf(&(self.max_mm - point_mm)).min();
         let of_start_mm = |start_mm: Vector3<f64>| START_ROOM_MM - (point_mm - start_mm).norm();

@@ -1,4 +1,4 @@
-//! The session's record: everything that leaves it sideways and never comes back.
+//! What a session reports for its record. It never reads it back.
 
 use super::goal::Approach;
 use super::machine::Input;
@@ -37,7 +37,7 @@ pub enum Lane {
 }
 
 impl Lane {
-    /// Every lane, in the order in which they are shown.
+    /// Every lane.
     pub const ALL: [Lane; 5] =
         [Lane::Session, Lane::Stage, Lane::Tracker, Lane::Observer, Lane::Control];
 }
@@ -60,14 +60,14 @@ pub struct SampleRecord {
     pub received: Sample,
     /// Position in plane frame P, mm, where the sample was accepted.
     pub position_plane_mm: Option<Vector3<f64>>,
-    /// When the tip was there, by the stamp policy and latency, where the sample was accepted.
+    /// When the tip was there: the stamp less the latency, where the sample was accepted.
     pub acquisition_time: Option<Time>,
     /// Why the sample was refused; `None` when it was accepted.
     pub refused: Option<Refusal>,
 }
 
 impl SampleRecord {
-    /// `sample` as received, of which it is not known yet what becomes of it.
+    /// `sample` as received, not judged yet.
     pub fn received(sample: Sample) -> Self {
         SampleRecord {
             received: sample,
@@ -111,7 +111,7 @@ pub struct StepRecord {
     pub approach: Option<Approach>,
 }
 
-/// Something that left the session sideways.
+/// One record of a session.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Record {
     /// The session begins.
@@ -119,8 +119,8 @@ pub enum Record {
         /// The time it was made at.
         time: Time,
     },
-    /// The session was given something. What becomes of it follows from these alone, in their
-    /// order.
+    /// An input of the session. The inputs, in this order and with these times, determine the whole run: a
+    /// replay needs nothing else.
     Input {
         /// The time it was given at.
         time: Time,
@@ -136,9 +136,9 @@ pub enum Record {
         /// The frame.
         frame: Frame,
     },
-    /// A tip position, believed or not.
+    /// A tip position, accepted or not.
     Sample(SampleRecord),
-    /// A position of the target, where that is a tool of its own, believed or not.
+    /// A position of the target, where that is a tool of its own, accepted or not.
     Target(SampleRecord),
     /// The stage at one SYNC; depth and rotation of an insertion count from where it began.
     Stage(Feedback),

@@ -27,10 +27,16 @@ impl Axis {
 
     /// `value`, mm or rad, in the unit of the configuration and the command line, with that unit.
     pub fn in_unit(self, value: f64) -> (f64, &'static str) {
-        match self {
-            Axis::Insertion => (value, "mm"),
-            Axis::Rotation => (value.to_degrees(), "deg"),
-        }
+        let value = match self {
+            Axis::Insertion => value,
+            Axis::Rotation => value.to_degrees(),
+        };
+        (value, self.unit())
+    }
+
+    /// The unit of the configuration and the command line.
+    pub fn unit(self) -> &'static str {
+        ["mm", "deg"][self as usize]
     }
 
     /// `value`, mm or rad, as an operator reads it: `1.500 mm`, `90.000 deg`.

@@ -33,26 +33,28 @@ section! {
 }
 
 impl AxisLimits {
-    /// Refuses a `target` (mm or rad) outside the positions of `axis`.
+    /// Refuses a finite `target` (mm or rad) outside the positions of `axis`. NaN breaks no limit.
     ///
     /// # Errors
     /// The position limit that `target` breaks.
-    pub fn check_position(&self, axis: Axis, target: f64) -> Result<(), String> {
+    pub fn check_range(&self, axis: Axis, target: f64) -> Result<(), String> {
         self.check_rounded(axis, target, |value| value)
     }
 
-    /// The same, compared after rounding both target and limits.
+    /// The same, with `round` applied to the target and to the limits.
     fn check_rounded(
         &self,
         axis: Axis,
         target: f64,
         round: impl Fn(f64) -> f64,
     ) -> Result<(), String> {
-        let (rounded, unit) = (round(target), axis.in_unit(0.0).1);
-        let (side, limit, key) = match self {
-            AxisLimits { max, .. } if rounded > round(*max) => ("over", *max, "max"),
-            AxisLimits { min, .. } if rounded < round(*min) => ("under", *min, "min"),
-            _ => return Ok(()),
+        let (rounded, unit) = (round(target), axis.unit());
+        let (side, limit, key) = if rounded > round(self.max) {
+            ("over", self.max, "max")
+        } else if rounded < round(self.min) {
+            ("under", self.min, "min")
+        } else {
+            return Ok(());
         };
         let [target, limit] = [target, limit].map(|value| axis.shown(value));
         Err(format!("{axis}: {target} is {side} the limit of {limit} (stage.{axis}.{key}_{unit})"))
@@ -93,7 +95,8 @@ impl LimitCheck {
 
     /// The counts of `target` (mm or rad) if the axis may be sent there from `last`.
     ///
-    /// One count is allowed for the rounding of each of the targets compared.
+    /// Rounding to whole counts changes a step by up to 1 count, and the difference of two steps by up to 2:
+    /// so much is allowed.
     ///
     /// # Errors
     /// The first limit that `target` breaks.
@@ -130,7 +133,7 @@ impl LimitCheck {
 
     fn check_motion(&self, target: f64, counts: i64, last: Commanded) -> Result<(), String> {
         let (axis, per_unit, period_s) = (self.axis, self.scale.counts_per_unit(), self.period_s);
-        let unit = axis.in_unit(0.0).1;
+        let unit = axis.unit();
         let step_counts = counts.saturating_sub(last.counts);
         let speed_max = self.limits.speed_max;
         if step_counts.unsigned_abs() as f64 > speed_max * period_s * per_unit + 1.0 {
@@ -207,7 +210,7 @@ mod tests {
         );
         let limits = AxisLimits { min: -20_f64.to_radians(), ..check.limits };
         assert_eq!(
-            limits.check_position(Axis::Rotation, -0.5).expect_err("refused"),
+            limits.check_range(Axis::Rotation, -0.5).expect_err("refused"),
             "rotation: -28.648 deg is under the limit of -20.000 deg (stage.rotation.min_deg)"
         );
     }

@@ -86,7 +86,7 @@ pub fn insert(
         }
         let rotation_rad = needle.base.rotation_at(due.command_mm);
         let limits = &session.stage.rotation.limits;
-        if let Err(error) = limits.check_position(Axis::Rotation, rotation_rad) {
+        if let Err(error) = limits.check_range(Axis::Rotation, rotation_rad) {
             return Ok(Outcome::Stopped(format!("stage: {error}")));
         }
         if command.is_none() {

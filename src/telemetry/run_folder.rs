@@ -20,13 +20,14 @@ impl RunFolder {
     /// # Errors
     /// [`TelemetryError::NotARun`], and [`TelemetryError::Record`] if its manifest cannot be used.
     pub fn open(dir: &Path) -> Result<Self, TelemetryError> {
-        let none = |reason: String| TelemetryError::NotARun { path: dir.to_path_buf(), reason };
+        let not_a_run =
+            |reason: String| TelemetryError::NotARun { path: dir.to_path_buf(), reason };
         if !dir.is_dir() {
             let what = if dir.exists() { "it is a file" } else { "there is nothing of that name" };
-            return Err(none(what.to_owned()));
+            return Err(not_a_run(what.to_owned()));
         }
         let path = dir.join(file::MANIFEST);
-        let text = read_text(&path).map_err(|e| none(format!("{}: {e}", file::MANIFEST)))?;
+        let text = read_text(&path).map_err(|e| not_a_run(format!("{}: {e}", file::MANIFEST)))?;
         match Manifest::from_text(&text) {
             Ok(manifest) => Ok(RunFolder { dir: dir.to_path_buf(), manifest }),
             Err(error) => Err(TelemetryError::record(&path, error)),
@@ -55,40 +56,41 @@ impl RunFolder {
     /// [`TelemetryError::Record`] with every file that differs, and [`TelemetryError::File`].
     pub fn verify(&self) -> Result<(), TelemetryError> {
         let mut changes = Vec::new();
-        for (name, then) in &self.manifest.files {
-            changes.extend(self.change(name, then)?);
+        for (name, sealed) in &self.manifest.files {
+            changes.extend(self.change(name, sealed)?);
         }
         if self.is_closed() {
-            let sealed = |name: &&&str| self.manifest.files.contains_key(**name);
-            let unsealed = file::LINES.iter().filter(|name| !sealed(name));
-            let there = unsealed.filter(|name| self.dir.join(name).exists());
-            changes.extend(there.map(|name| format!("{name} has no seal in the closed record")));
+            let unsealed = file::LINES.into_iter().filter(|name| {
+                !self.manifest.files.contains_key(*name) && self.dir.join(name).exists()
+            });
+            changes.extend(unsealed.map(|name| format!("{name} has no seal in the closed record")));
         }
         if !self.manifest.files.contains_key(file::CONFIG) {
-            let seal = seal_of(&self.dir, file::CONFIG).ok().flatten();
-            let is_same = seal.is_some_and(|seal| seal.sha256 == self.manifest.config_sha256);
-            changes.extend((!is_same).then(|| edited(file::CONFIG)));
+            match seal_of(&self.dir, file::CONFIG)? {
+                Some(now) if now.sha256 == self.manifest.config_sha256 => {}
+                Some(_) => changes.push(edited(file::CONFIG)),
+                None => changes.push(gone(file::CONFIG)),
+            }
         }
         if changes.is_empty() {
             return Ok(());
         }
         let changes = changes.join("; ");
-        let reason = format!("{changes}; what it holds is not the record of that run");
+        let reason =
+            format!("{changes}: not the record of that run any more; restore it from a copy");
         Err(TelemetryError::record(&self.dir, reason))
     }
 
-    /// The change of the file `name` since it was sealed.
-    fn change(&self, name: &str, then: &FileSeal) -> Result<Option<String>, TelemetryError> {
+    /// How the file `name` differs from its seal; `None` if it does not.
+    fn change(&self, name: &str, sealed: &FileSeal) -> Result<Option<String>, TelemetryError> {
         Ok(match seal_of(&self.dir, name)? {
-            Some(now) if now == *then => None,
-            Some(FileSeal { bytes, .. }) if bytes != then.bytes => {
-                let then = then.bytes;
-                Some(format!(
-                    "{name} had {then} bytes when the record was closed and has {bytes} now"
-                ))
-            }
+            Some(now) if now == *sealed => None,
+            Some(FileSeal { bytes, .. }) if bytes != sealed.bytes => Some(format!(
+                "{name} had {} bytes when the record was closed and has {bytes} now",
+                sealed.bytes
+            )),
             Some(_) => Some(edited(name)),
-            None => Some(format!("{name} is gone")),
+            None => Some(gone(name)),
         })
     }
 
@@ -111,7 +113,11 @@ impl RunFolder {
 }
 
 fn edited(name: &str) -> String {
-    format!("{name} was edited: its SHA-256 is not that of the closed record")
+    format!("{name} was edited: its SHA-256 is not the one in manifest.json")
+}
+
+fn gone(name: &str) -> String {
+    format!("{name} is gone")
 }
 
 /// Opens the file `path`. A pipe or a device is refused, because reading it may never end.
@@ -142,17 +148,11 @@ pub(super) fn seal_of(dir: &Path, name: &str) -> Result<Option<FileSeal>, Teleme
 }
 
 fn seal_file(path: &Path) -> io::Result<FileSeal> {
-    let mut file = BufReader::with_capacity(1 << 16, open_regular(path)?);
+    let (mut file, mut buffer) = (open_regular(path)?, [0; 1 << 16]);
     let (mut hash, mut bytes) = (Sha256::new(), 0);
-    let mut buffer = [0; 1 << 14];
-    loop {
-        match file.read(&mut buffer)? {
-            0 => break,
-            n => {
-                hash.update(&buffer[..n]);
-                bytes += n as u64;
-            }
-        }
+    while let read @ 1.. = file.read(&mut buffer)? {
+        hash.update(&buffer[..read]);
+        bytes += read as u64;
     }
     Ok(FileSeal { bytes, sha256: hex(&hash.finalize()) })
 }
@@ -201,6 +201,8 @@ mod tests {
         fs::remove_file(dir.join(file::STEPS)).unwrap();
         fs::write(dir.join(file::CONFIG), "name = \"y\"\n").unwrap();
         assert!(said().contains("steps.csv is gone; config.toml was edited"), "{}", said());
+        fs::remove_file(dir.join(file::CONFIG)).unwrap();
+        assert!(said().contains("steps.csv is gone; config.toml is gone"), "{}", said());
     }
 
     #[test]

@@ -22,9 +22,8 @@ choice! {
 /// Dates samples: `acquisition = stamp − latency`, with the sender's stamp converted to the session's
 /// time line first.
 ///
-/// The sender has its own clock. The quickest delivery gives its offset (`ClockOffset`). The time
-/// that even the quickest delivery takes is part of that offset; the fixed latency makes up for it,
-/// and for the time that the tracker itself needs.
+/// The sender has its own clock. The quickest delivery gives its offset (`ClockOffset`), which includes the
+/// time that this delivery took. The fixed latency must cover that time, and the tracker's own.
 ///
 /// A stamp must also be later than the one before. Equal stamps are one measurement sent twice.
 #[derive(Debug, Clone)]
@@ -34,7 +33,8 @@ pub struct AcquisitionClock {
     offset: ClockOffset,
 }
 
-const NO_STAMP: &str = "none is sent, and tracker.stamp is \"source\"; set \"receive\" or \"auto\"";
+const NO_STAMP: &str =
+    "the sender sends no stamps, but tracker.stamp is \"source\": set \"receive\" or \"auto\"";
 
 impl AcquisitionClock {
     /// A clock with a fixed `latency` from measurement to stamp.
@@ -130,7 +130,7 @@ mod tests {
         assert_eq!(at_ms(&mut receive, 500, Some(1)), Ok(490));
         assert_eq!(at_ms(&mut clock(StampPolicy::Auto), 500, None), Ok(490));
         let error = at_ms(&mut clock(StampPolicy::Source), 1, None).unwrap_err();
-        assert!(error.starts_with("stamp: none is sent, "), "{error}");
+        assert!(error.starts_with("stamp: the sender sends no stamps, "), "{error}");
     }
 
     #[test]

@@ -12,7 +12,7 @@ use change::{Change, FASTER, SLOWER, Tenths};
 use nalgebra::Vector3;
 use std::collections::VecDeque;
 
-/// Positions are summed over so much depth, mm.
+/// Positions are summed in bins of this depth, mm.
 const BIN_MM: f64 = 0.25;
 /// Bins in each stretch that is looked at: 3 to 64 mm.
 const STRETCHES: [usize; 10] = [12, 16, 24, 32, 48, 64, 96, 128, 192, 256];
@@ -20,20 +20,20 @@ const STRETCHES: [usize; 10] = [12, 16, 24, 32, 48, 64, 96, 128, 192, 256];
 const POSITIONS_MIN: f64 = 6.0;
 /// Positions count as independent only so many to a mm: real noise is correlated.
 const INDEPENDENT_PER_MM: f64 = 10.0;
-/// Standard deviations of the slope's length that noise is given, on top of the tolerance.
-const SDS: f64 = 5.5;
+/// Standard deviations of the slope's length that are allowed for noise, besides the tolerance.
+const NOISE_SDS: f64 = 5.5;
 /// Bins over which positions that contradict the model are explained: 8 mm.
-const EXPLAINED: usize = 32;
+const EXPLAINED_BINS: usize = 32;
 /// What is tolerated besides noise: a share of the way, and a length over the whole stretch, mm.
 /// 59 recorded insertions of a real needle (docs/decisions/0013) stay inside with every stretch:
 /// 0.70 to 1.22 over 2.5 mm, 0.89 to 1.05 over 10 mm, 0.93 to 1.02 over 30 mm.
 const SHORT: (f64, f64) = (0.06, 0.75);
 const LONG: (f64, f64) = (0.03, 0.5);
-/// The slope along an arc of angle φ is shorter than the arc by φ²/40 of it; a needle may bend by this
-/// much more than it is told to.
-const BEND_MORE: f64 = 1.3;
+/// The slope along an arc of angle φ is shorter than the arc by φ²/40 of it; a needle may be more curved than
+/// configured by this factor.
+const CURVATURE_MARGIN: f64 = 1.3;
 
-/// Follows the slope of the believed positions over the depth.
+/// Follows the slope of the accepted positions over the depth.
 #[derive(Debug, Clone)]
 pub struct TravelCheck {
     noise_sd_mm: f64,
@@ -86,7 +86,7 @@ impl TravelCheck {
         TravelCheck { noise_sd_mm, curvature_per_mm, bins: VecDeque::new(), number: 0, error: None }
     }
 
-    /// Takes a believed position, measured at this depth of the stage, mm.
+    /// Takes an accepted position, measured at this depth of the stage, mm.
     pub fn take(&mut self, insertion_mm: f64, position_mm: &Vector3<f64>) {
         let number = (insertion_mm / BIN_MM).floor() as i64;
         if self.bins.is_empty() || number > self.number {
@@ -118,25 +118,22 @@ impl TravelCheck {
     /// Looks at every stretch that ends with the newest bin, the shortest first.
     fn check_stretches(&mut self) {
         let mut sum = Bin::default();
-        let mut stretches = STRETCHES.iter();
-        let mut next = stretches.next();
         for (bins, bin) in (1..).zip(self.bins.iter().rev()) {
             sum.add(bin);
-            if next == Some(&bins) {
-                next = stretches.next();
+            if STRETCHES.contains(&bins) {
                 let error = self.contradiction(&sum, bins);
                 self.error = self.error.take().or(error);
             }
         }
     }
 
-    /// Adds to the refusal of positions that contradict the model what they are: frozen or of too small a
-    /// scale, where the travel shows it.
+    /// Adds the likely cause to a refusal that loses the track: frozen or of too small a scale, where the
+    /// travel shows it.
     pub fn explain(&self, mut refusal: Refusal) -> Refusal {
         if refusal.effect == Effect::Loses {
-            let change = self.change_over(EXPLAINED, SLOWER);
+            let change = self.change_over(EXPLAINED_BINS, SLOWER);
             let what = change
-                .map_or("a jump, a drift, or of too large a scale".to_owned(), |change| {
+                .map_or("a jump, a drift, or too large a scale".to_owned(), |change| {
                     change.to_string()
                 });
             refusal.why += &format!(": {what}");
@@ -156,7 +153,7 @@ impl TravelCheck {
         if n < POSITIONS_MIN {
             return None;
         }
-        let spread_mm2 = sum.depth_mm2 - sum.depth_mm * sum.depth_mm / n;
+        let spread_mm2 = (sum.depth_mm2 - sum.depth_mm * sum.depth_mm / n).max(0.0);
         // Where the positions do not fill the stretch evenly, as much as would have their spread.
         let filled_mm = (12.0 * spread_mm2 / n).sqrt().min(stretch_mm);
         if filled_mm < 0.75 * stretch_mm {
@@ -169,11 +166,10 @@ impl TravelCheck {
         let independent = n.min(INDEPENDENT_PER_MM * filled_mm);
         let sd = (variance_mm2 / (spread_mm2 * independent / n)).sqrt();
         let ratio = slope.norm();
-        let bend_rad = BEND_MORE * self.curvature_per_mm * stretch_mm;
-        let min = 1.0 - SHORT.0 - SHORT.1 / filled_mm - bend_rad * bend_rad / 40.0 - SDS * sd;
-        // Noise makes the length of a slope longer, never shorter.
-        let max = (1.0 + 2.0 * sd * sd).sqrt() + LONG.0 + LONG.1 / filled_mm + SDS * sd;
-        // Written so that NaN is no contradiction: the positions are finite, and so is the slope.
+        let bend_rad = CURVATURE_MARGIN * self.curvature_per_mm * stretch_mm;
+        let min = 1.0 - SHORT.0 - SHORT.1 / filled_mm - bend_rad * bend_rad / 40.0 - NOISE_SDS * sd;
+        // On average noise lengthens the slope: its two components across it add 2 sd² to the squared length.
+        let max = (1.0 + 2.0 * sd * sd).sqrt() + LONG.0 + LONG.1 / filled_mm + NOISE_SDS * sd;
         (ratio < min || ratio > max).then(|| {
             let change = self.change_over(bins, if ratio < min { SLOWER } else { FASTER });
             let what = change.map_or("a jump, or a drift".to_owned(), |change| change.to_string());

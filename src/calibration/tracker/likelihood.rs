@@ -1,4 +1,4 @@
-//! The noise that makes recorded positions likeliest: a white part, and a part whose correlation decays
+//! Maximum-likelihood noise of recorded positions: a white part, and a part whose correlation decays
 //! with time.
 
 use crate::math;
@@ -8,9 +8,9 @@ const ROUNDS: usize = 14;
 /// Points of the search along each coordinate: of the first round, and of the others.
 const POINTS_FIRST: [usize; 2] = [13, 9];
 const POINTS: [usize; 2] = [5, 5];
-/// Twice the gain of the log likelihood by which a correlated part is seen: one white recording in
+/// Twice the gain of the log likelihood from which on a correlated part is reported: one white recording in
 /// 1000 reaches it (χ² of 2 degrees of freedom).
-const GAIN_MIN: f64 = 13.8;
+const LIKELIHOOD_RATIO_MIN: f64 = 13.8;
 /// Steps of the numerical derivatives: of the correlated share, and of the logarithm of the time.
 const STEPS: [f64; 2] = [0.01, 0.02];
 
@@ -58,14 +58,14 @@ pub(super) struct Residuals<'a> {
 }
 
 impl Residuals<'_> {
-    /// The likeliest noise, the same in every series.
+    /// The maximum-likelihood noise, the same in every series.
     pub(super) fn fit(&self) -> NoiseFit {
         let [share, ln_time] = self.search();
         let gain = self.ln_likelihood(share, ln_time) - self.ln_likelihood(0.0, 0.0);
-        if 2.0 * gain >= GAIN_MIN {
+        if 2.0 * gain >= LIKELIHOOD_RATIO_MIN {
             return self.with_errors(share, ln_time);
         }
-        let sd = self.scale_mm2(0.0, 0.0).sqrt();
+        let sd = self.variance_mm2(0.0, 0.0).sqrt();
         let sd_mm = Measured { value: sd, error: sd / (2.0 * self.count()).sqrt() };
         let none = Measured::default();
         NoiseFit { sd_mm, white_sd_mm: sd_mm, correlated_sd_mm: none, correlation_time_s: none }
@@ -76,12 +76,12 @@ impl Residuals<'_> {
     }
 
     /// The Kalman filter of the sum of an AR(1) process of variance `share` and white noise of variance
-    /// `1 - share`: the mean of the squared, normalised innovations, which is the likeliest variance of
-    /// the sum, and the sum of the logarithms of their variances.
+    /// `1 - share`: the mean of the squared, normalised innovations, which is the maximum-likelihood variance
+    /// of the sum, and the sum of the logarithms of their variances.
     fn filter(&self, share: f64, ln_time: f64) -> (f64, f64) {
         let time_s = math::exp(ln_time);
         let mut expected = vec![0.0; self.series.len()];
-        let (mut variance, mut squares, mut logarithms) = (share, 0.0, 0.0);
+        let (mut variance, mut squares, mut ln_determinant) = (share, 0.0, 0.0);
         for (k, gap_s) in self.gaps_s.iter().enumerate() {
             if k > 0 {
                 let phi = math::exp(-gap_s / time_s);
@@ -96,20 +96,20 @@ impl Residuals<'_> {
                 *expected += gain * innovation;
             }
             variance *= 1.0 - gain;
-            logarithms += math::ln(innovation_variance) * self.series.len() as f64;
+            ln_determinant += math::ln(innovation_variance) * self.series.len() as f64;
         }
-        (squares / self.count(), logarithms)
+        (squares / self.count(), ln_determinant)
     }
 
-    /// The likeliest variance of a coordinate, mm².
-    fn scale_mm2(&self, share: f64, ln_time: f64) -> f64 {
+    /// The maximum-likelihood variance of a coordinate, mm².
+    fn variance_mm2(&self, share: f64, ln_time: f64) -> f64 {
         self.filter(share, ln_time).0
     }
 
-    /// Logarithm of the likelihood, with the likeliest variance, but for a constant.
+    /// Logarithm of the likelihood with that variance, but for a constant.
     fn ln_likelihood(&self, share: f64, ln_time: f64) -> f64 {
-        let (scale_mm2, logarithms) = self.filter(share, ln_time);
-        -0.5 * (self.count() * math::ln(scale_mm2) + logarithms)
+        let (variance_mm2, ln_determinant) = self.filter(share, ln_time);
+        -0.5 * (self.count() * math::ln(variance_mm2) + ln_determinant)
     }
 
     /// The correlated share and the logarithm of the time at the maximum of the likelihood, by grids
@@ -128,7 +128,7 @@ impl Residuals<'_> {
             };
             for share in along(0) {
                 for ln_time in along(1) {
-                    // All white has no time.
+                    // At 0 the likelihood does not depend on the time; a little above it shows which is better.
                     let share = share.max(1e-6);
                     let ln_likelihood = self.ln_likelihood(share, ln_time);
                     if ln_likelihood > best.0 {
@@ -146,6 +146,7 @@ impl Residuals<'_> {
     /// Standard errors from the curvature of the likelihood at its maximum.
     fn with_errors(&self, best_share: f64, ln_time: f64) -> NoiseFit {
         let [h, g] = STEPS;
+        // So that a step to either side stays within 0 and 1.
         let share = best_share.clamp(2.0 * h, 1.0 - 2.0 * h);
         let l = |i: f64, j: f64| self.ln_likelihood(share + i * h, ln_time + j * g);
         let centre = l(0.0, 0.0);
@@ -153,7 +154,8 @@ impl Residuals<'_> {
         let b = -(l(0.0, 1.0) - 2.0 * centre + l(0.0, -1.0)) / (g * g);
         let c = -(l(1.0, 1.0) - l(1.0, -1.0) - l(-1.0, 1.0) + l(-1.0, -1.0)) / (4.0 * h * g);
         let determinant = a * b - c * c;
-        // Where the likelihood is no peak, each coordinate alone, or all of its range.
+        // Where the likelihood has no peak, each variance from its own curvature, with a standard error of at
+        // most 0.5 for the share and 2 for the logarithm of the time.
         let (share2, time2, both) = match determinant > 0.0 && a > 0.0 {
             true => (b / determinant, a / determinant, -c / determinant),
             false => (1.0 / a.max(4.0), 1.0 / b.max(0.25), 0.0),
@@ -171,8 +173,8 @@ impl Residuals<'_> {
                 + 2.0 / n;
             0.5 * variance.max(0.0).sqrt()
         };
-        let scale = |share, ln_time| math::ln(self.scale_mm2(share, ln_time));
-        let variance_mm2 = self.scale_mm2(best_share, ln_time);
+        let scale = |share, ln_time| math::ln(self.variance_mm2(share, ln_time));
+        let variance_mm2 = self.variance_mm2(best_share, ln_time);
         let sd = |part: f64, error: f64| {
             let value = (variance_mm2 * part).sqrt();
             Measured { value, error: value * error }

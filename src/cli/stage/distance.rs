@@ -61,7 +61,7 @@ impl Distance {
         match ratio.nearest_count(self.value / per_unit) {
             Some(0) => {
                 let smallest = format!("{:.2e}", ratio.value_of(1) * per_unit);
-                let unit = axis.in_unit(0.0).1;
+                let unit = axis.unit();
                 Err(format!(
                     "the {axis} axis would not move: --by is under half of its smallest step, \
                      {smallest}{unit}"
@@ -75,7 +75,7 @@ impl Distance {
 /// As it is written on the command line.
 impl fmt::Display for Distance {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}{}", self.value, self.axis.in_unit(0.0).1)
+        write!(f, "{}{}", self.value, self.axis.unit())
     }
 }
 

@@ -91,7 +91,7 @@ pub(super) fn status(config: &Config, as_json: bool) -> Result<ExitCode, Failure
 /// A drive as it describes itself.
 pub(in crate::cli) fn drive_json(axis: Axis, status: &AxisStatus) -> Value {
     let position = status.position.map(|position| axis.in_unit(position).0);
-    let unit = axis.in_unit(0.0).1;
+    let unit = axis.unit();
     let mut object = json!({
         "axis": axis.to_string(),
         "node": status.node.get(),

@@ -208,8 +208,8 @@ fn a_drive_notices_no_later_than_the_bench() {
     assert!(said("", &[&timeout(20)]).is_ok());
     assert_eq!(
         said("", &[&timeout(21)]).unwrap_err(),
-        "--set stage.insertion.following_error_timeout_ms is 21, allowed: up to twice \
-         can.sync_ms, which is 10, so that the drive notices no later than the bench"
+        "--set stage.insertion.following_error_timeout_ms is 21, allowed: up to 20 \
+         (twice can.sync_ms), so that the drive notices no later than the bench"
     );
 }
 

@@ -9,7 +9,7 @@ use super::state_machine::{Command, transition};
 use super::{DriveConfig, Model};
 use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::{Controlword, DriveState, Mode, Statusword, object};
-use crate::canopen::emcy::{EmcyCode, error_register};
+use crate::canopen::emcy::EmcyCode;
 use crate::canopen::nmt::NmtState;
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::canopen::sdo::AbortCode;
@@ -166,8 +166,8 @@ impl Axis {
     }
 
     /// Enters the fault reaction. During a fault, another one only sends its emergency message.
-    pub(super) fn fault(&mut self, now: Time, code: EmcyCode, register: u8, device: &mut Device) {
-        device.raise(code, register, [0; 5]);
+    pub(super) fn fault(&mut self, now: Time, code: EmcyCode, device: &mut Device) {
+        device.raise(code, [0; 5]);
         if self.state.is_fault() {
             return;
         }
@@ -191,7 +191,7 @@ impl Axis {
         let option = device.objects.integer(object::ABORT_CONNECTION_OPTION);
         let enabled = self.state == DriveState::OperationEnabled;
         match option {
-            1 => self.fault(now, code, error_register::COMMUNICATION, device),
+            1 => self.fault(now, code, device),
             2 if enabled => self.power_off(now),
             3 if enabled => self.quick_stop(now, &device.objects),
             // No action: the state stays. The axis stops, because no targets come any more.
@@ -247,8 +247,8 @@ impl Axis {
         }
         match (self.config.model, end) {
             (Model::Generic, _) => self.quick_stop(now, &device.objects),
-            (Model::Epos4, End::Negative) => self.fault(now, NEGATIVE_LIMIT_SWITCH, 0, device),
-            (Model::Epos4, End::Positive) => self.fault(now, POSITIVE_LIMIT_SWITCH, 0, device),
+            (Model::Epos4, End::Negative) => self.fault(now, NEGATIVE_LIMIT_SWITCH, device),
+            (Model::Epos4, End::Positive) => self.fault(now, POSITIVE_LIMIT_SWITCH, device),
         }
     }
 

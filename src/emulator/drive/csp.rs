@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::axis::{Axis, whole};
 use super::device::Device;
 use crate::canopen::cia402::{Mode, object};
-use crate::canopen::emcy::{EmcyCode, error_register};
+use crate::canopen::emcy::EmcyCode;
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::units::Time;
 
@@ -45,8 +45,7 @@ impl Axis {
         let timeout_ms = objects.integer(object::FOLLOWING_ERROR_TIMEOUT).unsigned_abs();
         let timeout = Duration::from_millis(timeout_ms);
         if self.behind_since.is_some_and(|since| now.since(since) >= timeout) {
-            let register = error_register::PROFILE;
-            self.fault(now, EmcyCode::FOLLOWING_ERROR, register, device);
+            self.fault(now, EmcyCode::FOLLOWING_ERROR, device);
         } else {
             self.motion = Motion::linear(now, from, to, period);
         }

@@ -34,13 +34,11 @@ impl Device {
 
     /// Raises an error: error register, history and emergency message. An error that is active is not
     /// raised again.
-    ///
-    /// `register` holds the bits of [`error_register`] beside the generic one.
-    pub(super) fn raise(&mut self, code: EmcyCode, register: u8, manufacturer: [u8; 5]) {
+    pub(super) fn raise(&mut self, code: EmcyCode, manufacturer: [u8; 5]) {
         if self.is_active(code) {
             return;
         }
-        self.active.push((code, register | error_register::GENERIC));
+        self.active.push((code, code.register_bits() | error_register::GENERIC));
         let register = self.update_register();
         self.remember(code);
         self.send(Emcy { code, register, manufacturer });

@@ -5,7 +5,7 @@ use super::device::Device;
 use super::inputs::End;
 use super::motion::Motion;
 use crate::canopen::cia402::DriveState;
-use crate::canopen::emcy::{EmcyCode, error_register};
+use crate::canopen::emcy::EmcyCode;
 use crate::emulator::fault::{Fault, FaultKind};
 use crate::units::Time;
 
@@ -29,37 +29,35 @@ impl Axis {
                     let ramped = matches!(self.motion, Motion::Ramped(_));
                     self.motion = Motion::Hold { at: self.motion.position_at(now) };
                     if ramped {
-                        let register = error_register::PROFILE;
-                        self.fault(now, EmcyCode::FOLLOWING_ERROR, register, device);
+                        self.fault(now, EmcyCode::FOLLOWING_ERROR, device);
                     }
                 }
             }
             FaultKind::DriveFault if begins => {
-                let code = EmcyCode(fault.code.unwrap_or_default());
-                self.fault(now, code, code.register(), device);
+                self.fault(now, EmcyCode(fault.code.unwrap_or_default()), device);
             }
             FaultKind::NegativeSwitch => self.inputs.stuck = stuck(End::Negative),
             FaultKind::PositiveSwitch => self.inputs.stuck = stuck(End::Positive),
             FaultKind::EmergencyStop => {
                 self.inputs.interlocked = begins;
-                self.without_torque(now, INTERLOCK, 0, device);
+                self.without_torque(now, INTERLOCK, device);
             }
             FaultKind::NoVoltage => {
                 self.voltage = !begins;
-                self.without_torque(now, EmcyCode::UNDERVOLTAGE, error_register::VOLTAGE, device);
+                self.without_torque(now, EmcyCode::UNDERVOLTAGE, device);
             }
             _ => {}
         }
     }
 
-    fn without_torque(&mut self, now: Time, code: EmcyCode, register: u8, device: &mut Device) {
+    fn without_torque(&mut self, now: Time, code: EmcyCode, device: &mut Device) {
         let powered = matches!(
             self.state(),
             DriveState::SwitchedOn | DriveState::OperationEnabled | DriveState::QuickStopActive
         );
         if !self.has_torque() && powered {
             self.stand(now);
-            self.fault(now, code, register, device);
+            self.fault(now, code, device);
         }
     }
 }

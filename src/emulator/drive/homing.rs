@@ -7,7 +7,7 @@ use super::motion::Motion;
 use super::objects::{ACCELERATION_MAX_COUNTS_PER_S2, MAX_ACCELERATION};
 use super::profile::Profile;
 use crate::canopen::cia402::{Controlword, Mode, object};
-use crate::canopen::emcy::{EmcyCode, error_register};
+use crate::canopen::emcy::EmcyCode;
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::units::Time;
 
@@ -124,8 +124,7 @@ impl Axis {
     /// Starts a move of an axis at rest. A blocked axis faults with a following error.
     fn begin_move(&mut self, now: Time, leg: Leg, device: &mut Device) {
         if self.stalled {
-            let register = error_register::PROFILE;
-            return self.fault(now, EmcyCode::FOLLOWING_ERROR, register, device);
+            return self.fault(now, EmcyCode::FOLLOWING_ERROR, device);
         }
         let (speed, acceleration) = self.limits(leg.fast, &device.objects);
         let (from, to) = (self.motion.position_at(now), leg.to_counts as f64);

@@ -11,7 +11,7 @@ use super::objects::data_sheet;
 use super::parameters::{self, SUPERVISED_LEN};
 use super::pdo::{Rpdo, Tpdo, Values};
 use crate::canopen::cia402::DriveState;
-use crate::canopen::emcy::{EmcyCode, error_register};
+use crate::canopen::emcy::EmcyCode;
 use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatEvent, HeartbeatProducer};
 use crate::canopen::nmt::{NmtCommand, NmtState, heartbeat_frame, nmt_frame, parse_nmt};
 use crate::canopen::object::communication::{self, consumer_heartbeat};
@@ -228,7 +228,7 @@ impl Drive {
         let supervised = &mut self.supervised[n];
         supervised.lost = true;
         let lost = [supervised.consumer.node.get(), 0, 0, 0, 0];
-        self.device.raise(EmcyCode::HEARTBEAT, error_register::COMMUNICATION, lost);
+        self.device.raise(EmcyCode::HEARTBEAT, lost);
         self.axis.heartbeat_lost(now, &mut self.device);
         let operational = self.nmt_state() == NmtState::Operational;
         match self.device.objects.integer(communication::COMMUNICATION_ERROR_BEHAVIOUR) {
@@ -315,10 +315,7 @@ impl Drive {
                 self.device.clear(EmcyCode::PDO_LENGTH);
                 self.write_values(now, values);
             }
-            None => {
-                let register = error_register::COMMUNICATION;
-                self.device.raise(EmcyCode::PDO_LENGTH, register, [0; 5]);
-            }
+            None => self.device.raise(EmcyCode::PDO_LENGTH, [0; 5]),
         }
     }
 

@@ -20,7 +20,7 @@ pub(super) const APPLICATION: &str = "needle-bench";
 
 /// The run's own time.
 pub(super) const RUN_TIME: &str = "run_time";
-/// Number of the step, the next one from a step to the next.
+/// Number of the newest step.
 pub(super) const STEP: &str = "step";
 /// Depth reached so far, µm. It stands still while the needle is withdrawn: on a time line that runs
 /// back the rows of a chunk are out of order.
@@ -33,7 +33,7 @@ pub(super) fn builder(manifest: &Manifest) -> RecordingStreamBuilder {
         .recording_id(format!("{}-{}", manifest.started_utc, manifest.name))
         .recording_name(manifest.name.as_str())
         .recording_started(rerun::datatypes::TimeInt(started_us.saturating_mul(1000)))
-        // A recording identity switches the properties off, and RERUN=0 the whole recording.
+        // Setting an identity turned the properties off, and RERUN=0 in the environment would turn off all.
         .send_properties(true)
         .enabled(true)
 }
@@ -41,8 +41,8 @@ pub(super) fn builder(manifest: &Manifest) -> RecordingStreamBuilder {
 /// Logs the records of a run. Bound to the thread that opened it: time lines are thread-local.
 pub(super) struct Content {
     stream: RecordingStream,
-    /// Until it is known where the needle starts.
-    unseen: Option<Scene>,
+    /// The scene, until a step shows where the needle starts.
+    scene_until_start: Option<Scene>,
     step: u32,
     depth_um: i64,
     frames: can::Selection,
@@ -73,7 +73,7 @@ impl Content {
         ));
         stream.log_static("config", &config)?;
         Ok(Content {
-            unseen: Some(scene.clone()),
+            scene_until_start: Some(scene.clone()),
             step: 0,
             depth_um: 0,
             frames: can::Selection::new(&scene.stage),
@@ -102,7 +102,7 @@ impl Content {
     }
 
     /// Moves on to the measured depth `insertion_mm` where it is deeper and a number.
-    fn reach(&mut self, insertion_mm: f64) {
+    fn advance_to(&mut self, insertion_mm: f64) {
         self.depth_um = reached_um(self.depth_um, insertion_mm);
     }
 
@@ -111,18 +111,16 @@ impl Content {
         match record {
             Record::Begun { .. } | Record::Input { .. } => Ok(()),
             Record::Can { time, direction, frame } => {
-                self.at(time);
                 if let Some((axis, state)) = self.frames.entered(&frame) {
                     let state_name = state.to_string();
                     self.enter(time, &drive_lane(axis), &state_name, Meaning::of_drive(state))?;
-                    self.at(time);
                 }
                 if let Some((axis, emcy)) = self.frames.emergency(&frame)
                     && self.now.emergency(time, axis, &emcy)
                 {
                     self.log_now(time)?;
-                    self.at(time);
                 }
+                self.at(time);
                 match self.frames.line(self.step, direction, &frame) {
                     Some((level, text)) => self.line("can", level, text),
                     None => Ok(()),
@@ -137,15 +135,15 @@ impl Content {
                 log_refused(&self.stream, &sample)
             }
             Record::Stage(stage) => {
-                self.reach(stage.measured.insertion_mm);
+                self.advance_to(stage.measured.insertion_mm);
                 self.at(stage.time);
                 self.motion.log(&self.stream, &stage)
             }
             Record::Step(step) => {
                 self.step = step.step;
-                self.reach(step.insertion_meas_mm);
+                self.advance_to(step.insertion_meas_mm);
                 self.at(step.time);
-                self.find_needle(&step)?;
+                self.move_view_to_needle(&step)?;
                 self.steps.log(&self.stream, &step, truth.as_ref())?;
                 self.space.log(&self.stream, &step, truth.as_ref())
             }
@@ -155,7 +153,6 @@ impl Content {
                 self.line("events/stage", level(Severity::Info), text)
             }
             Record::State { time, state } => {
-                self.at(time);
                 self.enter(time, &state.lane().to_string(), state.as_str(), Meaning::of(state))
             }
             Record::Event { time, lane, severity, text } => {
@@ -172,6 +169,7 @@ impl Content {
 
     /// Logs that `lane` enters `state`.
     fn enter(&mut self, time: Time, lane: &str, state: &str, meaning: Meaning) -> Logged {
+        self.at(time);
         self.states.log(&self.stream, lane, state, meaning)?;
         self.now.enter(time, lane, state);
         self.log_now(time)
@@ -186,10 +184,10 @@ impl Content {
     }
 
     /// Moves the plane and the view to a needle that starts outside of them.
-    fn find_needle(&mut self, step: &StepRecord) -> Logged {
+    fn move_view_to_needle(&mut self, step: &StepRecord) -> Logged {
         let estimated_mm = step.estimate.as_ref().map(|estimate| estimate.x_pb.translation);
         let Some(start_mm) = step.tip_meas_mm.or(estimated_mm) else { return Ok(()) };
-        let Some(scene) = self.unseen.take() else { return Ok(()) };
+        let Some(scene) = self.scene_until_start.take() else { return Ok(()) };
         match Reach::of(&scene).moved_to(&start_mm) {
             None => Ok(()),
             Some(reach) => {

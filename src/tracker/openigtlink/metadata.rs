@@ -15,26 +15,26 @@ type Metadata = Vec<(String, String)>;
 
 /// Splits a version 2 body into content and metadata, and checks every size that it states.
 pub(super) fn split(body: &[u8]) -> Result<(&[u8], Metadata), String> {
-    let short = |stated: u16| {
-        let body = body.len();
-        format!("extended header of {stated} bytes in a body of {body} (12 or more expected)")
-    };
     let Some(&[s0, s1, i0, i1, t0, t1, t2, t3, _, _, _, _]) = body.first_chunk() else {
-        return Err(short(0));
+        let len = body.len();
+        return Err(format!(
+            "a version 2 body of {len} bytes; its extended header alone has {EXTENDED_HEADER_LEN}"
+        ));
     };
-    let size = u16::from_be_bytes([s0, s1]);
+    let size = usize::from(u16::from_be_bytes([s0, s1]));
     let index_len = usize::from(u16::from_be_bytes([i0, i1]));
-    let text_len = u32::from_be_bytes([t0, t1, t2, t3]);
-
-    if usize::from(size) < EXTENDED_HEADER_LEN {
-        return Err(short(size));
+    let text_len = u32::from_be_bytes([t0, t1, t2, t3]) as usize;
+    let len = body.len();
+    if !(EXTENDED_HEADER_LEN..=len).contains(&size) {
+        return Err(format!(
+            "extended header of {size} bytes (expected {EXTENDED_HEADER_LEN}, at most the body's {len})"
+        ));
     }
-    let rest = body.get(usize::from(size)..).ok_or_else(|| short(size))?;
-    let stated = index_len as u64 + u64::from(text_len);
-    let content_len = (rest.len() as u64)
-        .checked_sub(stated)
-        .and_then(|len| usize::try_from(len).ok())
-        .ok_or_else(|| format!("{stated} bytes of metadata where the body has {}", rest.len()))?;
+    let rest = &body[size..];
+    let stated = index_len.saturating_add(text_len);
+    let content_len = rest.len().checked_sub(stated).ok_or_else(|| {
+        format!("{stated} bytes of metadata, but {} follow the extended header", rest.len())
+    })?;
     let (content, metadata) = rest.split_at(content_len);
     let (index, text) = metadata.split_at(index_len);
     Ok((content, entries(index, text)?))
@@ -43,23 +43,22 @@ pub(super) fn split(body: &[u8]) -> Result<(&[u8], Metadata), String> {
 /// The key and value pairs of a metadata index and its text.
 fn entries(index: &[u8], mut text: &[u8]) -> Result<Metadata, String> {
     let Some((count, index)) = index.split_first_chunk() else {
-        return Ok(Vec::new()); // no metadata at all
+        return Ok(Vec::new()); // No count, so no metadata; a lone byte is ignored.
     };
-    let count = u16::from_be_bytes(*count);
-    let sizes: Vec<&[u8; ENTRY_LEN]> =
-        index.as_chunks().0.iter().take(usize::from(count)).collect();
-    if sizes.len() < usize::from(count) {
-        return Err(format!("{count} metadata entries in an index of {} bytes", index.len() + 2));
-    }
+    let count = usize::from(u16::from_be_bytes(*count));
+    let sizes = index.as_chunks::<ENTRY_LEN>().0.get(..count).ok_or_else(|| {
+        format!("{count} metadata entries in an index of {} bytes", index.len() + 2)
+    })?;
     let text_len = text.len();
     let mut take = |len: usize| {
         let (head, rest) = text.split_at_checked(len)?;
         text = rest;
         Some(escaped(&String::from_utf8_lossy(head)).into_owned())
     };
-    (0u16..)
-        .zip(sizes)
-        .map(|(index, &[k0, k1, _, _, v0, v1, v2, v3])| {
+    sizes
+        .iter()
+        .enumerate()
+        .map(|(n, &[k0, k1, _, _, v0, v1, v2, v3])| {
             // The value's character set is ignored: UTF-8 includes ASCII, and other sets only lose
             // their accents.
             let mut entry = || {
@@ -68,7 +67,7 @@ fn entries(index: &[u8], mut text: &[u8]) -> Result<Metadata, String> {
                 Some((key, take(usize::try_from(value_len).ok()?)?))
             };
             entry().ok_or_else(|| {
-                format!("metadata entry {index} goes beyond the {text_len} bytes of metadata text")
+                format!("metadata entry {n} goes beyond the {text_len} bytes of metadata text")
             })
         })
         .collect()
@@ -103,16 +102,20 @@ mod tests {
             body
         };
         let problem = |body: &[u8]| split(body).err().unwrap_or_default();
-        let header = |stated, body| {
-            format!("extended header of {stated} bytes in a body of {body} (12 or more expected)")
-        };
-        assert_eq!(problem(&[0; 11]), header(0, 11));
-        assert_eq!(problem(&extended(11, 0, 0)), header(11, 12));
-        assert_eq!(problem(&extended(13, 0, 0)), header(13, 12));
+        assert_eq!(
+            problem(&[0; 11]),
+            "a version 2 body of 11 bytes; its extended header alone has 12"
+        );
+        for size in [11, 13] {
+            assert_eq!(
+                problem(&extended(size, 0, 0)),
+                format!("extended header of {size} bytes (expected 12, at most the body's 12)")
+            );
+        }
         let too_much = u64::from(u32::MAX) + 2;
         assert_eq!(
             problem(&extended(12, 2, u32::MAX)),
-            format!("{too_much} bytes of metadata where the body has 0")
+            format!("{too_much} bytes of metadata, but 0 follow the extended header")
         );
         let count_too_large = [&extended(12, 2, 0)[..], &[0, 1]].concat();
         assert_eq!(problem(&count_too_large), "1 metadata entries in an index of 2 bytes");

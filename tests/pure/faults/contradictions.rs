@@ -337,7 +337,7 @@ fn a_jump_is_held_whatever_the_noise() {
                 let jump = move |sample: &mut Sample| sample.position_mm.x += jump_mm;
                 let (bench, held_mm) = contradicted(run, struck_mm, jump);
                 assert!(
-                    bench.reason().contains(": a jump, a drift, or of too large a scale; "),
+                    bench.reason().contains(": a jump, a drift, or too large a scale; "),
                     "{}",
                     bench.reason()
                 );
@@ -435,5 +435,5 @@ fn a_jump_that_noise_hides() {
         _ => None,
     });
     let text = warned.expect("it is told at once");
-    assert!(text.ends_with(": a jump, a drift, or of too large a scale"), "{text}");
+    assert!(text.ends_with(": a jump, a drift, or too large a scale"), "{text}");
 }
