@@ -14,6 +14,8 @@ import sys
 import tempfile
 
 RADIUS_MM, MARGIN_MM, TOLERANCE_MM, SIDE_MM, FAR_MM = 50.0, 2.0, 3.0, 150.0, 1000.0
+# As the exhaustive search.
+LENGTH_MAX_MM = 300.0
 
 
 def obstacle(o):
@@ -38,8 +40,11 @@ position_mm = [0.0, {goal["x_mm"]}, {goal["y_mm"]}]
 tolerance_mm = {TOLERANCE_MM}
 clearance_mm = {MARGIN_MM}
 curvature_margin = 0.0
+reserve_mm = 0.0
 workspace_mm = {{ min = [-1.0, 0.0, 0.0], max = [1.0, {SIDE_MM}, {SIDE_MM}] }}
 {obstacles}
+[insertion]
+depth_mm = {LENGTH_MAX_MM}
 [needle]
 radius_mm = {RADIUS_MM}
 [observer]

@@ -10,7 +10,7 @@ use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 const POSITION: [&str; 4] = ["rotation_rad", "x_mm", "y_mm", "z_mm"];
 
-/// A circle has three unknowns, and its plane three.
+/// A circle in space has six unknowns; two more points show whether it fits.
 const POINTS_MIN: usize = 8;
 /// Less than half a circle does not determine its centre.
 const ARC_MIN_RAD: f64 = PI;
@@ -64,7 +64,7 @@ pub struct TipFit {
     pub arc_rad: f64,
     /// A point of the axis in the tracker's frame: the circle's centre, mm.
     pub centre_mm: Vector3<f64>,
-    /// Standard error of the centre where it is least sure, mm, of positions with independent noise.
+    /// Standard error of the centre in its least certain direction, mm, if the noise is independent.
     pub centre_sd_mm: f64,
     /// The same of the direction, rad.
     pub axis_sd_rad: f64,
@@ -114,7 +114,12 @@ impl TipFit {
                 ARC_MIN_RAD.to_degrees()
             ))
         };
-        let Some(mut circle) = Circle::fit(&positions_mm) else { return short(0.0) };
+        let Some(mut circle) = Circle::fit(&positions_mm) else {
+            return refused(format!(
+                "the {points} positions are all the same, or on one line: is the tracker's value frozen, did the \
+                 base turn, or is the sensor on the needle's axis?"
+            ));
+        };
         let (radius_mm, rms_mm) = (circle.radius_mm, circle.rms_mm());
         if rms_mm > rms_max_mm || rms_max_mm.is_nan() {
             return refused(format!(
@@ -130,8 +135,8 @@ impl TipFit {
         }
         if radius_mm < RADIUS_PER_RMS_MIN * rms_mm {
             return refused(format!(
-                "the circle's radius is {radius_mm:.3} mm, its positions {rms_mm:.3} mm RMS off it (at \
-                 most a third of it): the sensor is on the needle's axis as far as can be told; leave \
+                "the circle's radius is {radius_mm:.3} mm, and the positions scatter {rms_mm:.3} mm RMS about \
+                 it (limit: a third of the radius): no offset from the needle's axis can be seen; leave \
                  tracker.tip_offset_mm at zero"
             ));
         }
@@ -152,7 +157,7 @@ impl TipFit {
         if coherence < COHERENCE_MIN {
             return refused(format!(
                 "the sensor does not follow the base: their angles agree to {coherence:.2} (at least \
-                 {COHERENCE_MIN:.2}, 1 being exactly); is rotation_rad in rad, and is the needle in air"
+                 {COHERENCE_MIN:.2}, 1 being exactly); is rotation_rad in rad, and is the needle in air?"
             ));
         }
         let (centre_sd_mm, axis_sd_rad) = circle.errors(&angles);
@@ -222,7 +227,7 @@ impl SensorMount {
     }
 }
 
-/// Gauss-Newton steps; from the algebraic fit a few are enough.
+/// Gauss-Newton steps: from the algebraic fit a few converge, the others cost nothing.
 const STEPS: usize = 20;
 
 /// A circle in space.

@@ -69,9 +69,8 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let preflight = Preflight::inspect(&config, &config, Duration::from_secs_f64(arguments.listen));
     let troubles = preflight.troubles();
     if !troubles.is_empty() {
-        let error = troubles.join("\n       ");
-        tell(format_args!("error: {error}"));
-        report["error"] = json!(error);
+        tell(format_args!("error: {}", troubles.join("\n       ")));
+        report["error"] = json!(troubles.join("; "));
     }
     if arguments.json {
         report["drives"] = match config.is_emulated() {
@@ -92,7 +91,7 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
     }
     Ok(match (troubles.len(), config.tracker.registration.is_none()) {
         (0, _) => ExitCode::SUCCESS,
-        // Nothing fails but what the configuration lacks.
+        // The registration that is missing is the only trouble.
         (1, true) => ExitCode::from(BAD_CONFIGURATION),
         _ => ExitCode::from(ENVIRONMENT_FAILED),
     })

@@ -43,10 +43,14 @@ pub(super) fn plan(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let (config, _) = arguments.configured.load_with_warnings()?;
     let (world, problem) = config.to_plan(&mask_reader(arguments.configured.path()))?;
     let begun = Instant::now();
-    let answer = solve(&world, &problem);
+    let mut answer = solve(&world, &problem);
     let seconds = begun.elapsed().as_secs_f64();
-    let mut object = to_json(&world, &problem, &answer, seconds);
     let roomy = plan_with_reserve(&world, &problem, config.goal.reserve_mm, &answer);
+    // A path that no run may take is no plan.
+    if let (Status::Plan, Err(refusal)) = (answer.status, &roomy) {
+        (answer.status, answer.reason) = (Status::None, Some(refusal.clone()));
+    }
+    let mut object = to_json(&world, &problem, &answer, seconds);
     let reserve_mm = roomy.as_ref().ok().filter(|_| !world.obstacles.is_empty());
     object["run_reserve_mm"] = json!(reserve_mm.map(|roomy| roomy.reserve_mm));
     object["run_refusal"] = json!(roomy.err());

@@ -42,8 +42,8 @@ pub(super) fn newest_first(dir: &Path) -> impl Iterator<Item = RunFolder> + use<
     folders.into_iter().rev().filter_map(|folder| RunFolder::open(&folder).ok())
 }
 
-/// Names the newest run that was on a bus (not on the emulated stage in memory), in a line of its own
-/// that begins with `before`; empty without one.
+/// Names the newest run that was on a bus (not on the emulated stage in memory), in a line of its own: `before`,
+/// then `--config` and its file. Empty without such a run.
 pub(super) fn last_run_on_a_bus(before: &str) -> String {
     let memory = CanInterface::Memory.to_string();
     newest_first(Path::new(RUNS))
@@ -133,7 +133,7 @@ pub(super) fn replay_run(path: &Path) -> Result<ReplayedRun, Failure> {
 pub(super) fn position_at(stage: &[(Time, SetPoint)], time: Time) -> Option<SetPoint> {
     let after = stage.partition_point(|(at, _)| *at <= time);
     let ((t0, a), (t1, b)) = (stage.get(after.checked_sub(1)?)?, stage.get(after)?);
-    let part = time.seconds_after(*t0) / t1.seconds_after(*t0).max(1e-9);
+    let part = time.seconds_after(*t0) / t1.seconds_after(*t0);
     Some(SetPoint {
         insertion_mm: a.insertion_mm + part * (b.insertion_mm - a.insertion_mm),
         rotation_rad: a.rotation_rad + part * (b.rotation_rad - a.rotation_rad),
@@ -182,8 +182,7 @@ impl Insertions {
             }
             all.push(Insertion { path: path.to_owned(), text, recording });
         }
-        let is_folder = |path: &&&Path| path.is_dir();
-        if let (None, Some(run)) = (configuration, files.iter().find(is_folder)) {
+        if let (None, Some(run)) = (configuration, files.iter().find(|path| path.is_dir())) {
             tell(format_args!(
                 "warning: judged with the needle, noises and mount of bench-config/recordings.toml; those of the \
                  run itself: --config {}",
@@ -227,8 +226,9 @@ fn insertion(path: &Path) -> Result<(String, Recording), Failure> {
     }
     let ReplayedRun { folder, config, stage, samples } = replay_run(path)?;
     let registration = config.tracker.to_registration()?;
-    let samples = samples.into_iter();
-    let dated = samples.filter_map(|sample| Some((sample.acquisition_time?, sample.received)));
+    let numbered = (1..).zip(samples);
+    let dated = numbered
+        .filter_map(|(line, sample)| Some((line, sample.acquisition_time?, sample.received)));
     let rows = rows(&stage, &registration, dated);
     match rows.is_empty() {
         true => {
@@ -243,10 +243,10 @@ fn insertion(path: &Path) -> Result<(String, Recording), Failure> {
 fn rows(
     stage: &[(Time, SetPoint)],
     registration: &Registration,
-    samples: impl Iterator<Item = (Time, Sample)>,
+    samples: impl Iterator<Item = (usize, Time, Sample)>,
 ) -> Vec<RecordedRow> {
     let mut rows: Vec<RecordedRow> = Vec::new();
-    for (n, (time, sample)) in samples.enumerate() {
+    for (line, time, sample) in samples {
         let Some(at) = position_at(stage, time) else { continue };
         let next_mm =
             rows.last().map_or(f64::NEG_INFINITY, |row| row.insertion_meas_mm + ROWS_APART_MM);
@@ -255,7 +255,7 @@ fn rows(
         }
         let Ok(position_meas_mm) = registration.tip_mm(&sample) else { continue };
         rows.push(RecordedRow {
-            line: n + 1,
+            line,
             insertion_meas_mm: at.insertion_mm,
             rotation_meas_rad: at.rotation_rad,
             position_meas_mm,
@@ -268,6 +268,29 @@ fn rows(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::Pose;
+    use crate::tracker::Validity;
+    use nalgebra::Vector3;
+
+    /// Samples that were refused have lines in the file too.
+    #[test]
+    fn a_row_has_the_number_of_its_line() {
+        let at = |s: f64, insertion_mm: f64| {
+            (Time::from_secs_f64(s), SetPoint { insertion_mm, rotation_rad: 0.0 })
+        };
+        let sample = Sample {
+            receive_time: Time::from_secs_f64(1.0),
+            source_unix_ns: None,
+            tool: String::new(),
+            position_mm: Vector3::zeros(),
+            orientation: None,
+            validity: Validity::Valid,
+        };
+        let registration = Registration::new(Pose::identity());
+        let seen = [(4, sample.receive_time, sample)].into_iter();
+        let rows = rows(&[at(0.0, 0.0), at(2.0, 4.0)], &registration, seen);
+        assert_eq!((rows[0].line, rows[0].insertion_meas_mm), (4, 2.0));
+    }
 
     #[test]
     fn a_toml_file_among_insertions_is_the_configuration() {

@@ -22,7 +22,7 @@ const VCAN_TOML: (&str, &str) =
 
 /// Two emulated CiA 402 drives on a CAN interface, a needle in tissue behind them, and an
 /// OpenIGTLink tracker server in front. It runs until it is interrupted. Of CONFIG, by default
-/// bench-config/vcan.toml, the sections can, stage, plane, tracker and emulator are used.
+/// bench-config/vcan.toml, the sections can, stage, plane, tracker, goal (a tracked target) and emulator are used.
 #[derive(Debug, Parser)]
 #[command(name = "vcan-stage", version)]
 pub(super) struct Arguments {
@@ -99,11 +99,12 @@ fn frame_log(
     let started_unix_us = i64::try_from(origin.as_micros()).unwrap_or(0);
     let interface = interface_name(interface).to_owned();
     Ok(move |direction, frame: &Frame| {
-        let Some((file, path)) = &mut file else { return };
+        let Some((out, path)) = &mut file else { return };
         let (time, interface) = (clock.now(), &interface);
         let line = CandumpLine { started_unix_us, interface, time, direction, frame };
-        if let Err(error) = writeln!(file, "{line}") {
-            tracing::warn!("{path}: {error}");
+        if let Err(error) = writeln!(out, "{line}") {
+            tracing::warn!("{path}: {error}; frames are no longer logged");
+            file = None;
         }
     })
 }

@@ -1,7 +1,7 @@
 //! Contradictions within `[stage]`: settings of an axis, its drive and its operations.
 
 use super::Config;
-use super::checks::ROTATION_ACCELERATION_MAX;
+use super::checks::{ROTATION_ACCELERATION_MAX, rounded_down};
 use super::reader::Reader;
 use crate::session::PROFILE_PEAK;
 use crate::stage::{Axis, AxisConfig, Reference};
@@ -297,7 +297,7 @@ fn accelerations(config: &Config, reader: &mut Reader) {
             format!(
                 "{key} is {acceleration}, allowed: up to {:.3}: the last set-point brakes {PROFILE_PEAK} \
                  times as hard, and {max_key} is {max}",
-                max / PROFILE_PEAK
+                rounded_down(max / PROFILE_PEAK, 3)
             )
         });
     }

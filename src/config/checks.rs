@@ -40,7 +40,7 @@ fn insertion(config: &Config, reader: &mut Reader) {
         format!("{arrival_key} is {arrival_mm}, allowed: up to half of {step_key}, which is {step}")
     });
     // A step is taken at a SYNC: at most one a period.
-    let per_sync = speed * f64::from(config.can.bus.sync_ms) * 1e-3;
+    let per_sync = speed * f64::from(config.can.bus.sync_ms) / 1e3;
     let [speed_key, sync_key] = ["insertion.speed_mm_per_s", "can.sync_ms"];
     reader.check(&[step_key, speed_key, sync_key], per_sync > step, || {
         format!(
@@ -67,18 +67,24 @@ fn rotation(config: &Config, reader: &mut Reader) {
         format!(
             "{key} is {per_mm}: at {speed} mm/s that is {deg_per_s} deg/s, over {max_key} = {max}; turn \
              by {:.4} deg/mm or insert at {:.4} mm/s",
-            max / speed,
-            max / per_mm,
+            rounded_down(max / speed, 4),
+            rounded_down(max / per_mm, 4),
         )
     });
     let (max_key, max) = (ROTATION_ACCELERATION_MAX, config.number(ROTATION_ACCELERATION_MAX));
     let peak = rotation_peak(per_mm, speed, Duration::from_millis(config.can.bus.sync_ms.into()));
     reader.check(&[key, speed_key, sync_key, max_key], peak > max, || {
         format!(
-            "{key} is {per_mm}: reversed within a SYNC at {speed} mm/s, that is {peak:.0} deg/s², \
-             over {max_key} = {max}; raise it, or turn or insert more slowly"
+            "{key} is {per_mm}: reversed from one SYNC to the next at {speed} mm/s, that is {peak:.0} \
+             deg/s², over {max_key} = {max}; turn or insert more slowly, or raise the limit"
         )
     });
+}
+
+/// To so many digits, so that what a message advises is allowed.
+pub(super) fn rounded_down(value: f64, digits: i32) -> f64 {
+    let per_one = 10f64.powi(digits);
+    (value * per_one).floor() / per_one
 }
 
 fn torsion(section: &str, torsion: TorsionConfig, reader: &mut Reader) {
@@ -104,7 +110,9 @@ fn study(config: &Config, reader: &mut Reader) {
     let is_drawn = study.target_depth_mm.is_some() || study.obstacles.unwrap_or_default() > 0;
     let [depth, obstacles, kind] = ["study.target_depth_mm", "study.obstacles", "goal.kind"];
     reader.check(&[depth, obstacles, kind], is_drawn && config.goal.kind == GoalKind::Plane, || {
-        format!("{depth} and {obstacles} have no effect, since {kind} is \"plane\": set it to \"target\"")
+        format!(
+            "{depth} or {obstacles} is given, without effect since {kind} is \"plane\": set it to \"target\""
+        )
     });
     let emulated = |key: &str| [config.number(&format!("emulator.torsion.{key}")); 2];
     let [low, high] = study.torsion_offset_deg.unwrap_or_else(|| emulated("offset_deg"));
@@ -131,7 +139,7 @@ fn noise(config: &Config, reader: &mut Reader) {
     let keys = [told, "insertion.depth_mm", "insertion.speed_mm_per_s"];
     reader.check(&keys, time_s > run_s, || {
         format!(
-            "{told} is {time_s}, allowed: up to the {run_s:.1} s of the insertion; noise that lasts \
+            "{told} is {time_s}, allowed: up to the {run_s:.3} s of the insertion; noise that lasts \
              longer is an error of the registration, tracker.registration.sd_mm"
         )
     });
@@ -179,8 +187,8 @@ fn bus(config: &Config, reader: &mut Reader) {
     });
     let unjudged = config.stage.hardware && !config.tracker.gates.stream;
     reader.check(&["stage.hardware", "tracker.gates.stream"], unjudged, || {
-        "tracker.gates.stream is false, but stage.hardware is true: a stream that contradicts the \
-         insertion ends a run with a real needle"
+        "tracker.gates.stream is false, but stage.hardware is true: with a real needle a stream that \
+         contradicts the insertion must end the run; set it to true"
             .to_owned()
     });
     let unprotected = !config.stage.hardware && !interface.is_virtual();
@@ -227,7 +235,8 @@ fn tracker(config: &Config, reader: &mut Reader) {
         )
     });
 
-    // Blind already when a position comes in, until the next does, for two SYNCs, and while braking.
+    // The longest way without a position: its latency, the tracker's period, two SYNCs until the hold begins,
+    // and the braking.
     let (speed, hold_mm) = (config.insertion.speed_mm_per_s, config.tracker.hold.after_mm);
     let braking = config.tracker.hold.braking_mm_per_s2;
     let is_seen_here = config.tip_source() == TrackerSource::Emulated;
@@ -238,8 +247,9 @@ fn tracker(config: &Config, reader: &mut Reader) {
     let keys = [key, "insertion.speed_mm_per_s", brake, latency];
     reader.check(&keys, hold_mm <= least_mm, || {
         format!(
-            "{key} is {hold_mm}, allowed: over the {least_mm:.3} mm to standstill from {speed} mm/s \
-             with {brake} = {braking} and {latency} = {latency_ms}: insert slower or brake harder"
+            "{key} is {hold_mm}, allowed: over the {:.3} mm to standstill from {speed} mm/s \
+             with {brake} = {braking} and {latency} = {latency_ms}: insert slower or brake harder",
+            (least_mm * 1e3).ceil() / 1e3
         )
     });
 

@@ -1,5 +1,4 @@
-//! `[control]`: the law that steers, and its settings. A law needs a kind, a section, and what it is
-//! told, all of them here.
+//! `[control]`: the law that steers, and its settings. A new law needs a kind and a section here.
 
 use crate::control::{FeedbackLinearizationConfig, NestedSaturationConfig};
 use crate::keys::{choice, section};
@@ -20,9 +19,9 @@ section! {
 choice! {
     /// A control law.
     pub enum ControlKind {
-        /// The paper's.
+        /// Feedback linearisation, as in the paper.
         FeedbackLinearization = "feedback-linearization",
-        /// The one that converges from every pose.
+        /// Nested saturation, which converges from every pose.
         NestedSaturation = "nested-saturation",
     }
 }

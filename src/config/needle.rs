@@ -3,7 +3,7 @@
 use super::tracker::FILE;
 use super::{Config, ConfigError};
 use crate::calibration::{NeedleRecord, PathNoise};
-use crate::keys::{Rule, over, section, within};
+use crate::keys::{Rule, section, within};
 use crate::needle::{Needle, Torsion, TorsionConfig};
 use crate::session::Samples;
 
@@ -33,7 +33,7 @@ section! {
         /// Radius of the arc that the needle cuts unturned, mm.
         radius_mm: Option<f64> [within(10.0, 100_000.0)] = 122.0;
         /// Its curvature, per mm.
-        curvature_per_mm: Option<f64> [over(0.0, 0.1)], instead_of("radius_mm");
+        curvature_per_mm: Option<f64> [within(1e-5, 0.1)], instead_of("radius_mm");
     }
 }
 

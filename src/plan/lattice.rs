@@ -12,7 +12,7 @@ const TURN_RAD: f64 = 0.02;
 const STEP_MM: [f64; 2] = [0.5, 2.0];
 /// Side of a cell in the plane, mm.
 const CELL_MM: f64 = 0.5;
-/// Memory for the visited cells, bits: 128 MB.
+/// Memory for the visited cells, bits: 128 MiB.
 const BITS_MAX: f64 = (1u64 << 30) as f64;
 
 /// The resolution of a search: its cells and headings, and the length of its arcs.
@@ -22,7 +22,7 @@ pub struct Resolution {
     pub step_mm: f64,
     /// Side of a cell, mm.
     pub cell_mm: f64,
-    /// Between two headings, rad.
+    /// Angle between two headings, rad.
     pub heading_rad: f64,
 }
 
@@ -32,7 +32,7 @@ pub(super) struct Lattice {
     pub(super) resolution: Resolution,
     pub(super) in_plane: bool,
     curvature_per_mm: f64,
-    /// Of an arc of full curvature.
+    /// The chord of one step at full curvature.
     chord: Chord,
     first_mm: Vector3<f64>,
     counts: [usize; 3],
@@ -80,7 +80,7 @@ impl Visited {
     }
 }
 
-/// The arc that leads to a node: straight, or bent in one of the directions.
+/// Number of the straight arc; those from 1 on are bent, one for each direction.
 pub(super) const STRAIGHT: u8 = 0;
 /// Directions of bending in space.
 const BENDS: u8 = 8;
@@ -147,11 +147,6 @@ impl Lattice {
         1 + if self.in_plane { 2 } else { BENDS }
     }
 
-    /// The memory of the visited cells, for the next search.
-    pub(super) fn into_visited(self) -> Visited {
-        self.visited
-    }
-
     /// Where arc number `by` ends. `before` is the heading at the start of the arc that led here.
     pub(super) fn next(&self, from: &Place, before: Option<Vector3<f64>>, by: u8) -> Place {
         let Tip { position_mm, heading } = from.tip;
@@ -174,7 +169,7 @@ impl Lattice {
     fn bend(&self, tip: &Tip, before: Option<Vector3<f64>>, by: u8) -> Vector3<f64> {
         let heading = tip.heading;
         if self.in_plane {
-            // In the plane x = 0.
+            // The heading turned by 90 degrees about the plane's normal.
             let left = Vector3::new(0.0, -heading.z, heading.y);
             return if by == 2 { -left } else { left };
         }
@@ -203,7 +198,8 @@ impl Lattice {
     }
 }
 
-/// Of a search in space: length of an arc, side of a cell, mm, and headings along an edge of the cube.
+/// Resolutions of a search in space, the coarsest first: length of an arc and side of a cell, mm, and headings
+/// along an edge of the cube.
 pub(super) const LEVELS: [(f64, f64, usize); 3] = [(12.0, 5.0, 6), (6.0, 3.0, 10), (3.0, 2.0, 16)];
 
 /// The number of a heading among the squares of a cube's faces, each divided so many times.

@@ -102,7 +102,7 @@ pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path 
             nodes.push(Node { place: next, before, length_mm, from: Some((from, arc)) });
         }
     }
-    field.visited = lattice.into_visited();
+    field.visited = lattice.visited;
     let (_, mut node, last) = best;
     let mut arcs = Vec::from_iter(last);
     while let Some((from, arc)) = nodes[node].from {

@@ -59,7 +59,7 @@ pub fn plan_with_reserve(
         )),
         (Some(_), _) => Err(format!(
             "there is a path, but none was found that keeps goal.reserve_mm, {least_mm}, beside \
-             goal.clearance_mm; with less the needle may lose it on the way"
+             goal.clearance_mm: the needle may lose it on the way; to try it, set goal.reserve_mm = 0"
         )),
     }
 }

@@ -229,7 +229,7 @@ impl Search<'_, '_> {
             answer.status = Status::Plan;
         }
         answer.reason = answer.path.is_none().then(|| self.why_none(answer.status));
-        self.field.visited = self.lattice.into_visited();
+        self.field.visited = self.lattice.visited;
         answer
     }
 

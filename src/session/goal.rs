@@ -39,7 +39,7 @@ impl Goal {
         let (shortest, target_mm) = (plan::plan(&world, &problem), problem.target_mm);
         let roomy = plan_with_reserve(&world, &problem, reserve_mm, &shortest);
         let RoomyPath { path, .. } = roomy.map_err(|reason| {
-            let nearest = shortest.nearest_mm.map(|at| {
+            let nearest = shortest.nearest_mm.filter(|_| shortest.path.is_none()).map(|at| {
                 let (at, off_mm) = (text(&at), (at - target_mm).norm());
                 format!("; nearest is {at}, {off_mm:.1} mm from it")
             });

@@ -8,12 +8,12 @@ use nalgebra::Vector3;
 const SDS: f64 = 3.0;
 /// A shorter insertion is a trial, which need not reach the plane, mm.
 const TRIAL_MM: f64 = 60.0;
-/// Positions and headings tried, from one end of what is allowed to the other.
+/// Intervals between the positions and headings that are tried, over what the standard deviations allow.
 const POSITIONS: u32 = 8;
 const HEADINGS: u32 = 48;
 
-/// Refuses a start from which the depth, or 60 mm where it is less, does not suffice for the shortest way
-/// into the plane, not even from the most favourable position and heading within three standard deviations.
+/// Refuses a start from which no way into the plane is as short as the depth (60 mm for a shorter insertion),
+/// even from the most favourable position and heading within three standard deviations.
 /// On the way to a target in the plane the tip need only come as near to the plane as the target's tolerance. A
 /// target in space does not need the plane.
 ///
@@ -38,9 +38,9 @@ pub(super) fn check_reach(config: &SessionConfig, tip_mm: &Vector3<f64>) -> Resu
         return match left_mm <= tolerance_mm {
             true => Ok(()),
             false => Err(format!(
-                "the target is out of reach: the tip is {off_mm:.1} mm off the plane, of which the path \
-                 to the target, {length_mm:.1} mm, mends {mended_mm:.1} at most; goal.tolerance_mm is \
-                 {tolerance_mm}"
+                "the target is out of reach: the tip is {off_mm:.1} mm off the plane, and the path to the \
+                 target, {length_mm:.1} mm, corrects {mended_mm:.1} at most (plus {margin_mm:.1} for noise); \
+                 goal.tolerance_mm is {tolerance_mm}"
             )),
         };
     }
@@ -68,7 +68,7 @@ pub(super) fn check_reach(config: &SessionConfig, tip_mm: &Vector3<f64>) -> Resu
     ))
 }
 
-/// From `middle - reach` to `middle + reach`, with the middle and what is nearest to zero.
+/// `parts + 1` values from `middle - reach` to `middle + reach`, and the one in that range nearest to zero.
 fn spread(middle: f64, reach: f64, parts: u32) -> impl Iterator<Item = f64> {
     let nearest = middle - middle.clamp(-reach, reach);
     let part = move |part| middle + reach * (2.0 * f64::from(part) / f64::from(parts) - 1.0);
@@ -117,8 +117,8 @@ mod tests {
         };
         assert_eq!(at(3.0, 3.0, &[]), Ok(()), "within the noise");
         assert_eq!(at(30.0, 10.0, &[]), Ok(()));
-        let missed = "the target is out of reach: the tip is 5.0 mm off the plane, of which the path to the \
-                      target, 3.0 mm, mends 1.3 at most; goal.tolerance_mm is 1";
+        let missed = "the target is out of reach: the tip is 5.0 mm off the plane, and the path to the \
+                      target, 3.0 mm, corrects 1.3 at most (plus 1.8 for noise); goal.tolerance_mm is 1";
         assert_eq!(at(3.0, 5.0, &[]).unwrap_err(), missed);
         assert_eq!(at(3.0, -5.0, &[]).unwrap_err(), missed);
         // A heading that is known leaves less, or leads there.

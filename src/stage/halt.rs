@@ -63,7 +63,7 @@ impl Halt {
 #[derive(Debug)]
 struct AxisHalt {
     sdo: Sdo,
-    /// A command got no answer.
+    /// A request failed: from now on each command is also sent at once, see [`AxisHalt::command`].
     is_unanswered: bool,
     give_up: Time,
     /// Until then a drive that keeps its power is commanded again to take it off.
@@ -86,17 +86,17 @@ impl AxisHalt {
     async fn stop(mut self) -> Result<i32, String> {
         let stood = self.come_to_stand(Some(Controlword::QUICK_STOP)).await;
         let result = self.take_power_off(stood).await;
-        // Once more: the first time it may not have heard it.
+        // Once more: the drive may have missed the first command.
         self.sdo.leave_operational();
         result
     }
 
-    /// Waits until the axis has left Operation Enabled and stands; gives its position, counts. The command
-    /// `told` is repeated until the axis has left Operation Enabled.
-    async fn come_to_stand(&mut self, told: Option<Controlword>) -> Result<i32, String> {
+    /// Waits until the axis has left Operation Enabled and stands; gives its position, counts. `command` is
+    /// repeated until the axis has left Operation Enabled.
+    async fn come_to_stand(&mut self, command: Option<Controlword>) -> Result<i32, String> {
         let node = self.sdo.node();
         loop {
-            if let Some(word) = told {
+            if let Some(word) = command {
                 self.command(word).await?;
             }
             let word = self.statusword().await?;
@@ -122,14 +122,12 @@ impl AxisHalt {
         }
     }
 
-    /// Takes power off until it is seen to be off. `stood` is what was seen before.
+    /// Takes power off until it is seen to be off. `stood` is the result of [`AxisHalt::come_to_stand`].
     async fn take_power_off(&mut self, stood: Result<i32, String>) -> Result<i32, String> {
         loop {
             if let Err(error) = self.command(Controlword::DISABLE_VOLTAGE).await {
-                return Err(match stood {
-                    Ok(_) => error,
-                    Err(trouble) => format!("{trouble}; power off was not confirmed"),
-                });
+                let trouble = stood.err().unwrap_or(error);
+                return Err(format!("{trouble}; power off was not confirmed"));
             }
             let trouble = match self.statusword().await {
                 Ok(word) if may_have_power(word.state()) => {
@@ -183,7 +181,7 @@ impl AxisHalt {
         }
     }
 
-    /// Waits before the next look. An error is `trouble`, when there is no more time to look.
+    /// Waits before the next look. Once there is no more time to look, `trouble` is the error.
     async fn wait_to_look_again(&self, trouble: String) -> Result<(), String> {
         if self.sdo.now() >= self.give_up {
             return Err(trouble);

@@ -76,8 +76,9 @@ impl RunFolder {
             return Ok(());
         }
         let changes = changes.join("; ");
-        let reason =
-            format!("{changes}: not the record of that run any more; restore it from a copy");
+        let reason = format!(
+            "{changes}, so this is not the record of that run any more (restore it from a copy)"
+        );
         Err(TelemetryError::record(&self.dir, reason))
     }
 

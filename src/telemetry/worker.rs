@@ -24,7 +24,7 @@ pub enum Backpressure {
 /// Retry interval while the queue is full.
 const RETRY: Duration = Duration::from_millis(1);
 /// The operator is told that the writer is still completing its files after this long.
-const TOLD_AFTER: Duration = Duration::from_secs(3);
+const WARN_AFTER: Duration = Duration::from_secs(3);
 
 /// The work of the thread.
 pub(super) trait Sink: 'static {
@@ -166,7 +166,7 @@ impl<T: Send + 'static> Worker<T> {
     }
 
     /// Tells the thread how the run ended, and waits for it no longer than `limit`, whatever it has left to
-    /// take. A full queue keeps it from being told.
+    /// take. If the queue is full the thread is not told, and this returns at once.
     pub(super) fn leave(&mut self, manifest: &Manifest, limit: Duration) {
         if self.push(Message::Close(Box::new(manifest.clone()))).is_ok() {
             let _ = self.done.recv_timeout(limit);
@@ -183,18 +183,19 @@ impl<T: Send + 'static> Worker<T> {
         manifest: &Manifest,
         limit: Duration,
     ) -> Result<(Left, Option<TelemetryError>), TelemetryError> {
-        let (mut is_told, mut knows) = (false, false);
+        let (mut is_told, mut is_close_sent) = (false, false);
         let mut silence = Silence::new(self.vitals.beats(), Instant::now());
         let writer = self.writer;
         let failed = |reason| TelemetryError::writer_failed(writer, reason);
         loop {
-            knows = knows || self.push(Message::Close(Box::new(manifest.clone()))).is_ok();
+            is_close_sent =
+                is_close_sent || self.push(Message::Close(Box::new(manifest.clone()))).is_ok();
             if let Ok((left, result)) = self.done.recv_timeout(RETRY) {
                 return Ok((left, result.err().map(failed)));
             }
             silence.look(self.vitals.beats(), Instant::now());
             let silent = silence.lasted();
-            if silent > TOLD_AFTER && !std::mem::replace(&mut is_told, true) {
+            if silent > WARN_AFTER && !std::mem::replace(&mut is_told, true) {
                 let limit_s = limit.as_secs();
                 tracing::warn!(
                     "{writer}: waiting for it to complete its files, {limit_s} s at most"

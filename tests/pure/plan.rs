@@ -88,15 +88,12 @@ fn the_reserve_of_a_run_is_said() {
     let reserve = ["--set", "goal.reserve_mm=40"];
     let (status, json) = plan(&scratch, BALL, &reserve);
     let refusal = json["run_refusal"].as_str().unwrap();
-    assert_eq!((status, &json["status"]), (0, &Value::from("plan")));
-    assert_eq!(json["run_reserve_mm"], Value::Null);
+    assert_eq!((status, &json["status"]), (1, &Value::from("none")));
+    assert_eq!([&json["run_reserve_mm"], &json["reason"]], [&Value::Null, &refusal.into()]);
     assert!(refusal.contains("none was found that keeps goal.reserve_mm, 40,"), "{refusal}");
+    assert!(json["path"].is_array(), "the path that was found is shown");
     let said = needle_bench(&scratch, &[&["plan", "goal.toml"], &reserve[..]].concat());
-    assert!(
-        said.stdout.contains(&format!("\nrun         refused: {refusal}\n")),
-        "{}",
-        said.stdout
-    );
+    assert!(said.stdout.starts_with(&format!("none: {refusal}\nlength ")), "{}", said.stdout);
     let run = needle_bench(&scratch, &[&["run", "goal.toml", "--json"], &reserve[..]].concat());
     assert!(run.status == 2 && run.json()["error"].to_string().contains(refusal), "{}", run.stdout);
     let clear = BALL.split("[[goal").next().unwrap();

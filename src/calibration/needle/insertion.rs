@@ -10,7 +10,7 @@ const DEPTH_MIN_MM: f64 = 20.0;
 /// Turns are compared over this much depth, mm, and only below this depth, mm: the skin does not hold
 /// the needle yet.
 const SPACING_MM: f64 = 1.0;
-const ENTRY_MM: f64 = 3.0;
+pub(super) const ENTRY_MM: f64 = 3.0;
 /// The tip must turn back and forth by this much, RMS, rad/mm, to show its axis.
 const TURN_MIN_RAD_PER_MM: f64 = 0.05;
 

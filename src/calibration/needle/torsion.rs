@@ -1,6 +1,6 @@
 //! Fits the torsion from the recorded rotations of base and tip.
 
-use super::insertion::Insertion;
+use super::insertion::{ENTRY_MM, Insertion};
 use super::{CalibrationError, covariance, refused};
 use crate::needle::{NeedleError, Play, Torsion, TorsionConfig};
 use nalgebra::{SMatrix, SVector};
@@ -18,8 +18,6 @@ const DIFFERENCE: [f64; PARAMETERS] = [1e-5, 1e-7, 1e-5, 1e-5, 1e-7];
 const CLEAR_SD: f64 = 2.0;
 /// The lower bounds of the parameters: a creep shorter than the distance of the rows is no creep.
 const LEAST: [f64; PARAMETERS] = [0.0, 0.0, f64::NEG_INFINITY, 0.02, 0.0];
-/// The roll counts from this depth, mm: the skin does not hold the needle yet.
-const ENTRY_MM: f64 = 3.0;
 const ITERATIONS_MAX: usize = 100;
 
 /// A torsion with its standard errors.
@@ -37,7 +35,7 @@ pub struct TorsionFit {
 
 fn undetermined() -> CalibrationError {
     refused(
-        "the insertions do not determine its torsion; turn the base both ways, by more than the tip \
+        "the insertions do not determine the shaft's torsion; turn the base both ways, by more than the tip \
          lags, at several depths",
     )
 }

@@ -3,10 +3,8 @@
 use crate::stage::{Axis, CountsRatio};
 use std::fmt;
 
-/// The units, each of one axis. No axis of a stage goes further than the last number: the bounds of its
-/// limits in the configuration.
-const UNITS: [(&str, Axis, f64); 2] =
-    [("mm", Axis::Insertion, 1000.0), ("deg", Axis::Rotation, 360_000.0)];
+/// No axis of a stage goes further, in its unit: the bounds of its limits in the configuration.
+const FARTHEST: [(Axis, f64); 2] = [(Axis::Insertion, 1000.0), (Axis::Rotation, 360_000.0)];
 
 /// A distance along an axis in its unit, `2mm` or `10deg`; or a speed, the distance a second.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -18,8 +16,9 @@ pub(in crate::cli) struct Distance {
 impl Distance {
     /// Reads a distance.
     pub(super) fn parse(text: &str) -> Result<Self, String> {
-        for (unit, axis, max) in UNITS {
-            let number = text.strip_suffix(unit).and_then(|number| number.trim_end().parse().ok());
+        for (axis, max) in FARTHEST {
+            let number = text.strip_suffix(axis.unit());
+            let number = number.and_then(|number| number.trim_end().parse().ok());
             match number.filter(|value: &f64| value.is_finite()) {
                 Some(value) if value.abs() <= max => return Ok(Distance { value, axis }),
                 Some(_) => return Err("at most 1000mm or 360000deg, either way".to_owned()),
@@ -32,7 +31,7 @@ impl Distance {
     /// Reads a speed.
     pub(super) fn parse_speed(text: &str) -> Result<Self, String> {
         let distance = text.strip_suffix("/s").and_then(|text| Distance::parse(text).ok());
-        distance.ok_or_else(|| "a number with its unit, such as 0.5mm/s or 20deg/s".to_owned())
+        distance.ok_or_else(|| "a number with its unit, such as 0.5mm/s or 20deg/s, at most 1000mm/s or 360000deg/s".to_owned())
     }
 
     /// In the unit of `axis`, mm or rad.
@@ -42,8 +41,7 @@ impl Distance {
     pub(super) fn along(self, axis: Axis) -> Result<f64, String> {
         match axis {
             _ if self.axis != axis => {
-                let right = UNITS.iter().find(|(_, of, _)| *of == axis);
-                let unit = right.map_or("", |(unit, ..)| unit);
+                let unit = axis.unit();
                 Err(format!("the {axis} axis does not move by {self}: give {unit}, as in 10{unit}"))
             }
             Axis::Insertion => Ok(self.value),

@@ -103,8 +103,8 @@ fn accelerations_keep_to_the_axis_limits() {
     assert_eq!(
         said.lines().collect::<Vec<_>>(),
         [
-            peak("insertion.acceleration_mm_per_s2", "9.956", "mm", "insertion"),
-            peak("stage.insertion.jog_acceleration_mm_per_s2", "9.956", "mm", "insertion"),
+            peak("insertion.acceleration_mm_per_s2", "9.955", "mm", "insertion"),
+            peak("stage.insertion.jog_acceleration_mm_per_s2", "9.955", "mm", "insertion"),
         ]
     );
     assert_eq!(
@@ -115,9 +115,9 @@ fn accelerations_keep_to_the_axis_limits() {
     let about = |max: f64| format!("stage.rotation.acceleration_max_deg_per_s2 = {max:?}\n");
     assert_eq!(
         refusal(&about(3600.0)),
-        "bench.toml:1: control.nested_saturation.rotation_max_deg_per_mm is 60: reversed within a \
-         SYNC at 2 mm/s, that is 24000 deg/s², over stage.rotation.acceleration_max_deg_per_s2 = \
-         3600; raise it, or turn or insert more slowly"
+        "bench.toml:1: control.nested_saturation.rotation_max_deg_per_mm is 60: reversed from one \
+         SYNC to the next at 2 mm/s, that is 24000 deg/s², over stage.rotation.acceleration_max_deg_per_s2 = \
+         3600; turn or insert more slowly, or raise the limit"
     );
     let jog = about(24_000.0) + "stage.rotation.jog_acceleration_deg_per_s2 = 22000\n";
     assert_eq!(
@@ -149,6 +149,25 @@ fn the_stage_is_told_how_its_axes_are_homed() {
 }
 
 const RIG: &str = include_str!("../../../bench-config/rig-epos4.toml");
+
+/// What a message advises is allowed.
+#[test]
+fn an_advised_rotation_or_speed_is_allowed() {
+    let told = |deg_per_mm: &str, mm_per_s: &str| {
+        let sets = [
+            format!("control.nested_saturation.rotation_max_deg_per_mm={deg_per_mm}"),
+            format!("insertion.speed_mm_per_s={mm_per_s}"),
+            "stage.rotation.speed_max_deg_per_s=50".to_owned(),
+        ];
+        let message = said("", &sets.each_ref().map(String::as_str)).err().unwrap_or_default();
+        let of_rotation = "control.nested_saturation.rotation_max_deg_per_mm is ";
+        message.lines().find(|line| line.contains(of_rotation)).map(str::to_owned)
+    };
+    let refused = told("30", "3").expect("90 deg/s is over 50");
+    let advice = "turn by 16.6666 deg/mm or insert at 1.6666 mm/s";
+    assert!(refused.ends_with(advice), "{refused}");
+    assert_eq!([told("16.6666", "3"), told("30", "1.6666")], [None, None]);
+}
 
 fn said(text: &str, sets: &[&str]) -> Result<Config, String> {
     let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();

@@ -460,6 +460,15 @@ fn correlated_noise_without_a_time_or_a_size() {
     );
 }
 
+/// The planner's lattice would have no end of headings.
+#[test]
+fn a_curvature_under_that_of_the_largest_radius_is_refused() {
+    assert_eq!(
+        set_refusal(&["needle.curvature_per_mm=1e-9"]),
+        "--set needle.curvature_per_mm is 1e-9, allowed: 0.00001 to 0.1 per mm"
+    );
+}
+
 #[test]
 fn noise_that_lasts_longer_than_the_run() {
     let noise = |time: &str| {
@@ -467,7 +476,7 @@ fn noise_that_lasts_longer_than_the_run() {
     };
     assert_eq!(
         set_refusal(&[&noise("126")]),
-        "--set tracker.noise.correlation_time_s is 126, allowed: up to the 125.0 s of the insertion; \
+        "--set tracker.noise.correlation_time_s is 126, allowed: up to the 125.000 s of the insertion; \
          noise that lasts longer is an error of the registration, tracker.registration.sd_mm"
     );
     assert_eq!(

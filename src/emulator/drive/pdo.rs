@@ -89,7 +89,7 @@ pub(super) struct Tpdo {
     settings: Settings,
     inhibit: Duration,
     event_timer: Duration,
-    /// The last payload that was sent because it changed; `None` before the first one in Operational.
+    /// Payload of the last event-driven PDO; `None` before the first one in Operational.
     last: Option<Vec<u8>>,
     /// SYNCs since it was sent.
     syncs: u8,

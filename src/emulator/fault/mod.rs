@@ -21,34 +21,35 @@ section! {
     pub struct Fault {
         /// What goes wrong.
         kind: FaultKind;
-        /// It begins when the needle truly passes this depth, either way, mm.
+        /// It begins when the needle has truly moved this far since the stage was switched on, mm; negative is
+        /// withdrawn.
         at_mm: Option<f64> [within(-1000.0, 1000.0)];
-        /// It begins so long after the stage was switched on.
+        /// It begins this long after the stage was switched on.
         at as "at_s": Option<Duration> [within(0.0, 86_400.0)], instead_of("at_mm");
         /// The drives that have the fault.
         axis: FaultyDrives = "both";
         /// How long the fault lasts; left out, for good.
         duration as "duration_s": Option<Duration> [over(0.0, 86_400.0)];
-        /// Of faults of frames: which frames. Heartbeats toward the drives are the bench's.
+        /// For faults of frames: which frames are affected. Heartbeats toward the drives are those of the bench.
         frames: FrameClass = "any";
-        /// Of faults of frames: on their way to whom.
+        /// For faults of frames: their direction.
         toward: Toward = "bench";
-        /// Of faults of frames: so many frames; left out, all.
+        /// For faults of frames: how many frames are affected; left out, all.
         count: Option<u32> [within(1.0, u32::MAX as f64)];
-        /// Of "delay": how late the frames are; with frames = "sdo" a slow server.
+        /// For "delay": how late the frames are; with frames = "sdo" a slow server.
         delay as "delay_ms": Option<Duration> [over(0.0, 60_000.0)];
-        /// Of "corrupt": the byte that is changed, from 0; left out, the first.
+        /// For "corrupt": the byte that is changed, from 0; left out, the first.
         byte: Option<u8> [within(0.0, 7.0)];
-        /// Of "corrupt": the bits of that byte that are inverted; left out, all. With frames = "pdo", byte = 1 and
+        /// For "corrupt": the bits of that byte that are inverted; left out, all. With frames = "pdo", byte = 1 and
         /// mask = 2 a drive shows bit 9 of its statusword inverted.
         mask: Option<u8> [within(1.0, 255.0)];
-        /// Of "resize": bytes.
+        /// For "resize": the new length, bytes.
         length: Option<u8> [within(0.0, 8.0)];
-        /// Of "drive-fault": its emergency code.
+        /// For "drive-fault": the emergency code.
         code: Option<u16> [within(1.0, u16::MAX as f64)];
-        /// Of "foreign": the frame, as candump writes it.
+        /// For "foreign": the frame, as candump writes it.
         frame: Option<String> [FRAME];
-        /// Of "foreign": time between two frames; left out, one frame.
+        /// For "foreign": time between two frames; left out, one frame.
         period as "period_ms": Option<Duration> [within(0.1, 60_000.0)];
     }
     beside {
@@ -92,9 +93,9 @@ choice! {
         BusOff = "bus-off",
         /// The bench's interface is down.
         BusDown = "bus-down",
-        /// Its transmit queue is full.
+        /// The transmit queue of the bench's interface is full.
         BusFull = "bus-full",
-        /// Its frames are held, and leave in a burst at the end.
+        /// The bench's interface holds its frames, and sends them in a burst at the end.
         BusStuck = "bus-stuck",
         /// Another node sends a frame.
         Foreign = "foreign",
@@ -210,7 +211,7 @@ impl Fault {
         match self.kind {
             FaultKind::Delay => {
                 let delay = self.delay.unwrap_or_default();
-                format!("late by {} ms", delay.as_secs_f64() * 1e3)
+                format!("late by {} ms", delay.as_nanos() as f64 / 1e6)
             }
             FaultKind::Duplicate => "doubled".to_owned(),
             FaultKind::Reorder => "out of order".to_owned(),
@@ -245,8 +246,9 @@ impl fmt::Display for Fault {
             FaultKind::BusStuck => write!(f, "frames held by the interface"),
             FaultKind::Foreign => {
                 write!(f, "foreign frame {}", self.frame.as_deref().unwrap_or_default())?;
-                self.period
-                    .map_or(Ok(()), |period| write!(f, " every {} ms", period.as_secs_f64() * 1e3))
+                self.period.map_or(Ok(()), |period| {
+                    write!(f, " every {} ms", period.as_nanos() as f64 / 1e6)
+                })
             }
             _ => {
                 f.write_str(match self.frames {

@@ -6,10 +6,9 @@
 //! tip frame, `ĝ⁻¹ y`, with `H = [I 0]` (the invariant filter of Barrau and Bonnabel). Curvature
 //! and torsion are additional states.
 
-use super::error_state::{ANCHOR, Extent};
 use super::error_state::{
-    BACKLOG, CURVATURE, Covariance, ErrorState, GROWTH, LAG, LOWER, Transition, UPPER,
-    adjoint_inverse, bracket,
+    ANCHOR, BACKLOG, CURVATURE, Covariance, ErrorState, Extent, GROWTH, LAG, LOWER, Transition,
+    UPPER, adjoint_inverse, bracket,
 };
 use super::positive_part::PositivePart;
 use crate::geometry::{Pose, Twist};
@@ -131,8 +130,8 @@ impl Hypothesis {
         }
     }
 
-    /// True if base and tip do not, or may not, turn as one.
-    fn plays(&self) -> bool {
+    /// True if the shaft has play, or may have: the tip then lags behind the base.
+    fn has_play(&self) -> bool {
         let Band { lower_rad, upper_rad, growth_rad_per_mm, .. } = self.band;
         self.covariance.extent() == Extent::Banded
             || upper_rad > lower_rad
@@ -170,7 +169,7 @@ impl Hypothesis {
     /// the tip, rad, and the derivatives of this with respect to the edge's distance from the
     /// anchor and to the growth.
     fn push(&mut self, turn_rad: f64, depth_mm: f64) -> (f64, f64, f64) {
-        if !self.plays() {
+        if !self.has_play() {
             return (turn_rad, 0.0, 0.0);
         }
         if turn_rad * self.stroke.sign < 0.0 {
@@ -293,8 +292,8 @@ impl Hypothesis {
             self.covariance.add_variance(2, noise.axial_mm2_per_mm * depth_mm);
             self.covariance.add_roll_variance(noise.roll_rad2_per_mm * depth_mm);
             self.covariance.add_variance(CURVATURE, noise.curvature_per_mm3 * depth_mm);
-            // Without a band the tip creeps to the middle, so its random walk is one of the
-            // backlog.
+            // Without an uncertain band the tip creeps toward its middle, so the random walk of the edges
+            // is one of the backlog.
             let edges: &[usize] = match self.covariance.extent() {
                 Extent::Rigid => &[],
                 Extent::Creeping => &[BACKLOG],
@@ -306,8 +305,8 @@ impl Hypothesis {
         }
     }
 
-    /// Corrects with a measured position. Returns the normalised square of the innovation, χ² with
-    /// three degrees of freedom, or `None` if its covariance is not positive. The covariance must
+    /// Corrects with a measured position. Returns the normalised innovation squared (NIS), χ² with three
+    /// degrees of freedom, or `None` if its covariance is not positive. The covariance must
     /// have been propagated.
     pub(super) fn correct(&mut self, tip_meas: &TipPosition, variance_mm2: f64) -> Option<f64> {
         let off_mm = tip_meas.mm() - self.x_pb.translation;
@@ -340,7 +339,7 @@ impl Hypothesis {
         xi
     }
 
-    /// True while mean and covariance are finite and no variance is negative.
+    /// True while pose, curvature, backlog, lag, weight and covariance are finite and no variance is negative.
     pub(super) fn is_sound(&self) -> bool {
         self.x_pb.is_finite()
             && [self.curvature_per_mm, self.backlog_rad, self.lag_rad, self.log_weight]

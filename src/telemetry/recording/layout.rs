@@ -131,7 +131,7 @@ fn log(layout: &RecordingStream, parts: &Part) -> Logged {
     layout.log(format!("{SHARED}/TimeAxis"), &whole)
 }
 
-/// Logs a part and what is inside of it, with this identity; gives its path.
+/// Logs a part under `id`, and the parts inside it; gives its path.
 fn log_part(layout: &RecordingStream, part: &Part, id: Uuid) -> Logged<String> {
     let class = match part.class.as_str() {
         "horizontal" => return log_container(layout, part, ContainerKind::Horizontal, id),

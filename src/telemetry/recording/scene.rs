@@ -1,4 +1,4 @@
-//! The fixed part of the 3-D view: the desired plane with its lines and axes.
+//! The fixed part of the 3-D view: the desired plane with its lines and axes, the target and the obstacles.
 
 use super::{Logged, palette};
 use crate::geometry::Pose;
@@ -23,7 +23,7 @@ pub(super) struct Reach {
 
 impl Reach {
     const MARGIN_MM: f64 = 10.0;
-    /// No plane is drawn larger or smaller than this to one side.
+    /// Least and greatest extent of the plane to one side, without the margin, mm.
     const SIDE_MM: [f64; 2] = [20.0, 1000.0];
     /// No needle is looked for further away, mm.
     const PLACE_MM_MAX: f64 = 10_000.0;
@@ -42,7 +42,8 @@ impl Reach {
         Reach { y_mm: [-side_mm, side_mm], z_mm: [-Self::MARGIN_MM, ahead_mm] }
     }
 
-    /// This rectangle moved to a needle that starts elsewhere; `None` where it starts inside.
+    /// This rectangle moved to a needle that starts at `start_mm`; `None` if it starts near the origin, or at no
+    /// place (NaN, or over 10 m away).
     pub(super) fn moved_to(&self, start_mm: &Vector3<f64>) -> Option<Self> {
         let (y_mm, z_mm) = (start_mm.y, start_mm.z);
         let is_inside = y_mm.abs() <= 0.5 * self.y_mm[1] && z_mm.abs() <= Self::MARGIN_MM;

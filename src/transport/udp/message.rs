@@ -35,7 +35,7 @@ fn as_bytes<S: Serializer>(data: &&[u8], serializer: S) -> Result<S::Ok, S::Erro
 /// The datagram that carries `event`, sent at `timestamp_s` by the sender's clock, s since 1970.
 ///
 /// # Errors
-/// These fields cause none; the encoder's signature has it.
+/// Never with these fields; the encoder's signature has it.
 pub(super) fn encode(
     timestamp_s: f64,
     event: &BusEvent,
