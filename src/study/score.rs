@@ -35,7 +35,7 @@ pub struct TrialResult {
 /// The result of a trial with a target.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TargetScore {
-    /// No path was found before the insertion.
+    /// There was no plan at the start.
     pub is_refused: bool,
     /// True distance of the tip from the target at the end, mm; `None` if the trial was stopped.
     pub error_mm: Option<f64>,

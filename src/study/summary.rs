@@ -94,7 +94,7 @@ pub struct Targets {
     pub target_error_mm: OffPlane,
     /// Share of those trials that ended within the tolerance.
     pub reached_fraction: f64,
-    /// Share of all trials for which no path was found before the insertion.
+    /// Share of all trials without a plan at the start.
     pub refused_fraction: f64,
     /// The least distance of the true tip from an obstacle, mm.
     pub clearance_mm_min: Clearance,
