@@ -1,5 +1,5 @@
-//! Where calibrated values in a configuration came from, and how good they are. For the record alone: the
-//! bench does not use it.
+//! Where calibrated values in a configuration came from, and how good they are. The preflight judges their
+//! age and the registration's RMS; nothing else uses them.
 
 use crate::keys::{Rule, section, within};
 use crate::needle::TorsionConfig;

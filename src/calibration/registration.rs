@@ -66,7 +66,7 @@ pub struct RegistrationFit {
     pub worst_mm: f64,
     /// RMS extent of the fiducials along their principal axes, largest first, mm.
     pub spread_mm: [f64; 3],
-    /// How many times as far apart the tracker has the fiducials as the bench, where that is no chance.
+    /// Scale of the tracker's distances to the bench's, where it differs significantly from 1.
     pub scale: Option<f64>,
     /// Centroid of the fiducials on the bench, mm.
     centre_bench: Vector3<f64>,
@@ -90,8 +90,8 @@ impl RegistrationFit {
     /// half of the sets would give a reflection.
     ///
     /// # Errors
-    /// Fewer than three points, positions beyond 5 m, the same position twice, points on a line,
-    /// or more than `rms_max_mm` RMS.
+    /// Fewer than three points, positions beyond 5 m, the same position twice, sets whose sizes differ by more
+    /// than a factor of 2, points on a line, or more than `rms_max_mm` RMS.
     pub fn of(pairs: &[FiducialPair], rms_max_mm: f64) -> Result<Self, CalibrationError> {
         let points = pairs.len();
         if points < 3 {
@@ -131,7 +131,7 @@ impl RegistrationFit {
         let check_breadth = |limit_mm: f64| match breadth_mm >= limit_mm {
             true => Ok(()),
             false => refused(format!(
-                "{points} points lie within {breadth_mm:.2} mm of a line (at least {limit_mm:.2} \
+                "{points} points lie {breadth_mm:.2} mm RMS off a line (at least {limit_mm:.2} \
                  needed for their length and error): the turn about it is unknown; add points to \
                  its sides"
             )),

@@ -62,10 +62,8 @@ impl CanInterface {
     /// True for a bus without a wire, on which the drives are emulated: `memory`, `udp`, and network
     /// interfaces whose names begin with `vcan` or `vxcan`, as Linux names its virtual ones.
     pub fn is_virtual(&self) -> bool {
-        match self {
-            CanInterface::Memory | CanInterface::Udp(_) => true,
-            CanInterface::Socket(name) => name.starts_with("vcan") || name.starts_with("vxcan"),
-        }
+        let is_virtual = |name: &str| name.starts_with("vcan") || name.starts_with("vxcan");
+        self.is_for_tests() || matches!(self, CanInterface::Socket(name) if is_virtual(name))
     }
 
     /// The bus of this name; `None` where no bus can have it.
@@ -73,7 +71,11 @@ impl CanInterface {
         match name.split_once(':') {
             None if name == "memory" => Some(CanInterface::Memory),
             None if name == "udp" => Some(CanInterface::Udp(UDP_GROUP)),
-            Some(("udp", group)) => group.parse().ok().map(CanInterface::Udp),
+            Some(("udp", group)) => {
+                let group = group.parse().ok();
+                let is_group = |to: &SocketAddrV4| to.ip().is_multicast() && to.port() != 0;
+                group.filter(is_group).map(CanInterface::Udp)
+            }
             _ => is_interface(name).then(|| CanInterface::Socket(name.to_owned())),
         }
     }
@@ -104,9 +106,24 @@ impl Field for NodeId {
     }
 }
 
-/// What Linux takes for the name of a network interface: under 16 bytes (IFNAMSIZ), no space, no
-/// slash.
+/// What Linux takes for the name of a network interface: under 16 bytes (IFNAMSIZ), no space, slash or colon, and
+/// no folder.
 fn is_interface(name: &str) -> bool {
     (1..16).contains(&name.len())
-        && name.bytes().all(|byte| byte.is_ascii_graphic() && byte != b'/')
+        && name.bytes().all(|byte| byte.is_ascii_graphic() && !b"/:".contains(&byte))
+        && ![".", ".."].contains(&name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_no_bus_can_have_is_no_name() {
+        for name in ["vcan0:1", "memory:1", ".", "..", "udp:127.0.0.1:43113", "udp:239.1.2.3:0"] {
+            assert_eq!(CanInterface::named(name), None, "{name}");
+        }
+        let group = CanInterface::named("udp:239.1.2.3:43113");
+        assert!(matches!(group, Some(CanInterface::Udp(_))), "{group:?}");
+    }
 }

@@ -1,4 +1,4 @@
-//! The bench silent on purpose: who notices, when, and whether he stops.
+//! The bench falls silent on purpose: whether each drive notices, after how long, and whether it stops.
 
 use std::time::Duration;
 
@@ -8,7 +8,7 @@ use crate::session::{Lane, PROVED, Record, Severity, Shell, State, Task};
 use crate::stage::{Axis, Dialogue, Halt, PerAxis, StageConfig, StageEvent};
 use crate::units::Time;
 
-/// A drive may look at its watch this much later than the bench.
+/// A drive may notice a timeout this much later than its configured time.
 const MARGIN: Duration = Duration::from_millis(200);
 
 /// A silence under way. The drives are looked at by SDO: those that notice leave Operational as a
@@ -44,7 +44,7 @@ impl Silence {
             format!("{axis} after {after_ms} ms")
         });
         format!(
-            "{PROVED}both drives notice a silent bench and stand: {} (limit {})",
+            "{PROVED}both drives notice a silent bench and stand: {} (limit {} ms)",
             noticed.join(", "),
             self.within.as_millis()
         )
@@ -61,7 +61,7 @@ impl Silence {
             return ended.then(|| {
                 Err(format!(
                     "{}: no emergency 0x8130 within {} ms of the bench's last heartbeat: if the \
-                     bench dies, this axis may go on; does the drive watch a heartbeat (0x1016), \
+                     bench dies, it may go on; does the drive watch a heartbeat (0x1016), \
                      and send emergencies?",
                     deaf.join(", "),
                     self.within.as_millis()
@@ -75,7 +75,7 @@ impl Silence {
             true => Ok(self.proof()),
             false => Err(format!(
                 "{}; it noticed the bench's silence and was not seen to stop: if the bench dies, \
-                 this axis may go on; see abort_connection_option (0x6007)",
+                 it may go on; see abort_connection_option (0x6007)",
                 moving.join(", ")
             )),
         })

@@ -140,13 +140,13 @@ pub(super) fn doubts(run: &Run) -> Vec<String> {
         all.push(format!("{label}: {} {unit}, to be {}", figure.value_text(), figure.limit_text()));
     }
     for (key, what) in [
-        ("syncs_late", "SYNC was sent late"),
-        ("syncs_skipped", "SYNC was skipped"),
-        ("feedback_missed", "SYNC was not answered by both drives"),
-        ("frames_dropped", "frame was lost before the bench took it"),
+        ("syncs_late", "SYNCs sent late"),
+        ("syncs_skipped", "SYNCs skipped"),
+        ("feedback_missed", "SYNCs not answered by both drives"),
+        ("frames_dropped", "frames lost before the bench took them"),
     ] {
         if let Some(times) = manifest.timing.get(key).and_then(Value::as_u64).filter(|n| *n > 0) {
-            all.push(format!("{what}: {times} times"));
+            all.push(format!("{what}: {times}"));
         }
     }
     if manifest.git.as_deref().is_some_and(|git| git.ends_with("-dirty")) {
@@ -217,7 +217,7 @@ mod tests {
                 .starts_with("the limits are unknown, because the configuration cannot be read: ")
         );
         assert!(said[2].starts_with("not recorded: 3 records of the text files"));
-        assert!(said.contains(&"SYNC was skipped: 2 times".to_owned()), "{said:?}");
+        assert!(said.contains(&"SYNCs skipped: 2".to_owned()), "{said:?}");
         assert!(said.contains(&"the bench was built from uncommitted changes".to_owned()));
     }
 

@@ -134,7 +134,7 @@ impl<'a, W: Witness> VirtualRun<'a, W> {
             FaultKind::BusDown => Some(CanError::Down(interface)),
             FaultKind::BusFull => Some(full(interface)),
             FaultKind::BusStuck => match self.unconfirmed.too_many() {
-                Some(frames) => Some(CanError::NotConfirmed { interface, frames }),
+                Some((frames, syncs)) => Some(CanError::NotConfirmed { interface, frames, syncs }),
                 None => (self.stage.frames_held() >= QUEUE_MAX).then(|| full(interface)),
             },
             _ => None,

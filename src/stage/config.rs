@@ -27,10 +27,7 @@ impl Axis {
 
     /// `value`, mm or rad, in the unit of the configuration and the command line, with that unit.
     pub fn in_unit(self, value: f64) -> (f64, &'static str) {
-        let value = match self {
-            Axis::Insertion => value,
-            Axis::Rotation => value.to_degrees(),
-        };
+        let value = if self == Axis::Rotation { value.to_degrees() } else { value };
         (value, self.unit())
     }
 
@@ -48,10 +45,7 @@ impl Axis {
 
 impl fmt::Display for Axis {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Axis::Insertion => "insertion",
-            Axis::Rotation => "rotation",
-        })
+        f.pad(["insertion", "rotation"][*self as usize])
     }
 }
 
@@ -370,8 +364,8 @@ impl StageConfig {
         if !range_ok || rates.iter().any(|rate| !rate.is_finite() || *rate <= 0.0) {
             let [min, max, speed] = [min, max, speed_max].map(|value| axis.shown(value));
             return Err(format!(
-                "{axis}: limits {min} to {max}, {speed}/s: the range and the speed must be finite and \
-                 over zero"
+                "{axis}: limits {min} to {max}, {speed}/s: range, speed and acceleration_max must be \
+                 finite and over zero"
             ));
         }
         let homing = config.homing.as_ref();
@@ -395,13 +389,13 @@ impl StageConfig {
                 ));
             }
         }
-        let window = self.standstill_window(axis);
         // It brakes first, and the last SYNC counts when the next is due.
-        if window + 2 * self.bus.sync_period() >= self.power.stop_timeout {
+        let needed = self.standstill_window(axis) + 2 * self.bus.sync_period();
+        if needed >= self.power.stop_timeout {
             return Err(format!(
-                "{axis}: {:.0} ms of its counts are needed to see it stand, and stop_timeout_s is \
-                 {:.3}: set a longer one",
-                window.as_secs_f64() * 1e3,
+                "{axis}: more than {:.0} ms are needed to see it stand, and stop_timeout_s is {:.3}: set \
+                 a longer one",
+                needed.as_secs_f64() * 1e3,
                 self.power.stop_timeout.as_secs_f64()
             ));
         }
@@ -460,8 +454,8 @@ mod tests {
         );
         assert_eq!(
             text(|c| c.insertion.ratio = CountsRatio::new(20, 1).expect("not zero")),
-            "insertion: 2500 ms of its counts are needed to see it stand, and stop_timeout_s is 2.000: \
-             set a longer one"
+            "insertion: more than 2520 ms are needed to see it stand, and stop_timeout_s is 2.000: set a \
+             longer one"
         );
         assert!(text(|c| c.insertion.limits.speed_max = f64::NAN).starts_with("insertion: limits"));
     }

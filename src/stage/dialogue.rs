@@ -14,6 +14,7 @@ use std::task::{Context, Poll, Waker};
 use std::time::Duration;
 
 use super::{Axis, Output, PerAxis, StageConfig, StageEvent};
+use crate::canopen::cia402::{Statusword, object};
 use crate::canopen::nmt::{NmtCommand, NmtState, nmt_frame, parse_heartbeat};
 use crate::canopen::sdo::{SdoClient, SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::canopen::{Frame, NodeId, ObjectAddress};
@@ -126,6 +127,29 @@ impl Sdo {
             Ok(SdoReply::Downloaded) => Err(format!("node {} {object}: no value", self.node())),
             Err(error) => Err(self.explain(object, error)),
         }
+    }
+
+    /// Reads `object`; `None` if the drive answers, but not with its value.
+    ///
+    /// # Errors
+    /// The drive does not answer.
+    pub(super) async fn read_optional(
+        &self,
+        object: ObjectAddress,
+    ) -> Result<Option<SdoValue>, String> {
+        match self.ask(SdoRequest::Upload(object)).await {
+            Ok(SdoReply::Uploaded(value)) => Ok(Some(value)),
+            Err(error @ SdoError::Timeout(_)) => Err(self.explain(object, error)),
+            Ok(SdoReply::Downloaded) | Err(_) => Ok(None),
+        }
+    }
+
+    /// Reads the statusword.
+    ///
+    /// # Errors
+    /// As [`Sdo::read`].
+    pub(super) async fn statusword(&self) -> Result<Statusword, String> {
+        Ok(Statusword(self.read(object::STATUSWORD).await?.to_u32() as u16))
     }
 
     /// Writes `value` to `object`.

@@ -100,7 +100,7 @@ pub enum Ignored {
     /// From a drive, but of the wrong length.
     #[display("frame of the wrong length")]
     WrongLength,
-    /// A position without a SYNC: before any SYNC, or the second after one. An SDO answer without a
+    /// A TPDO1 that no SYNC asked for: before the first SYNC, or a second one after the same SYNC. An SDO answer without a
     /// request.
     #[display("position without a SYNC, or answer without a question")]
     Unexpected,

@@ -52,6 +52,11 @@ section! {
 impl HomingConfig {
     /// Bit 12 in homing mode: homing attained.
     pub const ATTAINED_BIT: u8 = 12;
+
+    /// True if the bit that says so is set in `statusword`.
+    pub(super) fn is_set(&self, statusword: Statusword) -> bool {
+        u32::from(statusword.0) >> self.homed_bit.min(31) & 1 != 0
+    }
 }
 
 /// From then on the bits of the statusword are of this homing even where they were never seen to

@@ -246,13 +246,13 @@ impl Script {
             self.set_mode(Mode::HOMING).await?;
         }
         let statusword = self.read_statusword().await?;
-        match statusword.0.checked_shr(homing.homed_bit.into()).unwrap_or(0) & 1 {
-            0 => Err(format!(
+        match homing.is_set(statusword) {
+            false => Err(format!(
                 "not homed (statusword {statusword}, bit {} clear), home it first: needle-bench stage \
                  home",
                 homing.homed_bit
             )),
-            _ => Ok(()),
+            true => Ok(()),
         }
     }
 

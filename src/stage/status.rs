@@ -2,9 +2,10 @@
 //! power by either.
 
 use super::dialogue::{Conversation, Sdo, WithBothDrives};
+use super::drive::may_have_power;
 use super::{Axis, AxisConfig, HomingConfig, Identity, StageConfig};
 use crate::canopen::NodeId;
-use crate::canopen::cia402::{Controlword, DriveState, Mode, Statusword, object};
+use crate::canopen::cia402::{Controlword, Mode, Statusword, object};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::nmt::NmtState;
 use crate::canopen::object::communication::{DEVICE_TYPE, error_history, identity};
@@ -73,24 +74,27 @@ impl StatusReader {
 
 /// Reads one object after the other. The drive must have the first; it may lack the others.
 async fn read_status(sdo: Sdo, axis: Axis, config: AxisConfig) -> Result<AxisStatus, String> {
-    let statusword = Statusword(sdo.read(object::STATUSWORD).await?.to_u32() as u16);
-    let number = async |object| sdo.read(object).await.ok().map(SdoValue::to_u32);
-    let device_type = number(DEVICE_TYPE).await;
-    let identity = Identity {
-        vendor: number(identity(1)).await.unwrap_or(0),
-        product: number(identity(2)).await.unwrap_or(0),
-        revision: number(identity(3)).await,
-        serial: number(identity(4)).await,
+    let statusword = sdo.statusword().await?;
+    let number = async |object| {
+        let value = sdo.read_optional(object).await?;
+        Ok::<_, String>(value.map(SdoValue::to_u32))
     };
-    let mode = number(object::MODES_OF_OPERATION_DISPLAY).await.map(|mode| Mode(mode as i8));
-    let position_counts = number(object::POSITION_ACTUAL).await.map(|counts| counts as i32);
+    let device_type = number(DEVICE_TYPE).await?;
+    let identity = Identity {
+        vendor: number(identity(1)).await?.unwrap_or(0),
+        product: number(identity(2)).await?.unwrap_or(0),
+        revision: number(identity(3)).await?,
+        serial: number(identity(4)).await?,
+    };
+    let mode = number(object::MODES_OF_OPERATION_DISPLAY).await?.map(|mode| Mode(mode as i8));
+    let position_counts = number(object::POSITION_ACTUAL).await?.map(|counts| counts as i32);
     let scale = config.scale(axis, 0);
-    let error_code = number(object::ERROR_CODE).await.filter(|code| *code != 0);
-    let errors = number(error_history(0)).await.unwrap_or(0).min(HISTORY_MAX);
+    let error_code = number(object::ERROR_CODE).await?.filter(|code| *code != 0);
+    let errors = number(error_history(0)).await?.unwrap_or(0).min(HISTORY_MAX);
     let mut history = Vec::new();
     for entry in 1..=errors as u8 {
         // The upper 16 bits are manufacturer-specific.
-        history.extend(number(error_history(entry)).await.map(|error| EmcyCode(error as u16)));
+        history.extend(number(error_history(entry)).await?.map(|error| EmcyCode(error as u16)));
     }
     Ok(AxisStatus {
         node: config.node,
@@ -103,7 +107,7 @@ async fn read_status(sdo: Sdo, axis: Axis, config: AxisConfig) -> Result<AxisSta
         homed: config.homing.and_then(|homing| is_homed(homing, statusword, mode)),
         error_code: error_code.map(|code| EmcyCode(code as u16)),
         error_history: history,
-        digital_inputs: number(object::DIGITAL_INPUTS).await,
+        digital_inputs: number(object::DIGITAL_INPUTS).await?,
         nmt_state: None,
     })
 }
@@ -112,7 +116,7 @@ async fn read_status(sdo: Sdo, axis: Axis, config: AxisConfig) -> Result<AxisSta
 /// other mode.
 fn is_homed(homing: HomingConfig, statusword: Statusword, mode: Option<Mode>) -> Option<bool> {
     let is_valid = homing.homed_bit != HomingConfig::ATTAINED_BIT || mode == Some(Mode::HOMING);
-    is_valid.then_some(statusword.0.checked_shr(homing.homed_bit.into()).unwrap_or(0) & 1 != 0)
+    is_valid.then_some(homing.is_set(statusword))
 }
 
 /// A drive leaves Fault within this time, or stays there.
@@ -143,18 +147,18 @@ impl Reset {
 }
 
 async fn reset(sdo: Sdo) -> Result<Statusword, String> {
-    let statusword =
-        async || Ok::<_, String>(Statusword(sdo.read(object::STATUSWORD).await?.to_u32() as u16));
-    let node = sdo.node();
-    if statusword().await?.state() == Some(DriveState::OperationEnabled) {
-        return Err(format!("node {node} has power: stop it first, needle-bench stop"));
+    let (node, word) = (sdo.node(), sdo.statusword().await?);
+    if may_have_power(word.state()) {
+        return Err(format!("node {node} has power ({word}): stop it first, needle-bench stop"));
     }
     // The drive takes the rising edge of the reset bit.
-    for word in [Controlword::DISABLE_VOLTAGE.0, Controlword::FAULT_RESET_BIT, 0] {
-        sdo.write(object::CONTROLWORD, SdoValue::from(word)).await?;
+    for word in
+        [Controlword::DISABLE_VOLTAGE, Controlword::FAULT_RESET, Controlword::DISABLE_VOLTAGE]
+    {
+        sdo.write(object::CONTROLWORD, SdoValue::from(word.0)).await?;
     }
     sdo.pause(SETTLE).await;
-    let word = statusword().await?;
+    let word = sdo.statusword().await?;
     if word.is_fault() {
         let code = sdo.read(object::ERROR_CODE).await.map(|code| EmcyCode(code.to_u32() as u16));
         let code = code.map(|code| format!(", error {code}")).unwrap_or_default();

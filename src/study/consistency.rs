@@ -51,8 +51,7 @@ pub enum Verdict {
     UnderConfident,
 }
 
-/// A mean of normalised errors, with the bounds that contain the mean of a consistent observer with
-/// 95 % probability.
+/// A mean of normalised errors, with the 95 % acceptance interval of a consistent observer.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Consistency {
     /// Mean over the trials.
@@ -85,15 +84,21 @@ impl Consistency {
     fn of_means(values: &[f64], freedom: f64) -> Option<Self> {
         let mean = mean(values.iter().copied())?;
         let spread = rms(values.iter().map(|value| value - mean))?;
-        let within = WITHIN_95 * spread / (values.len() as f64).sqrt();
+        // One trial has no spread.
+        let within = match values {
+            [_] => f64::INFINITY,
+            _ => WITHIN_95 * spread / (values.len() as f64 - 1.0).sqrt(),
+        };
         Some(Self::judge(mean, freedom - within, freedom + within))
     }
 
     fn judge(mean: f64, lo95: f64, hi95: f64) -> Self {
-        let verdict = match mean {
-            mean if mean > hi95 => Verdict::OverConfident,
-            mean if mean < lo95 => Verdict::UnderConfident,
-            _ => Verdict::Consistent,
+        let verdict = if mean > hi95 {
+            Verdict::OverConfident
+        } else if mean < lo95 {
+            Verdict::UnderConfident
+        } else {
+            Verdict::Consistent
         };
         Consistency { mean, lo95, hi95, verdict }
     }
@@ -127,6 +132,14 @@ mod tests {
     use crate::geometry::Twist;
     use crate::observer::{Belief, Shaft, Slack};
     use nalgebra::{Matrix6, Vector6};
+
+    /// One trial has no spread, and tells nothing.
+    #[test]
+    fn one_trial_is_never_judged() {
+        let verdict = |values: &[f64]| Consistency::of_innovations(values).map(|c| c.verdict);
+        assert_eq!(verdict(&[9.0]), Some(Verdict::Consistent));
+        assert_eq!(verdict(&[9.0, 9.1]), Some(Verdict::OverConfident));
+    }
 
     /// Errors `scale` times as large as their covariance says.
     fn verdicts(scale: f64) -> Nees {

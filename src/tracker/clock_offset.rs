@@ -27,23 +27,24 @@ const DATED_BEHIND_MAX_NS: i64 = 40_000_000;
 const ANOTHER_CLOCK_NS: i64 = 500_000_000;
 /// … and its offset is learnt over this time instead.
 const ANOTHER_CLOCK_TIME: Duration = Duration::from_secs(1);
-/// The operator is told of stamps as late as that once all were over this time …
+/// The operator is told once all stamps were as late as that for this time …
 const FAR_LATE_TIME: Duration = Duration::from_secs(1);
-/// … of others once all were over this time …
+/// … or all were late for this time …
 const LATE_TIME: Duration = Duration::from_secs(5);
 /// … and at least this many.
 const LATE_SAMPLES: u32 = 10;
 
-/// Tracks the minimum of `receive − source` over the last 30 to 60 s. The quickest delivery shows the
-/// offset best, and the window follows a clock that drifts.
+/// Tracks the minimum of `receive − source` over the last 30 to 60 s; after a gap, the one from before it counts
+/// for 30 s more. The quickest delivery shows the offset best, and the window follows a clock that drifts.
 ///
 /// - The first samples of a connection are not believed: they may have waited in a queue, and there
 ///   are no others to compare them with. The offset counts once it has stopped falling.
 /// - A single stamp ahead would be the minimum for a minute, so it is set aside. If the stamps after
 ///   it agree with it, the sender's clock was set, and the offset is learnt again.
 /// - If a stamp goes back and the next ones go on from there, the sender's clock was set back: a
-///   connection keeps its order, so a queue never makes a stamp go back. The offset is learnt again,
-///   if it is larger than just before: after a stamp that was overtaken it is not. Meanwhile stamps that are a little late are dated by the old offset, and others are refused.
+///   connection keeps its order, so a queue never makes a stamp go back. The offset is learnt again if
+///   it is larger than just before the step back; where one stamp was only overtaken, it is not. Meanwhile
+///   stamps that are a little late are dated by the old offset, and others are refused.
 /// - Stamps that are later than before but never went back may have waited. They are dated by the
 ///   old offset. If it was the clock after all, they are dated too old, never too young. The
 ///   operator is told.
@@ -57,7 +58,8 @@ pub(super) struct ClockOffset {
     before_ns: Option<i64>,
     /// A stamp went back, and none since has matched the old offset.
     went_back: bool,
-    late: Option<Late>,
+    /// Stamps that are all far late, and that are all late.
+    late: [Option<Late>; 2],
     news: Option<String>,
 }
 
@@ -161,26 +163,31 @@ impl ClockOffset {
         self.news.take()
     }
 
-    /// Counts stamps that are late by `late_ns`, and reports them once.
+    /// Counts stamps that are late by `late_ns`, and reports each kind once.
     fn note_late(&mut self, receive: Time, late_ns: i64) {
-        if late_ns <= BEHIND_MIN_NS {
-            self.late = None;
-            return;
-        }
-        let first = Late { since: receive, samples: 0, least_ns: late_ns, is_told: false };
-        let late = self.late.get_or_insert(first);
-        late.samples = late.samples.saturating_add(1);
-        late.least_ns = late.least_ns.min(late_ns);
-        let is_far_late = late.least_ns > DATED_BEHIND_MAX_NS;
-        let time = if is_far_late { FAR_LATE_TIME } else { LATE_TIME };
-        let lasts = late.samples >= LATE_SAMPLES && receive.since(late.since) >= time;
-        if lasts && !std::mem::replace(&mut late.is_told, lasts) {
-            self.news = Some(format!(
-                "by their stamps, positions come {:.3} s later than before: delayed, or the sender's \
-                 clock was set back or runs slow; they are dated as delayed; if it was the clock, reconnect the \
-                 tracker",
-                seconds(late.least_ns)
-            ));
+        let kinds = [(DATED_BEHIND_MAX_NS, FAR_LATE_TIME), (BEHIND_MIN_NS, LATE_TIME)];
+        let mut is_told = false;
+        for (run, (min_ns, time)) in self.late.iter_mut().zip(kinds) {
+            if late_ns <= min_ns {
+                *run = None;
+                continue;
+            }
+            let first = Late { since: receive, samples: 0, least_ns: late_ns, is_told: false };
+            let late = run.get_or_insert(first);
+            late.samples = late.samples.saturating_add(1);
+            late.least_ns = late.least_ns.min(late_ns);
+            let lasts = late.samples >= LATE_SAMPLES && receive.since(late.since) >= time;
+            // Those that are far late are late as well.
+            if lasts && !late.is_told && !is_told {
+                self.news = Some(format!(
+                    "by their stamps, positions come {:.3} s later than before: delayed, or the sender's \
+                     clock was set back or runs slow; they are dated as delayed; if it was the clock, \
+                     reconnect the tracker",
+                    seconds(late.least_ns)
+                ));
+            }
+            late.is_told |= lasts || is_told;
+            is_told |= late.is_told;
         }
     }
 }
@@ -403,6 +410,22 @@ mod tests {
         let (at_ms, text) = &told[0];
         assert!(told.len() == 1 && text.contains(" come 0.015 s later than before: "), "{told:?}");
         assert_eq!(*at_ms, 5000);
+    }
+
+    /// A small delay that lasts hides no large one.
+    #[test]
+    fn a_delay_that_grows_is_told_again() {
+        let mut offset = ClockOffset::default();
+        listen(&mut offset, 0, 0);
+        let mut told = Vec::new();
+        for n in 12..600 {
+            let late_ms = if n < 300 { 15 } else { 300 };
+            assert_eq!(update(&mut offset, 25 * n + late_ms, 25 * n), Ok(0), "{n}");
+            told.extend(offset.news().map(|text| (25 * n, text)));
+        }
+        let late_s = |text: &str| text.split(' ').nth(5).map(str::to_owned);
+        let said: Vec<_> = told.iter().map(|(at_ms, text)| (*at_ms, late_s(text))).collect();
+        assert_eq!(said, [(5300, Some("0.015".to_owned())), (8500, Some("0.300".to_owned()))]);
     }
 
     /// A network that delays each position by up to 60 ms, in order.

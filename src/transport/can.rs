@@ -137,7 +137,7 @@ pub enum CanError {
     },
     /// Queued frames were not sent, so no more are taken. They leave when a node acknowledges again.
     #[error(
-        "{interface}: {frames} frames not confirmed on the bus within 2 SYNCs, is the cable in and \
+        "{interface}: {frames} frames not confirmed on the bus within {syncs} SYNCs, is the cable in and \
          does anyone acknowledge?"
     )]
     NotConfirmed {
@@ -145,6 +145,8 @@ pub enum CanError {
         interface: String,
         /// How many wait.
         frames: usize,
+        /// Of how many SYNCs.
+        syncs: usize,
     },
     /// Another error of the operating system.
     #[error("{interface}: cannot {action}: {reason}")]
@@ -169,6 +171,10 @@ fn bring_up(interface: &str) -> String {
         format!(
             "sudo ip link add dev {interface} type vcan; sudo ip link set {interface} up \
              (or let vcan/run.sh do it)"
+        )
+    } else if interface.starts_with("vxcan") {
+        format!(
+            "sudo ip link add dev {interface} type vxcan; sudo ip link set {interface} up, and its peer"
         )
     } else {
         format!(

@@ -152,11 +152,12 @@ impl SocketCan {
 
 impl CanBus for SocketCan {
     fn send(&mut self, frame: &Frame) -> Result<(), CanError> {
-        if let Some(frames) = self.unconfirmed.as_ref().and_then(Unconfirmed::too_many) {
+        if let Some((frames, syncs)) = self.unconfirmed.as_ref().and_then(Unconfirmed::too_many) {
             // A full socket drops echoes as it drops other frames.
             let dropped = self.dropped()?;
             if dropped == std::mem::replace(&mut self.dropped_before, dropped) {
-                return Err(CanError::NotConfirmed { interface: self.interface.clone(), frames });
+                let interface = self.interface.clone();
+                return Err(CanError::NotConfirmed { interface, frames, syncs });
             }
             self.give_up_unconfirmed();
         }

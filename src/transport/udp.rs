@@ -19,8 +19,8 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 /// More than the length of any message, which is some 190 bytes.
 const DATAGRAM_MAX: usize = 2048;
-/// Maximum number of ignored datagrams in a call with no timeout, so that a flood of them does not
-/// block the caller.
+/// A call whose time is over returns after this many ignored datagrams, so that a flood of them does not block
+/// the caller.
 const PASSED_OVER_MAX: usize = 1024;
 
 /// An endpoint of the bus. The bus is a multicast group.
@@ -75,7 +75,7 @@ impl UdpBus {
     fn send_event(&self, event: &BusEvent) -> io::Result<()> {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let datagram = message::encode(now.as_secs_f64(), event).map_err(io::Error::other)?;
-        self.sender.send_to(&datagram, self.group).map(|_| ())
+        self.sender.send_to(&datagram, self.group).map(drop)
     }
 
     /// The event in the next datagram that has arrived. `None` for a datagram to ignore: not of this
@@ -96,7 +96,7 @@ impl UdpBus {
         if from.is_some_and(|from| from.port() == self.sender_port) {
             return Ok(None);
         }
-        let event = message::decode(datagram.get(..len).unwrap_or(&datagram));
+        let event = message::decode(&datagram[..len]);
         if event.is_none() {
             tracing::debug!("{}: {len} bytes that are no classic CAN frame", self.name);
         }

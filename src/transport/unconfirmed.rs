@@ -35,10 +35,10 @@ impl Unconfirmed {
         }
     }
 
-    /// How many frames wait, if no more may be sent.
-    pub fn too_many(&self) -> Option<usize> {
+    /// How many frames wait, and of how many SYNCs, if no more may be sent.
+    pub fn too_many(&self) -> Option<(usize, usize)> {
         let syncs = self.frames.iter().filter(|frame| is_sync(frame)).count();
-        (syncs >= self.syncs_max).then_some(self.frames.len())
+        (syncs >= self.syncs_max).then_some((self.frames.len(), syncs))
     }
 
     /// Adds a frame that the kernel took.
@@ -101,9 +101,9 @@ mod tests {
             unconfirmed.sent(set_point(cycle));
             unconfirmed.sent(sync());
         }
-        assert_eq!(unconfirmed.too_many(), Some(4));
+        assert_eq!(unconfirmed.too_many(), Some((4, 2)));
         assert!(unconfirmed.take_echo(&set_point(0)));
-        assert_eq!(unconfirmed.too_many(), Some(3));
+        assert_eq!(unconfirmed.too_many(), Some((3, 2)));
         assert!(unconfirmed.take_echo(&sync()));
         assert_eq!(unconfirmed.too_many(), None, "it goes on as soon as one cycle is out");
     }

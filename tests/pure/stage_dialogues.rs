@@ -275,6 +275,54 @@ fn status_of_drives_that_are_moving_disturbs_nothing() {
     assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
 }
 
+/// A drive that lacks an object answers; one that answers nothing any more has no status.
+#[test]
+fn the_status_of_a_drive_that_falls_silent_is_an_error() {
+    struct Heard(StatusReader, usize);
+    impl Dialogue for Heard {
+        fn handle_frame(&mut self, now: Time, frame: &Frame) {
+            if frame.cob_id() == Some(0x581) {
+                self.1 += 1;
+            }
+            if self.1 <= 1 {
+                self.0.handle_frame(now, frame);
+            }
+        }
+        fn handle_timeout(&mut self, now: Time) {
+            self.0.handle_timeout(now);
+        }
+        fn poll_transmit(&mut self) -> Option<Frame> {
+            self.0.poll_transmit()
+        }
+        fn deadline(&self) -> Time {
+            self.0.deadline()
+        }
+        fn is_over(&self) -> bool {
+            self.0.is_over()
+        }
+    }
+    let mut bench = Bench::moving();
+    let mut heard = Heard(StatusReader::new(&bench.config, bench.now), 0);
+    bench.talk(&mut heard);
+    let said = heard.0.status(Axis::Insertion).unwrap_err();
+    assert!(said.starts_with("insertion: node 1 0x1000:00: no SDO reply within 150 ms"), "{said}");
+}
+
+/// Power is never taken from a drive that may need it to brake.
+#[test]
+fn a_drive_with_power_is_not_reset() {
+    let mut bench = Bench::moving();
+    // Quick stop of the insertion.
+    bench.stage.handle_frame(bench.now, &Frame::new(0x601, &[0x2B, 0x40, 0x60, 0, 2, 0, 0, 0]));
+    assert_eq!(bench.states()[0], DriveState::QuickStopActive);
+    let mut reset = Reset::new(&bench.config, bench.now);
+    bench.talk(&mut reset);
+    for (axis, node) in [(Axis::Insertion, 1), (Axis::Rotation, 2)] {
+        let why = reset.result(axis).unwrap_err();
+        assert!(why.starts_with(&format!("{axis}: node {node} has power (")), "{why}");
+    }
+}
+
 /// A fault and its history are cleared, and nothing has power.
 #[test]
 fn a_reset_clears_a_fault_whose_cause_is_gone() {

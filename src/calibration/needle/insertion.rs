@@ -7,9 +7,9 @@ use nalgebra::{Matrix2, Matrix3, Rotation3, Vector2, Vector3};
 
 /// Shorter insertions are refused, mm.
 const DEPTH_MIN_MM: f64 = 20.0;
-/// Turns are compared over this much depth, mm, and only below this depth, mm: the skin does not hold
-/// the needle yet.
+/// Turns are compared over this much depth, mm.
 const SPACING_MM: f64 = 1.0;
+/// Turns above this depth, mm, do not count: so near to the skin nothing holds the needle yet.
 pub(super) const ENTRY_MM: f64 = 3.0;
 /// The tip must turn back and forth by this much, RMS, rad/mm, to show its axis.
 const TURN_MIN_RAD_PER_MM: f64 = 0.05;
@@ -54,6 +54,11 @@ pub(super) fn shaft_axis(insertions: &[Vec<PosedRow>]) -> Result<Vector3<f64>, C
         }
     }
     let count = normal[(0, 0)];
+    if count == 0.0 {
+        return Err(refused(format!(
+            "no insertion goes on for {SPACING_MM:.0} mm below {ENTRY_MM:.0} mm; is insertion_mm in mm?"
+        )));
+    }
     let variance = (normal[(1, 1)] - normal[(0, 1)].powi(2) / count) / count;
     let rms_rad_per_mm = variance.max(0.0).sqrt();
     let inverse = normal.try_inverse().filter(|_| rms_rad_per_mm >= TURN_MIN_RAD_PER_MM);

@@ -111,6 +111,12 @@ fn what_says_too_little_is_refused() {
         message(&rows),
         "needle: insertion 2 is 5.0 mm deep, at least 20 needed; leave it out"
     );
+    let mut shallow = recorded(CREEPING, 0.0);
+    shallow.iter_mut().for_each(|rows| rows.truncate(60));
+    assert_eq!(
+        message(&shallow),
+        "needle: no insertion goes on for 1 mm below 3 mm; is insertion_mm in mm?"
+    );
     let mut huge = recorded(CREEPING, 0.0);
     huge[0][5].rotation_rad = 1e300;
     assert!(

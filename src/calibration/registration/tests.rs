@@ -58,7 +58,7 @@ proptest! {
                 prop_assert!((fit.x_wt.rotation.matrix().determinant() - 1.0).abs() < 1e-12);
             }
             Err(error) => {
-                let thin = error.to_string().contains(" of a line ");
+                let thin = error.to_string().contains(" RMS off a line ");
                 prop_assert!(thin, "{error}");
             }
         }
@@ -190,7 +190,7 @@ fn what_determines_nothing_is_refused() {
     let line: Vec<_> = (0..6).map(|n| Vector3::new(20.0 * f64::from(n), 5.0, 1.0)).collect();
     assert_eq!(
         refusal(&pairs(&Pose::identity(), &line)),
-        "registration: 6 points lie within 0.00 mm of a line (at least 1.00 needed for their \
+        "registration: 6 points lie 0.00 mm RMS off a line (at least 1.00 needed for their \
          length and error): the turn about it is unknown; add points to its sides"
     );
     let mut twice = good.clone();
@@ -231,7 +231,7 @@ fn noise_does_not_pass_for_breadth() {
         pair.bench_mm += 1.5 * Noise::Uniform(1.0).draw(4, point as u64);
     }
     let error = RegistrationFit::of(&pairs, 3.0).expect_err("no turn to be known");
-    assert!(error.to_string().contains(" of a line "), "{error}");
+    assert!(error.to_string().contains(" RMS off a line "), "{error}");
 }
 
 #[test]

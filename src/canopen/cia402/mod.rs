@@ -45,7 +45,7 @@ impl DriveState {
 pub struct Statusword(pub u16);
 
 impl Statusword {
-    /// Bit 4: power is on.
+    /// Bit 4: the power stage has its supply.
     pub const VOLTAGE_ENABLED: u16 = 1 << 4;
     /// Bit 7.
     pub const WARNING: u16 = 1 << 7;

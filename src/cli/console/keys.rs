@@ -87,7 +87,8 @@ fn first_len(bytes: &[u8]) -> Option<usize> {
                 None => Some(bytes.len()),
             }
         }
-        [ESCAPE, b'O', ..] => Some(3),
+        // As above.
+        [ESCAPE, b'O', last, ..] => Some(if (0x40..=0x7e).contains(last) { 3 } else { 2 }),
         _ => Some(1),
     }
 }
@@ -104,7 +105,8 @@ fn command(key: u8, shared: &Shared, speed_mm_per_s: &mut Option<f64>) -> Option
         let set_mm_per_s = if set_mm_per_s > 0.0 { set_mm_per_s } else { speed_max };
         let from_mm_per_s = speed_mm_per_s.unwrap_or(set_mm_per_s);
         let mm_per_s = ((from_mm_per_s / speed_max * 10.0).round() + by) * 0.1 * speed_max;
-        *speed_mm_per_s = Some(mm_per_s);
+        // What the session refuses does not add up.
+        *speed_mm_per_s = Some(mm_per_s.clamp(0.1 * speed_max, speed_max));
         Some(OperatorCommand::Speed { mm_per_s })
     };
     match key {

@@ -269,6 +269,7 @@ fn a_paste_holds_and_stops_and_lets_nothing_go_on() {
     assert_eq!(asked(b"1~r"), (1, false), "the paste is over");
     // A space after half of a sequence.
     assert_eq!(asked(b"\x1b[ "), (0, true));
+    assert_eq!(asked(b"\x1bO "), (0, true));
     shared.is_over.store(true, Ordering::Relaxed);
     lock(&shared.screen).left = Some(Ok("to depth 0".to_owned()));
     asked(b"\x1b[200~wy\x1b[201~");

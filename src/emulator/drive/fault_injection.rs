@@ -21,7 +21,6 @@ impl Axis {
         begins: bool,
         device: &mut Device,
     ) {
-        let stuck = |end| begins.then_some(end);
         match fault.kind {
             FaultKind::Stall => {
                 self.stalled = begins;
@@ -36,8 +35,12 @@ impl Axis {
             FaultKind::DriveFault if begins => {
                 self.fault(now, EmcyCode(fault.code.unwrap_or_default()), device);
             }
-            FaultKind::NegativeSwitch => self.inputs.stuck = stuck(End::Negative),
-            FaultKind::PositiveSwitch => self.inputs.stuck = stuck(End::Positive),
+            FaultKind::NegativeSwitch => {
+                self.inputs.stuck[End::Negative as usize] = begins;
+            }
+            FaultKind::PositiveSwitch => {
+                self.inputs.stuck[End::Positive as usize] = begins;
+            }
             FaultKind::EmergencyStop => {
                 self.inputs.interlocked = begins;
                 self.without_torque(now, INTERLOCK, device);

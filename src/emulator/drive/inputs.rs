@@ -24,8 +24,8 @@ pub struct Switches {
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Inputs {
     pub(super) switches: Switches,
-    /// A limit switch that is stuck closed.
-    pub(super) stuck: Option<End>,
+    /// The limit switches that are stuck closed, by [`End`].
+    pub(super) stuck: [bool; 2],
     /// The safety input is open and removes the torque: bit 3 of 0x60FD.
     pub(super) interlocked: bool,
 }
@@ -37,7 +37,7 @@ impl Inputs {
             End::Negative => self.switches.negative_counts.is_some_and(|at| counts <= at),
             End::Positive => self.switches.positive_counts.is_some_and(|at| counts >= at),
         };
-        at_switch || self.stuck == Some(end)
+        at_switch || self.stuck[end as usize]
     }
 
     /// Object 0x60FD.
@@ -47,5 +47,17 @@ impl Inputs {
             | i64::from(self.is_closed(End::Positive, counts)) << 1
             | i64::from(home) << 2
             | i64::from(self.interlocked) << 3
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A wire that is broken opens both of the normally closed switches.
+    #[test]
+    fn both_limit_switches_may_be_stuck() {
+        let inputs = Inputs { stuck: [true; 2], ..Inputs::default() };
+        assert_eq!(inputs.bits(0), 0b11);
     }
 }
