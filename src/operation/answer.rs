@@ -148,6 +148,7 @@ impl Answering {
             Leg::Turning(_) => {
                 self.leg = Leg::Resting { since: None };
                 self.means.push(Mean::default());
+                self.refused = None;
                 Ok(())
             }
             Leg::Returning(_) => match self.failed.take() {

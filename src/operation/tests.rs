@@ -6,11 +6,12 @@ use crate::canopen::cia402::DriveState;
 use crate::config::Config;
 use crate::emulator::fault::{Fault, FaultKind};
 use crate::emulator::{StageOutput, VirtualStage};
-use crate::session::{Input, Machine, Outcome, Output, Session};
+use crate::session::{Input, Machine, Outcome, Output, Session, State};
 use crate::tracker::{Event, Sample, Validity};
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::f64::consts::FRAC_PI_4;
+use std::time::Duration;
 
 /// Where a tracker sees its sensor, by the base's true rotation, rad.
 type Sensor = fn(f64) -> Vector3<f64>;
@@ -418,6 +419,25 @@ fn a_sensor_that_answers_wrongly_is_named() {
         assert!(reason.starts_with("tracker: ") && reason.contains(why), "{reason}");
         assert!(reason.len() < 200, "{} characters", reason.len());
     }
+}
+
+#[test]
+fn a_refusal_at_one_rest_does_not_explain_the_silence_at_the_next() {
+    let mut bench = answer(Some(|_| Vector3::repeat(f64::NAN)));
+    while bench.operation.progress().state != State::TurningInAir {
+        bench.step();
+    }
+    let until = bench.now + Duration::from_millis(600);
+    while bench.now < until {
+        bench.step();
+    }
+    bench.sensor = Some(off_axis);
+    while bench.travel().1 < 0.1 {
+        bench.step();
+    }
+    bench.sensor = None;
+    let reason = bench.reason();
+    assert!(reason.ends_with("the stream is silent, or has another tool"), "{reason}");
 }
 
 #[test]

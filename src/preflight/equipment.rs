@@ -7,7 +7,7 @@ use crate::canopen::cia402::DriveState;
 use crate::config::{CanInterface, Config};
 use crate::math;
 use crate::session::PlaneOutOfReach;
-use crate::stage::{Axis, AxisLimits, AxisStatus, Reference};
+use crate::stage::{Axis, AxisConfig, AxisLimits, AxisStatus, Reference};
 use crate::tracker::{StampPolicy, Workspace};
 use nalgebra::Vector3;
 
@@ -49,6 +49,7 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
     let CanInterface::Socket(name) = config.bus() else {
         return vec![Check::unlimited("bus", format!("{}: not a CAN interface", config.bus()))];
     };
+    let virtual_kind = ["vcan", "vxcan"].into_iter().find(|kind| name.starts_with(kind));
     let look = format!("look at it yourself: ip -details -statistics link show {name}");
     let set = |what: &str| {
         format!("sudo ip link set {name} down; sudo ip link set {name} up type can {what}")
@@ -56,11 +57,11 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
     let BusFacts { is_up, state, may_send, bit_rate, restart_ms, errors } = match facts {
         Ok(Some(facts)) => facts,
         Ok(None) => {
-            let next = match name.starts_with("vcan") {
-                true => {
-                    format!("sudo ip link add dev {name} type vcan; sudo ip link set {name} up")
+            let next = match virtual_kind {
+                Some(kind) => {
+                    format!("sudo ip link add dev {name} type {kind}; sudo ip link set {name} up")
                 }
-                false => format!(
+                None => format!(
                     "plug the adapter in, then sudo ip link set {name} up type can {BRING_UP}"
                 ),
             };
@@ -77,7 +78,12 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
     let unknown = || "the interface does not say".to_owned();
     let state = state.map(|state| format!(", {state}")).unwrap_or_default();
     let found = format!("{name} {}{state}", if is_up { "up" } else { "down" });
-    let bus = Check::new("bus", found, UP).unless(is_up && may_send, Fail, set(BRING_UP));
+    let next = match (virtual_kind, bit_rate) {
+        (Some(_), _) => format!("sudo ip link set {name} up"),
+        (None, Some(rate)) => set(&format!("bitrate {rate} restart-ms 0")),
+        (None, None) => set(BRING_UP),
+    };
+    let bus = Check::new("bus", found, UP).unless(is_up && may_send, Fail, next);
 
     let load_of =
         |rate: u32| CYCLE_BITS * 1e3 / f64::from(config.can.bus.sync_ms) / f64::from(rate);
@@ -168,14 +174,17 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
     }
     let way = if axis == Axis::Insertion { config.insertion.depth_mm } else { 0.0 };
     if let Some(position) = status.position.filter(|_| !drive.wraps && drive.zero.is_some()) {
-        checks.push(room(axis, position, way, &drive.limits));
+        checks.push(room(axis, position, way, drive));
     }
     checks
 }
 
 /// The travel left for an axis at `position`, in mm or rad.
-fn room(axis: Axis, position: f64, way: f64, limits: &AxisLimits) -> Check {
-    let AxisLimits { min, max, .. } = *limits;
+fn room(axis: Axis, position: f64, way: f64, drive: &AxisConfig) -> Check {
+    let AxisLimits { min, max, .. } = drive.limits;
+    // As the run compares them: on the grid of counts.
+    let scale = drive.scale(axis, 0);
+    let on_grid = |value| scale.counts(value).map_or(value, |counts| scale.value(counts));
     let goal = position + way;
     let found = match way == 0.0 {
         true => format!("at {}", axis.shown(position)),
@@ -184,7 +193,8 @@ fn room(axis: Axis, position: f64, way: f64, limits: &AxisLimits) -> Check {
     let limit = format!("{} to {}", axis.shown(min), axis.shown(max));
     let next = "withdraw, insert less deep, or set the limits of this axis";
     let check = Check::new(format!("{axis} room"), found, limit);
-    check.unless(position >= min && goal <= max, Fail, next)
+    let is_inside = on_grid(position) >= on_grid(min) && on_grid(goal) <= on_grid(max);
+    check.unless(is_inside, Fail, next)
 }
 
 /// The tracker, from a report about the tool at rest.

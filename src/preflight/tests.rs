@@ -90,6 +90,9 @@ fn a_drive_is_refused_for_what_a_run_would_stumble_over() {
     // 50 mm from there are over the limit of 60 mm.
     assert_eq!(of(AxisStatus { position: Some(10.01), ..status() }), "PPPF");
     assert_eq!(of(AxisStatus { position: Some(-1.01), ..status() }), "PPPF");
+    // Jogged to 10 mm: to the next count beyond.
+    let to_a_count = 46_457.0 * 127.0 / 590_000.0;
+    assert_eq!(of(AxisStatus { position: Some(to_a_count), ..status() }), "PPPP");
     let known = vec![EmcyCode::HEARTBEAT];
     assert_eq!(of(AxisStatus { error_history: known, ..status() }), "PWPP");
     assert_eq!(of(AxisStatus { statusword: Statusword(0x8208), ..status() }), "FPPP");

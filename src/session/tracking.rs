@@ -23,6 +23,8 @@ const PENDING_MAX: usize = 256;
 const UNPAIRED_MAX: Duration = Duration::from_millis(100);
 /// Why a position that still waits at the end is refused.
 const NEVER_PAIRED: &str = "the stage gave no position at its acquisition before the run ended";
+/// Why the oldest of too many positions that wait is refused.
+const TOO_MANY_WAIT: &str = "too many positions wait for the stage's position at their acquisition";
 
 /// The stream of the tracker.
 ///
@@ -150,7 +152,7 @@ impl Tracking {
         }
         self.waiting.push_back(Waiting { record, is_target: false, position });
         if self.waiting.len() > PENDING_MAX {
-            self.refuse_oldest(now, 1);
+            self.refuse_oldest(now, 1, TOO_MANY_WAIT);
         }
         self.release();
     }
@@ -283,6 +285,8 @@ impl Tracking {
                 let refused = self.track.refused_in_a_row();
                 (Severity::Warning, format!("lost, {refused} refused in a row; the last: {last}"))
             }
+            // Before an insertion it is looked for anew, without a model.
+            (TrackState::Lost, TrackState::Waiting) => return,
             (TrackState::Lost, _) => {
                 (Severity::Info, "found again: it agrees with the model".to_owned())
             }
@@ -292,11 +296,11 @@ impl Tracking {
     }
 
     /// Decides that the `count` oldest samples are never judged, where they still wait.
-    fn refuse_oldest(&mut self, now: Time, count: usize) {
+    fn refuse_oldest(&mut self, now: Time, count: usize, why: &str) {
         let mut waiting = std::mem::take(&mut self.waiting);
         for sample in waiting.iter_mut().take(count) {
             if sample.position.take().is_some() {
-                let refusal = Refusal::new(GateName::Pairing, NEVER_PAIRED);
+                let refusal = Refusal::new(GateName::Pairing, why);
                 self.decide(now, &mut sample.record, Some(refusal));
             }
         }
@@ -317,13 +321,13 @@ impl Tracking {
         let oldest = now - self.unpaired_max;
         let is_late = |sample: &&Waiting| sample.record.received.receive_time < oldest;
         let late = self.waiting.iter().take_while(is_late).count();
-        self.refuse_oldest(now, late);
+        self.refuse_oldest(now, late, NEVER_PAIRED);
         self.release();
     }
 
     /// Nothing is judged any more: what still waits is recorded as it is.
     pub(crate) fn close(&mut self, now: Time) {
-        self.refuse_oldest(now, usize::MAX);
+        self.refuse_oldest(now, usize::MAX, NEVER_PAIRED);
         self.release();
     }
 
@@ -394,4 +398,49 @@ fn fix(
 ) -> Fix {
     let (receive_time, position_mm) = (record.received.receive_time, tip_meas.mm());
     Fix { receive_time, acquisition_time, position_mm, insertion_mm }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use crate::tracker::Validity;
+    use nalgebra::Vector3;
+
+    /// The records after `count` samples, of which those numbered `lost` are out of view.
+    fn records(count: i64, lost: std::ops::Range<i64>, is_inserting: bool) -> Vec<Record> {
+        let config = Config::from_sources(&[], &[]).unwrap().session().unwrap();
+        let mut tracking = Tracking::new(&config);
+        for n in 0..count {
+            let now = Time::from_nanos(n * 2_000_000);
+            let validity = if lost.contains(&n) { Validity::OutOfView } else { Validity::Valid };
+            let sample = Sample {
+                tool: "NeedleToTracker".to_owned(),
+                receive_time: now,
+                source_unix_ns: None,
+                position_mm: Vector3::new(1.0, 0.01 * n as f64, 0.0),
+                orientation: None,
+                validity,
+            };
+            tracking.take(now, sample, is_inserting);
+        }
+        tracking.records.into()
+    }
+
+    #[test]
+    fn a_tip_that_is_lost_before_the_insertion_is_not_found_by_a_model() {
+        let records = records(9, 3..8, false);
+        let says = |part: &str| {
+            let said = |record: &Record| matches!(record, Record::Event { text, .. } if text.contains(part));
+            records.iter().any(said)
+        };
+        assert!(says("lost, 5 refused") && !says("found"), "{records:?}");
+    }
+
+    #[test]
+    fn the_oldest_of_too_many_waiting_positions_is_refused_as_that() {
+        let records = records(257, 0..0, true);
+        let [Record::Sample(sample), ..] = &records[..] else { panic!("{records:?}") };
+        assert_eq!(sample.refused.as_ref().map(|refusal| &*refusal.why), Some(TOO_MANY_WAIT));
+    }
 }

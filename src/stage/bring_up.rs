@@ -52,7 +52,7 @@ pub struct FoundFault {
 /// Bytes of an expedited answer that does not give its size.
 const UNSIZED: usize = 4;
 /// Interval between two readings of an object that the drive changes by itself.
-const POLL_PERIOD: Duration = Duration::from_millis(10);
+pub(super) const POLL_PERIOD: Duration = Duration::from_millis(10);
 
 /// Brings up one drive.
 #[derive(Debug)]

@@ -1,7 +1,8 @@
 //! The steps of bring-up, in order: what is read from a drive, and what is written to it.
 
-use super::bring_up::{FoundFault, Identity, Object, Script, optional};
+use super::bring_up::{FoundFault, Identity, Object, POLL_PERIOD, Script, optional};
 use super::config::unsigned_counts;
+use super::drive::may_have_power;
 use super::{AxisConfig, HomingConfig, Reference, Sign, StageEvent};
 use crate::canopen::cia402::{Controlword, Mode, Statusword, object as drive};
 use crate::canopen::emcy::EmcyCode;
@@ -118,7 +119,7 @@ impl Script {
     async fn disarm(&self) -> Result<(), String> {
         self.begin("taking power off, looking for faults");
         self.command(drive::CONTROLWORD, Controlword::DISABLE_VOLTAGE.0.into()).await?;
-        let statusword = self.read_statusword().await?;
+        let statusword = self.wait_for_power_off().await?;
         self.note(|so_far| so_far.disarmed = true);
         if !statusword.is_fault() {
             return Ok(());
@@ -138,6 +139,24 @@ impl Script {
             "drive found in fault (statusword {statusword}, 0x603F {error_code}, 0x1003:01 {history}); \
              clear its cause, then: needle-bench stage reset"
         ))
+    }
+
+    /// Reads the statusword until the motor has no power: a brake may take its time.
+    async fn wait_for_power_off(&self) -> Result<Statusword, String> {
+        let give_up = self.sdo.now() + self.config.power.enable_timeout;
+        loop {
+            let statusword = self.read_statusword().await?;
+            if !may_have_power(statusword.state()) {
+                return Ok(statusword);
+            }
+            if self.sdo.now() >= give_up {
+                return Err(format!(
+                    "the drive keeps its power (statusword {statusword}), does an input or another tool \
+                     hold it? Press the emergency stop"
+                ));
+            }
+            self.sdo.pause(POLL_PERIOD).await;
+        }
     }
 
     async fn read_statusword(&self) -> Result<Statusword, String> {

@@ -166,7 +166,13 @@ impl Stage {
         if must_follow && let Some(count) = self.drives[axis].begins_to_warn() {
             self.tell(StageEvent::Warns { axis, statusword, count });
         }
-        if faulty && !((standby || enabling) && self.drives[axis].may_be_in_fault()) {
+        if standby && state == Some(DriveState::OperationEnabled) {
+            let fault = format!(
+                "{axis}: the drive has power before the bench gave it any (statusword {statusword}), does \
+                 an input or another tool enable it?"
+            );
+            self.fail(now, fault);
+        } else if faulty && !((standby || enabling) && self.drives[axis].may_be_in_fault()) {
             self.fail(now, format!("{axis}: drive in fault (statusword {statusword})"));
         } else if fell_back {
             self.fail_switch_on(now, axis, statusword);

@@ -168,8 +168,8 @@ impl Track {
     /// `Repeat` from an imaging tracker; `Step` away from the position before, which this one then
     /// takes the place of.
     pub fn seek(&mut self, fix: Fix) -> Result<(), Refusal> {
-        self.is_lost = false;
         self.check_repeat(&fix)?;
+        self.is_lost = false;
         let step = self.check_step(&fix);
         self.agreeing = if step.is_ok() { self.agreeing + 1 } else { 1 };
         self.is_found = self.agreeing >= self.settings.found_after;
@@ -281,8 +281,9 @@ impl Track {
             }
         };
         value.times = value.times.saturating_add(1);
-        let came_at_mm = *value.insertion_mm.get_or_insert(fix.insertion_mm.unwrap_or(0.0));
-        let moved_mm = fix.insertion_mm.map_or(0.0, |mm| mm - came_at_mm);
+        // Before an insertion the needle stands, wherever the stage is.
+        let moved_mm =
+            fix.insertion_mm.map_or(0.0, |mm| mm - *value.insertion_mm.get_or_insert(mm));
         let is_measured_anew =
             self.settings.kind == TrackerKind::Electromagnetic && moved_mm.abs() <= STANDSTILL_MM;
         if is_measured_anew { Ok(()) } else { Err(Refusal::repeat(value.times)) }

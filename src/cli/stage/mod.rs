@@ -210,7 +210,8 @@ impl Motion {
         };
         let moved = done.iter().find_map(|done| Some((done.from?, done.to)));
         let (from_mm, to_mm) = moved.unwrap_or_default();
-        let left_mm = by_mm - (from_mm - to_mm);
+        // Down to a tenth: rounded up, the rest might pass the limit.
+        let left_mm = (10.0 * (by_mm - (from_mm - to_mm)) + 1e-6).floor() / 10.0;
         let is_allowed = moved.is_none() || from_mm - by_mm >= min_mm;
         (left_mm >= 0.05 && is_allowed).then(|| format!(" --by {left_mm:.1}mm"))
     }
@@ -410,6 +411,8 @@ fn with_speed(jog: Move, speed: Option<Distance>, stage: &StageConfig) -> Result
         return Ok(Move { speed, ..jog });
     }
     let (max, unit) = jog.axis.in_unit(max);
+    // As it was configured, not as radians make it.
+    let max = (max * 1e9).round() / 1e9;
     Err(Failure::configuration(format_args!(
         "--speed is {asked}/s, allowed: over 0, up to {max}{unit}/s"
     )))
@@ -458,6 +461,18 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_highest_speed_is_told_as_configured() {
+        let config = Config::from_sources(&[], &[]).unwrap();
+        let mut stage = config.stage.to_stage(&config.can).unwrap();
+        stage.rotation.limits.speed_max = 3_f64.to_radians();
+        let jog = jog_move(&config, Axis::Rotation, Goal::By(1.0));
+        let speed = |text| with_speed(jog, Some(Distance::parse_speed(text).unwrap()), &stage);
+        let Err(Failure { message, .. }) = speed("5deg/s") else { panic!("it is refused") };
+        assert!(message.ends_with("up to 3deg/s"), "{message}");
+        assert!(speed("3deg/s").is_ok());
+    }
+
+    #[test]
     fn the_rest_of_a_withdrawal_is_what_was_asked_for_and_not_done() {
         let rest = |line: &str, to: f64| {
             let done = Done { axis: Axis::Insertion, from: Some(30.0), to };
@@ -465,6 +480,7 @@ mod tests {
         };
         assert_eq!(rest("withdraw --by 20mm", 24.5).as_deref(), Some(" --by 14.5mm"));
         assert_eq!(rest("withdraw --by 20mm", 10.01), None);
+        assert_eq!(rest("withdraw --by 31mm", 24.46).as_deref(), Some(" --by 25.4mm"));
         assert_eq!(rest("withdraw", 24.5).as_deref(), Some(""), "to depth 0");
         assert_eq!(rest("withdraw --by 32mm", 30.0), None, "was refused");
         assert_eq!(rest("jog --axis insertion --by=-20mm", 24.5), None);

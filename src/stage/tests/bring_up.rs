@@ -280,6 +280,28 @@ fn a_drive_that_is_not_let_on_ends_it_at_once() {
 }
 
 #[test]
+fn a_drive_that_keeps_its_power_is_not_configured() {
+    let mut bench = Bench::new(config());
+    bench.insertion.state = DriveState::OperationEnabled;
+    (bench.insertion.ignores_sdo, bench.insertion.ignores_rpdo) = (true, true);
+    let said = bench.until_fault().to_string();
+    assert!(said.contains("the drive keeps its power (statusword 0x0237"), "{said}");
+    assert!(!bench.insertion.configured_under_power);
+}
+
+/// Nothing but the bench may give it power.
+#[test]
+fn a_drive_enabled_by_something_else_while_power_is_awaited_is_a_fault() {
+    let mut bench = Bench::new(config());
+    bench.stage.permit_power(false);
+    bench.run_until(|event| matches!(event, StageEvent::Located(_)));
+    bench.insertion.state = DriveState::OperationEnabled;
+    (bench.insertion.ignores_rpdo, bench.insertion.ignores_sdo) = (true, true);
+    let said = bench.until_fault().to_string();
+    assert!(said.starts_with("insertion: the drive has power before the bench gave it"), "{said}");
+}
+
+#[test]
 fn a_drive_left_enabled_loses_power_before_it_is_configured() {
     let mut bench = Bench::new(config());
     bench.insertion.state = DriveState::OperationEnabled;

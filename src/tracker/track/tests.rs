@@ -56,6 +56,29 @@ fn judge(track: &mut Track, n: i32, x_mm: f64) -> Result<(), Refusal> {
     track.judge(fix, Some(&model(&fix)))
 }
 
+#[test]
+fn a_repeated_frame_finds_no_lost_track() {
+    let mut track = Track::new(TrackSettings { kind: TrackerKind::Imaging, ..settings() });
+    for n in 0..3 {
+        assert_eq!(track.seek(standing(n, 0.1 * f64::from(n))), Ok(()));
+    }
+    let missing = Refusal::new(GateName::Status, "tool missing");
+    (0..5).for_each(|_| track.refuse(&missing));
+    assert!(!track.is_held());
+    assert_eq!(gate(track.seek(standing(3, 0.1 * 2.0))), Some(GateName::Repeat));
+    assert!(!track.is_held());
+}
+
+#[test]
+fn a_value_that_came_again_before_the_insertion_is_measured_at_any_depth() {
+    let mut track = Track::new(settings());
+    (0..4).for_each(|n| assert_eq!(track.seek(standing(n, 0.0)), Ok(())));
+    let begun = Fix { insertion_mm: Some(50.0), ..standing(4, 0.0) };
+    assert_eq!(track.judge(begun, None), Ok(()));
+    let moved = Fix { insertion_mm: Some(50.5), ..standing(5, 0.0) };
+    assert_eq!(gate(track.judge(moved, None)), Some(GateName::Repeat));
+}
+
 /// A track that was found at standstill and has followed to position 9.
 fn followed(settings: TrackSettings) -> Track {
     let mut track = Track::new(settings);

@@ -30,6 +30,18 @@ fn ask(bench: &mut Bench, command: OperatorCommand) -> String {
     answer.expect("every command is answered").to_owned()
 }
 
+#[test]
+fn the_last_of_many_steps_is_not_refused_for_its_rounding() {
+    let mut bench = bench(&["insertion.depth_mm=3"]);
+    ask(&mut bench, Hold);
+    bench.run_for(3 * SECOND);
+    for n in 0..15 {
+        let answer = ask(&mut bench, Step { mm: 0.2 });
+        assert!(!answer.contains("refused"), "{n}: {answer}");
+        bench.run_for(2 * SECOND);
+    }
+}
+
 fn state(bench: &Bench) -> State {
     bench.session.progress().state
 }
