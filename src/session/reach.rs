@@ -68,7 +68,7 @@ pub(super) fn check_reach(config: &SessionConfig, tip_mm: &Vector3<f64>) -> Resu
     ))
 }
 
-/// `parts + 1` values from `middle - reach` to `middle + reach`, and the one in that range nearest to zero.
+/// Gives `parts + 1` values from `middle - reach` to `middle + reach`, and the one in that range nearest to zero.
 fn spread(middle: f64, reach: f64, parts: u32) -> impl Iterator<Item = f64> {
     let nearest = middle - middle.clamp(-reach, reach);
     let part = move |part| middle + reach * (2.0 * f64::from(part) / f64::from(parts) - 1.0);

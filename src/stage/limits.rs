@@ -95,8 +95,8 @@ impl LimitCheck {
 
     /// The counts of `target` (mm or rad) if the axis may be sent there from `last`.
     ///
-    /// Rounding to whole counts changes a step by up to 1 count, and the difference of two steps by up to 2:
-    /// so much is allowed.
+    /// Rounding to whole counts changes a step by up to 1 count, and the difference of two steps by up to 2.
+    /// The check allows that.
     ///
     /// # Errors
     /// The first limit that `target` breaks.

@@ -87,7 +87,7 @@ fn first_len(bytes: &[u8]) -> Option<usize> {
                 None => Some(bytes.len()),
             }
         }
-        // As above.
+        // A space or Ctrl-C after these two is a key of its own.
         [ESCAPE, b'O', last, ..] => Some(if (0x40..=0x7e).contains(last) { 3 } else { 2 }),
         _ => Some(1),
     }
