@@ -38,7 +38,7 @@ fn check_distances(
     match distances_mm.find(|(mm, _)| mm.is_nan() || *mm > DISTANCE_MAX_MM) {
         None => Ok(()),
         Some((mm, number)) => Err(CalibrationError(format!(
-            "{what} {number} is {mm} mm from the {frame}'s origin (limit {DISTANCE_MAX_MM:.0}); give \
+            "{what} {number} is {mm:?} mm from the {frame}'s origin (limit {DISTANCE_MAX_MM:.0}); give \
              positions in mm"
         ))),
     }

@@ -168,11 +168,9 @@ impl RegistrationFit {
     pub fn remarks(&self) -> Vec<String> {
         let is_flat = self.spread_mm[2]
             < (BREADTH_PER_LENGTH_MIN * self.spread_mm[0]).max(self.localisation_error_mm());
-        let flat = || {
-            "the points lie in a plane, and so cannot show a mirrored axis of the tracker: touch one off it"
-                .to_owned()
-        };
-        is_flat.then(flat).into_iter().chain(self.scale.map(scaled)).collect()
+        let flat = "the points lie in a plane, and so cannot show a mirrored axis of the tracker: touch one \
+                    off it";
+        is_flat.then(|| flat.to_owned()).into_iter().chain(self.scale.map(scaled)).collect()
     }
 
     /// The RMS error of locating one fiducial (FLE), mm, from the remaining distances:

@@ -5,8 +5,8 @@ use super::{CalibrationError, check_distances, mean, principal};
 use crate::geometry::{FixedAngles, Pose};
 use crate::math;
 use crate::table::{Table, TableError};
-use nalgebra::{Complex, Matrix2, Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
-use std::f64::consts::{FRAC_PI_2, PI, TAU};
+use nalgebra::{Matrix2, Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
+use std::f64::consts::{PI, TAU};
 
 const POSITION: [&str; 4] = ["rotation_rad", "x_mm", "y_mm", "z_mm"];
 
@@ -105,15 +105,6 @@ impl TipFit {
         let rotations = samples.iter().map(|sample| sample.rotation_meas_rad);
         let turn_rad = rotations.clone().fold(f64::NEG_INFINITY, f64::max)
             - rotations.fold(f64::INFINITY, f64::min);
-        let short = |arc_rad: f64| {
-            refused(format!(
-                "the positions cover {:.0} deg of a circle and the base turned {:.0} deg (at least \
-                 {:.0} needed); turn the base a whole turn",
-                arc_rad.to_degrees(),
-                turn_rad.to_degrees(),
-                ARC_MIN_RAD.to_degrees()
-            ))
-        };
         let Some(mut circle) = Circle::fit(&positions_mm) else {
             return refused(format!(
                 "the {points} positions are all the same, or on one line: is the tracker's value frozen, did the \
@@ -130,8 +121,14 @@ impl TipFit {
         }
         let angles = circle.angles(&positions_mm);
         let arc_rad = arc_of(&angles);
-        if arc_rad < ARC_MIN_RAD || turn_rad < ARC_MIN_RAD || turn_rad.is_nan() {
-            return short(arc_rad);
+        if arc_rad < ARC_MIN_RAD || turn_rad < ARC_MIN_RAD {
+            return refused(format!(
+                "the positions cover {:.0} deg of a circle and the base turned {:.0} deg (at least \
+                 {:.0} needed); turn the base a whole turn",
+                arc_rad.to_degrees(),
+                turn_rad.to_degrees(),
+                ARC_MIN_RAD.to_degrees()
+            ));
         }
         if radius_mm < RADIUS_PER_RMS_MIN * rms_mm {
             return refused(format!(
@@ -143,10 +140,10 @@ impl TipFit {
         // The angle increases with the base if the normal is right-handed, and decreases if it is
         // left-handed.
         let agreement = |sign: f64| {
-            let differences = angles.iter().zip(samples);
-            let sum: Complex<f64> = differences
-                .map(|(angle, sample)| Complex::cis(angle - sign * sample.rotation_meas_rad))
-                .sum();
+            let differences =
+                angles.iter().zip(samples).map(|(a, sample)| a - sign * sample.rotation_meas_rad);
+            let sum: Vector2<f64> =
+                differences.map(|d| Vector2::new(math::cos(d), math::sin(d))).sum();
             sum.norm() / points as f64
         };
         let (along, against) = (agreement(1.0), agreement(-1.0));
@@ -154,7 +151,7 @@ impl TipFit {
             circle.normal = -circle.normal;
         }
         let coherence = along.max(against);
-        if coherence < COHERENCE_MIN {
+        if coherence < COHERENCE_MIN || coherence.is_nan() {
             return refused(format!(
                 "the sensor does not follow the base: their angles agree to {coherence:.2} (at least \
                  {COHERENCE_MIN:.2}, 1 being exactly); is rotation_rad in rad, and is the needle in air?"
@@ -162,13 +159,13 @@ impl TipFit {
         }
         let (centre_sd_mm, axis_sd_rad) = circle.errors(&angles);
         let mount = SensorMount::of(samples, &circle);
-        if let Some(tilt_rad) = mount.as_ref().map(|mount| mount.axis.angle(&Vector3::z()))
-            && tilt_rad > FRAC_PI_2
+        if let Some(SensorMount { axis, .. }) = mount
+            && axis.z < 0.0
         {
             return refused(format!(
                 "the needle's axis is {:.0} deg from the sensor's own z axis (limit 90): is \
                  stage.rotation.sign right, or is the sensor mounted backwards?",
-                tilt_rad.to_degrees()
+                axis.angle(&Vector3::z()).to_degrees()
             ));
         }
         Ok(TipFit {

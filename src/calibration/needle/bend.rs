@@ -148,13 +148,14 @@ impl BendFit {
         r_sa: &Rotation3<f64>,
         noise: &PathNoise,
     ) -> Result<Self, CalibrationError> {
-        let (mut bend, mut told) = (Vector4::zeros(), Vec::new());
+        let (mut bend, mut information) = (Vector4::zeros(), Vec::new());
         let (mut weight, mut weighted) = (Matrix4::zeros(), Vector4::zeros());
         for _ in 0..PASSES {
             let follow = |insertion| follow(insertion, &bend, noise);
-            told = insertions.iter().map(follow).collect::<Option<Vec<_>>>().ok_or_else(no_bend)?;
-            weight = told.iter().map(|t| t.weight).sum();
-            weighted = told.iter().map(|t| t.weighted).sum();
+            information =
+                insertions.iter().map(follow).collect::<Option<Vec<_>>>().ok_or_else(no_bend)?;
+            weight = information.iter().map(|one| one.weight).sum();
+            weighted = information.iter().map(|one| one.weighted).sum();
             bend = weight.try_inverse().ok_or_else(no_bend)? * weighted;
         }
         let mut p = Vector3::new(bend[0], bend[1], 0.0);
@@ -165,8 +166,10 @@ impl BendFit {
             p += hessian.try_inverse().ok_or_else(no_bend)? * gradient;
         }
         let (model, by) = bicycle(&p);
-        let gradients: Vec<Vector3<f64>> =
-            told.iter().map(|t| by.transpose() * (t.weighted - t.weight * model)).collect();
+        let gradients: Vec<Vector3<f64>> = information
+            .iter()
+            .map(|one| by.transpose() * (one.weighted - one.weight * model))
+            .collect();
         let covariance =
             covariance(&(by.transpose() * weight * by), &gradients).ok_or_else(no_bend)?;
         let curvature_per_mm = math::hypot(p.x, p.y);

@@ -200,7 +200,9 @@ fn what_determines_nothing_is_refused() {
         "registration: points 2 and 4 have the same tracker position; remove the copy, or give the \
          mean of repeated measurements as one pair"
     );
-    for (x_mm, said) in [(f64::NAN, "NaN"), (f64::INFINITY, "inf"), (5000.1, "5000.1")] {
+    for (x_mm, said) in
+        [(f64::NAN, "NaN"), (f64::INFINITY, "inf"), (5000.1, "5000.1"), (1e100, "1e100")]
+    {
         let mut far = good.clone();
         far[2].bench_mm = Vector3::new(x_mm, 0.0, 0.0);
         assert_eq!(

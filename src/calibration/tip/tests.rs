@@ -207,6 +207,11 @@ fn what_determines_nothing_is_refused() {
     let said = refusal(&in_degrees);
     assert!(said.contains("is rotation_rad in rad"), "{said}");
 
+    let mut unknown = whole();
+    unknown[50].rotation_meas_rad = f64::NAN;
+    let said = refusal(&unknown);
+    assert!(said.contains("their angles agree to NaN"), "{said}");
+
     let mut far = whole();
     far[4].position_meas_mm.x = f64::NAN;
     assert!(refusal(&far).starts_with("tip: position 5 is NaN mm"), "{}", refusal(&far));

@@ -19,9 +19,9 @@ const DRIFT_MAX_MM: f64 = 0.5;
 /// Standard errors of the drift that noise may explain.
 const DRIFT_ERRORS: f64 = 6.0;
 /// Correlation times are looked for up to this part of the recording: over more, noise cannot be told
-/// from a motion…
+/// from a motion.
 const TIME_PART_MAX: f64 = 0.05;
-/// … and over less it is refused, if it is this large in space, mm RMS.
+/// A correlation time over this part of it is refused if the positions wander by more than this, mm RMS.
 const TIME_PART_REFUSED: f64 = 0.035;
 const WANDER_MAX_MM: f64 = 0.2;
 /// Robust standard deviations from the median over which a position is an outlier.
@@ -128,6 +128,8 @@ impl TrackerFit {
         }
         let mut gaps_s: Vec<f64> = points.windows(2).map(|pair| pair[1].0 - pair[0].0).collect();
         let rate_hz = rate(&gaps_s);
+        // Positions that are received together have no interval between them.
+        gaps_s.retain(|gap_s| *gap_s > 0.0);
         let interval_s = median(&mut gaps_s);
         let dropouts = gaps_s.iter().filter(|gap| **gap > DROPOUT_INTERVALS * interval_s);
         let dropouts = dropouts.map(|gap| (gap / interval_s).round() as usize - 1).sum();

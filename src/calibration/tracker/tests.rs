@@ -135,6 +135,20 @@ fn the_stream_is_counted() {
     assert!((fit.rate_hz.value - 40.0).abs() < 0.6, "by receipt");
 }
 
+/// Four positions at a time, without stamps: most have the time of the one before.
+#[test]
+fn positions_that_are_received_in_bursts_are_no_dropouts() {
+    let mut samples = rest(NEAR, 7, 1200, still);
+    for (k, sample) in (0i64..).zip(&mut samples) {
+        let burst_time = Time::from_nanos(k / 4 * 100_000_000);
+        (sample.receive_time, sample.source_unix_ns) = (burst_time, None);
+    }
+    let fit = TrackerFit::of(&samples).unwrap();
+    assert_eq!((fit.positions, fit.dropouts), (1200, 0));
+    assert!((fit.rate_hz.value - 40.0).abs() < 0.2, "{:?}", fit.rate_hz);
+    assert!((fit.together.sd_mm.value - 0.026).abs() < 0.001, "{fit:?}");
+}
+
 #[test]
 fn a_recording_that_moves_is_refused_with_number_and_limit() {
     type Moved<'a> = &'a dyn Fn(f64) -> Vector3<f64>;
