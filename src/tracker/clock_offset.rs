@@ -8,30 +8,29 @@ use std::time::Duration;
 const WINDOW: Duration = Duration::from_secs(30);
 /// A stamp that leads the quickest delivery so far by more than this is not a quicker delivery.
 const AHEAD_MAX_NS: i64 = 50_000_000;
-/// An offset is learnt from at least this many samples …
+/// An offset is learnt from at least this many samples, over at least this time.
 const SETTLING_SAMPLES: u32 = 3;
-/// … over at least this time …
 const SETTLING_TIME: Duration = Duration::from_millis(200);
-/// … none of them delivered quicker than the first by more than this: while a queue empties, each
-/// delivery is quicker than the one before …
+/// None of them was delivered quicker than the first by more than this: while a queue empties, each
+/// delivery is quicker than the one before.
 const SETTLING_FALL_NS: i64 = 20_000_000;
-/// … nor slower than the first by more than this.
+/// None was delivered slower than the first by more than this.
 const SETTLING_RISE_NS: i64 = 1_000_000_000;
 
-/// If a stamp trails the quickest delivery by more than this, it is late, or the sender's clock was
-/// set back …
+/// A stamp that trails the quickest delivery by more than this is late, or the sender's clock was set
+/// back.
 const BEHIND_MIN_NS: i64 = 10_000_000;
-/// … and by more than this, it is not dated by the old offset while a new one is learnt.
+/// One that trails it by more than this is far late, and is not dated by the old offset while a new one
+/// is learnt.
 const DATED_BEHIND_MAX_NS: i64 = 40_000_000;
-/// A clock that goes back by this much or more is another clock, not a corrected one …
+/// A clock that goes back by this much or more is another clock, not a corrected one. Its offset is
+/// learnt over a longer time.
 const ANOTHER_CLOCK_NS: i64 = 500_000_000;
-/// … and its offset is learnt over this time instead.
 const ANOTHER_CLOCK_TIME: Duration = Duration::from_secs(1);
-/// If all stamps are as late as that for this time, the operator is told …
+/// The operator is told when all stamps are far late for this time …
 const FAR_LATE_TIME: Duration = Duration::from_secs(1);
-/// … or if all are late for this time …
+/// … or late for this time, and at least this many of them.
 const LATE_TIME: Duration = Duration::from_secs(5);
-/// … and at least this many.
 const LATE_SAMPLES: u32 = 10;
 
 /// Tracks the minimum of `receive − source` over the last 30 to 60 s. The quickest delivery shows the offset
@@ -51,17 +50,23 @@ const LATE_SAMPLES: u32 = 10;
 ///   operator is told.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ClockOffset {
-    known: Option<Minimum>,
+    known: Option<Known>,
     candidate: Settling,
-    /// The last stamp that was dated.
-    last_source_ns: Option<i64>,
-    /// `receive − source` of the last one that was dated before a stamp went back.
-    before_ns: Option<i64>,
     /// A stamp went back, and none since has matched the old offset.
     went_back: bool,
     /// Stamps that are all far late, and that are all late.
     late: [Option<Late>; 2],
     news: Option<String>,
+}
+
+/// An offset that was learnt.
+#[derive(Debug, Clone)]
+struct Known {
+    offset: Minimum,
+    /// The last stamp that was dated.
+    last_source_ns: i64,
+    /// `receive − source` of the last one that was dated before a stamp went back.
+    before_ns: Option<i64>,
 }
 
 /// A run of stamps that are all late.
@@ -79,84 +84,70 @@ impl ClockOffset {
     /// # Errors
     /// [`Refusal`]; the stamp must not be used.
     pub(super) fn update(&mut self, receive: Time, source_ns: i64) -> Result<i64, Refusal> {
-        let back_ns = self.last_source_ns.map(|last_ns| last_ns.saturating_sub(source_ns));
-        if back_ns == Some(0) {
+        let offset_ns = receive.as_nanos().saturating_sub(source_ns);
+        let Some(known) = &mut self.known else {
+            let learnt = self.candidate.take(receive, source_ns, offset_ns, SETTLING_TIME);
+            let offset = learnt.map_err(still_learning)?;
+            return Ok(self.learn(offset, source_ns, None));
+        };
+        let back_ns = known.last_source_ns.saturating_sub(source_ns);
+        if back_ns == 0 {
             let why = format!("sent twice (stamp {source_ns} ns)");
             return Err(Refusal::new(GateName::Duplicate, why));
         }
-        let offset_ns = receive.as_nanos().saturating_sub(source_ns);
-        let known_ns = self.known.as_ref().map(Minimum::ns);
-        let behind_ns = known_ns.map(|known_ns| offset_ns.saturating_sub(known_ns));
-        let has_gone_back = back_ns.is_some_and(|back_ns| back_ns > 0);
-        let is_behind = behind_ns.is_some_and(|behind_ns| behind_ns > BEHIND_MIN_NS);
+        let known_ns = known.offset.ns();
+        let behind_ns = offset_ns.saturating_sub(known_ns);
+        let is_ahead = behind_ns < -AHEAD_MAX_NS;
         let goes_on = self.went_back && self.candidate.goes_on(source_ns, offset_ns);
-        self.went_back = is_behind && (goes_on || has_gone_back);
-        let is_ahead = behind_ns.is_some_and(|behind_ns| behind_ns < -AHEAD_MAX_NS);
-        let is_far_behind = behind_ns.is_some_and(|behind_ns| behind_ns > DATED_BEHIND_MAX_NS);
-        let settled = if is_ahead || self.went_back || self.known.is_none() {
-            let time = match behind_ns {
-                Some(ANOTHER_CLOCK_NS..) => ANOTHER_CLOCK_TIME,
-                _ => SETTLING_TIME,
+        self.went_back = behind_ns > BEHIND_MIN_NS && (goes_on || back_ns > 0);
+        if is_ahead || self.went_back {
+            let is_another = behind_ns >= ANOTHER_CLOCK_NS;
+            let time = if is_another { ANOTHER_CLOCK_TIME } else { SETTLING_TIME };
+            let has_risen = |offset: &Minimum| {
+                let rise_ns = |before_ns| offset.ns().saturating_sub(before_ns);
+                known.before_ns.is_none_or(|before_ns| rise_ns(before_ns) > BEHIND_MIN_NS)
             };
-            let settled = self.candidate.take(receive, source_ns, offset_ns, time);
-            let before_ns = self.before_ns.filter(|_| self.went_back);
-            let has_risen = |settled: &Minimum| {
-                before_ns.is_none_or(|ns| settled.ns().saturating_sub(ns) > BEHIND_MIN_NS)
-            };
-            match settled {
-                Ok(settled) if !has_risen(&settled) => {
-                    (self.candidate, self.went_back) = (Settling::default(), false);
-                    Err(0)
+            match self.candidate.take(receive, source_ns, offset_ns, time) {
+                Ok(offset) if is_ahead => return Ok(self.learn(offset, source_ns, None)),
+                Ok(offset) if has_risen(&offset) => {
+                    let by_s = seconds(offset.ns().saturating_sub(known_ns));
+                    let news = format!(
+                        "the sender's clock was set back by {by_s:.3} s; its offset was learnt again"
+                    );
+                    return Ok(self.learn(offset, source_ns, Some(news)));
                 }
-                settled => settled,
+                // Stamps were only overtaken.
+                Ok(_) => (self.candidate, self.went_back) = (Settling::default(), false),
+                Err(samples) if is_ahead || behind_ns > DATED_BEHIND_MAX_NS => {
+                    return Err(match is_ahead {
+                        _ if back_ns > 0 => went_back(back_ns),
+                        true => ahead(behind_ns.saturating_neg()),
+                        false => still_learning(samples),
+                    });
+                }
+                Err(_) => {}
             }
         } else {
             self.candidate = Settling::default();
-            Err(0)
-        };
-        let is_set_aside = is_ahead || (self.went_back && is_far_behind);
-        if let Some(known) = self.known.as_mut().filter(|_| settled.is_err() && !is_set_aside) {
-            if let Some(by_ns) = back_ns.filter(|_| has_gone_back) {
-                return Err(went_back(by_ns));
-            }
-            self.last_source_ns = Some(source_ns);
-            if !self.went_back {
-                self.before_ns = Some(offset_ns);
-            }
-            let dated_by_ns = known.update(receive, offset_ns);
-            self.note_late(receive, offset_ns.saturating_sub(dated_by_ns));
-            return Ok(dated_by_ns);
         }
-        match settled {
-            Ok(settled) => {
-                let settled_ns = settled.ns();
-                let set_back_ns = known_ns.filter(|_| self.went_back);
-                let news = set_back_ns.map(|known_ns| {
-                    let by_s = seconds(settled_ns.saturating_sub(known_ns));
-                    format!(
-                        "the sender's clock was set back by {by_s:.3} s; its offset was learnt again"
-                    )
-                });
-                let (known, last_source_ns) = (Some(settled), Some(source_ns));
-                *self = ClockOffset { known, last_source_ns, news, ..ClockOffset::default() };
-                Ok(settled_ns)
-            }
-            Err(samples) => Err(match (back_ns, behind_ns) {
-                (Some(by_ns @ 1..), _) => went_back(by_ns),
-                (_, Some(behind_ns @ ..0)) => {
-                    let by_s = seconds(behind_ns.saturating_neg());
-                    let why =
-                        format!("{by_s:.3} s ahead of the sender's clock so far; was it set?");
-                    Refusal::new(GateName::Stamp, why)
-                }
-                _ => {
-                    let why = format!(
-                        "the sender's clock is still being learnt, from {samples} samples so far"
-                    );
-                    Refusal { effect: Effect::None, ..Refusal::new(GateName::Stamp, why) }
-                }
-            }),
+        if back_ns > 0 {
+            return Err(went_back(back_ns));
         }
+        known.last_source_ns = source_ns;
+        if !self.went_back {
+            known.before_ns = Some(offset_ns);
+        }
+        let dated_by_ns = known.offset.update(receive, offset_ns);
+        self.note_late(receive, offset_ns.saturating_sub(dated_by_ns));
+        Ok(dated_by_ns)
+    }
+
+    /// Starts anew with an offset that was learnt with this stamp.
+    fn learn(&mut self, offset: Minimum, source_ns: i64, news: Option<String>) -> i64 {
+        let ns = offset.ns();
+        let known = Known { offset, last_source_ns: source_ns, before_ns: None };
+        *self = ClockOffset { known: Some(known), news, ..ClockOffset::default() };
+        ns
     }
 
     /// What to tell the operator about the sender's clock.
@@ -196,6 +187,16 @@ impl ClockOffset {
 fn went_back(by_ns: i64) -> Refusal {
     let why = format!("went back by {:.3} s; was the sender's clock set?", seconds(by_ns));
     Refusal::new(GateName::Stamp, why)
+}
+
+fn ahead(by_ns: i64) -> Refusal {
+    let why = format!("{:.3} s ahead of the sender's clock so far; was it set?", seconds(by_ns));
+    Refusal::new(GateName::Stamp, why)
+}
+
+fn still_learning(samples: u32) -> Refusal {
+    let why = format!("the sender's clock is still being learnt, from {samples} samples so far");
+    Refusal { effect: Effect::None, ..Refusal::new(GateName::Stamp, why) }
 }
 
 fn seconds(ns: i64) -> f64 {
