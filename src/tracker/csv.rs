@@ -146,7 +146,7 @@ impl Columns {
                 _ => Orientation::Absent,
             },
         };
-        let stamp_ns = if self.stamp.is_empty() { 0 } else { sum_ns(row, &self.stamp)? };
+        let stamp_ns = sum_ns(row, &self.stamp)?;
         let sample = Sample {
             tool: tool.to_owned(),
             receive_time: Time::from_nanos(sum_ns(row, &self.time)?),
@@ -159,7 +159,7 @@ impl Columns {
     }
 }
 
-/// The sum of `columns`, each in its unit, ns. Whole numbers stay exact.
+/// The sum of `columns`, each in its unit, ns; 0 of none. Whole numbers stay exact.
 fn sum_ns(row: &Row, columns: &[(Column, i64)]) -> Result<i64, TableError> {
     columns.iter().try_fold(0i64, |sum, (column, unit_ns)| {
         nanoseconds(row.text(column), *unit_ns)

@@ -52,7 +52,7 @@ impl Gate {
     /// True for a sample that is a measurement by itself, wherever the tracker stands: finite, a
     /// rotation, not the exact zero, and valid by the tracker's own word.
     pub fn is_measurement(sample: &Sample) -> bool {
-        is_finite(&sample.position_mm) && check_word(sample, true, true, true).is_ok()
+        is_finite(&sample.position_mm) && check_content(sample, true, true, true).is_ok()
     }
 
     /// The tip's position on the bench, `p_WB` in mm, finite.
@@ -68,7 +68,7 @@ impl Gate {
         if !is_finite(&sample.position_mm) {
             return Err(Refusal::not_finite(&sample.position_mm));
         }
-        check_word(sample, self.rotation, self.zero, self.status)?;
+        check_content(sample, self.rotation, self.zero, self.status)?;
         let p_wb_mm = self.registration.tip_mm(sample)?;
         // The registration can overflow what was finite.
         if !is_finite(&p_wb_mm) {
@@ -103,8 +103,8 @@ impl Workspace {
     }
 }
 
-/// Checks what the sample says itself: its orientation, its zeros, its status.
-fn check_word(sample: &Sample, rotation: bool, zero: bool, status: bool) -> Result<(), Refusal> {
+/// Checks the orientation, the zeros and the status.
+fn check_content(sample: &Sample, rotation: bool, zero: bool, status: bool) -> Result<(), Refusal> {
     let turned = sample.orientation.as_ref().is_none_or(is_rotation);
     if rotation && !(turned && sample.validity != Validity::NotARotation) {
         return Err(Refusal::new(GateName::Rotation, "the orientation sent is not a rotation"));
@@ -124,7 +124,7 @@ fn check_word(sample: &Sample, rotation: bool, zero: bool, status: bool) -> Resu
     }
 }
 
-/// The type promises a rotation, and cannot keep it where a source fills it unchecked.
+/// A source may fill a `UnitQuaternion` unchecked.
 fn is_rotation(quaternion: &UnitQuaternion<f64>) -> bool {
     // Written so that NaN is refused.
     (quaternion.norm_squared() - 1.0).abs() <= ROTATION_TOLERANCE

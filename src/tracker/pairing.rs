@@ -33,8 +33,7 @@ pub struct StageHistory {
 impl StagePoint {
     /// The straight line from `self` to `later`, at `time` between them.
     fn interpolate(&self, later: &StagePoint, time: Time) -> StagePoint {
-        let span_s = later.time.seconds_after(self.time);
-        let fraction = if span_s > 0.0 { time.seconds_after(self.time) / span_s } else { 0.0 };
+        let fraction = time.seconds_after(self.time) / later.time.seconds_after(self.time);
         let moved = later.since(self);
         StagePoint {
             time,
@@ -108,9 +107,9 @@ impl StageHistory {
             ));
         }
         let next = self.points.partition_point(|point| point.time <= time);
-        Ok(match (next.checked_sub(1).and_then(|i| self.points.get(i)), self.points.get(next)) {
-            (Some(before), Some(after)) => before.interpolate(after, time),
-            _ => StagePoint { time, ..*newest },
+        Ok(match self.points.get(next) {
+            Some(after) => self.points[next - 1].interpolate(after, time),
+            None => *newest,
         })
     }
 

@@ -23,11 +23,11 @@ pub struct Sample {
     /// `R_TS`: orientation of the sensor in T; none where none was sent, or nothing that is a
     /// rotation. A quaternion, as it is recorded, so that a replay turns by the same bits.
     pub orientation: Option<UnitQuaternion<f64>>,
-    /// What the tracker says of the measurement itself.
+    /// The tracker's own verdict on it.
     pub validity: Validity,
 }
 
-/// A tracker's own word on a measurement.
+/// The tracker's own verdict on a measurement.
 #[derive(Debug, Clone, PartialEq, Eq, derive_more::Display)]
 pub enum Validity {
     /// Measured, or nothing was said of it.
@@ -90,12 +90,12 @@ impl Sample {
             }
             .oriented(orientation)
         };
-        let of_device = |pose| {
-            let validity = device_validity(message).unwrap_or(Validity::Valid);
-            vec![sample(message.full_device_name(), validity, pose)]
-        };
+        let of_device =
+            |pose| vec![sample(message.full_device_name(), device_validity(message), pose)];
         let of_tool = |name: &str, kind, (position, orientation)| {
-            sample(name, tool_validity(message, name), (position, as_known(kind, orientation)))
+            let has_orientation = kind != tool_kind::THREE_D;
+            let orientation = if has_orientation { orientation } else { Orientation::Absent };
+            sample(name, tool_validity(message, name), (position, orientation))
         };
         match &message.body {
             Body::Transform(matrix) => of_device(matrix_pose(matrix)),
@@ -130,17 +130,15 @@ impl Sample {
 }
 
 /// PLUS's metadata of the device: `TransformStatus` names the fault, `TransformValid` is true or
-/// false. None where neither is there.
-fn device_validity(message: &Message) -> Option<Validity> {
-    let status = message.metadata("TransformStatus").map(Validity::from_status);
-    match (status, message.metadata("TransformValid")) {
-        (None | Some(Validity::Valid), Some(word))
-            if !word.eq_ignore_ascii_case("true") && word != "1" =>
-        {
-            Some(Validity::Invalid(format!("TransformValid is {word}")))
+/// false. Valid where neither is there.
+fn device_validity(message: &Message) -> Validity {
+    let status = message.metadata("TransformStatus").map_or(Validity::Valid, Validity::from_status);
+    let is_true = |word: &str| word.eq_ignore_ascii_case("true") || word == "1";
+    match message.metadata("TransformValid").filter(|word| !is_true(word)) {
+        Some(word) if status == Validity::Valid => {
+            Validity::Invalid(format!("TransformValid is {word}"))
         }
-        (None, Some(_)) => Some(Validity::Valid),
-        (status, _) => status,
+        _ => status,
     }
 }
 
@@ -151,7 +149,7 @@ fn tool_validity(message: &Message, tool: &str) -> Validity {
         let name = key.strip_suffix("Status")?;
         is_tool(tool, name).then(|| Validity::from_status(status))
     });
-    of_tool.or_else(|| device_validity(message)).unwrap_or(Validity::Valid)
+    of_tool.unwrap_or_else(|| device_validity(message))
 }
 
 /// Position and orientation in the numbers of a TRANSFORM.
@@ -173,11 +171,6 @@ fn quaternion_orientation(sent: &Quaternion) -> Orientation {
         Quaternion::Imaginary(xyz) => Orientation::of_imaginary(xyz.map(f64::from)),
         Quaternion::Full([x, y, z, w]) => Orientation::of_quaternion([w, x, y, z].map(f64::from)),
     }
-}
-
-/// The orientation as far as a tool of this kind has one.
-fn as_known(kind: u8, orientation: Orientation) -> Orientation {
-    if kind == tool_kind::THREE_D { Orientation::Absent } else { orientation }
 }
 
 #[cfg(test)]

@@ -97,18 +97,18 @@ struct Value {
 const STANDSTILL_MM: f64 = 0.01;
 /// Innovations over which a jump is looked for: 0.2 s of a tracker at 40 Hz.
 const JUMP_POSITIONS: usize = 8;
-/// One that the gates refuse counts among them up to so many times the largest step of the noise: a
-/// jump is looked for in the mean, and a single one further off tells nothing of it.
+/// The innovation of a refused position counts among them up to this multiple of the largest step of
+/// the noise: one farther off would move their mean by itself.
 const JUMP_STEPS: f64 = 2.0;
 /// Only so many of them count as independent: real noise is correlated.
 const JUMP_INDEPENDENT: f64 = 4.0;
-/// Limit of the squared Mahalanobis distance of their mean, over that of a single one: 41 by default,
-/// by chance once in 1e8 …
+/// The limit of the squared Mahalanobis distance of their mean is this multiple of that of a single one:
+/// 41 by default, exceeded by chance once in 1e8.
 const JUMP_CHI2_TIMES: f64 = 2.5;
-/// … that of its lag behind the model along the heading alone, with one degree of freedom and one side,
-/// over the same: 31.5 by default, by chance as seldom …
+/// The limit of the mean's lag behind the model along the heading (one degree of freedom, one side) is this
+/// share of the limit of the mean: 31.5 by default, exceeded by chance as seldom.
 const LAG_CHI2_SHARE: f64 = 0.77;
-/// … and the standard deviation, mm, that any model is given besides what it says of itself.
+/// Standard deviation, mm, added to that of any model when a jump is looked for.
 const JUMP_MODEL_SD_MM: f64 = 0.2;
 const NO_MODEL: &str = "no observer has an estimate yet to find the tip again";
 /// The period is averaged over about so many positions.
@@ -125,13 +125,13 @@ const PERIOD_MEMORY: f64 = 16.0;
 /// - **innovation**: `rᵀ S⁻¹ r` under the χ² limit, with r the distance from the model and
 ///   `S = P + (g d)² I + σ² I`, P the observer's covariance or a configured prior, d the
 ///   millimetres since its last correction and g the configured growth.
-/// - **jump**: the same of the mean of the last innovations, whose noise is less, refused positions
-///   among them unless they are far off. A jump that a single position hides in its noise shows here,
-///   and the track is lost at once.
+/// - **jump**: the same test of the mean of the last innovations, which has less noise. Refused positions
+///   count in it unless they are far off. It shows a jump that the noise of a single position hides, and
+///   the track is lost at once.
 ///
-/// A jump is told before what is wrong with the position by itself. After some refusals in a row the
-/// track is lost. Then the step is no measure, and it is found again by positions that agree with the
-/// model, one after the other and in their mean, wherever the stream may have jumped to.
+/// A jump is reported before what is wrong with the position by itself. After some refusals in a row the
+/// track is lost. Then the step is not checked, and the track is found again by positions that agree with
+/// the model, one after the other and in their mean, wherever the stream may have jumped to.
 #[derive(Debug, Clone)]
 pub struct Track {
     settings: TrackSettings,
@@ -330,8 +330,8 @@ impl Track {
         Err(Refusal::new(GateName::Innovation, why))
     }
 
-    /// Sets the mean of the last innovations, so many of them independent, against the model, and how far
-    /// it lags: there a position that stands while the tip goes on shows first.
+    /// Tests the mean of the last innovations, of which `independent` are independent, and how far it lags
+    /// behind the model. The lag shows first that a position stands while the tip goes on.
     fn check_jump(
         &self,
         prediction: &Prediction,

@@ -15,7 +15,8 @@ use std::collections::VecDeque;
 /// Positions are summed in bins of this depth, mm.
 const BIN_MM: f64 = 0.25;
 /// Bins in each stretch that is looked at: 3 to 64 mm.
-const STRETCHES: [usize; 10] = [12, 16, 24, 32, 48, 64, 96, 128, 192, 256];
+const STRETCHES: [usize; 10] = [12, 16, 24, 32, 48, 64, 96, 128, 192, BINS_MAX];
+const BINS_MAX: usize = 256;
 /// Fewer positions than this in a stretch say nothing.
 const POSITIONS_MIN: f64 = 6.0;
 /// Positions count as independent only so many to a mm: real noise is correlated.
@@ -93,9 +94,9 @@ impl TravelCheck {
             self.check_stretches();
             // Bins without a position are kept empty, so that places tell depths.
             let first = if self.bins.is_empty() { number - 1 } else { self.number };
-            for _ in 0..(number - first).min(STRETCHES[9] as i64) {
+            for _ in 0..(number - first).min(BINS_MAX as i64) {
                 self.bins.push_back(Bin::default());
-                if self.bins.len() > STRETCHES[9] {
+                if self.bins.len() > BINS_MAX {
                     self.bins.pop_front();
                 }
             }
@@ -131,12 +132,10 @@ impl TravelCheck {
     /// travel shows it.
     pub fn explain(&self, mut refusal: Refusal) -> Refusal {
         if refusal.effect == Effect::Loses {
-            let change = self.change_over(EXPLAINED_BINS, SLOWER);
-            let what = change
-                .map_or("a jump, a drift, or too large a scale".to_owned(), |change| {
-                    change.to_string()
-                });
-            refusal.why += &format!(": {what}");
+            refusal.why += &match self.change_over(EXPLAINED_BINS, SLOWER) {
+                Some(change) => format!(": {change}"),
+                None => ": a jump, a drift, or too large a scale".to_owned(),
+            };
         }
         refusal
     }
@@ -252,7 +251,7 @@ mod tests {
             for depth_mm in depths {
                 check.take(depth_mm, &(Vector3::z() * depth_mm));
             }
-            prop_assert!(check.bins.len() <= STRETCHES[9]);
+            prop_assert!(check.bins.len() <= BINS_MAX);
         }
     }
 }

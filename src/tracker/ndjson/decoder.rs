@@ -31,32 +31,22 @@ impl LineDecoder {
         loop {
             let unread = self.buffer.get(self.used..).unwrap_or_default();
             let end = unread.iter().position(|byte| *byte == b'\n');
-            let text = unread.get(..end.unwrap_or(unread.len())).unwrap_or_default();
-            let too_long = text.len() > LINE_LIMIT;
-            match end {
-                None if !too_long && !self.skipping => return Ok(None),
-                None => {
-                    // Skipped bytes are not kept.
-                    self.used = self.buffer.len();
-                    if std::mem::replace(&mut self.skipping, true) {
-                        return Ok(None);
-                    }
-                    self.lines += 1;
-                    return Err(self.too_long());
-                }
-                Some(len) => {
-                    self.used += len + 1;
-                    if std::mem::take(&mut self.skipping) {
-                        continue;
-                    }
-                    self.lines += 1;
-                    if too_long {
-                        return Err(self.too_long());
-                    }
-                    if !text.trim_ascii().is_empty() {
-                        return Ok(Some(Line::parse(self.lines, text)?.printable()));
-                    }
-                }
+            let text = &unread[..end.unwrap_or(unread.len())];
+            let is_too_long = text.len() > LINE_LIMIT;
+            if end.is_none() && (text.is_empty() || !is_too_long && !self.skipping) {
+                return Ok(None);
+            }
+            // Skipped bytes are not kept.
+            self.used += text.len() + usize::from(end.is_some());
+            if std::mem::replace(&mut self.skipping, end.is_none()) {
+                continue;
+            }
+            self.lines += 1;
+            if is_too_long {
+                return Err(wrong(self.lines, format_args!("longer than {LINE_LIMIT} bytes")));
+            }
+            if !text.trim_ascii().is_empty() {
+                return Ok(Some(Line::parse(self.lines, text)?.printable()));
             }
         }
     }
@@ -73,10 +63,6 @@ impl LineDecoder {
         let length = unread.len();
         let problem = format_args!("{length} bytes and no end of line; it was cut off");
         Err(wrong(self.lines + 1, problem))
-    }
-
-    fn too_long(&self) -> String {
-        wrong(self.lines, format_args!("longer than {LINE_LIMIT} bytes"))
     }
 }
 

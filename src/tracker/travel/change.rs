@@ -1,4 +1,4 @@
-//! Where a stream ceased to keep step with the insertion, and how far it goes since.
+//! The depth from which a tip no longer travels as far as the needle is inserted, and its scale since.
 
 use super::{BIN_MM, Bin};
 use std::fmt;
@@ -15,7 +15,7 @@ const FROZEN_MARGIN: f64 = 10.0;
 /// … and nothing has changed unless a change fits better by so much.
 const CHANGE_MARGIN: f64 = 15.0;
 
-/// A stream that keeps step with the insertion up to a depth, and goes on by a scale of it from there.
+/// A tip that travels as far as the needle is inserted up to a depth, and by a scale of it from there.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::tracker) struct Change {
     /// Inserted since, mm.
