@@ -66,6 +66,7 @@ const NAMES_SHOWN: usize = 2;
 const SHOWN_MAX: usize = 22;
 /// The message about a missing tool has at most this many characters.
 const MESSAGE_MAX: usize = 168;
+const IN_VIEW: &str = "is the tool in view?";
 
 /// Counts what came over a connection, to say what came when the wanted tool did not.
 #[derive(Debug, Clone, Default)]
@@ -119,43 +120,39 @@ impl Census {
     /// Says that `tool` has not come, what has instead, and what to do.
     pub fn explain_missing(&self, tool: &str) -> String {
         let Census { peer, messages, refused, samples, unread } = self;
-        let tool = clipped(tool, SHOWN_MAX);
+        let shown = |name| format!("\"{}\"", clipped(name, SHOWN_MAX));
         if peer.is_empty() {
-            return format!("tracker: not connected, so nothing of \"{tool}\"");
+            return format!("tracker: not connected, so nothing of {}", shown(tool));
         }
+        // Tools first, which have no kind.
         let others = unread.iter().filter(|(name, _)| !samples.contains_key(*name));
-        let mut seen = samples
-            .keys()
-            .map(|name| (name, ""))
-            .chain(others.map(|(name, kind)| (name, if has_positions(kind) { "" } else { kind })));
-        let shown: Vec<String> = (seen.by_ref().take(NAMES_SHOWN))
-            .map(|(name, kind)| match kind {
-                "" => format!("\"{}\"", clipped(name, SHOWN_MAX)),
-                _ => format!("\"{}\" ({kind})", clipped(name, SHOWN_MAX)),
-            })
-            .collect();
-        let more = match seen.count() {
+        let (tools, others): (Vec<_>, Vec<_>) = others.partition(|(_, kind)| has_positions(kind));
+        let tools = samples.keys().chain(tools.into_iter().map(|(name, _)| name));
+        let mut seen: Vec<String> = tools.map(|name| shown(name)).collect();
+        let has_tools = !seen.is_empty();
+        seen.extend(others.into_iter().map(|(name, kind)| format!("{} ({kind})", shown(name))));
+        let more = match seen.len().saturating_sub(NAMES_SHOWN) {
             0 => String::new(),
             more => format!(" and {more} more"),
         };
-        let next = match refused {
-            _ if !shown.is_empty() => format!("saw {}{more}; set tracker.tool", shown.join(", ")),
-            Some((count, last)) => format!("{count} refused: {last}"),
-            None => "is the tool in view, and does the server send it?".to_owned(),
+        seen.truncate(NAMES_SHOWN);
+        let (of_tool, next) = match refused {
+            _ if self.has(tool) => ("no new position", IN_VIEW.to_owned()),
+            _ if !seen.is_empty() => {
+                let advice = if has_tools { "set tracker.tool" } else { IN_VIEW };
+                ("none", format!("saw {}{more}; {advice}", seen.join(", ")))
+            }
+            Some((count, last)) => ("none", format!("{count} refused: {last}")),
+            None => ("none", "is the tool in view, and does the server send it?".to_owned()),
         };
-        let peer = clipped(peer, SHOWN_MAX);
-        let (of_tool, next) = match self.has(&tool) {
-            true => ("no new position", "is the tool in view?"),
-            false => ("none", &*next),
-        };
-        let text =
-            format!("tracker: {peer} sent {messages} messages, {of_tool} of \"{tool}\"; {next}");
+        let (peer, tool) = (clipped(peer, SHOWN_MAX), shown(tool));
+        let text = format!("tracker: {peer} sent {messages} messages, {of_tool} of {tool}; {next}");
         clipped(&text, MESSAGE_MAX).into_owned()
     }
 }
 
 /// True for a type of message that contains samples.
-fn has_positions(message_type: &str) -> bool {
+pub(super) fn has_positions(message_type: &str) -> bool {
     matches!(message_type, "TRANSFORM" | "POSITION" | "TDATA" | "QTDATA" | "NDJSON")
 }
 
@@ -239,6 +236,37 @@ mod tests {
         assert_eq!(
             census.explain_missing("Needle"),
             "tracker: localhost:18944 sent 1 messages, no new position of \"Needle\"; is the tool in view?"
+        );
+    }
+
+    /// A name longer than what is shown of it, as NDJSON and version 2 send it.
+    #[test]
+    fn a_tool_of_a_long_name_is_not_said_to_be_another() {
+        let tool = "NeedleTipToTrackerBaseFrame";
+        let mut census = Census::default();
+        census.note(&connected());
+        census.note(&sample(tool));
+        assert_eq!(
+            census.explain_missing(tool),
+            "tracker: localhost:18944 sent 1 messages, no new position of \
+             \"NeedleTipToTrackerBas…\"; is the tool in view?"
+        );
+    }
+
+    /// A server whose tools are all out of view may send its status alone, or messages without tools.
+    #[test]
+    fn what_is_no_tool_is_not_advised_as_one() {
+        let mut census = Census::default();
+        census.note(&connected());
+        for (device, message_type) in [("PlusServer", "STATUS"), ("Tracker", "TDATA without tools")]
+        {
+            let (tool, message_type) = (device.to_owned(), message_type.to_owned());
+            census.note(&Event::SawTool { tool, message_type });
+        }
+        assert_eq!(
+            census.explain_missing("Needle"),
+            "tracker: localhost:18944 sent 0 messages, none of \"Needle\"; saw \"PlusServer\" (STATUS), \
+             \"Tracker\" (TDATA without tools); is the tool in view?"
         );
     }
 

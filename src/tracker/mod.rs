@@ -4,8 +4,8 @@
 //! Everything here is pure: bytes and times come in, samples and refusals go out. Sockets are in
 //! `transport`. A sample goes through [`gate`] (which holds the [`registration`]), is dated by
 //! [`timing`], set against the stage's position by [`pairing`], and against its neighbours and the
-//! model by [`track`]; it is then a tip position at a known depth and rotation. What refuses it on
-//! the way says so by a [`refusal`].
+//! model by [`track`]; it is then a tip position at a known depth and rotation. A gate that refuses it
+//! says why in a [`refusal`].
 
 mod clock_offset;
 pub mod csv;

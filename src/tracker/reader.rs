@@ -1,6 +1,6 @@
 //! Turns the bytes of a tracker's connection into events, for either protocol.
 
-use super::Event;
+use super::event::{Event, has_positions};
 use super::ndjson::LineDecoder;
 use super::openigtlink::{Body, Message, StreamDecoder};
 use super::sample::Sample;
@@ -43,7 +43,7 @@ impl Reader {
     pub fn new(protocol: Protocol) -> Self {
         Reader {
             decoder: match protocol {
-                Protocol::OpenIgtLink => Decoder::OpenIgtLink(StreamDecoder::new()),
+                Protocol::OpenIgtLink => Decoder::OpenIgtLink(StreamDecoder::default()),
                 Protocol::Ndjson => Decoder::Ndjson(LineDecoder::default()),
             },
             received: Time::ZERO,
@@ -114,7 +114,9 @@ impl Reader {
         let samples = Sample::from_message(&message, self.received);
         let message_type = message.body.type_name();
         if samples.is_empty() {
-            self.note_name(message.full_device_name(), message_type);
+            // Without tools the device is not taken for one.
+            let without = if has_positions(message_type) { " without tools" } else { "" };
+            self.note_name(message.full_device_name(), &format!("{message_type}{without}"));
         }
         for sample in samples {
             self.take_sample(sample, message_type);
@@ -224,6 +226,13 @@ mod tests {
         assert_eq!(lines[..2], ["saw Needle (NDJSON)", "Needle at Time(7)"]);
         assert!(lines[2].starts_with("ndjson: line 2: "), "{}", lines[2]);
         assert_eq!(lines[3..], ["Needle at Time(7)"]);
+    }
+
+    #[test]
+    fn the_device_of_a_message_without_tools_is_told_from_a_tool() {
+        let empty = encode(&Message::new("Tracker", None, Body::TrackingData(Vec::new())));
+        let events = read(Protocol::OpenIgtLink, [&empty[..]]);
+        assert_eq!(summary(&events), ["saw Tracker (TDATA without tools)"]);
     }
 
     #[test]

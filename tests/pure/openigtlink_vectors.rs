@@ -32,7 +32,7 @@ fn vectors() -> Option<Vec<Vector>> {
 
 /// Reads the message that `bytes` start with.
 pub(crate) fn decode(bytes: &[u8]) -> Result<Message, DecodeError> {
-    let mut decoder = StreamDecoder::new();
+    let mut decoder = StreamDecoder::default();
     decoder.push(bytes);
     match decoder.poll()? {
         Some(message) => Ok(message),
@@ -93,7 +93,7 @@ fn all_fixtures_in_one_stream_come_out_in_order() {
     let Some(vectors) = vectors() else { return };
     let fixtures: Vec<_> = vectors.iter().filter(|vector| vector.positive).collect();
     let stream: Vec<u8> = fixtures.iter().flat_map(|vector| vector.bytes.clone()).collect();
-    let mut decoder = StreamDecoder::new();
+    let mut decoder = StreamDecoder::default();
     let mut messages = Vec::new();
     for chunk in stream.chunks(97) {
         decoder.push(chunk);

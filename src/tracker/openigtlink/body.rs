@@ -5,13 +5,13 @@
 //!
 //! Source: the specification's tables; `igtl_tdata.h` and `igtl_qtdata.h` of the reference library.
 
-use super::header::{NAME_LEN, padded, text};
+use super::header::{DEVICE_NAME_LEN, padded, text};
 use super::message::packet;
 
 /// Bytes of the name of a coordinate system; zeros ask for the server's own.
 const COORDINATES_LEN: usize = 32;
 /// Name, kind, a reserved byte.
-const TOOL_HEAD_LEN: usize = NAME_LEN + 2;
+const TOOL_HEAD_LEN: usize = DEVICE_NAME_LEN + 2;
 
 /// One tool of a TDATA or QTDATA message.
 ///
@@ -199,7 +199,7 @@ fn tools<const N: usize>(content: &[u8]) -> Option<Vec<Tool<N>>> {
 }
 
 fn tool<const N: usize>(bytes: &[u8]) -> Option<Tool<N>> {
-    let (name, rest) = bytes.split_first_chunk::<NAME_LEN>()?;
+    let (name, rest) = bytes.split_first_chunk::<DEVICE_NAME_LEN>()?;
     let ([kind, _reserved], numbers) = rest.split_first_chunk()?;
     let pose = floats(numbers)?;
     Some(Tool { name: text(name), kind: *kind, pose })
@@ -207,7 +207,7 @@ fn tool<const N: usize>(bytes: &[u8]) -> Option<Tool<N>> {
 
 fn put_tools<const N: usize>(tools: &[Tool<N>], out: &mut Vec<u8>) {
     for tool in tools {
-        out.extend_from_slice(&padded::<{ NAME_LEN - 1 }>(&tool.name));
+        out.extend_from_slice(&padded::<{ DEVICE_NAME_LEN - 1 }>(&tool.name));
         out.extend_from_slice(&[0, tool.kind, 0]);
         out.extend(tool.pose.iter().flat_map(|number| number.to_be_bytes()));
     }
@@ -237,6 +237,7 @@ fn status(content: &[u8]) -> Option<Status> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::header::TEXT_MAX;
     use super::*;
 
     #[test]
@@ -260,6 +261,15 @@ mod tests {
         let status = |len| Body::decode(b"STATUS", &[0; 64][..len]);
         assert_eq!(status(29), Err("content of 29 bytes (30 or more expected)".to_owned()));
         assert!(matches!(status(30), Ok(Body::Status(s)) if s.message.is_empty()));
+    }
+
+    #[test]
+    fn a_long_status_is_cut() {
+        let content = [&[0; 30][..], &[b'x'; 100_000]].concat();
+        let Ok(Body::Status(status)) = Body::decode(b"STATUS", &content) else {
+            panic!("a status")
+        };
+        assert_eq!(status.message.chars().count(), TEXT_MAX);
     }
 
     #[test]

@@ -23,15 +23,10 @@ impl DecodeError {
     }
 
     /// The content of the message is wrong.
-    pub(super) fn content(header: &Header, problem: &str) -> Self {
+    fn content(header: &Header, problem: &str) -> Self {
         let problem = format!("{}: {problem}", header.type_and_device());
         DecodeError { problem, loses_framing: false }
     }
-}
-
-/// The largest body accepted of the header's type.
-fn limit(header: &Header) -> u64 {
-    if body::is_read(header.type_bytes()) { BODY_LIMIT } else { SKIPPED_BODY_LIMIT }
 }
 
 /// Turns the chunks of a connection into messages, wherever the chunks were cut.
@@ -62,11 +57,6 @@ enum State {
 }
 
 impl StreamDecoder {
-    /// A decoder at the start of a connection.
-    pub fn new() -> Self {
-        Self::default()
-    }
-
     /// Takes in what was received. After an error that loses the framing, input is ignored.
     pub fn push(&mut self, chunk: &[u8]) {
         if matches!(self.state, State::Lost(_)) {
@@ -129,17 +119,18 @@ impl StreamDecoder {
                 State::Header => {
                     let Some(bytes) = unread.first_chunk() else { return Ok(None) };
                     let header = Header::parse(bytes)?;
-                    let (size, limit) = (header.body_size, limit(&header));
+                    let is_read = body::is_read(header.type_bytes());
+                    let limit = if is_read { BODY_LIMIT } else { SKIPPED_BODY_LIMIT };
+                    let size = header.body_size;
                     if size > limit {
                         let message = header.type_and_device();
                         let problem = format!("{message}: body of {size} bytes (limit {limit})");
                         return Err(DecodeError::framing(problem));
                     }
                     self.used += HEADER_LEN;
-                    self.state = if body::is_read(header.type_bytes()) {
-                        State::Body(header)
-                    } else {
-                        State::Skipping { header, remaining: header.body_size }
+                    self.state = match is_read {
+                        true => State::Body(header),
+                        false => State::Skipping { header, remaining: size },
                     };
                 }
                 State::Body(header) => {
@@ -153,7 +144,8 @@ impl StreamDecoder {
                             header.type_and_device()
                         )));
                     }
-                    let message = Message::from_parts(header, body);
+                    let message = Message::from_parts(header, body)
+                        .map_err(|problem| DecodeError::content(header, &problem));
                     self.used += len;
                     self.state = State::Header;
                     return message.map(Some);

@@ -1,7 +1,7 @@
 //! The 58-byte header that every message starts with, its time stamp and its checksum.
 
 use super::decoder::DecodeError;
-use crate::text::escaped;
+use crate::text::{clipped, escaped};
 use std::sync::LazyLock;
 
 /// Bytes of a header.
@@ -16,14 +16,15 @@ pub const BODY_LIMIT: u64 = 1 << 20;
 pub const SKIPPED_BODY_LIMIT: u64 = 1 << 28;
 
 pub(super) const TYPE_LEN: usize = 12;
-pub(super) const NAME_LEN: usize = 20;
+/// The longest device name that fits the header; a longer one is cut there.
+pub const DEVICE_NAME_LEN: usize = 20;
 
 /// A header as it stands on the wire: version, type, device name, stamp, body size, CRC.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Header {
     pub(super) version: u16,
     message_type: [u8; TYPE_LEN],
-    device_name: [u8; NAME_LEN],
+    device_name: [u8; DEVICE_NAME_LEN],
     stamp_bits: u64,
     pub(super) body_size: u64,
     pub(super) crc: u64,
@@ -97,9 +98,17 @@ pub(super) fn unpadded(field: &[u8]) -> &[u8] {
     field.split(|byte| *byte == 0).next().unwrap_or_default()
 }
 
-/// The text of a field up to its first zero, [escaped]; bytes that are not UTF-8 are replaced.
+/// The longest text of a peer that is kept, characters: each status and each name is recorded.
+pub(super) const TEXT_MAX: usize = 1000;
+
+/// `bytes` as text, [escaped] and [clipped]; bytes that are not UTF-8 are replaced.
+pub(super) fn printable(bytes: &[u8]) -> String {
+    clipped(&escaped(&String::from_utf8_lossy(bytes)), TEXT_MAX).into_owned()
+}
+
+/// The text of a field up to its first zero.
 pub(super) fn text(field: &[u8]) -> String {
-    escaped(&String::from_utf8_lossy(unpadded(field))).into_owned()
+    printable(unpadded(field))
 }
 
 /// A time stamp as sent: 32.32 fixed-point seconds since 1970-01-01 UTC.
@@ -134,8 +143,8 @@ impl IgtlStamp {
     pub fn unix_ns(self) -> i64 {
         let (seconds, fraction) = (self.0 >> 32, self.0 & 0xFFFF_FFFF);
         let ns = seconds * NANOS_PER_S + ((fraction * NANOS_PER_S + (1 << 31)) >> 32);
-        // At most 2³² seconds: fits.
-        i64::try_from(ns).unwrap_or(i64::MAX)
+        // Under 2³² seconds: fits.
+        ns as i64
     }
 }
 

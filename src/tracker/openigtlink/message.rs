@@ -1,9 +1,11 @@
 //! A whole message and its bytes.
 
 use super::body::Body;
-use super::decoder::DecodeError;
-use super::header::{Header, IgtlStamp, NAME_LEN, TYPE_LEN, crc64, padded};
-use super::{DEVICE_NAME_KEY, metadata};
+use super::header::{DEVICE_NAME_LEN, Header, IgtlStamp, TYPE_LEN, crc64, padded};
+use super::metadata;
+
+/// The metadata key under which a device name too long for the header is sent in full.
+const DEVICE_NAME_KEY: &str = "IGTL_DEVICE_NAME";
 
 /// One OpenIGTLink message.
 #[derive(Debug, Clone, PartialEq)]
@@ -36,11 +38,10 @@ impl Message {
     }
 
     /// A message from its header and its whole body, whose checksum has been checked.
-    pub(super) fn from_parts(header: &Header, body: &[u8]) -> Result<Self, DecodeError> {
-        Self::read(header, body).map_err(|problem| DecodeError::content(header, &problem))
-    }
-
-    fn read(header: &Header, body: &[u8]) -> Result<Self, String> {
+    ///
+    /// # Errors
+    /// What is wrong with the body.
+    pub(super) fn from_parts(header: &Header, body: &[u8]) -> Result<Self, String> {
         let (content, metadata) = match header.version {
             1 => (body, Vec::new()),
             _ => metadata::split(body)?,
@@ -72,7 +73,7 @@ pub(super) fn packet(
     [
         &1_u16.to_be_bytes()[..],
         &padded::<TYPE_LEN>(message_type),
-        &padded::<NAME_LEN>(device_name),
+        &padded::<DEVICE_NAME_LEN>(device_name),
         &timestamp.map_or(0, IgtlStamp::bits).to_be_bytes(),
         &(content.len() as u64).to_be_bytes(),
         &crc64(content).to_be_bytes(),

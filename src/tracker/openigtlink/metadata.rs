@@ -4,7 +4,7 @@
 //! id), content, metadata index (count, then key size, encoding and value size of each entry),
 //! metadata text (each key followed by its value).
 
-use crate::text::escaped;
+use super::header::printable;
 
 /// Bytes of the extended header, as all known senders write it. A longer one is allowed.
 const EXTENDED_HEADER_LEN: usize = 12;
@@ -53,7 +53,7 @@ fn entries(index: &[u8], mut text: &[u8]) -> Result<Metadata, String> {
     let mut take = |len: usize| {
         let (head, rest) = text.split_at_checked(len)?;
         text = rest;
-        Some(escaped(&String::from_utf8_lossy(head)).into_owned())
+        Some(printable(head))
     };
     sizes
         .iter()
@@ -63,8 +63,7 @@ fn entries(index: &[u8], mut text: &[u8]) -> Result<Metadata, String> {
             // their accents.
             let mut entry = || {
                 let key = take(usize::from(u16::from_be_bytes([k0, k1])))?;
-                let value_len = u32::from_be_bytes([v0, v1, v2, v3]);
-                Some((key, take(usize::try_from(value_len).ok()?)?))
+                Some((key, take(u32::from_be_bytes([v0, v1, v2, v3]) as usize)?))
             };
             entry().ok_or_else(|| {
                 format!("metadata entry {n} goes beyond the {text_len} bytes of metadata text")
@@ -75,6 +74,7 @@ fn entries(index: &[u8], mut text: &[u8]) -> Result<Metadata, String> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::header::TEXT_MAX;
     use super::*;
     use proptest::prelude::*;
 
@@ -91,6 +91,18 @@ mod tests {
     fn a_longer_extended_header_is_stepped_over() {
         let body = [&[0, 14, 0, 0, 0, 0, 0, 0, 0, 0, 0, 7, 0xAA, 0xBB][..], b"content"].concat();
         assert_eq!(split(&body).expect("well formed"), (&b"content"[..], Vec::new()));
+    }
+
+    #[test]
+    fn a_long_value_is_cut() {
+        let value_len = 100_000_u32;
+        let index = [&[0, 1, 0, 1, 0, 3][..], &value_len.to_be_bytes()].concat();
+        let text_len = value_len + 1;
+        let extended = [&[0, 12, 0, 10][..], &text_len.to_be_bytes(), &[0; 4]].concat();
+        let body = [extended, index, vec![b'k'; text_len as usize]].concat();
+        let (_, metadata) = split(&body).expect("well formed");
+        let value = format!("{}…", "k".repeat(TEXT_MAX - 1));
+        assert_eq!(metadata, [("k".to_owned(), value)]);
     }
 
     #[test]

@@ -15,14 +15,8 @@ mod metadata;
 
 pub use body::{Body, Quaternion, Status, Tool, ToolStream, tool_kind};
 pub use decoder::{DecodeError, StreamDecoder};
-pub use header::{BODY_LIMIT, HEADER_LEN, IgtlStamp, SKIPPED_BODY_LIMIT, crc64};
+pub use header::{BODY_LIMIT, DEVICE_NAME_LEN, HEADER_LEN, IgtlStamp, SKIPPED_BODY_LIMIT, crc64};
 pub use message::{Message, encode};
-
-/// The longest device name that fits the header; a longer one is cut there.
-pub const DEVICE_NAME_LEN: usize = header::NAME_LEN;
-
-/// The metadata key under which a device name too long for the header is sent in full.
-pub const DEVICE_NAME_KEY: &str = "IGTL_DEVICE_NAME";
 
 #[cfg(test)]
 mod tests;

@@ -137,7 +137,7 @@ fn bytes_of_others_are_read_and_written_the_same() {
 
 /// Reads one whole message.
 fn decode(bytes: &[u8]) -> Result<Message, DecodeError> {
-    let mut decoder = StreamDecoder::new();
+    let mut decoder = StreamDecoder::default();
     decoder.push(bytes);
     decoder.poll().map(|message| message.expect("whole"))
 }
@@ -164,7 +164,7 @@ fn a_damaged_body_loses_the_framing_for_good() {
     let mut stream = bytes(TRANSFORM_V1);
     stream[100] ^= 1;
     stream.extend(bytes(TRANSFORM_V1));
-    let mut decoder = StreamDecoder::new();
+    let mut decoder = StreamDecoder::default();
     decoder.push(&stream);
     let first = decoder.poll();
     let error = first.clone().expect_err("damaged");
@@ -184,7 +184,7 @@ fn a_message_wrong_inside_is_refused_and_the_next_is_read() {
     stream[50..58].copy_from_slice(&crc64(body).to_be_bytes());
     stream.extend_from_slice(body);
     stream.extend_from_slice(&good);
-    let mut decoder = StreamDecoder::new();
+    let mut decoder = StreamDecoder::default();
     decoder.push(&stream);
     let error = decoder.poll().expect_err("one float short");
     assert!(!error.loses_framing);
@@ -200,7 +200,7 @@ fn lengths_that_a_peer_states_are_bounded() {
     let with_size = |hex: &str, size: u64| {
         let mut stream = bytes(hex);
         stream[42..50].copy_from_slice(&size.to_be_bytes());
-        let mut decoder = StreamDecoder::new();
+        let mut decoder = StreamDecoder::default();
         decoder.push(&stream);
         decoder.poll()
     };
@@ -211,7 +211,7 @@ fn lengths_that_a_peer_states_are_bounded() {
     }
     assert_eq!(with_size(TRANSFORM_V1, BODY_LIMIT), Ok(None));
     // An image is skipped as it comes, and can be larger. Nothing of it is kept.
-    let mut decoder = StreamDecoder::new();
+    let mut decoder = StreamDecoder::default();
     let mut image = bytes(STRING_V1);
     image[42..50].copy_from_slice(&SKIPPED_BODY_LIMIT.to_be_bytes());
     decoder.push(&image);
@@ -229,7 +229,7 @@ fn a_stream_that_ends_within_a_message_says_so() {
     for (hex, _) in frozen() {
         let whole = bytes(hex);
         for cut in 0..=whole.len() {
-            let mut decoder = StreamDecoder::new();
+            let mut decoder = StreamDecoder::default();
             decoder.push(&whole[..cut]);
             let message = decoder.poll().expect("nothing wrong yet");
             assert_eq!(message.is_some(), cut == whole.len());
@@ -269,7 +269,7 @@ proptest! {
     fn any_split_gives_the_same_messages(mut cuts in prop::collection::vec(any::<Index>(), 0..40)) {
         let stream = all_frozen();
         cuts.sort_by_key(|cut| cut.index(stream.len()));
-        let mut decoder = StreamDecoder::new();
+        let mut decoder = StreamDecoder::default();
         let (mut messages, mut from) = (Vec::new(), 0);
         for to in cuts.iter().map(|cut| cut.index(stream.len())).chain([stream.len()]) {
             decoder.push(&stream[from..to]);
@@ -301,7 +301,7 @@ proptest! {
             message[50..58].copy_from_slice(&crc.to_be_bytes());
         }
         let body_intact = message[HEADER_LEN..] == bytes(hex)[HEADER_LEN..];
-        let mut decoder = StreamDecoder::new();
+        let mut decoder = StreamDecoder::default();
         decoder.push(&message);
         for read in drain(&mut decoder).into_iter().flatten() {
             // The type itself may be damaged, and the body be skipped.
