@@ -91,7 +91,8 @@ impl TrackerFit {
     /// The model of a coordinate is an offset, a drift, white noise, and a stationary process whose
     /// correlation decays as `exp(-t / time)`. The noise is the likeliest one: the likelihood comes
     /// from a Kalman filter, which takes unequal intervals as they are. Standard errors are from its
-    /// curvature. Positions are dated by their stamps where all have one, else by their receipt.
+    /// curvature. Positions are dated by their stamps where all have one and none goes back, else by their
+    /// receipt.
     ///
     /// # Errors
     /// A recording that is too short, that moves, or that has positions no bench reaches.
@@ -102,20 +103,14 @@ impl TrackerFit {
         check_distances("position", "tracker", &positions_mm)?;
         valid.dedup_by_key(|(_, position)| *position);
         let repeats = positions_mm.len() - valid.len();
-        let is_stamped = valid.iter().all(|(sample, _)| sample.source_unix_ns.is_some());
-        let time_ns = |sample: &RestSample| match sample.source_unix_ns.filter(|_| is_stamped) {
-            Some(stamp_ns) => stamp_ns,
-            None => sample.receive_time.as_nanos(),
-        };
-        let first_ns = valid.first().map_or(0, |(sample, _)| time_ns(sample));
-        let mut points: Vec<(f64, Vector3<f64>)> = Vec::new();
-        for (sample, position_mm) in valid {
-            let time_s = time_ns(sample).saturating_sub(first_ns) as f64 * 1e-9;
-            // A stamp that goes back dates nothing.
-            if points.last().is_none_or(|(last_s, _)| time_s >= *last_s) {
-                points.push((time_s, position_mm));
-            }
-        }
+        let stamps: Option<Vec<i64>> =
+            valid.iter().map(|(sample, _)| sample.source_unix_ns).collect();
+        let received = || valid.iter().map(|(sample, _)| sample.receive_time.as_nanos()).collect();
+        let times_ns = stamps.filter(|stamps| stamps.is_sorted()).unwrap_or_else(received);
+        let first_ns = times_ns.first().copied().unwrap_or(0);
+        let since_s = times_ns.iter().map(|ns| ns.saturating_sub(first_ns) as f64 * 1e-9);
+        let points: Vec<(f64, Vector3<f64>)> =
+            since_s.zip(valid.iter().map(|(_, position_mm)| *position_mm)).collect();
         let duration_s = points.last().map_or(0.0, |(time_s, _)| *time_s);
         if points.len() < POSITIONS_MIN || duration_s < DURATION_MIN_S {
             let repeated =

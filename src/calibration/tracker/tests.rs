@@ -135,6 +135,16 @@ fn the_stream_is_counted() {
     assert!((fit.rate_hz.value - 40.0).abs() < 0.6, "by receipt");
 }
 
+/// If the stamps dated the positions, those of ten seconds would come before the one ahead.
+#[test]
+fn one_stamp_ahead_costs_no_position() {
+    let mut samples = rest(NEAR, 7, 1200, still);
+    samples[300].source_unix_ns = samples[300].source_unix_ns.map(|ns| ns + 10_000_000_000);
+    let fit = TrackerFit::of(&samples).unwrap();
+    assert_eq!((fit.positions, fit.dropouts), (1200, 0));
+    assert!((fit.duration_s - 30.0).abs() < 0.1, "{fit:?}");
+}
+
 /// Four positions at a time, without stamps: most have the time of the one before.
 #[test]
 fn positions_that_are_received_in_bursts_are_no_dropouts() {

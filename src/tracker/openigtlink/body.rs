@@ -153,32 +153,34 @@ impl Body {
         }
     }
 
-    pub(super) fn encode(&self, out: &mut Vec<u8>) {
-        let mut put = |floats: &[f32]| {
-            out.extend(floats.iter().flat_map(|value| value.to_be_bytes()));
-        };
+    pub(super) fn encode(&self) -> Vec<u8> {
         match self {
-            Body::Transform(elements) => put(elements),
+            Body::Transform(elements) => bytes(elements),
             Body::Position { position_mm, quaternion } => {
-                put(position_mm);
-                match quaternion {
-                    Quaternion::Absent => {}
-                    Quaternion::Imaginary(xyz) => put(xyz),
-                    Quaternion::Full(xyzw) => put(xyzw),
-                }
+                let orientation: &[f32] = match quaternion {
+                    Quaternion::Absent => &[],
+                    Quaternion::Imaginary(xyz) => xyz,
+                    Quaternion::Full(xyzw) => xyzw,
+                };
+                bytes(&[position_mm, orientation].concat())
             }
-            Body::TrackingData(tools) => put_tools(tools, out),
-            Body::QuaternionTrackingData(tools) => put_tools(tools, out),
-            Body::Status(status) => {
-                out.extend_from_slice(&status.code.to_be_bytes());
-                out.extend_from_slice(&status.subcode.to_be_bytes());
-                out.extend_from_slice(&padded::<STATUS_NAME_LEN>(&status.error_name));
-                out.extend_from_slice(status.message.as_bytes());
-                out.push(0);
-            }
-            Body::Other(_) => {}
+            Body::TrackingData(tools) => bytes_of_tools(tools),
+            Body::QuaternionTrackingData(tools) => bytes_of_tools(tools),
+            Body::Status(Status { code, subcode, error_name, message }) => [
+                &code.to_be_bytes()[..],
+                &subcode.to_be_bytes(),
+                &padded::<STATUS_NAME_LEN>(error_name),
+                message.as_bytes(),
+                &[0],
+            ]
+            .concat(),
+            Body::Other(_) => Vec::new(),
         }
     }
+}
+
+fn bytes(floats: &[f32]) -> Vec<u8> {
+    floats.iter().flat_map(|value| value.to_be_bytes()).collect()
 }
 
 /// Exactly `N` floats; `None` if there are more or fewer.
@@ -205,12 +207,12 @@ fn tool<const N: usize>(bytes: &[u8]) -> Option<Tool<N>> {
     Some(Tool { name: text(name), kind: *kind, pose })
 }
 
-fn put_tools<const N: usize>(tools: &[Tool<N>], out: &mut Vec<u8>) {
-    for tool in tools {
-        out.extend_from_slice(&padded::<{ DEVICE_NAME_LEN - 1 }>(&tool.name));
-        out.extend_from_slice(&[0, tool.kind, 0]);
-        out.extend(tool.pose.iter().flat_map(|number| number.to_be_bytes()));
-    }
+fn bytes_of_tools<const N: usize>(tools: &[Tool<N>]) -> Vec<u8> {
+    let tool = |tool: &Tool<N>| {
+        let name = padded::<{ DEVICE_NAME_LEN - 1 }>(&tool.name);
+        [&name[..], &[0, tool.kind, 0], &bytes(&tool.pose)].concat()
+    };
+    tools.iter().flat_map(tool).collect()
 }
 
 fn position(content: &[u8]) -> Option<Body> {
@@ -277,8 +279,7 @@ mod tests {
         let sent = [tool_kind::SIX_D, tool_kind::THREE_D, 9];
         let sent =
             sent.map(|kind| Tool { name: format!("Tool{kind}"), kind, pose: [1.0; 7] }).to_vec();
-        let mut bytes = Vec::new();
-        put_tools(&sent, &mut bytes);
+        let bytes = bytes_of_tools(&sent);
         assert_eq!(bytes.len(), 3 * 50);
         assert_eq!(tools(&bytes), Some(sent));
         assert_eq!(tools::<7>(&[]), Some(Vec::new()));
@@ -291,8 +292,7 @@ mod tests {
     fn a_name_of_20_bytes_is_read_and_sent_with_a_zero_at_its_end() {
         let name = "ReferenceToTrackerBa".to_owned();
         let sent = Tool { name: name.clone(), kind: tool_kind::SIX_D, pose: [0.0; 7] };
-        let mut bytes = Vec::new();
-        put_tools(&[sent], &mut bytes);
+        let mut bytes = bytes_of_tools(&[sent]);
         assert_eq!(bytes[..22], *b"ReferenceToTrackerB\0\x02\0");
         bytes[19] = b'a';
         assert_eq!(

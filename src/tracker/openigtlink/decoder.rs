@@ -88,23 +88,17 @@ impl StreamDecoder {
     /// # Errors
     /// If it ends within a message, or the framing was lost before.
     pub fn finish(&self) -> Result<(), DecodeError> {
-        let have = self.unread().len();
-        let truncated = |have: usize, need: u64| {
-            let problem = format!("{have} bytes of a message of {need}; it was cut off");
-            Err(DecodeError::framing(problem))
+        let unread = self.unread().len() as u64;
+        let whole = |header: &Header| HEADER_LEN as u64 + header.body_size;
+        let (have, need) = match &self.state {
+            State::Header if unread == 0 => return Ok(()),
+            State::Header => (unread, HEADER_LEN as u64),
+            State::Body(header) => (HEADER_LEN as u64 + unread, whole(header)),
+            State::Skipping { header, remaining } => (whole(header) - remaining, whole(header)),
+            State::Lost(error) => return Err(error.clone()),
         };
-        match &self.state {
-            State::Header if have == 0 => Ok(()),
-            State::Header => truncated(have, HEADER_LEN as u64),
-            State::Body(header) => {
-                truncated(have + HEADER_LEN, header.body_size + HEADER_LEN as u64)
-            }
-            State::Skipping { header, remaining } => {
-                let need = header.body_size + HEADER_LEN as u64;
-                truncated(usize::try_from(need - remaining).unwrap_or(usize::MAX), need)
-            }
-            State::Lost(error) => Err(error.clone()),
-        }
+        let problem = format!("{have} bytes of a message of {need}; it was cut off");
+        Err(DecodeError::framing(problem))
     }
 
     pub(super) fn unread(&self) -> &[u8] {

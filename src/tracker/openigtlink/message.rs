@@ -58,9 +58,8 @@ impl Message {
 
 /// The bytes of a message, in version 1: a device name over 20 bytes is cut, metadata are left out.
 pub fn encode(message: &Message) -> Vec<u8> {
-    let mut content = Vec::new();
-    message.body.encode(&mut content);
-    packet(message.body.type_name(), &message.device_name, message.timestamp, &content)
+    let Message { device_name, timestamp, body, .. } = message;
+    packet(body.type_name(), device_name, *timestamp, &body.encode())
 }
 
 /// The bytes of a version 1 message with this content.
