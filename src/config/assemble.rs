@@ -74,7 +74,7 @@ impl Config {
             // The first is the one that steers.
             observer: observers.next().unwrap_or(ObserverConfig::Invariant(invariant)),
             shadows: observers.collect(),
-            control: self.control.to_session(),
+            control: self.control,
             goal: None,
             stage: self.stage.to_stage(&self.can)?,
             tracker: self.tracker.to_session()?,
@@ -88,29 +88,24 @@ impl Config {
     /// No registration, or a curvature that no needle has.
     pub fn virtual_stage(&self) -> Result<VirtualStageConfig, ConfigError> {
         let emulator = &self.emulator;
-        let (switches_mm, switches_deg) =
-            (emulator.insertion_switches_mm, emulator.rotation_switches_deg);
         let turns_per_s = self.number("stage.rotation.speed_max_deg_per_s") / 360.0;
         let (along, about) = (&self.stage.insertion, &self.stage.rotation);
-        let mut insertion = self.emulated_drive(along, along.limits.speed_max);
-        let mut rotation = self.emulated_drive(about, turns_per_s);
-        let (per_mm, per_turn) = (insertion.1, rotation.1);
+        let (mut insertion, per_mm) = self.emulated_drive(along, along.limits.speed_max);
+        let (mut rotation, per_turn) = self.emulated_drive(about, turns_per_s);
         let [zero, zero_turned] = [along.zero, about.zero].map(|zero| zero.unwrap_or(0).into());
-        insertion.0.start_counts = zero + (emulator.insertion_start_mm * per_mm).round() as i64;
-        rotation.0.start_counts = zero_turned;
-        let switches = &mut insertion.0.switches;
-        *switches = switches_mm.to_counts(zero, per_mm);
-        let switches_turned = &mut rotation.0.switches;
-        *switches_turned = switches_deg.to_counts(zero_turned, per_turn / 360.0);
+        insertion.start_counts = zero + (emulator.insertion_start_mm * per_mm).round() as i64;
+        rotation.start_counts = zero_turned;
+        insertion.switches = emulator.insertion_switches_mm.to_counts(zero, per_mm);
+        rotation.switches = emulator.rotation_switches_deg.to_counts(zero_turned, per_turn / 360.0);
         if emulator.rehearse {
-            *switches = rehearsal::switches(*switches, along, per_mm);
-            *switches_turned = rehearsal::switches(*switches_turned, about, per_turn / TAU);
+            insertion.switches = rehearsal::switches(insertion.switches, along, per_mm);
+            rotation.switches = rehearsal::switches(rotation.switches, about, per_turn / TAU);
         }
         let bench = Some(self.can.bus.bench_node);
         let faults = emulator.fault.iter().map(|fault| Fault { bench, ..fault.clone() });
         Ok(VirtualStageConfig {
-            insertion,
-            rotation,
+            insertion: (insertion, per_mm),
+            rotation: (rotation, per_turn),
             needle: emulator.arc.to_needle(emulator.tip_ahead_mm, "emulator")?,
             torsion: torsion(emulator.torsion, "emulator")?,
             start: emulator.start.to_pose(),

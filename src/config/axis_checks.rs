@@ -65,11 +65,21 @@ const STOPPING: [(&str, &[i16], &str); 4] = [
     ),
 ];
 
+/// Objects that the bench writes where the key of the axis is given. Where it is not, a raw SDO may write them,
+/// in the drive's own unit.
+const SET_BY: [((u16, u8), &str); 6] = [
+    ((0x607C, 0), "homing.offset_UNIT"),
+    ((0x6085, 0), "quick_stop_deceleration_UNIT_per_s2"),
+    ((0x6098, 0), "homing.method"),
+    ((0x6099, 1), "homing.speed_switch_UNIT_per_s"),
+    ((0x6099, 2), "homing.speed_zero_UNIT_per_s"),
+    ((0x609A, 0), "homing.acceleration_UNIT_per_s2"),
+];
+
 /// Notes every contradiction.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
     for which in Axis::BOTH {
-        let axis = [&config.stage.insertion, &config.stage.rotation][which as usize];
-        let checks = Checks { config, which, axis };
+        let checks = Checks { config, which, axis: config.stage.axis(which) };
         checks.reference(reader);
         checks.home(reader);
         checks.homing_direction(reader);
@@ -105,7 +115,7 @@ impl Checks<'_> {
     }
 
     fn reference(&self, reader: &mut Reader) {
-        let Checks { axis, .. } = self;
+        let axis = self.axis;
         let [reference, homing, zero] = ["reference", "homing", "zero"].map(|key| self.key(key));
         let homed = axis.reference == Reference::Homing;
         reader.check(&[&reference, &homing], homed && axis.homing.is_none(), || {
@@ -117,8 +127,8 @@ impl Checks<'_> {
                  zero"
             )
         });
-        // Limits of a real axis are what its screw, its needle or the sensor's cable bear. Counted from
-        // where each command begins they would bear nothing: three jogs go three times as far.
+        // The limits of a real axis protect its screw, its needle or the sensor's cable. Limits that count
+        // from where each command begins protect nothing: three jogs go three times as far.
         let ([_, high], [min, max]) = self.limits();
         let drifts = self.config.stage.hardware && axis.zero.is_none() && !axis.wraps;
         reader.check(&[&zero, &high, "stage.hardware"], drifts, || {
@@ -164,7 +174,7 @@ impl Checks<'_> {
         });
     }
 
-    /// The needle's axis has its way on one side of its end switch, where home is.
+    /// The insertion axis travels on one side of its end switch, where home is.
     fn homing_direction(&self, reader: &mut Reader) {
         let Some(homing) = self.axis.homing.filter(|_| self.which == Axis::Insertion) else {
             return;
@@ -179,13 +189,14 @@ impl Checks<'_> {
         let ([low, high], [min, max]) = self.limits();
         let offset = self.number(&self.offset_key());
         let home = self.home_at(if offset.is_nan() { 0.0 } else { offset });
-        let [beyond, before] =
-            if toward > 0.0 { [max - home, home - min] } else { [home - min, max - home] };
+        let (end, beyond, before) = match toward > 0.0 {
+            true => ("deep", max - home, home - min),
+            false => ("withdrawn", home - min, max - home),
+        };
         let [method_key, sign_key, zero] =
             ["homing.method", "sign", "zero"].map(|key| self.key(key));
         reader.check(&[&method_key, &sign_key, &zero, &low, &high], beyond > before, || {
-            let (unit, end) =
-                (self.which.unit(), if toward > 0.0 { "deep" } else { "withdrawn" });
+            let unit = self.which.unit();
             format!(
                 "{method_key} is {method}, which with sign = {sign} seeks the switch at the {end} end: home \
                  is {home:.3} {unit}, the limits of {min} to {max} {unit} go {beyond:.1} {unit} beyond it; \
@@ -208,10 +219,9 @@ impl Checks<'_> {
     fn optional_objects(&self, reader: &mut Reader) {
         for (n, index) in self.axis.optional_objects.iter().enumerate() {
             let needed = NEEDED.iter().find(|(indexes, _)| indexes.contains(index));
-            let needed = needed.filter(|_| *index != SOFTWARE_LIMITS || !self.axis.wraps);
+            let Some((_, why)) = needed else { continue };
             let key = self.key(&format!("optional_objects[{n}]"));
-            reader.check(&[&key], needed.is_some(), || {
-                let why = needed.map_or("", |(_, why)| why);
+            reader.check(&[&key], *index != SOFTWARE_LIMITS || !self.axis.wraps, || {
                 format!("{key} is 0x{index:04X}, which is not optional; remove it: {why}")
             });
         }
@@ -231,8 +241,7 @@ impl Checks<'_> {
         });
     }
 
-    /// Refuses raw SDOs whose value does not fit, and those to objects that the bench writes itself. 6085 may
-    /// be written where no deceleration of a quick stop is configured, in the drive's own unit.
+    /// Refuses raw SDOs whose value does not fit, and those to objects that the bench writes itself.
     fn raw_sdos(&self, reader: &mut Reader) {
         for (n, sdo) in self.axis.sdo.iter().enumerate() {
             let [index_key, value_key, bits_key] =
@@ -242,19 +251,17 @@ impl Checks<'_> {
             reader.check(&[&bits_key, &value_key], !(low..=high).contains(&value), || {
                 format!("{value_key} is {value}, allowed: {low} to {high}")
             });
-            let why = match (index, self.axis.quick_stop_deceleration) {
-                (0x6085, Some(_)) => {
-                    let unit = self.which.unit();
-                    Some(format!(
-                        "quick_stop_deceleration_{unit}_per_s2 sets it: give one of the two"
-                    ))
-                }
-                _ => reserved(index).map(str::to_owned),
-            };
-            reader.check(&[&index_key], why.is_some(), || {
-                let why = why.unwrap_or_default();
-                format!("{index_key} is 0x{index:04X}, not for raw SDOs: {why}")
+            let object = (index, sdo.subindex);
+            let set_by = SET_BY.iter().find_map(|(set, key)| {
+                let key = key.replace("UNIT", self.which.unit());
+                let is_given = *set == object && !self.number(&key).is_nan();
+                is_given.then(|| format!("{key} sets it: give one of the two"))
             });
+            if let Some(why) = reserved(index).map(str::to_owned).or(set_by) {
+                reader.check(&[&index_key], true, || {
+                    format!("{index_key} is 0x{index:04X}, not for raw SDOs: {why}")
+                });
+            }
         }
     }
 }

@@ -1,8 +1,8 @@
-//! Contradictions between keys, each of which is right by itself. Where one key is the upper limit of
-//! another, the declaration says so.
+//! Contradictions between keys, each of which is right by itself.
 
 use super::axis_checks;
 use super::goal;
+use super::needle;
 use super::reader::{REGISTRATION, Reader};
 use super::registration::GivenRegistration;
 use super::study::StudyConfig;
@@ -10,15 +10,15 @@ use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
 use super::{CanInterface, Config, GoalKind};
 use crate::emulator::fault::Fault;
 use crate::keys::{Key, expanded};
-use crate::needle::{Torsion, TorsionConfig};
-use crate::session::{InsertionConfig, rotation_peak};
-use std::time::Duration;
+use crate::needle::TorsionConfig;
+use crate::session::rotation_peak;
 
 pub(super) const ROTATION_ACCELERATION_MAX: &str = "stage.rotation.acceleration_max_deg_per_s2";
 
 /// Notes every contradiction in `config`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
-    insertion(config, reader);
+    limits(config, reader);
+    step(config, reader);
     goal::check(config, reader);
     rotation(config, reader);
     torsion("needle", config.needle.torsion, reader);
@@ -33,32 +33,44 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     faults(config, reader);
 }
 
-fn insertion(config: &Config, reader: &mut Reader) {
-    let InsertionConfig { step_mm: step, speed_mm_per_s: speed, arrival_mm, .. } = config.insertion;
-    let [arrival_key, step_key] = ["insertion.arrival_mm", "insertion.step_mm"];
-    reader.check(&[arrival_key, step_key], arrival_mm > 0.5 * step, || {
-        format!("{arrival_key} is {arrival_mm}, allowed: up to half of {step_key}, which is {step}")
-    });
-    // A step is taken at a SYNC: at most one a period.
-    let per_sync = speed * f64::from(config.can.bus.sync_ms) / 1e3;
-    let [speed_key, sync_key] = ["insertion.speed_mm_per_s", "can.sync_ms"];
-    reader.check(&[step_key, speed_key, sync_key], per_sync > step, || {
+/// Numbers that limit others. Where one is the upper limit of another, the declaration says so.
+fn limits(config: &Config, reader: &mut Reader) {
+    let limited = std::mem::take(&mut reader.limited);
+    let mut limit = |key: &str, allowed: &str, other: &str, is_wrong: fn(f64, f64) -> bool| {
+        let [value, limit] = [key, other].map(|key| config.number(key));
+        reader.check(&[key, other], is_wrong(value, limit), || {
+            format!("{key} is {value}, allowed: {allowed} {other}, which is {limit}")
+        });
+    };
+    for (key, other) in limited {
+        limit(&key, "up to", other, |value, max| value > max);
+    }
+    let step = "insertion.step_mm";
+    limit("insertion.arrival_mm", "up to half of", step, |arrival, step| arrival > 0.5 * step);
+    let baseline = "observer.finite_difference.baseline_mm";
+    limit(baseline, "at least", step, |baseline, step| baseline < step);
+    let [timeout, period] = ["can.heartbeat_timeout_ms", "can.heartbeat_ms"];
+    limit(timeout, "at least twice", period, |timeout, period| timeout < 2.0 * period);
+}
+
+/// A step is taken at a SYNC: at most one a period.
+fn step(config: &Config, reader: &mut Reader) {
+    let keys = ["insertion.step_mm", "insertion.speed_mm_per_s", "can.sync_ms"];
+    let [step, speed, sync_ms] = keys.map(|key| config.number(key));
+    let per_sync = speed * sync_ms / 1e3;
+    let [step_key, speed_key, sync_key] = keys;
+    reader.check(&keys, per_sync > step, || {
         format!(
             "{step_key} is {step}, allowed: at least what {speed_key} = {speed} moves in {sync_key} = \
-             {}, which is {per_sync}",
-            config.can.bus.sync_ms
+             {sync_ms}, which is {per_sync}"
         )
-    });
-    let baseline = config.observer.finite_difference.baseline_mm;
-    let key = "observer.finite_difference.baseline_mm";
-    reader.check(&[key, step_key], baseline < step, || {
-        format!("{key} is {baseline}, allowed: at least {step_key}, which is {step}")
     });
 }
 
 /// The rotation that the law may ask for is within the limits of the axis, and so is its reversal.
 fn rotation(config: &Config, reader: &mut Reader) {
-    let (_, key) = config.control.rotation_max_rad_per_mm();
+    let section = config.control.kind.to_string().replace('-', "_");
+    let key = &*format!("control.{section}.rotation_max_deg_per_mm");
     let (per_mm, speed) = (config.number(key), config.insertion.speed_mm_per_s);
     let (speed_key, sync_key) = ("insertion.speed_mm_per_s", "can.sync_ms");
     let max_key = "stage.rotation.speed_max_deg_per_s";
@@ -72,7 +84,7 @@ fn rotation(config: &Config, reader: &mut Reader) {
         )
     });
     let (max_key, max) = (ROTATION_ACCELERATION_MAX, config.number(ROTATION_ACCELERATION_MAX));
-    let peak = rotation_peak(per_mm, speed, Duration::from_millis(config.can.bus.sync_ms.into()));
+    let peak = rotation_peak(per_mm, speed, config.can.bus.sync_period());
     reader.check(&[key, speed_key, sync_key, max_key], peak > max, || {
         format!(
             "{key} is {per_mm}: reversed from one SYNC to the next at {speed} mm/s, that is {peak:.0} \
@@ -88,13 +100,10 @@ pub(super) fn rounded_down(value: f64, digits: i32) -> f64 {
 }
 
 fn torsion(section: &str, torsion: TorsionConfig, reader: &mut Reader) {
-    let keys =
-        ["offset_deg", "half_width_deg", "half_width_deg_per_mm", "creep_mm", "creep_mm_per_mm"];
-    let keys = keys.map(|key| format!("{section}.torsion.{key}"));
-    if let Err(error) = Torsion::new(torsion) {
-        let message = || format!("{section}.torsion: {error}");
-        reader.check(&keys.each_ref().map(String::as_str), true, message);
-    }
+    let keys = TorsionConfig::KEYS.iter().map(|key| format!("{section}.torsion.{}", key.name));
+    let keys: Vec<String> = keys.collect();
+    let keys: Vec<&str> = keys.iter().map(String::as_str).collect();
+    reader.check_made(&keys, needle::torsion(torsion, section));
 }
 
 /// Each range has its lower end first, and no trial may draw an offset outside the band that it draws.
@@ -114,13 +123,15 @@ fn study(config: &Config, reader: &mut Reader) {
             "{depth} or {obstacles} is given, without effect since {kind} is \"plane\": set it to \"target\""
         )
     });
-    let emulated = |key: &str| [config.number(&format!("emulator.torsion.{key}")); 2];
-    let [low, high] = study.torsion_offset_deg.unwrap_or_else(|| emulated("offset_deg"));
-    let [half_width, _] =
-        study.torsion_half_width_deg.unwrap_or_else(|| emulated("half_width_deg"));
+    let or_emulated = |drawn: Option<[f64; 2]>, key: &str| {
+        drawn.unwrap_or_else(|| [config.number(&format!("emulator.torsion.{key}")); 2])
+    };
+    let (offset, half_width) = (study.torsion_offset_deg, study.torsion_half_width_deg);
+    let is_drawn = offset.is_some() || half_width.is_some();
+    let [low, high] = or_emulated(offset, "offset_deg");
+    let [half_width, _] = or_emulated(half_width, "half_width_deg");
     let offset = low.abs().max(high.abs());
-    let drawn = study.torsion_offset_deg.is_some() || study.torsion_half_width_deg.is_some();
-    let outside = drawn && config.emulator.torsion.creep_mm == 0.0 && offset > half_width;
+    let outside = is_drawn && config.emulator.torsion.creep_mm == 0.0 && offset > half_width;
     let [key, band] = ["study.torsion_offset_deg", "study.torsion_half_width_deg"];
     reader.check(&[key, band], outside, || {
         format!(
@@ -139,17 +150,17 @@ fn noise(config: &Config, reader: &mut Reader) {
     let keys = [told, "insertion.depth_mm", "insertion.speed_mm_per_s"];
     reader.check(&keys, time_s > run_s, || {
         format!(
-            "{told} is {time_s}, allowed: up to the {run_s:.3} s of the insertion; noise that lasts \
-             longer is an error of the registration, tracker.registration.sd_mm"
+            "{told} is {time_s}, allowed: up to the {:.3} s of the insertion; noise that lasts longer \
+             is an error of the registration, tracker.registration.sd_mm",
+            rounded_down(run_s, 3)
         )
     });
     let noise = config.emulator.noise;
-    let [sd, time] = ["emulator.noise.correlated_sd_mm", "emulator.noise.correlation_time_s"];
-    let lacks_time = noise.correlated_sd_mm.is_some() && noise.correlation_time.is_none();
-    let lacks_sd = noise.correlation_time.is_some() && noise.correlated_sd_mm.is_none();
-    for (given, other, lacks) in [(sd, time, lacks_time), (time, sd, lacks_sd)] {
-        reader.check(&[given, other], lacks, || {
-            format!("{given} is given without {other}: give both")
+    let keys = ["emulator.noise.correlated_sd_mm", "emulator.noise.correlation_time_s"];
+    let is_given = [noise.correlated_sd_mm.is_some(), noise.correlation_time.is_some()];
+    for (given, other) in [(0, 1), (1, 0)] {
+        reader.check(&keys, is_given[given] && !is_given[other], || {
+            format!("{} is given without {}: give both", keys[given], keys[other])
         });
     }
 }
@@ -160,22 +171,12 @@ fn bus(config: &Config, reader: &mut Reader) {
         ("stage.insertion.node", config.stage.insertion.node),
         ("stage.rotation.node", config.stage.rotation.node),
     ];
-    for (i, (first, node)) in nodes.iter().enumerate() {
-        for (second, other) in &nodes[i + 1..] {
-            reader.check(&[first, second], node == other, || {
-                format!("{second} is {other}, the same as {first}: each node needs its own number")
-            });
-        }
+    for [first, second] in [[0, 1], [0, 2], [1, 2]] {
+        let ((first, node), (second, other)) = (nodes[first], nodes[second]);
+        reader.check(&[first, second], node == other, || {
+            format!("{second} is {other}, the same as {first}: each node needs its own number")
+        });
     }
-
-    let (period, timeout) = (config.can.bus.heartbeat_ms, config.can.bus.heartbeat_timeout_ms);
-    let too_short = u32::from(timeout) < 2 * u32::from(period);
-    reader.check(&["can.heartbeat_timeout_ms", "can.heartbeat_ms"], too_short, || {
-        format!(
-            "can.heartbeat_timeout_ms is {timeout}, allowed: at least twice can.heartbeat_ms, which \
-             is {period}"
-        )
-    });
 
     let interface = &config.can.interface;
     let wrong_bus = config.stage.hardware && interface.is_for_tests();
@@ -204,37 +205,35 @@ fn bus(config: &Config, reader: &mut Reader) {
 fn tracker(config: &Config, reader: &mut Reader) {
     let interface = &config.can.interface;
     let source = config.tracker.source;
-    let emulated = source == TrackerSource::Emulated;
-    let apart = emulated && *interface != CanInterface::Memory;
-    reader.check(&["tracker.source", "can.interface"], apart, || {
+    let is_emulated = source == TrackerSource::Emulated;
+    let is_in_memory = *interface == CanInterface::Memory;
+    let keys = ["tracker.source", "can.interface"];
+    reader.check(&keys, is_emulated && !is_in_memory, || {
         format!(
             "tracker.source is \"emulated\", allowed only with can.interface = \"memory\", which is \
              \"{interface}\": it sees the emulated needle alone. Set tracker.source = \"openigtlink\""
         )
     });
-
-    let recorded = config.tracker.file.is_some() || source == TrackerSource::Csv;
-    let blind = !emulated && !recorded && *interface == CanInterface::Memory;
-    let recording = match source {
-        TrackerSource::Ndjson => ", or a recording as tracker.file",
-        _ => "",
-    };
-    reader.check(&["tracker.source", "can.interface"], blind, || {
+    let is_recorded = config.tracker.file.is_some() || source == TrackerSource::Csv;
+    reader.check(&keys, is_in_memory && !is_emulated && !is_recorded, || {
+        let recording = match source {
+            TrackerSource::Ndjson => ", or a recording as tracker.file",
+            _ => "",
+        };
         format!(
             "tracker.source is \"{source}\", but can.interface = \"memory\" is the emulated stage, \
              which only its own tracker sees: name \"vcan0\" with vcan-stage on it{recording}"
         )
     });
-    let latency_ms = config.number("tracker.latency_ms");
-    let hold_after_s = config.tracker.hold.after.as_secs_f64();
-    let [latency, after] = ["tracker.latency_ms", "tracker.hold_after_s"];
-    reader.check(&[latency, after], latency_ms * 1e-3 >= hold_after_s, || {
+
+    let keys = ["tracker.latency_ms", "tracker.hold_after_s"];
+    let ([latency, after], [latency_ms, after_s]) = (keys, keys.map(|key| config.number(key)));
+    reader.check(&keys, latency_ms * 1e-3 >= after_s, || {
         format!(
-            "{latency} is {latency_ms}, allowed: under {after}, which is {hold_after_s} s: no position \
-             would be young enough to steer by"
+            "{latency} is {latency_ms}, allowed: under {after}, which is {after_s} s: no position would \
+             be young enough to steer by"
         )
     });
-
     // The longest way without a position: its latency, the tracker's period, two SYNCs until the hold begins,
     // and the braking.
     let (speed, hold_mm) = (config.insertion.speed_mm_per_s, config.tracker.hold.after_mm);
@@ -255,8 +254,8 @@ fn tracker(config: &Config, reader: &mut Reader) {
 
     let Some(workspace) = &config.tracker.workspace else { return };
     let [min_mm, max_mm] = [workspace.min_mm, workspace.max_mm].map(<[f64; 3]>::from);
-    let empty = min_mm.iter().zip(max_mm).any(|(&min, max)| min >= max);
-    reader.check(&["tracker.workspace.min_mm", "tracker.workspace.max_mm"], empty, || {
+    let is_empty = min_mm.iter().zip(max_mm).any(|(&min, max)| min >= max);
+    reader.check(&["tracker.workspace.min_mm", "tracker.workspace.max_mm"], is_empty, || {
         format!(
             "tracker.workspace.min_mm is {min_mm:?}, allowed: each under that of \
              tracker.workspace.max_mm, which is {max_mm:?}"
@@ -276,10 +275,7 @@ fn registration(config: &Config, reader: &mut Reader) {
             reader.refuse(REGISTRATION, key, &message);
         }
     }
-    let unregistered = config.registration_sd_mm().err();
-    reader.check(&[key, REGISTRATION], unregistered.is_some(), || {
-        unregistered.map(|error| error.to_string()).unwrap_or_default()
-    });
+    reader.check_made(&[key, REGISTRATION], config.registration_sd_mm());
 }
 
 /// Keys that only some sources of tip positions take.
@@ -291,25 +287,27 @@ fn source(config: &Config, reader: &mut Reader) {
     reader.check(&[key, file], source == TrackerSource::Csv && tracker.file.is_none(), || {
         format!("{key} is \"{source}\", and there is no {file} to read")
     });
-    let recording = tracker.file.as_deref().unwrap_or_default();
+    let recording = format!("\"{}\"", tracker.file.as_deref().unwrap_or_default());
     let is_file = matches!(source, TrackerSource::Ndjson | TrackerSource::Csv);
-    reader.check(&[file, key], tracker.file.is_some() && !is_file, || {
-        format!("{file} is \"{recording}\", allowed with {key} = \"ndjson\" or \"csv\", which is \"{source}\"")
-    });
-    let hardware = tracker.file.is_some() && config.stage.hardware;
-    reader.check(&[file, "stage.hardware"], hardware, || {
+    let is_ndjson = source == TrackerSource::Ndjson;
+    let is_openigtlink = source == TrackerSource::OpenIgtLink;
+    let is_asked = tracker.request != TrackerRequest::None;
+    let is_standard_input = tracker.address == STANDARD_INPUT;
+    for (other, is_given, value, has_it, sources) in [
+        (file, tracker.file.is_some(), &*recording, is_file, "\"ndjson\" or \"csv\""),
+        (address, is_standard_input, "\"-\"", is_ndjson, "\"ndjson\""),
+        (request, is_asked, "given", is_openigtlink, "\"openigtlink\""),
+    ] {
+        reader.check(&[other, key], is_given && !has_it, || {
+            format!("{other} is {value}, allowed with {key} = {sources}, which is \"{source}\"")
+        });
+    }
+    let is_real = tracker.file.is_some() && config.stage.hardware;
+    reader.check(&[file, "stage.hardware"], is_real, || {
         format!(
-            "{file} is \"{recording}\", but stage.hardware is true: a recording does not see the \
-             needle that would move"
+            "{file} is {recording}, but stage.hardware is true: a recording does not see the needle \
+             that would move"
         )
-    });
-    let no_lines = tracker.address == STANDARD_INPUT && source != TrackerSource::Ndjson;
-    reader.check(&[address, key], no_lines, || {
-        format!("{address} is \"-\", allowed with {key} = \"ndjson\", which is \"{source}\"")
-    });
-    let asked = tracker.request != TrackerRequest::None && source != TrackerSource::OpenIgtLink;
-    reader.check(&[request, key], asked, || {
-        format!("{request} is given, allowed with {key} = \"openigtlink\", which is \"{source}\"")
     });
     let times = [
         ("tracker.csv.time", Some(&tracker.csv.time)),

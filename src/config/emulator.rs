@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::needle::{Arc, TIP_AHEAD};
-use super::pose::{PoseConfig, TIP_PITCH};
+use super::pose::{IDENTITY, PoseConfig, TIP_PITCH};
 use crate::emulator::drive::{Model, Switches};
 use crate::emulator::fault::Fault;
 use crate::emulator::{self, CorrelatedNoise, TrackerModel};
@@ -49,8 +49,7 @@ section! {
         /// emulated in memory, whatever `can.interface` and `tracker.source` say.
         rehearse: bool = false;
         /// The pose of the tracked sensor in the frame of the tip.
-        sensor: PoseConfig => "{ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, pitch_deg = 0.0, \
-            roll_deg = 0.0 }";
+        sensor: PoseConfig => IDENTITY;
         /// True where both drives were homed before the start.
         homed: bool = false;
         /// The make of drive that is emulated.
@@ -108,6 +107,27 @@ choice! {
         Ultrasound = "ultrasound",
         /// A pair of cameras.
         StereoCamera = "stereo-camera",
+    }
+}
+
+impl TrackerPreset {
+    /// The keys that it sets.
+    pub(super) fn toml(self) -> &'static str {
+        match self {
+            TrackerPreset::Plain => "",
+            TrackerPreset::ElectromagneticNear => {
+                include_str!("../../bench-config/emulated-trackers/electromagnetic-near.toml")
+            }
+            TrackerPreset::ElectromagneticFar => {
+                include_str!("../../bench-config/emulated-trackers/electromagnetic-far.toml")
+            }
+            TrackerPreset::Ultrasound => {
+                include_str!("../../bench-config/emulated-trackers/ultrasound.toml")
+            }
+            TrackerPreset::StereoCamera => {
+                include_str!("../../bench-config/emulated-trackers/stereo-camera.toml")
+            }
+        }
     }
 }
 

@@ -22,14 +22,6 @@ impl Problem {
         let place = origin.as_ref().map(Origin::to_string).unwrap_or_default();
         Problem { message: format!("{place}{message}"), origin }
     }
-
-    pub(super) fn unknown_key(origin: Origin, key: &str, hint: &str) -> Self {
-        let message = match origin {
-            Origin::File { .. } => format!("{origin}unknown key \"{key}\"; {hint}"),
-            Origin::Set => format!("{origin}{key}: unknown key; {hint}"),
-        };
-        Problem { origin: Some(origin), message }
-    }
 }
 
 /// A configuration that cannot be used: everything found wrong with it, in the order found.

@@ -3,7 +3,8 @@
 use super::pose::{POSITION, PoseConfig};
 use super::reader::Reader;
 use super::tracker::FILE;
-use super::{Config, ControlKind, TrackerSource};
+use super::{Config, ConfigError, TrackerSource};
+use crate::control::ControlKind;
 use crate::keys::{Rule, choice, named, over, section, within};
 use crate::plan::{Obstacle, Problem, Tip, Workspace, World};
 use crate::session::{Goal, TargetTool};
@@ -158,10 +159,8 @@ impl ObstacleConfig {
                 let min_mm = self.min_mm.ok_or_else(|| needs("min_mm"))?;
                 let max_mm = self.max_mm.ok_or_else(|| needs("max_mm"))?;
                 if !is_box(&min_mm, &max_mm) {
-                    return Err((
-                        "max_mm",
-                        "each coordinate of max_mm is over that of min_mm".into(),
-                    ));
+                    let message = "each coordinate of max_mm is over that of min_mm";
+                    return Err(("max_mm", message.to_owned()));
                 }
                 Obstacle::Box { min_mm, max_mm }
             }
@@ -205,7 +204,7 @@ impl Config {
     pub fn to_goal(
         &self,
         read_mask: ReadMask<'_>,
-    ) -> Result<Result<Option<Goal>, String>, super::ConfigError> {
+    ) -> Result<Result<Option<Goal>, String>, ConfigError> {
         if self.goal.kind == GoalKind::Plane {
             return Ok(Ok(None));
         }
@@ -219,10 +218,7 @@ impl Config {
     }
 
     /// The tool that is the target, where that is one.
-    fn target_tool(
-        &self,
-        expected_mm: Vector3<f64>,
-    ) -> Result<Option<TargetTool>, super::ConfigError> {
+    fn target_tool(&self, expected_mm: Vector3<f64>) -> Result<Option<TargetTool>, ConfigError> {
         let Some(tool) = self.goal.tool.clone() else { return Ok(None) };
         let gate = self.tracker.to_gate()?;
         // The tip's offset is that of another sensor.
@@ -258,21 +254,20 @@ impl Config {
     ///
     /// # Errors
     /// No target; a mask that cannot be read.
-    pub fn to_plan(&self, read_mask: ReadMask<'_>) -> Result<(World, Problem), super::ConfigError> {
+    pub fn to_plan(&self, read_mask: ReadMask<'_>) -> Result<(World, Problem), ConfigError> {
         let goal = &self.goal;
         let target_mm = goal.position_mm.filter(|_| goal.kind == GoalKind::Target);
         let target_mm = target_mm.ok_or_else(|| {
-            super::ConfigError::of("goal.kind is \"plane\": a plan needs goal.kind = \"target\"")
+            ConfigError::of("goal.kind is \"plane\": a plan needs goal.kind = \"target\"")
         })?;
         let obstacles = goal.obstacle.iter().enumerate().map(|(i, obstacle)| {
-            let at = |key| format!("goal.obstacle[{i}].{key}");
-            let obstacle = obstacle.to_obstacle(read_mask);
-            obstacle.map_err(|(key, message)| format!("{}: {message}", at(key)))
+            obstacle.to_obstacle(read_mask).map_err(|(key, message)| {
+                ConfigError::of(format!("goal.obstacle[{i}].{key}: {message}"))
+            })
         });
-        let obstacles: Result<_, _> = obstacles.collect();
-        let WorkspaceConfig { min, max } = goal.workspace_mm;
-        let workspace = Workspace { min_mm: min, max_mm: max, start_mm: None };
-        let world = World { obstacles: obstacles.map_err(super::ConfigError::of)?, workspace };
+        let obstacles = obstacles.collect::<Result<_, _>>()?;
+        let WorkspaceConfig { min: min_mm, max: max_mm } = goal.workspace_mm;
+        let world = World { obstacles, workspace: Workspace { min_mm, max_mm, start_mm: None } };
         let mut angles = self.observer.start;
         let mut position_mm = match self.tip_source() {
             TrackerSource::Emulated => self.emulator.start.to_pose().translation,
@@ -289,7 +284,7 @@ impl Config {
             tolerance_mm: goal.tolerance_mm,
             curvature_per_mm: self.needle.arc.curvature_per_mm() * (1.0 - goal.curvature_margin()),
             clearance_mm: goal.clearance_mm,
-            // Of NaN and a number the number is the less.
+            // `f64::min` ignores NaN.
             length_max_mm: length_max_mm.min(self.insertion.depth_mm),
             in_plane: goal.in_plane,
             expansions_max: goal.expansions_max,
@@ -325,13 +320,10 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     reader.check(&[tool, "tracker.source"], goal.tool.is_some() && has_one, || {
         format!("{tool} needs a stream of two tools, and tracker.source = \"csv\" has one")
     });
-    let law = "control.kind";
-    let cannot_follow = is_target && config.control.kind != ControlKind::NestedSaturation;
+    let (law, chosen) = ("control.kind", config.control.kind);
+    let cannot_follow = is_target && chosen != ControlKind::NestedSaturation;
     reader.check(&[law, kind], cannot_follow, || {
-        format!(
-            "{law} is \"{}\", allowed with {kind} = \"target\": \"nested-saturation\"",
-            config.control.kind
-        )
+        format!("{law} is \"{chosen}\", allowed with {kind} = \"target\": \"nested-saturation\"")
     });
     let WorkspaceConfig { min, max } = goal.workspace_mm;
     let is_workspace = is_box(&min, &max);
@@ -343,15 +335,14 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     reader.check(&[workspace, in_plane], is_workspace && goal.in_plane && !has_plane, || {
         format!("{workspace} does not have the plane x = 0 in it, where {in_plane} keeps the path")
     });
-    if let Some(target_mm) = goal.position_mm.filter(|_| is_target) {
-        reader.check(&[position, in_plane], goal.in_plane && target_mm.x != 0.0, || {
-            format!(
-                "{position} is {} mm off the plane, allowed with {in_plane}: 0; steer in space with \
-                 {in_plane} = false",
-                target_mm.x
-            )
-        });
-    }
+    let aside_mm = goal.position_mm.map_or(0.0, |target_mm| target_mm.x);
+    let is_aside = is_target && goal.in_plane && aside_mm != 0.0;
+    reader.check(&[position, in_plane], is_aside, || {
+        format!(
+            "{position} is {aside_mm} mm off the plane, allowed with {in_plane}: 0; steer in space with \
+             {in_plane} = false"
+        )
+    });
     // Files are not read here, so any obstacle stands for a mask.
     let any = |_: &str, _: Option<u32>, _: &PoseConfig| {
         Ok(Obstacle::Sphere { centre_mm: Vector3::zeros(), radius_mm: 0.0 })

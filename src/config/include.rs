@@ -3,9 +3,11 @@
 
 use std::path::Path;
 
+use super::TrackerPreset;
 use super::error::{ConfigError, Problem};
-use super::reader::{FIDUCIALS, REGISTRATION, is_inside};
+use super::reader::{FIDUCIALS, REGISTRATION, Tree, is_inside};
 use super::value::{self, Entries, Entry, Origin};
+use crate::keys::Field as _;
 
 /// Reads a file that the configuration names; what goes wrong, in words.
 pub type ReadFile<'a> = &'a dyn Fn(&Path) -> Result<String, String>;
@@ -17,9 +19,11 @@ struct CalibrationFile {
     made_by: &'static str,
     /// The keys that such a file holds, and no others.
     holds: &'static [&'static str],
-    /// Keys that say the same: they and `key` exclude one another in one source, and given in one
-    /// over it they take its place.
+    /// Keys that take the file's place where they are given in a source over the one that names it. In one
+    /// source neither they nor what the file holds may be given beside `key`.
     instead_of: &'static [&'static str],
+    /// Where the values came from: the one of the keys in `holds` that the preflight judges.
+    fit: &'static str,
 }
 
 const CALIBRATION_FILES: [CalibrationFile; 3] = [
@@ -28,12 +32,14 @@ const CALIBRATION_FILES: [CalibrationFile; 3] = [
         made_by: "needle-bench calibrate registration",
         holds: &[REGISTRATION],
         instead_of: &[REGISTRATION, FIDUCIALS],
+        fit: "tracker.registration.fit",
     },
     CalibrationFile {
         key: "tracker.tip_file",
         made_by: "needle-bench calibrate tip",
         holds: &["tracker.tip_offset_mm", "tracker.tip_tilt", "tracker.tip_fit"],
         instead_of: &["tracker.tip_offset_mm", "tracker.tip_tilt"],
+        fit: "tracker.tip_fit",
     },
     CalibrationFile {
         key: "needle.needle_file",
@@ -47,47 +53,27 @@ const CALIBRATION_FILES: [CalibrationFile; 3] = [
             "evaluation.bend_axis",
         ],
         instead_of: &["needle.curvature_per_mm", "needle.radius_mm"],
+        fit: "needle.fit",
     },
 ];
 
-const PRESETS: [(&str, &str); 4] = [
-    (
-        "electromagnetic-near",
-        include_str!("../../bench-config/emulated-trackers/electromagnetic-near.toml"),
-    ),
-    (
-        "electromagnetic-far",
-        include_str!("../../bench-config/emulated-trackers/electromagnetic-far.toml"),
-    ),
-    ("ultrasound", include_str!("../../bench-config/emulated-trackers/ultrasound.toml")),
-    ("stereo-camera", include_str!("../../bench-config/emulated-trackers/stereo-camera.toml")),
-];
-const PRESET_KEY: &str = "emulator.tracker";
-
 /// The preset that the topmost of `layers` names, as layer number `layer`.
 pub(super) fn preset(layers: &[Entries], layer: usize) -> Result<Entries, ConfigError> {
-    let named = last(layers, PRESET_KEY).and_then(|entry| entry.value.as_str());
-    let named = named.and_then(|name| PRESETS.iter().find(|(preset, _)| *preset == name));
-    match named {
-        Some((name, text)) => Ok(value::parse_file(name, text, layer)?),
-        None => Ok(Entries::new()),
-    }
+    let named = last(layers, "emulator.tracker").map(|entry| &entry.value);
+    let preset = TrackerPreset::take(named);
+    Ok(value::parse_file(&preset.to_string(), preset.toml(), layer)?)
 }
 
-/// A calibration file that is named and cannot be used.
-pub(super) struct Unusable {
-    /// The keys that are not known without it.
-    pub(super) keys: Vec<&'static str>,
-    pub(super) problems: Vec<Problem>,
-}
+/// Calibration files that cannot be used: the keys that are not known without each, and why.
+pub(super) type Unusable = Vec<(Vec<&'static str>, ConfigError)>;
 
 /// Lays what the named calibration files hold into the layers that name them, as if it were
 /// written there; the files with which that fails.
-pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Vec<Unusable> {
+pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Unusable {
     let mut unusable = Vec::new();
     for file in &CALIBRATION_FILES {
-        if let Err(problems) = file.lay(layers, read) {
-            unusable.push(Unusable { keys: [file.holds, file.instead_of].concat(), problems });
+        if let Err(error) = file.lay(layers, read) {
+            unusable.push(([file.holds, file.instead_of].concat(), error));
         }
         // What the file holds is in its layer now, or something given above it counts.
         for layer in layers.iter_mut() {
@@ -97,67 +83,83 @@ pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Vec<Un
     unusable
 }
 
+/// Removes the origin of each calibration over which a value of it is given: it does not vouch for that.
+pub(super) fn remove_outdated_fits(tree: &mut Tree) {
+    for file in &CALIBRATION_FILES {
+        let Some(layer) = tree.get(file.fit).map(|fit| fit.layer) else { continue };
+        if tree.iter().any(|(key, entry)| entry.layer > layer && file.is_about(key)) {
+            tree.retain(|key, _| !is_of(key, &[file.fit]));
+        }
+    }
+}
+
 impl CalibrationFile {
-    fn lay(&self, layers: &mut [Entries], read: ReadFile<'_>) -> Result<(), Vec<Problem>> {
+    /// True for the keys that the file holds, and for those that say the same.
+    fn is_about(&self, key: &str) -> bool {
+        is_of(key, self.holds) || is_of(key, self.instead_of)
+    }
+
+    fn lay(&self, layers: &mut [Entries], read: ReadFile<'_>) -> Result<(), ConfigError> {
         let Some(naming) = last(layers, self.key).cloned() else { return Ok(()) };
         let Some(path) = naming.value.as_str() else { return Ok(()) };
-        let given = self.instead_of.iter().filter_map(|key| Some((key, last(layers, key)?)));
-        if let Some((key, other)) = given.max_by_key(|(_, entry)| entry.layer) {
-            if other.is_beside(&naming) {
-                let message =
-                    format!("{} is given along with {key}: give one of the two", self.key);
-                return Err(vec![Problem::at(Some(naming.origin), message)]);
-            }
-            if other.layer > naming.layer {
-                return Ok(());
-            }
+        let refusal = |message: String| {
+            ConfigError::from(vec![Problem::at(Some(naming.origin.clone()), message)])
+        };
+        let mut others = self.instead_of.iter().filter_map(|key| last(layers, key));
+        if others.any(|other| other.layer > naming.layer && !other.is_beside(&naming)) {
+            return Ok(());
+        }
+        let beside = layers.iter().flatten().filter(|(_, entry)| entry.is_beside(&naming));
+        if let Some(key) = beside.map(|(key, _)| key).find(|key| self.is_about(key)) {
+            let message = format!("{} is given along with {key}: give one of the two", self.key);
+            return Err(refusal(message));
         }
         // A path is relative to the file that names it, or on the command line to where that is typed.
         let path = match &naming.origin {
             Origin::File { name, .. } => Path::new(name).with_file_name(path),
             Origin::Set => path.into(),
         };
-        let name = path.display().to_string();
         let text = read(&path).map_err(|error| {
-            let message = format!("{}: {error}; {} --out writes it", self.key, self.made_by);
-            vec![Problem::at(Some(naming.origin.clone()), message)]
+            refusal(format!("{}: {error}; {} --out writes it", self.key, self.made_by))
         })?;
+        let name = path.display().to_string();
         let entries = value::parse_file(&name, &text, naming.layer)?;
         self.check(&name, &entries)?;
-        let names_it =
-            |(key, entry): &(String, Entry)| key == self.key && entry.layer == naming.layer;
-        if let Some(layer) = layers.iter_mut().find(|layer| layer.iter().any(names_it)) {
+        let is_naming = |layer: &&mut Entries| layer.iter().any(|(_, e)| e.layer == naming.layer);
+        if let Some(layer) = layers.iter_mut().find(is_naming) {
             layer.extend(entries);
         }
         Ok(())
     }
 
     /// A calibration file holds its calibration, whole, and nothing else.
-    fn check(&self, name: &str, entries: &Entries) -> Result<(), Vec<Problem>> {
-        let holds =
-            |key: &str| self.holds.iter().any(|&table| key == table || is_inside(key, table));
-        let around = |key: &str| self.holds.iter().any(|table| is_inside(table, key));
-        let mut problems: Vec<Problem> = entries
-            .iter()
-            .filter(|(key, _)| !holds(key) && !around(key))
-            .map(|(key, entry)| {
+    fn check(&self, name: &str, entries: &Entries) -> Result<(), ConfigError> {
+        let mut problems = Vec::new();
+        for (key, entry) in entries {
+            let is_around = self.holds.iter().any(|table| is_inside(table, key));
+            if !is_around && !is_of(key, self.holds) {
                 let message = format!("{key} does not belong in a file for {}", self.key);
-                Problem::at(Some(entry.origin.clone()), message)
-            })
-            .collect();
-        let missing =
-            self.holds.iter().find(|&&table| !entries.iter().any(|(key, _)| key == table));
-        let missing = missing.filter(|_| problems.is_empty()).map(|table| {
+                problems.push(Problem::at(Some(entry.origin.clone()), message));
+            }
+        }
+        let mut held = self.holds.iter();
+        let missing = held.find(|held| !entries.iter().any(|(key, _)| key == *held));
+        if let (Some(key), true) = (missing, problems.is_empty()) {
             let origin = Origin::File { name: name.to_owned(), line: 1 };
-            Problem::at(Some(origin), format!("{table} is missing in a file for {}", self.key))
-        });
-        problems.extend(missing);
-        if problems.is_empty() { Ok(()) } else { Err(problems) }
+            let message = format!("{key} is missing in a file for {}", self.key);
+            problems.push(Problem::at(Some(origin), message));
+        }
+        ConfigError::unless_empty(problems)
     }
+}
+
+/// True for each of `keys` and what is inside it.
+fn is_of(key: &str, keys: &[&str]) -> bool {
+    keys.iter().any(|of| key == *of || is_inside(key, of))
 }
 
 /// The topmost value of `key`.
 fn last<'a>(layers: &'a [Entries], key: &str) -> Option<&'a Entry> {
-    let entries = layers.iter().rev().flat_map(|layer| layer.iter().rev());
-    entries.filter(|(name, _)| name == key).map(|(_, entry)| entry).next()
+    let mut entries = layers.iter().rev().flat_map(|layer| layer.iter().rev());
+    entries.find(|(name, _)| name == key).map(|(_, entry)| entry)
 }

@@ -8,6 +8,7 @@
 //! `tracker.registration_file`, `tracker.tip_file` and `needle.needle_file` calibrated values, which
 //! count as written where the file is named. The configuration as used has their content, and needs them no more.
 //! `emulator.rehearse` lays what a rehearsal implies beside the preset.
+//! A calibrated value that is given over its calibration leaves out where that came from (`fit`).
 //!
 //! Three things are not laid key by key:
 //! - of two alternatives (`needle.radius_mm` and `needle.curvature_per_mm`, `emulator.noise`'s two)
@@ -25,7 +26,6 @@ mod assemble;
 mod axis_checks;
 mod can;
 mod checks;
-mod control;
 mod emulator;
 mod error;
 mod goal;
@@ -47,7 +47,6 @@ mod value;
 mod warnings;
 
 pub use can::{CanConfig, CanInterface, Listen};
-pub use control::{ControlConfig, ControlKind};
 pub use emulator::{EmulatorConfig, SEED_MAX, TrackerPreset};
 pub use error::{ConfigError, nearest_key};
 pub use goal::{GoalConfig, GoalKind, ReadMask, WorkspaceConfig};
@@ -62,6 +61,7 @@ pub use stop::StopConfig;
 pub use study::StudyConfig;
 pub use tracker::{TrackerConfig, TrackerMode, TrackerSource};
 
+use crate::control::ControlConfig;
 use crate::keys::{self, Field, Rule, section};
 use crate::session::InsertionConfig;
 use reader::{Reader, Tree};
@@ -101,8 +101,7 @@ section! {
         /// Name of the run folder: `runs/<UTC>-<name>`.
         name: String [Rule::Text("1 to 64 letters, digits, '.', '_' or '-'", is_run_name)] = "virtual";
         /// Pose of the plane frame P in the bench frame W. The needle is steered into P's y-z plane, x = 0.
-        plane: PoseConfig => "{ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, pitch_deg = 0.0, \
-            roll_deg = 0.0 }";
+        plane: PoseConfig => pose::IDENTITY;
         /// Where the needle is steered: into the plane, or to a target around obstacles.
         goal: GoalConfig;
         /// How far the needle is inserted, and how.
@@ -174,13 +173,13 @@ impl Config {
 
     /// The configuration that `tree` gives, and the tree with all defaults. The files in `unusable` were
     /// to be laid into it.
-    fn checked(tree: Tree, unusable: Vec<include::Unusable>) -> Result<(Self, Tree), ConfigError> {
+    fn checked(mut tree: Tree, unusable: include::Unusable) -> Result<(Self, Tree), ConfigError> {
+        include::remove_outdated_fits(&mut tree);
         let mut reader = Reader::new(tree);
-        unusable.into_iter().for_each(|file| reader.fail_all(file.keys, file.problems));
+        unusable.into_iter().for_each(|(keys, error)| reader.fail_all(keys, error));
         let config = Config::of(reader.read(Self::KEYS));
         checks::check(&config, &mut reader);
-        reader.finish()?;
-        Ok((config, reader.tree))
+        Ok((config, reader.finish()?))
     }
 
     /// The configuration that is written so: every key of it checked, with all defaults.

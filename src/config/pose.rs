@@ -4,6 +4,9 @@ use crate::geometry::{FixedAngles, Pose};
 use crate::keys::{Rule, section, within};
 use nalgebra::Vector3;
 
+/// No displacement and no rotation, as a default.
+pub(super) const IDENTITY: &str =
+    "{ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }";
 pub(super) const POSITION: Rule = within(-10_000.0, 10_000.0);
 /// Pitch of a needle's tip, short of ±90°, where yaw and roll are the same rotation.
 pub(super) const TIP_PITCH: Rule = within(-85.0, 85.0);

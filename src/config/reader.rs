@@ -7,7 +7,7 @@ use toml::{Table, Value};
 use super::Config;
 use super::error::{ConfigError, Problem, nearest_key};
 use super::value::{self, Entries, Entry, Origin, element, join};
-use crate::keys::{DefaultHolds, Key, Kind, Rule, ValueError, Words, expanded, find, tables};
+use crate::keys::{DefaultHolds, Key, Kind, Rule, Words, expanded, find, tables};
 
 /// All sources laid over each other, by dotted key.
 pub(super) type Tree = BTreeMap<String, Entry>;
@@ -27,19 +27,12 @@ pub(super) struct Reader {
     /// The keys of the configuration, each with its allowed values in words; none for tables and arrays of
     /// tables.
     known: BTreeMap<String, Option<String>>,
-    /// Values that have an upper limit in another key.
-    limited: Vec<(String, &'static str)>,
+    /// Keys, each with another whose value is its upper limit.
+    pub(super) limited: Vec<(String, &'static str)>,
     /// Keys that were found wrong or missing.
     failed: BTreeSet<String>,
     /// By key.
     problems: Vec<(String, Problem)>,
-}
-
-/// Properties that the keys of a table inherit from the tables around it.
-#[derive(Clone, Copy)]
-struct Around {
-    has_defaults: bool,
-    narrowed: &'static [(&'static str, Rule)],
 }
 
 impl Reader {
@@ -61,24 +54,29 @@ impl Reader {
 
     /// The configuration as `keys` declare it. What is wrong in it is noted, and left out.
     pub(super) fn read(&mut self, keys: &'static [Key]) -> Value {
-        let around = Around { has_defaults: true, narrowed: &[] };
-        let read = self.table(keys, "", around);
-        for (key, max) in std::mem::take(&mut self.limited) {
-            let number = |key: &str| {
-                let value = &self.tree.get(key)?.value;
-                value.as_float().or(value.as_integer().map(|integer| integer as f64))
-            };
-            let (Some(value), Some(limit)) = (number(&key), number(max)) else { continue };
-            self.check(&[&key, max], value > limit, || {
-                format!("{key} is {value}, allowed: up to {max}, which is {limit}")
-            });
-        }
-        Value::Table(read)
+        self.table(&Kind::Table(keys), &[], "", true)
     }
 
-    fn table(&mut self, keys: &'static [Key], path: &str, around: Around) -> Table {
+    /// The table at `path`, with narrower rules for some keys. Where it `has_defaults`, the keys that are not
+    /// given have theirs.
+    fn table(
+        &mut self,
+        kind: &Kind,
+        narrowed: &[(&str, Rule)],
+        path: &str,
+        has_defaults: bool,
+    ) -> Value {
+        let keys = match *kind {
+            Kind::Either(key, [with, _]) if self.is_there(&join(path, key)) => with,
+            Kind::Either(_, [_, keys]) | Kind::Table(keys) => keys,
+            _ => &[],
+        };
+        let keys = expanded(keys, narrowed);
+        if let Some(entry) = self.tree.get(path).filter(|entry| !entry.value.is_table()) {
+            let message = format!("{path} is {}, expected a table{}", entry.written, form(&keys));
+            self.fail(path, Some(entry.origin.clone()), message);
+        }
         let mut table = Table::new();
-        let keys = expanded(keys, around.narrowed);
         for key in &keys {
             let at = join(path, key.name);
             let alternative = keys
@@ -86,7 +84,7 @@ impl Reader {
                 .filter(|other| key.is_alternative_to(other))
                 .map(|other| join(path, other.name))
                 .find(|other| self.is_given(other));
-            let has_default = around.has_defaults || key.default_holds == DefaultHolds::Everywhere;
+            let has_default = has_defaults || key.default_holds == DefaultHolds::Everywhere;
             match alternative {
                 None if has_default => self.lay_default(key, &at),
                 None => {}
@@ -99,11 +97,12 @@ impl Reader {
                 Some(other) if self.layer(&at) < self.layer(&other) => _ = self.tree.remove(&at),
                 Some(_) => {}
             }
-            if let Some(value) = self.key(key, &at, around) {
+            self.limited.extend(key.at_most.map(|max| (at.clone(), max)));
+            if let Some(value) = self.value(key, &key.kind, &at, has_defaults) {
                 table.insert(key.name.to_owned(), value);
             }
         }
-        table
+        Value::Table(table)
     }
 
     /// Lays the default of a key, at `at`, under what is given of it.
@@ -122,93 +121,41 @@ impl Reader {
         }
     }
 
-    fn key(&mut self, key: &Key, at: &str, around: Around) -> Option<Value> {
-        match &key.kind {
-            Kind::Table(_) | Kind::Either(..) => {
-                self.known.insert(at.to_owned(), None);
-                if key.is_optional && !self.is_there(at) {
-                    return None;
-                }
-                let is_whole = key.is_whole && self.tree.contains_key(at);
-                let has_defaults = around.has_defaults && !is_whole;
-                self.checked_table(&key.kind, at, Around { has_defaults, narrowed: key.narrowed })
+    /// The value at `at`, which is that of `key` or an element of it; `None` where it is left out or wrong.
+    fn value(&mut self, key: &Key, kind: &Kind, at: &str, has_defaults: bool) -> Option<Value> {
+        let words = Words::of(kind, &key.rule, key.name);
+        let allowed = tables(kind).is_empty().then(|| words.allowed.clone());
+        self.known.insert(at.to_owned(), allowed);
+        if let Kind::Table(_) | Kind::Either(..) = kind {
+            if key.is_optional && !self.is_there(at) {
+                return None;
             }
-            kind => {
-                let allowed = tables(kind).is_empty().then(|| Words::of_key(key).allowed);
-                self.known.insert(at.to_owned(), allowed);
-                if let Some(max) = key.at_most {
-                    self.limited.push((at.to_owned(), max));
-                }
-                if !self.tree.contains_key(at) && !key.is_optional {
-                    self.missing(at, &Words::of_key(key));
-                }
-                self.value(kind, &key.rule, key.name, at)
-            }
+            let has_defaults = has_defaults && !(key.is_whole && self.tree.contains_key(at));
+            return Some(self.table(kind, key.narrowed, at, has_defaults));
         }
-    }
-
-    /// The table at the key `at`, or why there is none.
-    fn checked_table(&mut self, kind: &Kind, at: &str, around: Around) -> Option<Value> {
-        self.known.insert(at.to_owned(), None);
-        let keys = match *kind {
-            Kind::Either(key, [with, _]) if self.is_there(&join(at, key)) => with,
-            Kind::Either(_, [_, without]) => without,
-            Kind::Table(keys) => keys,
-            _ => &[],
+        let Some(entry) = self.tree.get(at) else {
+            if !key.is_optional {
+                self.missing(at, &words.expected);
+            }
+            return None;
         };
-        let entry = self.tree.get(at).filter(|entry| !entry.value.is_table()).cloned();
-        if entry.is_some() {
-            // Before its keys are read, which would be reported as missing.
-            self.failed.insert(at.to_owned());
-        }
-        let table = self.table(keys, at, around);
-        if let Some(entry) = entry {
-            let expected = format!("a table{}", form(keys));
-            let words = Words { allowed: expected.clone(), expected };
-            let message = words.complaint(at, &entry.written, ValueError::Kind);
-            self.fail(at, Problem::at(Some(entry.origin), message));
-        }
-        Some(Value::Table(table))
-    }
-
-    /// The value at the key `at`; `None` where there is none, or where it is wrong.
-    fn value(&mut self, kind: &Kind, rule: &Rule, name: &str, at: &str) -> Option<Value> {
-        let entry = self.tree.get(at)?;
         match (kind, &entry.value) {
             (Kind::Array(of, count), Value::Array(given))
                 if count.is_none_or(|count| count == given.len()) =>
             {
-                return Some(self.elements(of, rule, name, at, given.len()));
+                let places = (0..given.len()).map(|i| element(at, i));
+                let elements = places.filter_map(|at| self.value(key, of, &at, true));
+                Some(Value::Array(elements.collect()))
             }
-            _ => {}
-        }
-        match scalar(kind, rule, &entry.value) {
-            Ok(value) => Some(value),
-            Err(error) => {
-                let message = Words::of(kind, rule, name).complaint(at, &entry.written, error);
-                let problem = Problem::at(Some(entry.origin.clone()), message);
-                self.fail(at, problem);
-                None
-            }
-        }
-    }
-
-    fn elements(&mut self, of: &Kind, rule: &Rule, name: &str, at: &str, count: usize) -> Value {
-        let mut elements = Vec::new();
-        for i in 0..count {
-            let at = element(at, i);
-            elements.extend(match of {
-                Kind::Table(_) => {
-                    let around = Around { has_defaults: true, narrowed: &[] };
-                    self.checked_table(of, &at, around)
+            (kind, value) => match scalar(kind, &key.rule, value, &words) {
+                Ok(value) => Some(value),
+                Err(why) => {
+                    let message = format!("{at} is {}, {why}", entry.written);
+                    self.fail(at, Some(entry.origin.clone()), message);
+                    None
                 }
-                _ => {
-                    self.known.insert(at.clone(), Some(Words::of(of, rule, name).allowed));
-                    self.value(of, rule, name, &at)
-                }
-            });
+            },
         }
-        Value::Array(elements)
     }
 
     /// True if there is a key `at`, or any of the table `at`.
@@ -240,6 +187,13 @@ impl Reader {
         self.problems.push((keys[0].to_owned(), problem));
     }
 
+    /// Notes why what `keys` describe cannot be `made`, when it cannot.
+    pub(super) fn check_made<T>(&mut self, keys: &[&str], made: Result<T, ConfigError>) {
+        if let Err(error) = made {
+            self.check(keys, true, || error.to_string());
+        }
+    }
+
     /// True where `key`, a part of it or what it is in was found wrong or missing.
     pub(super) fn is_wrong(&self, key: &str) -> bool {
         let is_part = |failed: &String| failed == key || is_inside(failed, key);
@@ -249,7 +203,7 @@ impl Reader {
     /// Notes that the key `at`, or the table that it is in, is wrong, as `message` says.
     pub(super) fn refuse(&mut self, at: &str, place: &str, message: &str) {
         let origin = self.origin(place).or_else(|| self.origin(at));
-        self.fail(at, Problem::at(origin, format!("{at}: {message}")));
+        self.fail(at, origin, format!("{at}: {message}"));
     }
 
     /// Notes what is wrong with the table `at`, in words `what`: the keys of `all` that are given and that it
@@ -270,9 +224,8 @@ impl Reader {
         let is_recorded = defaults.all(|key| self.is_given(&join(at, key.name)));
         for key in all.iter().filter(|key| !known.contains(&key.name)) {
             let path = join(at, key.name);
-            let entry = self.tree.get(&path).filter(|entry| entry.layer > 0);
             let is_allowed = |entry: &Entry| is_recorded && key.default == Some(&entry.written);
-            if entry.is_some_and(|entry| !is_allowed(entry)) {
+            if self.given(&path).is_some_and(|entry| !is_allowed(entry)) {
                 let known = known.join(", ");
                 self.refuse(&path, &path, &format!("{what} has no such key, only {known}"));
             }
@@ -292,26 +245,26 @@ impl Reader {
         ConfigError::unless_empty(about.map(|(_, problem)| problem.clone()).collect())
     }
 
-    /// Ends the reading: keys that are not declared are unknown.
+    /// Ends the reading; gives the tree with all defaults. Keys that are not declared are unknown.
     ///
     /// # Errors
     /// Everything found wrong, files first, by line.
-    pub(super) fn finish(&mut self) -> Result<(), ConfigError> {
+    pub(super) fn finish(mut self) -> Result<Tree, ConfigError> {
         self.find_unknown();
-        let problems = std::mem::take(&mut self.problems).into_iter();
-        let mut problems: Vec<Problem> = problems.map(|(_, problem)| problem).collect();
-        problems.sort_by_key(|problem| match problem.origin {
+        self.problems.sort_by_key(|(_, problem)| match problem.origin {
             Some(Origin::File { line, .. }) => (0, line),
             Some(Origin::Set) => (1, 0),
             None => (2, 0),
         });
-        ConfigError::unless_empty(problems)
+        let problems = self.problems.into_iter().map(|(_, problem)| problem);
+        ConfigError::unless_empty(problems.collect())?;
+        Ok(self.tree)
     }
 
     fn find_unknown(&mut self) {
         let is_known = |key: &str| self.known.contains_key(key);
         for (key, entry) in self.tree.iter().filter(|(_, entry)| entry.layer > 0) {
-            // Inside what is wrong or unknown as a whole there is nothing more to say.
+            // Nothing is reported inside a table that is wrong or unknown as a whole.
             let is_reported = |outer: &str| {
                 self.failed.contains(outer) || self.tree.contains_key(outer) && !is_known(outer)
             };
@@ -324,14 +277,22 @@ impl Reader {
                 }
                 _ => nearest_key(key, self.known.keys().map(String::as_str)),
             };
-            let problem = Problem::unknown_key(entry.origin.clone(), key, &hint);
+            let message = match entry.origin {
+                Origin::File { .. } => format!("unknown key \"{key}\"; {hint}"),
+                Origin::Set => format!("{key}: unknown key; {hint}"),
+            };
+            let problem = Problem::at(Some(entry.origin.clone()), message);
             self.problems.push((key.clone(), problem));
         }
     }
 
-    /// True if the key `key` is given, not by default.
+    /// What is given at `key`, not by default.
+    fn given(&self, key: &str) -> Option<&Entry> {
+        self.tree.get(key).filter(|entry| entry.layer > 0)
+    }
+
     pub(super) fn is_given(&self, key: &str) -> bool {
-        self.origin(key).is_some()
+        self.given(key).is_some()
     }
 
     /// True if both keys are given in one source.
@@ -347,43 +308,42 @@ impl Reader {
 
     /// Where `key` was given; `None` for a default.
     fn origin(&self, key: &str) -> Option<Origin> {
-        let entry = self.tree.get(key).filter(|entry| entry.layer > 0)?;
-        Some(entry.origin.clone())
+        self.given(key).map(|entry| entry.origin.clone())
     }
 
     /// Notes that a key is not there.
-    fn missing(&mut self, key: &str, words: &Words) {
+    fn missing(&mut self, key: &str, expected: &str) {
         if std::iter::once(key).chain(ancestors(key)).any(|key| self.failed.contains(key)) {
             return;
         }
         let origin = ancestors(key).find_map(|outer| self.origin(outer));
-        let expected = &words.expected;
         let message = format!("{key} is missing and has no default here, expected {expected}");
-        self.fail(key, Problem::at(origin, message));
+        self.fail(key, origin, message);
     }
 
     /// Notes that what was to give `keys` is wrong.
-    pub(super) fn fail_all(&mut self, keys: Vec<&'static str>, problems: Vec<Problem>) {
-        self.problems.extend(problems.into_iter().map(|problem| (keys.concat(), problem)));
+    pub(super) fn fail_all(&mut self, keys: Vec<&str>, error: ConfigError) {
+        self.problems
+            .extend(error.problems.into_iter().map(|problem| (keys[0].to_owned(), problem)));
         self.failed.extend(keys.into_iter().map(str::to_owned));
     }
 
     /// Notes that a key is wrong.
-    fn fail(&mut self, key: &str, problem: Problem) {
+    fn fail(&mut self, key: &str, origin: Option<Origin>, message: String) {
         self.failed.insert(key.to_owned());
-        self.problems.push((key.to_owned(), problem));
+        self.problems.push((key.to_owned(), Problem::at(origin, message)));
     }
 }
 
-/// A value of the kind, if it is allowed, or the word that stands for none.
-fn scalar(kind: &Kind, rule: &Rule, value: &Value) -> Result<Value, ValueError> {
+/// A value of the kind, if it is allowed, or the word that stands for none; else what was expected.
+fn scalar(kind: &Kind, rule: &Rule, value: &Value, words: &Words) -> Result<Value, String> {
     let is_allowed = match (kind, value) {
         (_, Value::String(text)) if matches!(rule, Rule::Or(word, _) if word == text) => true,
         (Kind::Number, &Value::Integer(integer)) => {
-            return scalar(kind, rule, &Value::Float(integer as f64));
+            return scalar(kind, rule, &Value::Float(integer as f64), words);
         }
         (Kind::Number, Value::Float(number)) if !number.is_finite() => {
-            return Err(ValueError::NotFinite);
+            return Err(format!("not finite, allowed: {}", words.allowed));
         }
         (Kind::Number, &Value::Float(number)) => {
             kind.range(rule).is_none_or(|range| range.contains(number))
@@ -397,14 +357,13 @@ fn scalar(kind: &Kind, rule: &Rule, value: &Value) -> Result<Value, ValueError> 
             !matches!(rule, Rule::Text(_, accepts) if !accepts(text))
         }
         (Kind::OneOf(names), Value::String(text)) => names.iter().any(|(name, _)| name == text),
-        _ => return Err(ValueError::Kind),
+        _ => return Err(format!("expected {}", words.expected)),
     };
-    if is_allowed { Ok(value.clone()) } else { Err(ValueError::NotAllowed) }
+    if is_allowed { Ok(value.clone()) } else { Err(format!("allowed: {}", words.allowed)) }
 }
 
 /// How a table of these `keys` is written: `, { a = …, b = … }`.
 fn form(keys: &[Key]) -> String {
-    let keys = expanded(keys, &[]);
     let mut fields: Vec<String> = keys.iter().map(|key| format!("{} = …", key.name)).collect();
     if fields.len() > FORM_KEYS_MAX {
         fields.truncate(FORM_KEYS_MAX);

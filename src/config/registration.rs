@@ -98,7 +98,7 @@ impl Config {
         }
     }
 
-    /// The same of a fit.
+    /// The same for a fit.
     pub fn registration_sd_of_mm(&self, fit: &RegistrationFit) -> f64 {
         let x_wp = self.plane.to_pose();
         let ends = [0.0, self.insertion.depth_mm].map(|depth_mm| Vector3::z() * depth_mm);
@@ -113,15 +113,18 @@ impl Config {
     /// # Errors
     /// As [`Config::to_toml`].
     pub fn calibration_toml(&self) -> Result<String, toml::ser::Error> {
-        let given = |(key, value): (&str, Option<_>)| Some((key.to_owned(), value?));
-        let tip = ["offset_mm", "tilt", "fit"]
-            .map(|key| (key, self.at(&format!("tracker.tip_{key}")).cloned()));
+        let tip = ["offset_mm", "tilt", "fit"].into_iter().filter_map(|key| {
+            Some((key.to_owned(), self.at(&format!("tracker.tip_{key}"))?.clone()))
+        });
+        let tip = Value::Table(tip.collect());
         let parts = [
-            ("registration", self.at("tracker.registration").cloned()),
-            ("tip", Some(Table::from_iter(tip.into_iter().filter_map(given)).into())),
-            ("needle", self.at("needle").cloned()),
+            ("registration", self.at("tracker.registration")),
+            ("tip", Some(&tip)),
+            ("needle", self.at("needle")),
         ];
-        toml::to_string(&Table::from_iter(parts.into_iter().filter_map(given)))
+        let given =
+            parts.into_iter().filter_map(|(key, part)| Some((key.to_owned(), part?.clone())));
+        toml::to_string(&given.collect::<Table>())
     }
 }
 

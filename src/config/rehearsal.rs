@@ -6,7 +6,7 @@
 
 use super::{Config, TrackerPreset};
 use crate::emulator::drive::Switches;
-use crate::geometry::FixedAngles;
+use crate::geometry::coordinates;
 use crate::stage::AxisConfig;
 use crate::tracker::TrackerKind;
 use std::fmt::Write as _;
@@ -24,8 +24,9 @@ pub(super) fn layer(config: &Config) -> String {
     let curvature = needle.arc.curvature_per_mm();
     let depth_mm = config.insertion.depth_mm;
     let start_mm = (depth_mm * depth_mm * curvature * START_PART).min(START_MAX_MM);
-    let x_bs = tracker.x_sb().inverse();
-    let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(&x_bs.rotation);
+    let start = pose([start_mm, 0.0, 0.0, 1.0, 1.0, 30.0]);
+    let [x, y, z, yaw, pitch, roll] = coordinates(&tracker.x_sb().inverse());
+    let sensor = pose([x, y, z, yaw.to_degrees(), pitch.to_degrees(), roll.to_degrees()]);
     let maxon = Some(MAXON_VENDOR_ID);
     let is_epos4 =
         config.stage.insertion.vendor_id == maxon || config.stage.rotation.vendor_id == maxon;
@@ -39,17 +40,9 @@ pub(super) fn layer(config: &Config) -> String {
          curvature_per_mm = {curvature:?}\n\
          tip_ahead_mm = {:?}\n\
          torsion = {torsion}\n\
-         start = {{ x_mm = {start_mm:?}, y_mm = 0.0, z_mm = 0.0, yaw_deg = 1.0, pitch_deg = 1.0, \
-         roll_deg = 30.0 }}\n\
-         sensor = {{ x_mm = {:?}, y_mm = {:?}, z_mm = {:?}, yaw_deg = {:?}, pitch_deg = {:?}, \
-         roll_deg = {:?} }}\n",
+         start = {start}\n\
+         sensor = {sensor}\n",
         needle.tip_ahead_mm,
-        x_bs.translation.x,
-        x_bs.translation.y,
-        x_bs.translation.z,
-        yaw.to_degrees(),
-        pitch.to_degrees(),
-        roll.to_degrees(),
     );
     if config.emulator.tracker == TrackerPreset::Plain {
         let repeats = u32::from(tracker.kind == TrackerKind::Imaging);
@@ -66,21 +59,26 @@ pub(super) fn layer(config: &Config) -> String {
     keys
 }
 
+/// A pose, mm and degrees, as TOML.
+fn pose([x, y, z, yaw, pitch, roll]: [f64; 6]) -> String {
+    format!(
+        "{{ x_mm = {x:?}, y_mm = {y:?}, z_mm = {z:?}, yaw_deg = {yaw:?}, pitch_deg = {pitch:?}, \
+         roll_deg = {roll:?} }}"
+    )
+}
+
 /// The switches of an axis that has `counts_per_unit` of mm or rad: those `given`, and if its homing seeks
 /// another one, that one at the place where homing changes no position.
 pub(super) fn switches(given: Switches, axis: &AxisConfig, counts_per_unit: f64) -> Switches {
     let Some(homing) = axis.homing else { return given };
     // From home the drive's zero is by the offset, and it is 0 now.
     let home = -(homing.offset.unwrap_or(0.0) * counts_per_unit).round() as i64;
-    let sought = match homing.method {
-        1 | 17 => Switches { negative_counts: Some(home - 1), ..Switches::default() },
-        2 | 18 => Switches { positive_counts: Some(home + 1), ..Switches::default() },
-        24 => Switches { home_counts: Some(home), ..Switches::default() },
-        _ => Switches::default(),
+    let mut switches = given;
+    match homing.method {
+        1 | 17 => switches.negative_counts.get_or_insert(home - 1),
+        2 | 18 => switches.positive_counts.get_or_insert(home + 1),
+        24 => switches.home_counts.get_or_insert(home),
+        _ => return given,
     };
-    Switches {
-        negative_counts: given.negative_counts.or(sought.negative_counts),
-        positive_counts: given.positive_counts.or(sought.positive_counts),
-        home_counts: given.home_counts.or(sought.home_counts),
-    }
+    switches
 }

@@ -3,8 +3,7 @@
 use super::can::CanConfig;
 use super::error::ConfigError;
 use crate::keys::section;
-use crate::stage;
-use crate::stage::{Axis, AxisConfig, PowerConfig};
+use crate::stage::{self, Axis, AxisConfig, PowerConfig};
 
 section! {
     /// `[stage]`: the two drives.
@@ -23,10 +22,18 @@ section! {
 }
 
 impl StageConfig {
+    /// The settings of an axis.
+    pub fn axis(&self, axis: Axis) -> &AxisConfig {
+        match axis {
+            Axis::Insertion => &self.insertion,
+            Axis::Rotation => &self.rotation,
+        }
+    }
+
     /// The settings of the stage's master, in mm, rad and counts.
     ///
     /// # Errors
-    /// None for a configuration that was read; a program may have put in what no drive can do.
+    /// What the stage cannot work with, such as a following-error window of less than a count.
     pub fn to_stage(&self, can: &CanConfig) -> Result<stage::StageConfig, ConfigError> {
         let config = self.to_unchecked_stage(can);
         config.validate().map_err(ConfigError::of)?;

@@ -10,6 +10,7 @@ use crate::stage;
 
 const INTERFACE: &str = "can.interface";
 const NODES: [&str; 2] = ["stage.insertion.node", "stage.rotation.node"];
+const NEEDED: [&str; 3] = [INTERFACE, NODES[0], NODES[1]];
 /// Other keys that a stop uses if they are valid.
 const USED: [&str; 5] = [
     "can.sdo_timeout_ms",
@@ -46,19 +47,19 @@ impl StopConfig {
     pub fn from_source(source: Option<Source<'_>>, sets: &[String]) -> Result<Self, ConfigError> {
         let mut layers = Vec::new();
         let mut problems = Vec::new();
-        match source.map(|source| value::parse_file(source.name, source.text, 1)) {
-            Some(Ok(entries)) => layers.push(entries),
-            Some(Err(syntax)) => {
-                problems = syntax;
-                let kept = source.map(|source| salvaged(source.text)).unwrap_or_default();
-                layers.push(value::recover_file("salvaged", &kept, 1).0);
+        if let Some(Source { name, text }) = source {
+            match value::parse_file(name, text, 1) {
+                Ok(entries) => layers.push(entries),
+                Err(syntax) => {
+                    problems = syntax;
+                    layers.push(value::recover_file("salvaged", &salvaged(text), 1).0);
+                }
             }
-            None => {}
         }
         for (set, layer) in sets.iter().zip(2..) {
             match value::parse_set(set, layer) {
                 Ok(entries) => layers.push(entries),
-                // It was to name the interface or a node.
+                // It would have named the interface or a node.
                 Err(problems) if names_what_a_stop_needs(set) => return Err(problems.into()),
                 Err(_) => {}
             }
@@ -89,7 +90,7 @@ impl StopConfig {
             let [first, second] = NODES;
             format!("{second} is {rotation}, the same as {first}: each node needs its own number")
         });
-        reader.about(&[INTERFACE, NODES[0], NODES[1]])?;
+        reader.about(&NEEDED)?;
         tree.retain(|key, _| {
             let used = USED.iter().find(|used| key == *used || is_inside(key, used));
             used.is_some_and(|used| !reader.is_wrong(used))
@@ -112,23 +113,16 @@ impl StopConfig {
 /// Returns true if `key=value` sets a key that a stop needs, or a table that holds one.
 fn names_what_a_stop_needs(set: &str) -> bool {
     let key = set.split('=').next().unwrap_or(set).trim();
-    let is_above =
-        |needed: &&str| needed.strip_prefix(key).is_some_and(|rest| rest.starts_with('.'));
-    let needed = [INTERFACE, NODES[0], NODES[1]];
-    needed.contains(&key) || needed.iter().any(is_above)
+    NEEDED.iter().any(|needed| *needed == key || is_inside(needed, key))
 }
 
 /// The lines of `text` that are TOML by themselves, if the text as a whole is not: a file that is being edited
 /// still has its bus and nodes. Keys below a broken header belong to no table that is used.
 fn salvaged(text: &str) -> String {
-    let lines = text.split(['\n', '\r']).map(|line| {
-        let is_toml = value::parse_file("", line, 1).is_ok();
-        let is_header = line.trim_start().starts_with('[');
-        match (is_toml, is_header) {
-            (true, _) => line,
-            (false, true) => "[unreadable]",
-            (false, false) => "",
-        }
+    let lines = text.split(['\n', '\r']).map(|line| match value::parse_file("", line, 1) {
+        Ok(_) => line,
+        Err(_) if line.trim_start().starts_with('[') => "[unreadable]",
+        Err(_) => "",
     });
     lines.collect::<Vec<_>>().join("\n")
 }

@@ -10,7 +10,7 @@ use crate::needle::{HALF_WIDTH, HALF_WIDTH_PER_MM, OFFSET};
 use crate::study::Prior;
 use nalgebra::{Vector3, Vector4};
 use std::f64::consts::TAU;
-use toml::Value;
+use toml::{Table, Value};
 
 /// The coordinates of the draws of a trial are numbered from here, apart from its noise.
 const DRAWS: u64 = 0x5354_5544_5900_0000;
@@ -92,7 +92,7 @@ impl Config {
     pub fn drawn(&self, seed: u64) -> Result<Config, ConfigError> {
         let mut written = self.written.clone();
         let emulator = &mut written["emulator"];
-        // Each has a number of its own, so that a range more changes none of the others.
+        // Each range has its own number, so a range that is declared after the others changes none of them.
         for (number, key) in (DRAWS..).zip(StudyConfig::KEYS) {
             if key.name.starts_with("target") || key.name.starts_with("obstacle") {
                 continue;
@@ -198,13 +198,10 @@ impl Config {
                      start or target; draw smaller ones"
                 ))
             })?;
-            let sphere = [
-                ("shape", "sphere".into()),
-                ("centre_mm", array(&centre_mm)),
-                ("radius_mm", radius_mm.into()),
-            ];
-            let sphere = sphere.map(|(key, value): (&str, Value)| (key.to_owned(), value));
-            drawn.push(Value::Table(sphere.into_iter().collect()));
+            let shape = ("shape".to_owned(), Value::from("sphere"));
+            let centre = ("centre_mm".to_owned(), array(&centre_mm));
+            let radius = ("radius_mm".to_owned(), Value::from(radius_mm));
+            drawn.push(Value::Table(Table::from_iter([shape, centre, radius])));
         }
         goal["obstacle"] = Value::Array(drawn);
         Ok(target_mm)
@@ -212,10 +209,8 @@ impl Config {
 
     /// The range given at this `key` of `[study]`, in its unit.
     pub(super) fn range(&self, key: &Key) -> Option<[f64; 2]> {
-        if key.name == "obstacles" {
-            return None;
-        }
-        self.at(&format!("study.{}", key.name)).map(|range| Field::take(Some(range)))
+        let range = self.at(&format!("study.{}", key.name));
+        range.filter(|range| range.is_array()).map(|range| Field::take(Some(range)))
     }
 
     /// What is not known of a trial before it begins, for the information bound: what the study

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::error::ConfigError;
+use super::pose::IDENTITY;
 use super::registration::RegistrationConfig;
 use crate::calibration::TipRecord;
 use crate::geometry::{FixedAngles, Pose};
@@ -61,8 +62,7 @@ section! {
         workspace: Option<Workspace>;
         /// Pose of the tracker frame T in the bench frame W, or fiducials to solve it from. Without
         /// one the bench does not move; only the emulated tracker has a default.
-        registration: Option<RegistrationConfig> => "{ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, \
-            yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }", whole, tracker_must_give;
+        registration: Option<RegistrationConfig> => IDENTITY, whole, tracker_must_give;
         /// In place of `[tracker.registration]`: the file that `needle-bench calibrate registration` wrote.
         registration_file: Option<String> [FILE];
         /// The columns of a CSV file; the defaults are those of a run's steps.csv.

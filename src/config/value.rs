@@ -52,27 +52,23 @@ pub(super) type Entries = Vec<(String, Entry)>;
 /// The syntax errors of the file, at most one per line. A duplicate key is one too.
 pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries, Vec<Problem>> {
     let (entries, errors) = recover_file(name, text, layer);
-    if !errors.is_empty() {
-        let mut problems: Vec<Problem> = Vec::new();
-        for error in errors {
-            let span = error.span().unwrap_or(text.len()..text.len());
-            let (line, column) = position(text, span.start);
-            let found = text.get(span).unwrap_or_default();
-            let message = match error.message() {
-                "duplicate key" => duplicate_key(&entries, text, line, found),
-                message => {
-                    number_with_unit(text, line).unwrap_or_else(|| message.replace('\n', ", "))
-                }
-            };
-            let at = Origin::File { name: name.to_owned(), line };
-            if problems.last().is_none_or(|last| last.origin.as_ref() != Some(&at)) {
-                let message = format!("{name}:{line}:{column}: {message}");
-                problems.push(Problem { origin: Some(at), message });
-            }
-        }
-        return Err(problems);
+    if errors.is_empty() {
+        return Ok(entries);
     }
-    Ok(entries)
+    let problem = |error: toml::de::Error| {
+        let span = error.span().unwrap_or(text.len()..text.len());
+        let (line, column) = position(text, span.start);
+        let found = text.get(span).unwrap_or_default();
+        let message = match error.message() {
+            "duplicate key" => duplicate_key(&entries, text, line, found),
+            message => number_with_unit(text, line).unwrap_or_else(|| message.replace('\n', ", ")),
+        };
+        let origin = Some(Origin::File { name: name.to_owned(), line });
+        Problem { origin, message: format!("{name}:{line}:{column}: {message}") }
+    };
+    let mut problems: Vec<Problem> = errors.into_iter().map(problem).collect();
+    problems.dedup_by(|next, last| next.origin == last.origin);
+    Err(problems)
 }
 
 /// The part of a TOML file that can be read, and its errors. If a key is given twice, the first one counts.
@@ -223,7 +219,7 @@ impl Flattener<'_> {
         let value = match spanned.get_ref() {
             DeValue::String(text) => Value::from(&**text),
             DeValue::Integer(integer) => {
-                // No key takes as many digits as do not fit.
+                // An integer of more than 64 bits is out of range for every key.
                 let parsed = i64::from_str_radix(integer.as_str(), integer.radix());
                 Value::from(parsed.unwrap_or(i64::MAX))
             }

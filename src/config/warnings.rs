@@ -2,8 +2,9 @@
 //! and a control law that do not hold together, a rehearsal without a registration.
 
 use super::reader::{REGISTRATION, Tree, is_inside};
-use super::{Config, ControlKind, ObserverKind, TrackerSource};
-use crate::keys::{Kind, find};
+use super::{Config, ObserverKind, TrackerSource};
+use crate::control::ControlKind;
+use crate::keys::{Field as _, Kind};
 use crate::observer::Gains;
 
 /// All warnings about `config`, which `tree` gives.
@@ -21,15 +22,13 @@ const ALWAYS_USED: &str = "observer.invariant";
 /// printed in full, as in a run folder, gives them all and gets none.
 fn unchosen(config: &Config, tree: &Tree) -> Vec<String> {
     let (law, observer) = (config.control.kind.to_string(), config.observer.kind.to_string());
-    let observers: Vec<String> = config.observers().map(|o| o.name().to_owned()).collect();
-    let chosen = [
-        ("control", &law, std::slice::from_ref(&law), ""),
-        ("observer", &observer, &observers, ", or add to observer.shadows"),
-    ];
+    let observers: Vec<String> = config.observer.kinds().iter().map(ToString::to_string).collect();
     let mut warnings = Vec::new();
-    for (table, kind, used, otherwise) in chosen {
-        let key = find(Config::KEYS, &format!("{table}.kind")).map(|key| key.kind);
-        let Some(Kind::OneOf(names)) = key else { continue };
+    for (table, kind, names, used, otherwise) in [
+        ("control", &law, ControlKind::KIND, std::slice::from_ref(&law), ""),
+        ("observer", &observer, ObserverKind::KIND, &observers, ", or add to observer.shadows"),
+    ] {
+        let Kind::OneOf(names) = names else { continue };
         let mut printed = tree.iter().filter(|(key, _)| is_inside(key, table));
         if printed.all(|(_, entry)| entry.layer > 0) {
             continue;

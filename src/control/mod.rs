@@ -9,6 +9,7 @@ pub use bend::{Bend, BendLaw};
 pub use feedback_linearization::{FeedbackLinearization, FeedbackLinearizationConfig};
 pub use nested_saturation::{NestedSaturation, NestedSaturationConfig};
 
+use crate::keys::{choice, section};
 use crate::needle::{Needle, Reduced};
 use crate::observer::Estimate;
 use thiserror::Error;
@@ -91,25 +92,50 @@ pub trait Controller: Send {
     fn command(&mut self, estimate: &Estimate, step_mm: f64) -> Result<Command, ControlError>;
 }
 
-/// The registry of control laws: each kind with its parameters.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum ControlConfig {
-    /// The paper's feedback linearisation.
-    FeedbackLinearization(FeedbackLinearizationConfig),
-    /// Nested saturation, which works from every start.
-    NestedSaturation(NestedSaturationConfig),
+section! {
+    /// `[control]`: the law that steers, and the settings of each. A section is named as its kind, with `_` for
+    /// `-`.
+    #[derive(Copy)]
+    pub struct ControlConfig {
+        /// The law that steers.
+        kind: ControlKind = "nested-saturation";
+        /// The nested saturation.
+        nested_saturation: NestedSaturationConfig;
+        /// The feedback linearisation.
+        feedback_linearization: FeedbackLinearizationConfig;
+    }
+}
+
+choice! {
+    /// A control law.
+    pub enum ControlKind {
+        /// Feedback linearisation, as in the paper.
+        FeedbackLinearization = "feedback-linearization",
+        /// Nested saturation, which converges from every pose.
+        NestedSaturation = "nested-saturation",
+    }
 }
 
 impl ControlConfig {
     /// Builds the law.
     pub fn build(&self, needle: Needle) -> Box<dyn Controller> {
-        match *self {
-            ControlConfig::FeedbackLinearization(config) => {
-                Box::new(FeedbackLinearization::new(needle, config))
+        match self.kind {
+            ControlKind::FeedbackLinearization => {
+                Box::new(FeedbackLinearization::new(needle, self.feedback_linearization))
             }
-            ControlConfig::NestedSaturation(config) => {
-                Box::new(NestedSaturation::new(needle, config))
+            ControlKind::NestedSaturation => {
+                Box::new(NestedSaturation::new(needle, self.nested_saturation))
             }
+        }
+    }
+
+    /// The fastest rotation that the law asks for, rad per mm.
+    pub fn rotation_max_rad_per_mm(&self) -> f64 {
+        match self.kind {
+            ControlKind::FeedbackLinearization => {
+                self.feedback_linearization.rotation_max_rad_per_mm
+            }
+            ControlKind::NestedSaturation => self.nested_saturation.rotation_max_rad_per_mm,
         }
     }
 }

@@ -12,7 +12,7 @@ pub(crate) use declare::{choice, section};
 pub(crate) use field::Field;
 pub(crate) use reference::{json_schema, toml_reference};
 pub(crate) use units::unit_of;
-pub(crate) use words::{ValueError, Words};
+pub(crate) use words::Words;
 
 use toml::{Table, Value};
 use units::converted;

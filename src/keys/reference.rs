@@ -142,11 +142,9 @@ fn kind(of: &Kind, rule: &Rule, key: &Key) -> Json {
         }
         (Kind::Number | Kind::Integer(..), _) => {
             let mut number = match of.range(rule) {
-                Some(Range { low, low_is_allowed: true, high }) => {
-                    json!({ "minimum": low, "maximum": high })
-                }
-                Some(Range { low, high, .. }) => {
-                    json!({ "exclusiveMinimum": low, "maximum": high })
+                Some(Range { low, low_is_allowed, high }) => {
+                    let minimum = if low_is_allowed { "minimum" } else { "exclusiveMinimum" };
+                    json!({ minimum: low, "maximum": high })
                 }
                 None => json!({}),
             };

@@ -10,17 +10,6 @@ pub(crate) struct Words {
     pub(crate) allowed: String,
 }
 
-/// How a value breaks its rule.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum ValueError {
-    /// It is of another kind.
-    Kind,
-    /// It is NaN or infinite.
-    NotFinite,
-    /// It is of the kind and not allowed.
-    NotAllowed,
-}
-
 impl Words {
     /// The allowed values of this kind and rule, in the unit that `name` ends in.
     pub(crate) fn of(kind: &Kind, rule: &Rule, name: &str) -> Self {
@@ -56,17 +45,6 @@ impl Words {
     /// The same of a key.
     pub(crate) fn of_key(key: &Key) -> Self {
         Words::of(&key.kind, &key.rule, key.name)
-    }
-
-    /// The message about the value `written` at `key`.
-    pub(crate) fn complaint(&self, key: &str, written: &str, error: ValueError) -> String {
-        match error {
-            ValueError::Kind => format!("{key} is {written}, expected {}", self.expected),
-            ValueError::NotFinite => {
-                format!("{key} is {written}, not finite, allowed: {}", self.allowed)
-            }
-            ValueError::NotAllowed => format!("{key} is {written}, allowed: {}", self.allowed),
-        }
     }
 }
 

@@ -35,7 +35,7 @@ fn is_young(days: Option<f64>, days_max: f64) -> bool {
 fn ago(days: Option<f64>) -> String {
     match days {
         Some(days) if days < -AHEAD_MAX_DAYS => format!("dated {:.0} days ahead", -days),
-        Some(days) if days < 2.0 => format!("{:.0} h ago", days * 24.0),
+        Some(days) if days < 2.0 => format!("{:.0} h ago", days.max(0.0) * 24.0),
         Some(days) => format!("{days:.0} days ago"),
         None => "no date".to_owned(),
     }
@@ -109,7 +109,7 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
 /// Whether a registration that is turned about the needle would show in a run: against the roll at the start
 /// alone. `None` of an emulated rig.
 pub fn start_roll(config: &Config) -> Option<Check> {
-    let sd_deg = config.observer.to_invariant().start_sd.roll.to_degrees();
+    let sd_deg = config.observer.invariant.start_sd.roll.to_degrees();
     let limit = format!("up to {:.0} deg", ROLL_KNOWN_RAD.to_degrees());
     let next = "a registration turned about the needle will not show: compare tracker watch with a tool \
                 moved along each axis, or tell observer.start.roll_deg and observer.invariant.start_sd";

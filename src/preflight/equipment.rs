@@ -3,11 +3,10 @@
 use super::Check;
 use super::Verdict::{Fail, Warn};
 use super::listening::{POSITIONS_MIN, TrackerReport};
-use crate::canopen::cia402::DriveState;
 use crate::config::{CanInterface, Config};
 use crate::math;
 use crate::session::PlaneOutOfReach;
-use crate::stage::{Axis, AxisConfig, AxisLimits, AxisStatus, Reference};
+use crate::stage::{Axis, AxisConfig, AxisLimits, AxisStatus, Reference, may_have_power};
 use crate::tracker::{StampPolicy, Workspace};
 use nalgebra::Vector3;
 
@@ -19,7 +18,7 @@ const LOAD_MAX: f64 = 0.5;
 const ERRORS_WARN: u16 = 96;
 /// The noise of a short rest may be this much over what is configured.
 const NOISE_MAX: f64 = 1.5;
-/// Clocks of two machines are set nearer to each other than this, s.
+/// The clocks of two machines agree within this, s.
 const SKEW_MAX_S: f64 = 1.0;
 /// Positions within the way that is inserted before a hold.
 const POSITIONS_PER_HOLD: f64 = 2.0;
@@ -73,9 +72,6 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
             return vec![check.unless(false, Warn, look)];
         }
     };
-    // A virtual interface has neither bit rate nor counters.
-    let is_told = |is_known: bool| is_known || !config.stage.hardware;
-    let unknown = || "the interface does not say".to_owned();
     let state = state.map(|state| format!(", {state}")).unwrap_or_default();
     let found = format!("{name} {}{state}", if is_up { "up" } else { "down" });
     let next = match (virtual_kind, bit_rate) {
@@ -85,29 +81,30 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
     };
     let bus = Check::new("bus", found, UP).unless(is_up && may_send, Fail, next);
 
+    // A virtual interface has neither bit rate nor counters.
+    let figure = |name: &str, found: Option<String>, limit: &str| {
+        let is_told = found.is_some() || !config.stage.hardware;
+        let found = found.unwrap_or_else(|| "the interface does not say".to_owned());
+        Check::new(name, found, limit).unless(is_told, Warn, &look)
+    };
     let load_of =
         |rate: u32| CYCLE_BITS * 1e3 / f64::from(config.can.bus.sync_ms) / f64::from(rate);
-    let found = bit_rate.map_or_else(unknown, |rate| {
+    let found = bit_rate.map(|rate| {
         let (kbit_per_s, load) = (f64::from(rate) * 1e-3, load_of(rate) * 1e2);
         format!("{kbit_per_s} kbit/s, {load:.0}% load by SYNC")
     });
     let is_light = bit_rate.is_none_or(|rate| load_of(rate) <= LOAD_MAX);
-    let rate = Check::new("bus bit rate", found, format!("load up to {:.0}%", LOAD_MAX * 1e2))
-        .unless(is_told(bit_rate.is_some()), Warn, &look)
-        .unless(is_light, Warn, "raise can.sync_ms");
+    let rate = figure("bus bit rate", found, &format!("load up to {:.0}%", LOAD_MAX * 1e2));
+    let rate = rate.unless(is_light, Warn, "raise can.sync_ms");
 
-    let found = restart_ms.map_or_else(unknown, |ms| format!("{ms} ms"));
-    let restart = Check::new("bus restart-ms", found, "0: a bus-off is final")
-        .unless(is_told(restart_ms.is_some()), Warn, &look)
-        .unless(restart_ms.is_none_or(|ms| ms == 0), Fail, set("restart-ms 0"));
+    let found = restart_ms.map(|ms| format!("{ms} ms"));
+    let restart = figure("bus restart-ms", found, "0: a bus-off is final");
+    let restart = restart.unless(restart_ms.is_none_or(|ms| ms == 0), Fail, set("restart-ms 0"));
 
-    let found = errors
-        .map_or_else(unknown, |[sent, received]| format!("{sent} sending, {received} receiving"));
+    let found = errors.map(|[sent, received]| format!("{sent} sending, {received} receiving"));
     let is_quiet = errors.is_none_or(|counts| counts.iter().all(|count| *count < ERRORS_WARN));
-    let counters = Check::new("bus error counters", found, format!("under {ERRORS_WARN}"))
-        .unless(is_told(errors.is_some()), Warn, &look)
-        .unless(is_quiet, Warn, CABLE);
-    vec![bus, rate, restart, counters]
+    let counters = figure("bus error counters", found, &format!("under {ERRORS_WARN}"));
+    vec![bus, rate, restart, counters.unless(is_quiet, Warn, CABLE)]
 }
 
 /// The drive of `axis`, as it describes itself.
@@ -136,11 +133,9 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
         let check = Check::new(name, found, given.map(|(what, _)| what).join(", "));
         return vec![check.unless(false, Fail, "is it a CiA 402 drive?")];
     }
-    let Ok(stage) = config.stage.to_stage(&config.can) else { return Vec::new() };
-    let drive = stage.axis(axis);
+    let drive = config.stage.axis(axis);
     let AxisStatus { node, identity, statusword, .. } = status;
-    let state = statusword.state();
-    let is_faulty = statusword.is_fault();
+    let is_healthy = !statusword.is_fault() || config.stage.power.fault_reset_on_start;
     let is_named = drive.vendor_id.is_some() && drive.product_code.is_some();
     let is_right = drive.vendor_id.is_none_or(|vendor| vendor == identity.vendor)
         && drive.product_code.is_none_or(|product| product == identity.product);
@@ -153,8 +148,8 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
     let mut checks = vec![
         Check::new(&name, format!("node {node}, {identity}; {statusword}"), limit)
             .unless(is_named, Warn, write)
-            .unless(state != Some(DriveState::OperationEnabled), Warn, POWERED)
-            .unless(!is_faulty || config.stage.power.fault_reset_on_start, Fail, reset)
+            .unless(!may_have_power(statusword.state()), Warn, POWERED)
+            .unless(is_healthy, Fail, reset)
             .unless(is_right, Fail, other),
     ];
     let errors: Vec<String> =

@@ -7,9 +7,9 @@ use serde::Serialize;
 
 /// The fewest positions from which noise is measured.
 pub(super) const POSITIONS_MIN: usize = 10;
-/// Two tools that take turns jump by more than this, mm, …
+/// Where two tools take turns, one position is further than this from the next, mm …
 const TURNS_MIN_MM: f64 = 3.0;
-/// … and by this factor more than every second position.
+/// … and further by this factor than from the next but one.
 const TURNS_RATIO: f64 = 4.0;
 
 /// What came from the tracker in a while.
@@ -40,7 +40,7 @@ pub struct TrackerReport {
 #[derive(Debug)]
 pub struct Listening {
     gate: Gate,
-    /// Out of the gate: the preflight shows a tip outside, which a run refuses.
+    /// Not in the gate, because the preflight shows a tip outside it. A run refuses one.
     workspace: Option<Workspace>,
     /// UTC at the origin of receive times, ns since 1970.
     origin_unix_ns: i64,

@@ -1,6 +1,7 @@
 //! The checks before a run, while nothing has power, as one list.
 //!
-//! The caller looks at the bus, the drives, the tracker, earlier runs and the disk; this folder judges. A [`Verdict::Fail`] never moves.
+//! The caller looks at the bus, the drives, the tracker, earlier runs and the disk; this folder judges. After a
+//! [`Verdict::Fail`] nothing moves.
 
 mod calibration;
 mod equipment;

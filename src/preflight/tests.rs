@@ -96,7 +96,10 @@ fn a_drive_is_refused_for_what_a_run_would_stumble_over() {
     let known = vec![EmcyCode::HEARTBEAT];
     assert_eq!(of(AxisStatus { error_history: known, ..status() }), "PWPP");
     assert_eq!(of(AxisStatus { statusword: Statusword(0x8208), ..status() }), "FPPP");
-    assert_eq!(of(AxisStatus { statusword: Statusword(0x8227), ..status() }), "WPPP");
+    // Operation enabled, quick stop active, switched on: each has power.
+    for powered in [0x8227, 0x8217, 0x8233] {
+        assert_eq!(of(AxisStatus { statusword: Statusword(powered), ..status() }), "WPPP");
+    }
     let other = Identity { product: 8, ..status().identity };
     assert_eq!(of(AxisStatus { identity: other, ..status() }), "FPPP");
     for silent in [
@@ -279,6 +282,8 @@ fn a_proof_counts_for_the_configuration_it_was_made_with() {
         (of(Some(&young)).verdict, of(Some(&young)).found.as_str()),
         (Verdict::Pass, "3 h ago")
     );
+    let ahead = of(Some(&earlier("2026-11-22T12:40:00.000000Z", &[])));
+    assert_eq!((ahead.verdict, ahead.found.as_str()), (Verdict::Pass, "0 h ago"), "two clocks");
     let changed = earlier("2026-11-22T09:00:00.000000Z", &["can.heartbeat_timeout_ms"]);
     assert_eq!(of(Some(&changed)).verdict, Verdict::Warn);
     for date in ["2026-01-22T09:00:00.000000Z", "2027-01-22T09:00:00.000000Z"] {

@@ -1,7 +1,7 @@
 //! Steering to a target: the path planned anew each step, and the law that follows it.
 
 use super::target::TargetTool;
-use crate::control::{Bend, BendLaw, Command, ControlConfig};
+use crate::control::{Bend, BendLaw, Command, ControlConfig, ControlKind};
 use crate::needle::Needle;
 use crate::observer::Estimate;
 use crate::plan::{self, Path, Problem, Replanner, RoomyPath, Step, Tip, World, plan_with_reserve};
@@ -118,11 +118,13 @@ pub(super) struct Pursuit {
 impl Pursuit {
     /// `None` if the control law is not one that can follow a path.
     pub(super) fn new(goal: Goal, needle: Needle, control: &ControlConfig) -> Option<Self> {
-        let ControlConfig::NestedSaturation(config) = *control else { return None };
+        if control.kind != ControlKind::NestedSaturation {
+            return None;
+        }
         let (world, problem, path) = (goal.world.clone(), goal.problem.clone(), goal.path.clone());
         Some(Pursuit {
             replanner: Replanner::new(world, problem, goal.curvature_margin, Some(path)),
-            law: BendLaw::new(needle, config),
+            law: BendLaw::new(needle, control.nested_saturation),
             target_mm: goal.problem.target_mm,
             goal,
             planned_at_mm: None,

@@ -420,7 +420,7 @@ impl Drive {
 }
 
 /// Whether the motor may have power in `state`, which may be undefined or not known.
-pub(super) fn may_have_power(state: Option<DriveState>) -> bool {
+pub fn may_have_power(state: Option<DriveState>) -> bool {
     matches!(
         state,
         None | Some(

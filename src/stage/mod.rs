@@ -57,7 +57,7 @@ mod tests;
 pub use bring_up::{FoundFault, Identity};
 pub use config::{Axis, AxisConfig, BusConfig, PerAxis, PowerConfig, RawSdo, StageConfig};
 pub use dialogue::Dialogue;
-pub use drive::DriveReport;
+pub use drive::{DriveReport, may_have_power};
 pub use event::{Counters, DriveFlag, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};
 pub use halt::Halt;
 pub use homing::{HomingConfig, Reference};

@@ -255,6 +255,7 @@ fn what_the_bench_writes_itself_is_not_for_raw_sdos() {
         (0x6065, "following_error_mm"),
         (0x6066, "following_error_timeout_ms"),
         (0x6085, "quick_stop_deceleration_mm_per_s2"),
+        (0x6098, "homing.method"),
         (0x60C2, "can.sync_ms"),
         (0x1400, "maps the PDOs"),
         (0x1BFF, "maps the PDOs"),
@@ -262,6 +263,14 @@ fn what_the_bench_writes_itself_is_not_for_raw_sdos() {
         let message = said("", &[&raw(index)]).unwrap_err();
         let key = format!("--set stage.insertion.sdo[0].index is 0x{index:04X}, not for raw SDOs");
         assert!(message.starts_with(&key) && message.contains(instead), "{message}");
+    }
+    for object in ["0x6099, subindex = 2", "0x609A, subindex = 0", "0x607C, subindex = 0"] {
+        let raw = format!("stage.rotation.sdo=[{{ index = {object}, value = 0, bits = 32 }}]");
+        assert!(said("", &[&raw]).is_ok(), "no key sets it");
+        let homing = "stage.rotation.homing={ method = 37, timeout_s = 10, homed_bit = 12, \
+                      speed_zero_deg_per_s = 9, acceleration_deg_per_s2 = 9, offset_deg = 9 }";
+        let message = said("", &[&raw, homing]).unwrap_err();
+        assert!(message.contains("not for raw SDOs: homing."), "{message}");
     }
     assert!(said("", &[&raw(0x2000)]).is_ok());
     assert!(said(RIG, &[]).is_ok(), "6085 in the drive's own units, where no key sets it");

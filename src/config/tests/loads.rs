@@ -121,12 +121,8 @@ fn what_is_set_in_a_shipped_file_has_an_effect() {
     }
     let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
     let config = loaded(&rig, &[]);
-    let (_, key) = config.control.rotation_max_rad_per_mm();
-    assert_eq!(
-        config.number(key) * config.insertion.speed_mm_per_s,
-        20.0,
-        "deg/s, as the file says of {key}"
-    );
+    let rotation = config.control.rotation_max_rad_per_mm() * config.insertion.speed_mm_per_s;
+    assert_eq!(rotation, 20f64.to_radians(), "per s, as the file says");
     assert_eq!(
         warnings("a.toml", "[observer]\nshadows = []\nfinite_difference.baseline_mm = 3\n"),
         ["a.toml:3: observer.finite_difference.baseline_mm has no effect, since observer.kind is \
@@ -345,4 +341,58 @@ fn a_calibration_file_that_cannot_be_used_hides_no_other_error() {
     let is_missing =
         |said: &&str| of_files.iter().any(|key| said.contains(&format!("{key} is missing")));
     assert!(!said.iter().any(is_missing), "{said:#?}");
+}
+
+/// It would be replaced without a word.
+#[test]
+fn a_value_beside_the_calibration_file_that_holds_it_is_refused() {
+    let read = |_: &Path| Err("cannot be read".to_owned());
+    let said = |text: &str, sets: &[&str]| {
+        let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+        let error = Config::with_warnings(&[Source { name: "bench.toml", text }], &sets, &read);
+        error.expect_err("refused").to_string()
+    };
+    let needle = "needle_file = \"needle.toml\"";
+    for (text, key) in [
+        (format!("[needle]\n{needle}\ntip_ahead_mm = 3"), "needle.tip_ahead_mm"),
+        (format!("[needle]\n{needle}\ntorsion.creep_mm = 3"), "needle.torsion"),
+        (format!("needle.{needle}\nevaluation.axis = [0, 1, 0]"), "evaluation.axis"),
+    ] {
+        let said = said(&text, &[]);
+        let expected = format!("needle.needle_file is given along with {key}: give one of the two");
+        assert!(said.starts_with("bench.toml:") && said.contains(&expected), "{said}");
+    }
+    let sets = ["tracker.registration_file=r.toml", "tracker.registration.sd_mm=0.3"];
+    assert_eq!(
+        said("", &sets),
+        "--set tracker.registration_file is given along with tracker.registration.sd_mm: give one of \
+         the two"
+    );
+    // Given in a source over the one that names the file, it is laid over what the file holds.
+    let over = said(&format!("needle.{needle}"), &["needle.tip_ahead_mm=3"]);
+    assert!(over.starts_with("bench.toml:1: needle.needle_file: cannot be read"), "{over}");
+}
+
+/// A registration, a tip or a needle that is changed by hand is not the one that was measured.
+#[test]
+fn a_calibration_does_not_vouch_for_a_value_that_is_given_over_it() {
+    let origin =
+        "file = \"p.csv\"\nsha256 = \"0\"\nversion = \"0\"\ndate_utc = \"2026-08-01T12:00:00Z\"";
+    let text = format!(
+        "[tracker.registration]\nx_mm = 1.0\ny_mm = 0.0\nz_mm = 0.0\nyaw_deg = 0.0\n\
+         pitch_deg = 0.0\nroll_deg = 0.0\n\
+         [tracker.registration.fit]\n{origin}\npoints = 9\nrms_mm = 0.4\nspread_mm = [9, 9, 9]\n\
+         [tracker.tip_fit]\n{origin}\npoints = 9\nradius_mm = 1.0\nrms_mm = 0.4\n"
+    );
+    let has_fit = |set: &str| {
+        let config = loaded(&text, &[set]);
+        let Some(RegistrationConfig::Given(given)) = config.tracker.registration else {
+            panic!("a pose is given")
+        };
+        [given.fit.is_some(), config.tracker.tip_fit.is_some()]
+    };
+    assert_eq!(has_fit("insertion.depth_mm=80"), [true, true]);
+    assert_eq!(has_fit("tracker.registration.x_mm=2.0"), [false, true]);
+    assert_eq!(has_fit("tracker.tip_tilt.roll_deg=3.0"), [true, false]);
+    assert_eq!(has_fit("tracker.tip_offset_mm=[0.0, 0.0, 7.0]"), [true, false]);
 }

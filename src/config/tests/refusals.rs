@@ -479,6 +479,9 @@ fn noise_that_lasts_longer_than_the_run() {
         "--set tracker.noise.correlation_time_s is 126, allowed: up to the 125.000 s of the insertion; \
          noise that lasts longer is an error of the registration, tracker.registration.sd_mm"
     );
+    // What is advised is allowed: 125.0006 s are not rounded up.
+    let longer = set_refusal(&["insertion.depth_mm=250.0012", &noise("125.001")]);
+    assert!(longer.contains("allowed: up to the 125.000 s"), "{longer}");
     assert_eq!(
         set_refusal(&[&noise("-0.1")]),
         "--set tracker.noise.correlation_time_s is -0.1, allowed: 0 to 3600 s"
