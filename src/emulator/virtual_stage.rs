@@ -1,7 +1,7 @@
 //! The emulated stage as the bench sees it: drives, needle and tracker.
 
 use super::drive::{Drive, DriveConfig};
-use super::fault::{Change, Fault, FaultKind, FaultyLine, FrameFault, Script, Toward};
+use super::fault::{Change, Fault, FaultKind, FaultyLine, Script, Toward};
 use super::tissue::Tissue;
 use super::tracker::{EmulatedTracker, TargetModel, TrackedTip, TrackerModel};
 use super::truth::Truth;
@@ -80,7 +80,6 @@ pub struct VirtualStage {
     tracker: EmulatedTracker,
     target: Option<(TargetModel, EmulatedTracker)>,
     script: Script,
-    bus_fault: Option<FaultKind>,
     /// Frames for the drives that wait for the end of [`FaultKind::BusStuck`].
     held: Vec<Frame>,
     outputs: VecDeque<StageOutput>,
@@ -106,7 +105,6 @@ impl VirtualStage {
             tissue: Tissue::new(config.needle, config.torsion, config.start),
             tracker: EmulatedTracker::new(config.tracker, config.x_tp, config.x_bs, now),
             script: Script::new(&config.faults, now),
-            bus_fault: None,
             held: Vec::new(),
             outputs: VecDeque::new(),
         };
@@ -118,8 +116,8 @@ impl VirtualStage {
     /// a target latched by this frame acts from here on only.
     pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
         self.handle_timeout(now);
-        match self.bus_fault {
-            None => (0..2).for_each(|drive| self.carry_to(drive, now, frame)),
+        match self.bus_fault() {
+            None => self.send_to_both(now, frame),
             Some(FaultKind::BusStuck) => self.held.push(*frame),
             Some(_) => {}
         }
@@ -132,7 +130,7 @@ impl VirtualStage {
             self.move_needle(self.tracker.next_acquisition());
             self.tracker.acquire(self.tissue.tip_true());
         }
-        self.look_at_target(now);
+        self.sample_target(now);
         self.move_needle(now);
         while let Some(change) = self.script.poll(now, self.position_true(now).0) {
             self.change(now, change);
@@ -143,8 +141,8 @@ impl VirtualStage {
             }
         }
         for drive in 0..2 {
-            self.arrive(drive, now);
-            self.leave(drive, now);
+            self.deliver_to(drive, now);
+            self.forward_from(drive, now);
         }
         self.drain_drives(now);
         while let Some((tip, truth)) = self.tracker.deliver(now) {
@@ -156,7 +154,7 @@ impl VirtualStage {
     }
 
     /// Takes the samples of the target that are due.
-    fn look_at_target(&mut self, now: Time) {
+    fn sample_target(&mut self, now: Time) {
         while let Some(due) = self.target.as_ref().map(|(_, tracker)| tracker.next_acquisition())
             && due <= now
         {
@@ -187,9 +185,9 @@ impl VirtualStage {
         drives.chain(lines).chain(own).chain(target).min().unwrap_or(Time::NEVER)
     }
 
-    /// The present fault of the bus. A bus with a fault carries no frame.
+    /// The present fault of the bus: of several, the first in the script. A bus with a fault carries no frame.
     pub fn bus_fault(&self) -> Option<FaultKind> {
-        self.bus_fault
+        self.script.active().map(|fault| fault.kind).find(|kind| kind.is_of_bus())
     }
 
     /// How many frames for the drives wait for the end of [`FaultKind::BusStuck`].
@@ -221,14 +219,19 @@ impl VirtualStage {
         self.tissue.advance(insertion_mm, rotation_rad);
     }
 
+    /// Sends a frame of the bus to both drives.
+    fn send_to_both(&mut self, now: Time, frame: &Frame) {
+        (0..2).for_each(|drive| self.send_to(drive, now, frame));
+    }
+
     /// Sends a frame of the bus to `drive`.
-    fn carry_to(&mut self, drive: usize, now: Time, frame: &Frame) {
+    fn send_to(&mut self, drive: usize, now: Time, frame: &Frame) {
         self.to_drive[drive].handle(now, frame);
-        self.arrive(drive, now);
+        self.deliver_to(drive, now);
     }
 
     /// Gives `drive` the frames that have arrived.
-    fn arrive(&mut self, drive: usize, now: Time) {
+    fn deliver_to(&mut self, drive: usize, now: Time) {
         while let Some(frame) = self.to_drive[drive].poll(now) {
             self.drives[drive].handle_frame(now, &frame);
         }
@@ -236,10 +239,10 @@ impl VirtualStage {
 
     /// Forwards the frames that have arrived from `drive` to the outside and to the other drive, as on a
     /// real bus.
-    fn leave(&mut self, drive: usize, now: Time) {
+    fn forward_from(&mut self, drive: usize, now: Time) {
         while let Some(frame) = self.from_drive[drive].poll(now) {
-            if self.bus_fault.is_none() {
-                self.carry_to(1 - drive, now, &frame);
+            if self.bus_fault().is_none() {
+                self.send_to(1 - drive, now, &frame);
                 self.outputs.push_back(StageOutput::Frame(frame));
             }
         }
@@ -251,7 +254,7 @@ impl VirtualStage {
             let sent = (0..2).find_map(|n| Some((n, self.drives[n].poll_transmit()?)));
             let Some((drive, frame)) = sent else { return };
             self.from_drive[drive].handle(now, &frame);
-            self.leave(drive, now);
+            self.forward_from(drive, now);
         }
     }
 
@@ -260,52 +263,61 @@ impl VirtualStage {
         match change {
             Change::Begins(fault, end) => {
                 self.outputs.push_back(StageOutput::FaultBegan(fault.clone()));
-                if fault.kind.is_of_bus() {
-                    self.bus_fault = Some(fault.kind);
-                }
                 for n in (0..2).filter(|n| fault.concerns(*n)) {
                     self.add_frame_faults(n, end, &fault);
                     self.change_drive(n, now, &fault, true);
                 }
             }
             Change::Ends(fault) => {
-                if fault.kind.is_of_bus() {
-                    self.bus_fault = None;
-                    for frame in std::mem::take(&mut self.held) {
-                        (0..2).for_each(|drive| self.carry_to(drive, now, &frame));
-                        self.drain_drives(now);
+                self.release_held(now);
+                for n in (0..2).filter(|n| fault.concerns(*n)) {
+                    let is_same = |other: &Fault| other.kind == fault.kind && other.concerns(n);
+                    if !self.script.active().any(is_same) {
+                        self.change_drive(n, now, &fault, false);
                     }
                 }
-                let drives = (0..2).filter(|n| fault.concerns(*n));
-                drives.for_each(|n| self.change_drive(n, now, &fault, false));
             }
-            Change::Foreign(frame) if self.bus_fault.is_none() => {
-                (0..2).for_each(|drive| self.carry_to(drive, now, &frame));
+            Change::Foreign(frame) if self.bus_fault().is_none() => {
+                self.send_to_both(now, &frame);
                 self.outputs.push_back(StageOutput::Frame(frame));
             }
             Change::Foreign(_) => {}
         }
     }
 
+    /// Sends the frames that the bench's interface held, when it no longer does. Another fault of the bus
+    /// loses them.
+    fn release_held(&mut self, now: Time) {
+        let bus_fault = self.bus_fault();
+        if bus_fault == Some(FaultKind::BusStuck) {
+            return;
+        }
+        for frame in std::mem::take(&mut self.held) {
+            if bus_fault.is_none() {
+                self.send_to_both(now, &frame);
+                self.drain_drives(now);
+            }
+        }
+    }
+
     /// Adds what `fault` does to the frames of drive `n` until `end`.
     fn add_frame_faults(&mut self, n: usize, end: Time, fault: &Fault) {
-        let all = FrameFault { fault: fault.clone(), id: None, until: end, count: None };
-        match (fault.kind, fault.toward) {
-            (kind, toward) if kind.has("frames") => {
-                let id = fault.id(self.drives[n].id());
-                let line = match toward {
-                    Toward::Bench => &mut self.from_drive[n],
-                    Toward::Drives => &mut self.to_drive[n],
-                };
-                line.add(FrameFault { id, count: fault.count, ..all });
-            }
+        let (from_drive, to_drive) = match fault.kind {
+            FaultKind::Silent => (true, true),
             // A restart without a duration takes no time.
-            (FaultKind::Restart, _) if fault.duration.is_none() => {}
-            (FaultKind::Silent | FaultKind::Restart, _) => {
-                self.to_drive[n].add(all.clone());
-                self.from_drive[n].add(all);
+            FaultKind::Restart => (fault.duration.is_some(), fault.duration.is_some()),
+            kind => (
+                kind.has("frames") && fault.toward == Toward::Bench,
+                kind.has("frames") && fault.toward == Toward::Drives,
+            ),
+        };
+        let id = fault.id(self.drives[n].id());
+        for (line, is_faulty) in
+            [(&mut self.from_drive[n], from_drive), (&mut self.to_drive[n], to_drive)]
+        {
+            if is_faulty {
+                line.add(fault.clone(), id, end);
             }
-            _ => {}
         }
     }
 
@@ -314,5 +326,72 @@ impl VirtualStage {
         self.drives[n].apply_fault(now, fault, begins);
         // The drive's answer goes through the lines as they are now.
         self.drain_drives(now);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+
+    fn at(ms: i64) -> Time {
+        Time::from_nanos(ms * 1_000_000)
+    }
+
+    fn stage(faults: &[&str]) -> VirtualStage {
+        let set = format!("emulator.fault=[{}]", faults.join(", "));
+        let config = Config::from_sources(&[], &[set]).expect("valid");
+        VirtualStage::new(config.virtual_stage().expect("valid"), Time::ZERO)
+    }
+
+    /// What the insertion drive answers to a request for its statusword, by its first byte; `None` if
+    /// nothing comes.
+    fn statusword(stage: &mut VirtualStage, now: Time) -> Option<u8> {
+        stage.handle_frame(now, &Frame::new(0x601, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]));
+        let answers = std::iter::from_fn(|| stage.poll()).filter_map(|output| match output {
+            StageOutput::Frame(frame) if frame.cob_id() == Some(0x581) => Some(frame.data()[4]),
+            _ => None,
+        });
+        answers.last()
+    }
+
+    #[test]
+    fn a_fault_lasts_its_own_time_whatever_other_begins_and_ends() {
+        let mut stage = stage(&[
+            r#"{ kind = "no-voltage", at_s = 0.1, duration_s = 0.3, axis = "insertion" }"#,
+            r#"{ kind = "no-voltage", at_s = 0.2, duration_s = 0.1 }"#,
+            r#"{ kind = "bus-down", at_s = 0.5, duration_s = 0.3 }"#,
+            r#"{ kind = "bus-off", at_s = 0.6, duration_s = 0.1 }"#,
+        ]);
+        let (with_voltage, without) = (Some(0x50), Some(0x40));
+        for (ms, answer) in [
+            (0, with_voltage),
+            (150, without),
+            (250, without),
+            (350, without),
+            (450, with_voltage),
+            (550, None),
+            (650, None),
+            (750, None),
+            (850, with_voltage),
+        ] {
+            assert_eq!(statusword(&mut stage, at(ms)), answer, "at {ms} ms");
+            let is_down = (500..800).contains(&ms);
+            assert_eq!(stage.bus_fault(), is_down.then_some(FaultKind::BusDown), "at {ms} ms");
+        }
+    }
+
+    #[test]
+    fn held_frames_leave_at_the_end_or_are_lost_with_the_interface() {
+        for (down, answers) in [("", 1), (r#"{ kind = "bus-down", at_s = 0.15 }"#, 0)] {
+            let stuck = r#"{ kind = "bus-stuck", at_s = 0.1, duration_s = 0.1 }"#;
+            let mut stage = stage(&[stuck, down]);
+            assert_eq!(statusword(&mut stage, at(120)), None);
+            assert_eq!(stage.frames_held(), 1);
+            [160, 250].into_iter().for_each(|ms| stage.handle_timeout(at(ms)));
+            let frames = std::iter::from_fn(|| stage.poll());
+            let frames = frames.filter(|output| matches!(output, StageOutput::Frame(_)));
+            assert_eq!((frames.count(), stage.frames_held()), (answers, 0));
+        }
     }
 }

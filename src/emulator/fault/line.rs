@@ -9,19 +9,18 @@ use crate::units::Time;
 
 /// A fault on a line.
 #[derive(Debug, Clone)]
-pub(in crate::emulator) struct FrameFault {
-    pub(in crate::emulator) fault: Fault,
+struct FrameFault {
+    /// Its count is of the frames that it still acts on.
+    fault: Fault,
     /// The identifier of the frames it acts on; `None` for all frames.
-    pub(in crate::emulator) id: Option<CanId>,
+    id: Option<CanId>,
     /// The first time at which it acts no more.
-    pub(in crate::emulator) until: Time,
-    /// How many frames it still acts on; `None` for any number.
-    pub(in crate::emulator) count: Option<u32>,
+    until: Time,
 }
 
 impl FrameFault {
     fn acts_on(&self, now: Time, frame: &Frame) -> bool {
-        now < self.until && self.count != Some(0) && self.id.is_none_or(|id| id == frame.id())
+        now < self.until && self.fault.count != Some(0) && self.id.is_none_or(|id| id == frame.id())
     }
 }
 
@@ -40,24 +39,25 @@ pub(in crate::emulator) struct FaultyLine {
 }
 
 impl FaultyLine {
-    /// Adds a fault after the others.
-    pub(in crate::emulator) fn add(&mut self, fault: FrameFault) {
-        self.faults.push(fault);
+    /// Adds a fault after the others. It acts on the frames with this identifier, or on all, until `until`.
+    pub(in crate::emulator) fn add(&mut self, fault: Fault, id: Option<CanId>, until: Time) {
+        self.faults.push(FrameFault { fault, id, until });
     }
 
     /// Takes a frame that is sent at `now`.
     pub(in crate::emulator) fn handle(&mut self, now: Time, frame: &Frame) {
         let (mut changed, mut copies) = (*frame, 1);
         let (mut late, mut held) = (Duration::ZERO, false);
-        for fault in self.faults.iter_mut().filter(|fault| fault.acts_on(now, frame)) {
+        for FrameFault { fault, .. } in
+            self.faults.iter_mut().filter(|fault| fault.acts_on(now, frame))
+        {
             fault.count = fault.count.map(|left| left - 1);
-            match fault.fault.kind {
-                FaultKind::Delay => late += fault.fault.delay.unwrap_or_default(),
+            match fault.kind {
+                FaultKind::Delay => late += fault.delay.unwrap_or_default(),
                 FaultKind::Duplicate => copies *= 2,
-                FaultKind::Reorder => held = true,
-                FaultKind::Corrupt | FaultKind::Resize => {
-                    changed = fault.fault.applied_to(&changed)
-                }
+                // The frame after a held one passes.
+                FaultKind::Reorder => held = self.held.is_empty(),
+                FaultKind::Corrupt | FaultKind::Resize => changed = fault.applied_to(&changed),
                 _ => {
                     copies = 0;
                     break;
@@ -77,9 +77,9 @@ impl FaultyLine {
 
     /// The next frame to arrive at `now`; `None` when none is due.
     pub(in crate::emulator) fn poll(&mut self, now: Time) -> Option<Frame> {
-        let due = self.under_way.iter().map(|(due, _)| *due).min().filter(|due| *due <= now)?;
-        let at = self.under_way.iter().position(|(at, _)| *at == due)?;
-        self.under_way.remove(at).map(|(_, frame)| frame)
+        let arrivals = self.under_way.iter().map(|(due, _)| *due).enumerate();
+        let (first, _) = arrivals.min_by_key(|(_, due)| *due).filter(|(_, due)| *due <= now)?;
+        self.under_way.remove(first).map(|(_, frame)| frame)
     }
 
     /// When [`poll`](Self::poll) next has a frame.
@@ -122,17 +122,14 @@ mod tests {
         Time::from_nanos(ms * 1_000_000)
     }
 
-    fn on_all(kind: FaultKind) -> FrameFault {
-        FrameFault { fault: Fault::of(kind), id: None, until: Time::NEVER, count: None }
-    }
-
-    /// What arrives, and when in ms, of frames 0 to 3 sent 10 ms apart; the fault begins with frame 1.
-    fn arrivals(fault: FrameFault) -> Vec<(i64, Vec<u8>)> {
+    /// What arrives, and when in ms, of frames 0 to 3 sent 10 ms apart; the fault begins with frame 1 and
+    /// ends with frame 2.
+    fn arrivals(fault: &Fault) -> Vec<(i64, Vec<u8>)> {
         let mut line = FaultyLine::default();
         let mut arrivals = Vec::new();
         for ms in 0..60 {
             if ms == 10 {
-                line.add(fault.clone());
+                line.add(fault.clone(), None, at(30));
             }
             if ms % 10 == 0 && ms < 40 {
                 line.handle(at(ms), &frame(ms as u8 / 10));
@@ -146,20 +143,13 @@ mod tests {
         arrivals
     }
 
-    /// A fault on frames 1 and 2 at most.
-    fn to_the_middle(kind: FaultKind) -> FrameFault {
-        FrameFault { until: at(30), ..on_all(kind) }
-    }
-
     #[test]
     fn each_action_does_what_it_says() {
-        let once = |fault: Fault| {
-            arrivals(FrameFault { count: Some(1), fault, ..to_the_middle(FaultKind::Drop) })
-        };
+        let once = |fault: Fault| arrivals(&Fault { count: Some(1), ..fault });
         let order = |arrivals: Vec<(i64, Vec<u8>)>| {
             arrivals.into_iter().map(|(ms, data)| (ms, data[0])).collect::<Vec<_>>()
         };
-        assert_eq!(order(arrivals(to_the_middle(FaultKind::Drop))), [(0, 0), (30, 3)]);
+        assert_eq!(order(arrivals(&Fault::of(FaultKind::Drop))), [(0, 0), (30, 3)]);
         let delay = Some(Duration::from_millis(15));
         let late = Fault { delay, ..Fault::of(FaultKind::Delay) };
         assert_eq!(order(once(late)), [(0, 0), (20, 2), (25, 1), (30, 3)]);
@@ -167,6 +157,8 @@ mod tests {
         assert_eq!(order(twice), [(0, 0), (10, 1), (10, 1), (20, 2), (30, 3)]);
         let swapped = once(Fault::of(FaultKind::Reorder));
         assert_eq!(order(swapped), [(0, 0), (20, 2), (20, 1), (30, 3)]);
+        let pairs = arrivals(&Fault::of(FaultKind::Reorder));
+        assert_eq!(order(pairs), [(0, 0), (20, 2), (20, 1), (30, 3)], "not held until it ends");
         let corrupt = |byte| Fault { byte, ..Fault::of(FaultKind::Corrupt) };
         let resize = |length| Fault { length, ..Fault::of(FaultKind::Resize) };
         let second = |fault| once(fault)[1].1.clone();
@@ -181,13 +173,15 @@ mod tests {
 
     #[test]
     fn a_fault_acts_on_its_own_identifier_and_in_order() {
-        let only = |id| FrameFault { id: Some(CanId::Base(id)), ..on_all(FaultKind::Drop) };
         let mut line = FaultyLine::default();
-        line.add(only(0x182));
+        let add = |line: &mut FaultyLine, kind, id: Option<u16>| {
+            line.add(Fault::of(kind), id.map(CanId::Base), Time::NEVER);
+        };
+        add(&mut line, FaultKind::Drop, Some(0x182));
         line.handle(at(0), &frame(7));
         assert_eq!(line.poll(at(0)), Some(frame(7)));
-        line.add(only(0x181));
-        line.add(on_all(FaultKind::Duplicate));
+        add(&mut line, FaultKind::Drop, Some(0x181));
+        add(&mut line, FaultKind::Duplicate, None);
         line.handle(at(0), &frame(7));
         assert_eq!(line.poll(at(0)), None);
     }

@@ -3,7 +3,7 @@
 mod line;
 mod script;
 
-pub(super) use line::{FaultyLine, FrameFault};
+pub(super) use line::FaultyLine;
 pub(super) use script::{Change, Script};
 
 use crate::canopen::emcy::EmcyCode;

@@ -81,6 +81,12 @@ impl Script {
         None
     }
 
+    /// The faults that have begun and not ended, in the order they were written.
+    pub(in crate::emulator) fn active(&self) -> impl Iterator<Item = &Fault> {
+        let is_active = |(_, state): &&(Fault, State)| matches!(state, State::Active(..));
+        self.faults.iter().filter(is_active).map(|(fault, _)| fault)
+    }
+
     /// When [`poll`](Self::poll) is due.
     pub(in crate::emulator) fn deadline(&self) -> Time {
         let due = |(fault, state): &(Fault, State)| match *state {
