@@ -5,6 +5,7 @@ use super::device::Device;
 use super::homing::{self, Homing};
 use super::inputs::{End, Inputs};
 use super::motion::Motion;
+use super::profile::Profile;
 use super::state_machine::{Command, transition};
 use super::{DriveConfig, Model};
 use crate::canopen::ObjectAddress;
@@ -35,7 +36,7 @@ pub(super) struct Axis {
     pub(super) demand: i64,
     /// Demand minus position at the end of the interpolation period, in counts.
     pub(super) lag: i64,
-    /// Since when the lag has exceeded the window 0x6065.
+    /// Since when the lag has exceeded the window 0x6065 without a break.
     pub(super) behind_since: Option<Time>,
     /// The encoder position that is 0 on the bus.
     pub(super) zero: i64,
@@ -54,8 +55,6 @@ pub(super) struct Axis {
     counts: i64,
     updated: Time,
     pub(super) homing: Homing,
-    /// The limit switch that the present leg of homing moves onto.
-    pub(super) onto: Option<End>,
     /// The last homing since power-on succeeded.
     pub(super) referenced: bool,
 }
@@ -79,7 +78,6 @@ impl Axis {
             counts: config.start_counts,
             updated: Time::ZERO,
             homing: Homing::default(),
-            onto: None,
             referenced: config.homed,
             config,
         }
@@ -87,10 +85,6 @@ impl Axis {
 
     pub(super) fn state(&self) -> DriveState {
         self.state
-    }
-
-    pub(super) fn position_at(&self, now: Time) -> f64 {
-        self.motion.position_at(now)
     }
 
     pub(super) fn has_torque(&self) -> bool {
@@ -142,7 +136,6 @@ impl Axis {
                 self.state = next;
                 self.after_stop = None;
                 self.demand = whole(self.motion.position_at(now));
-                self.lag = 0;
                 self.homing = Homing::default();
             }
             _ => {
@@ -209,12 +202,19 @@ impl Axis {
     pub(super) fn stand(&mut self, now: Time) {
         self.motion = Motion::Hold { at: self.motion.position_at(now) };
         self.after_stop = None;
-        self.lag = 0;
+        self.stop_following();
     }
 
     pub(super) fn brake(&mut self, now: Time, deceleration: i64) {
         self.motion = self.motion.brake(now, deceleration.max(1) as f64);
+        self.stop_following();
+    }
+
+    /// An axis that does not follow its target has no following error and no limited target.
+    fn stop_following(&mut self) {
         self.lag = 0;
+        self.behind_since = None;
+        self.target_limited = false;
     }
 
     /// True while commands may move the axis.
@@ -238,8 +238,8 @@ impl Axis {
         if self.state != DriveState::OperationEnabled || !self.inputs.is_closed(end, self.counts) {
             return;
         }
-        if matches!(self.homing, Homing::Under { .. }) {
-            if self.onto != Some(end) {
+        if let Homing::InProgress { onto, .. } = self.homing {
+            if onto != Some(end) {
                 self.homing = Homing::Failed;
                 self.brake(now, halt_deceleration(&device.objects));
             }
@@ -324,14 +324,10 @@ impl Axis {
     /// Brings the axis's objects up to `now`. Called before an object is read, sampled or sent.
     pub(super) fn update(&mut self, now: Time, device: &mut Device) {
         self.updated = now;
-        if let Motion::Brake(_) | Motion::Ramped(_) = self.motion
-            && self.motion.end().is_some_and(|end| now >= end)
-        {
+        if self.motion.profile().is_some_and(|profile| now >= profile.end()) {
             self.motion = Motion::Hold { at: self.motion.to() };
-            match self.after_stop.take() {
-                Some(next) => self.state = next,
-                None if self.may_move(device) => self.begin_next_leg(now, device),
-                None => {}
+            if self.after_stop.is_none() && self.may_move(device) {
+                self.begin_next_leg(now, device);
             }
         }
         if matches!(self.motion, Motion::Hold { .. })
@@ -387,14 +383,6 @@ impl Axis {
         self.update(now, device);
     }
 
-    /// The same SYNC: commands take effect. Its TPDOs are sampled, and the RPDOs that waited for it
-    /// are written.
-    pub(super) fn sync(&mut self, now: Time, device: &mut Device) {
-        if self.follows(device) {
-            self.take_target(now, device);
-        }
-    }
-
     /// The NMT state is no longer `before`; the new one is in `device`.
     pub(super) fn nmt_state_changed(&mut self, now: Time, before: NmtState, device: &mut Device) {
         let left = before == NmtState::Operational;
@@ -422,7 +410,6 @@ impl Axis {
     pub(super) fn reset(&mut self, now: Time) {
         self.power_off(now);
         self.demand = whole(self.motion.position_at(now));
-        self.target_limited = false;
         self.before = Controlword::default();
         self.partner_lost = false;
         self.homing = Homing::default();
@@ -431,11 +418,7 @@ impl Axis {
 
     /// When the axis is due.
     pub(super) fn deadline(&self) -> Time {
-        let end = match self.motion {
-            Motion::Brake(_) | Motion::Ramped(_) => self.motion.end().unwrap_or(Time::NEVER),
-            Motion::Hold { .. } | Motion::Linear { .. } => Time::NEVER,
-        };
-        end.min(self.switch_due())
+        self.motion.profile().map_or(Time::NEVER, Profile::end).min(self.switch_due())
     }
 }
 

@@ -21,12 +21,16 @@ impl Axis {
         self.may_move(device) && self.mode(&device.objects) == Mode::CSP
     }
 
-    /// Takes the target for the next interpolation period.
+    /// The same SYNC, after its TPDOs were sampled and the RPDOs that waited for it were written: an axis
+    /// that follows takes the target for the next interpolation period.
     ///
     /// The axis reaches it exactly at the end of the period, unless its maximum speed or acceleration is
     /// too low. Then it lags. When it would lag by more than 0x6065 for longer than 0x6066, it faults
     /// instead of moving.
     pub(super) fn take_target(&mut self, now: Time, device: &mut Device) {
+        if !self.follows(device) {
+            return;
+        }
         let objects = &device.objects;
         let target = objects.integer(object::TARGET_POSITION) as i32;
         let allowed = within_limits(target, objects);
@@ -62,9 +66,9 @@ impl Axis {
         let reach = self.speed_limit(objects) * seconds;
         let set = objects.integer(MAX_ACCELERATION) as f64;
         let change = set.min(ACCELERATION_MAX_COUNTS_PER_S2) * seconds * seconds;
-        let on = self.motion.velocity_at(now) * seconds;
-        let way = distance.clamp(-reach, reach).clamp(on - change, on + change);
-        if way == distance { self.demand as f64 } else { (from + way).round() }
+        let unchanged = self.motion.velocity_at(now) * seconds;
+        let travel = distance.clamp(-reach, reach).clamp(unchanged - change, unchanged + change);
+        if travel == distance { self.demand as f64 } else { (from + travel).round() }
     }
 
     pub(super) fn speed_limit(&self, objects: &ObjectDictionary) -> f64 {

@@ -18,7 +18,7 @@ pub(super) struct Device {
     pub(super) objects: ObjectDictionary,
     /// The state that the NMT master put the node in.
     pub(super) nmt_state: NmtState,
-    active: Vec<(EmcyCode, u8)>,
+    active: Vec<EmcyCode>,
     outgoing: VecDeque<Emcy>,
 }
 
@@ -38,7 +38,7 @@ impl Device {
         if self.is_active(code) {
             return;
         }
-        self.active.push((code, code.register_bits() | error_register::GENERIC));
+        self.active.push(code);
         let register = self.update_register();
         self.remember(code);
         self.send(Emcy { code, register, manufacturer });
@@ -47,7 +47,7 @@ impl Device {
     /// Ends one error, and sends an emergency message with code 0.
     pub(super) fn clear(&mut self, code: EmcyCode) {
         if self.is_active(code) {
-            self.active.retain(|(active, _)| *active != code);
+            self.active.retain(|active| *active != code);
             self.report_cleared();
         }
     }
@@ -62,7 +62,7 @@ impl Device {
 
     /// True while this error was raised and not cleared.
     pub(super) fn is_active(&self, code: EmcyCode) -> bool {
-        self.active.iter().any(|(active, _)| *active == code)
+        self.active.contains(&code)
     }
 
     pub(super) fn poll_emcy(&mut self) -> Option<Emcy> {
@@ -87,7 +87,8 @@ impl Device {
     }
 
     fn update_register(&mut self) -> u8 {
-        let register = self.active.iter().fold(0, |register, (_, bits)| register | bits);
+        let bits = self.active.iter().map(|code| code.register_bits() | error_register::GENERIC);
+        let register = bits.fold(0, |register, bits| register | bits);
         self.objects.set(ERROR_REGISTER, register.into());
         register
     }

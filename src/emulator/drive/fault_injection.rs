@@ -53,13 +53,17 @@ impl Axis {
         }
     }
 
+    /// An axis that has lost its torque stands at once, also in its fault reaction.
     fn without_torque(&mut self, now: Time, code: EmcyCode, device: &mut Device) {
         let powered = matches!(
             self.state(),
-            DriveState::SwitchedOn | DriveState::OperationEnabled | DriveState::QuickStopActive
+            DriveState::SwitchedOn
+                | DriveState::OperationEnabled
+                | DriveState::QuickStopActive
+                | DriveState::FaultReactionActive
         );
         if !self.has_torque() && powered {
-            self.stand(now);
+            self.motion = Motion::Hold { at: self.motion.position_at(now) };
             self.fault(now, code, device);
         }
     }

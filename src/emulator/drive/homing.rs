@@ -31,29 +31,26 @@ pub(super) enum Homing {
     /// Not started, interrupted, or finished.
     #[default]
     Idle,
-    /// In progress: the remaining legs, the next one first, and the home position.
-    Under { legs: Vec<Leg>, home_counts: i64 },
+    /// The remaining legs, the next one first, the limit switch that the present leg moves onto, and the home
+    /// position.
+    InProgress { legs: Vec<Leg>, onto: Option<End>, home_counts: i64 },
     /// Homing error: bit 13.
     Failed,
 }
 
-/// True for a homing method (0x6098) that works with these switches. Methods 1 and 2 seek a limit
-/// switch and then the index pulse, 17 and 18 the limit switch, 24 the home switch, 33 and 34 the
-/// index pulse. Methods 35 and 37 take the present position.
+/// True for a homing method (0x6098) that works with these switches.
 pub(super) fn is_supported(method: i64, switches: &Switches) -> bool {
-    match method {
-        1 | 17 => switches.negative_counts.is_some(),
-        2 | 18 => switches.positive_counts.is_some(),
-        24 => switches.home_counts.is_some(),
-        33 | 34 | 35 | 37 => true,
-        _ => false,
-    }
+    plan(method, 0, switches, INDEX_COUNTS, 0).is_some()
 }
 
-/// The legs and the home position of `method`, started at `at_counts`. The emulator knows the
-/// positions of its switches. The axis moves onto a switch, brakes `overrun_counts` beyond it, and
-/// moves back. The encoder has an index pulse every `index_counts`. `None` for an unsupported method.
-pub(super) fn plan(
+/// The legs and the home position of `method` (0x6098), started at `at_counts`. Methods 1 and 2 seek a limit
+/// switch and then the index pulse, 17 and 18 the limit switch, 24 the home switch, 33 and 34 the
+/// index pulse. Methods 35 and 37 take the present position.
+///
+/// The emulator knows the positions of its switches. The axis moves onto a switch, brakes `overrun_counts`
+/// beyond it, and moves back. The encoder has an index pulse every `index_counts`. `None` for a method that
+/// is not supported, or whose switch there is not.
+fn plan(
     method: i64,
     at_counts: i64,
     switches: &Switches,
@@ -142,7 +139,7 @@ impl Axis {
         self.brake(now, whole(acceleration));
         let (at, switches) = (whole(self.motion.to()), &self.inputs.switches);
         self.homing = match plan(method, at, switches, INDEX_COUNTS, overrun) {
-            Some((legs, home_counts)) => Homing::Under { legs, home_counts },
+            Some((legs, home_counts)) => Homing::InProgress { legs, onto: None, home_counts },
             None => Homing::Failed,
         };
         if matches!(self.motion, Motion::Hold { .. }) {
@@ -152,7 +149,7 @@ impl Axis {
 
     /// Starts the next leg of homing; the axis stands.
     pub(super) fn begin_next_leg(&mut self, now: Time, device: &mut Device) {
-        let Homing::Under { legs, home_counts } = &mut self.homing else { return };
+        let Homing::InProgress { legs, onto, home_counts } = &mut self.homing else { return };
         if legs.is_empty() {
             // The zero position is the home position plus the home offset.
             self.zero = *home_counts + device.objects.integer(object::HOME_OFFSET);
@@ -160,14 +157,14 @@ impl Axis {
             self.homing = Homing::Idle;
         } else {
             let leg = legs.remove(0);
-            self.onto = leg.onto;
+            *onto = leg.onto;
             self.begin_move(now, leg, device);
         }
     }
 
     /// Interrupts homing; the axis brakes.
     pub(super) fn interrupt_homing(&mut self, now: Time, objects: &ObjectDictionary) {
-        if matches!(self.homing, Homing::Under { .. }) {
+        if matches!(self.homing, Homing::InProgress { .. }) {
             self.homing = Homing::Idle;
             self.brake(now, objects.integer(object::PROFILE_DECELERATION));
         }
@@ -210,10 +207,19 @@ mod tests {
 
     #[test]
     fn a_method_needs_its_switch() {
-        for method in -128..128 {
-            let without = is_supported(method, &Switches::default());
-            assert_eq!(without, matches!(method, 33 | 34 | 35 | 37), "{method}");
-            assert_eq!(without, plan(method, 0, &Switches::default(), 300, 50).is_some());
+        let all = [1, 2, 17, 18, 24, 33, 34, 35, 37];
+        let [negative, positive, home] = [&[1, 17][..], &[2, 18], &[24]];
+        for (switches, lacking) in [
+            (SWITCHES, vec![]),
+            (Switches { negative_counts: None, ..SWITCHES }, negative.to_vec()),
+            (Switches { positive_counts: None, ..SWITCHES }, positive.to_vec()),
+            (Switches { home_counts: None, ..SWITCHES }, home.to_vec()),
+            (Switches::default(), [negative, positive, home].concat()),
+        ] {
+            for method in -128..128 {
+                let expected = all.contains(&method) && !lacking.contains(&method);
+                assert_eq!(is_supported(method, &switches), expected, "{method}, {switches:?}");
+            }
         }
     }
 }

@@ -68,6 +68,14 @@ impl Motion {
         }
     }
 
+    /// The profile of a motion with ramps, after which the axis stands.
+    pub(super) fn profile(&self) -> Option<&Profile> {
+        match self {
+            Motion::Brake(profile) | Motion::Ramped(profile) => Some(profile),
+            Motion::Hold { .. } | Motion::Linear { .. } => None,
+        }
+    }
+
     /// Where the axis will stand; a linear piece usually has a successor.
     pub(super) fn to(&self) -> f64 {
         match *self {

@@ -98,7 +98,7 @@ impl Drive {
 
     /// The true position of the axis in counts, not wrapped to 32 bits and not rounded.
     pub fn position_counts_at(&self, now: Time) -> f64 {
-        self.axis.position_at(now)
+        self.axis.motion.position_at(now)
     }
 
     /// A fault of the drive or its axis begins or ends; faults of frames and of the bus do nothing here.
@@ -306,7 +306,7 @@ impl Drive {
                 let values = self.rpdos[n].sync();
                 self.write_values(now, values);
             }
-            self.axis.sync(now, &mut self.device);
+            self.axis.take_target(now, &mut self.device);
             return;
         }
         let Some(rpdo) = self.rpdos.iter_mut().find(|rpdo| rpdo.is_for(frame)) else { return };

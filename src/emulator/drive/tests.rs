@@ -319,6 +319,14 @@ fn software_limits_cut_the_target() {
     bench.cycle(0x0f, -150);
     assert_eq!(bench.position(), -50.0);
     assert!(bench.sample.unwrap().0.has(Statusword::INTERNAL_LIMIT));
+    // Enabled anew, it has had no target yet.
+    for controlword in [0x00, 0x06, 0x0f] {
+        bench.write(object::CONTROLWORD, &[controlword, 0]);
+    }
+    let word = bench.read(object::STATUSWORD);
+    let word = Statusword(u16::from_le_bytes([word[0], word[1]]));
+    assert_eq!(bench.state(), DriveState::OperationEnabled);
+    assert!(!word.has(Statusword::INTERNAL_LIMIT));
 }
 
 #[test]

@@ -91,6 +91,39 @@ fn a_blocked_axis_is_given_the_time_of_6066() {
     assert_eq!(target, 2700, "three periods more than at once");
 }
 
+/// A fault ends the time that ran before it. Enabled anew with a target far off, this axis comes within its
+/// window in 30 ms, and is not beyond it for 25 ms.
+#[test]
+fn the_time_of_6066_begins_anew() {
+    let mut bench = moving();
+    bench.write(object::FOLLOWING_ERROR_TIMEOUT, &25u16.to_le_bytes());
+    bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::Stall), true);
+    while bench.state() == DriveState::OperationEnabled {
+        bench.cycle(0x0f, 3000);
+    }
+    bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::Stall), false);
+    for controlword in [0x00, 0x80, 0x06, 0x07, 0x0f, 0x0f, 0x0f, 0x0f, 0x0f] {
+        bench.cycle(controlword, 10_300);
+    }
+    assert_eq!((bench.state(), bench.position()), (DriveState::OperationEnabled, 10_300.0));
+}
+
+#[test]
+fn an_axis_in_its_fault_reaction_that_loses_its_torque_stands_at_once() {
+    for lost in [FaultKind::EmergencyStop, FaultKind::NoVoltage] {
+        let mut bench = moving();
+        let fault = Fault { code: Some(0x4210), ..Fault::of(FaultKind::DriveFault) };
+        bench.drive.apply_fault(bench.now, &fault, true);
+        bench.pass(PERIOD);
+        assert_eq!(bench.state(), DriveState::FaultReactionActive);
+        let stood = bench.position();
+        bench.drive.apply_fault(bench.now, &Fault::of(lost), true);
+        assert_eq!(bench.state(), DriveState::Fault);
+        bench.pass(Duration::from_secs(1));
+        assert_eq!(bench.position(), stood);
+    }
+}
+
 #[test]
 fn an_axis_that_is_released_in_time_catches_up() {
     let mut bench = moving();
