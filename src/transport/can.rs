@@ -65,8 +65,8 @@ pub trait CanBus: Send {
     ///
     /// # Errors
     /// [`CanError::TransmitQueueFull`] when the interface takes no more frames;
-    /// [`CanError::NotConfirmed`] when earlier frames were not sent; [`CanError::Down`] and
-    /// [`CanError::Gone`] when the interface has gone; [`CanError::Io`] otherwise.
+    /// [`CanError::NotConfirmed`] when earlier frames were not sent; [`CanError::Down`] or
+    /// [`CanError::Gone`] when the interface is; [`CanError::Io`] otherwise.
     fn send(&mut self, frame: &Frame) -> Result<(), CanError>;
 
     /// Waits up to `timeout` for the next event; `None` when none came in that time. With a zero
@@ -122,7 +122,7 @@ pub enum CanError {
     #[error("interface {0} is down: {next}", next = bring_up(.0))]
     Down(String),
     /// The interface vanished while in use.
-    #[error("interface {0} is gone; was the adapter unplugged")]
+    #[error("interface {0} is gone, was the adapter unplugged?")]
     Gone(String),
     /// Frames are not leaving: no other node acknowledges them, the bus is off, or it is full.
     #[error(
@@ -138,7 +138,7 @@ pub enum CanError {
     /// Queued frames were not sent, so no more are taken. They leave when a node acknowledges again.
     #[error(
         "{interface}: {frames} frames not confirmed on the bus within {syncs} SYNCs, is the cable in and \
-         does anyone acknowledge?"
+         does a node acknowledge?"
     )]
     NotConfirmed {
         /// The interface's name.
@@ -178,14 +178,14 @@ fn bring_up(interface: &str) -> String {
         )
     } else {
         format!(
-            "plug the adapter in, then sudo ip link set {interface} up type can bitrate 1000000"
+            "plug the adapter in, then sudo ip link set {interface} up type can bitrate 1000000 \
+             restart-ms 0, with the bit rate of your drives"
         )
     }
 }
 
 /// Waits up to `timeout` until `socket` has data or an error, by ppoll(2): poll(2) counts whole
-/// milliseconds. A signal ends the wait early; the caller
-/// waits again for the rest.
+/// milliseconds. A signal ends the wait early; the caller waits again for the rest.
 pub(super) fn readable(socket: BorrowedFd<'_>, timeout: Duration) -> io::Result<()> {
     let mut sockets = [PollFd::new(socket, PollFlags::POLLIN)];
     match ppoll(&mut sockets, Some(TimeSpec::from_duration(timeout)), None) {
@@ -217,7 +217,8 @@ mod tests {
         assert_eq!(
             text(CanError::NoInterface("can0".into())),
             "no interface can0: plug the adapter in, \
-             then sudo ip link set can0 up type can bitrate 1000000"
+             then sudo ip link set can0 up type can bitrate 1000000 restart-ms 0, \
+             with the bit rate of your drives"
         );
         assert_eq!(
             text(CanError::Down("memory".into())),

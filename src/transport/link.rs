@@ -165,11 +165,6 @@ impl Outlet {
     /// Interval between two checks for room.
     const ROOM_POLL: Duration = Duration::from_millis(10);
 
-    /// True when the link was dropped.
-    pub(super) fn is_closed(&self) -> bool {
-        self.events.is_abandoned()
-    }
-
     /// Waits until there is room for the events of a connection that must not be lost. Call it before
     /// connecting, while no data is waiting in the socket.
     pub(super) async fn wait_for_room(&mut self) {
@@ -260,7 +255,8 @@ fn read_to_end(
     clock: impl Fn() -> Time,
 ) -> String {
     let mut buffer = [0; 4096];
-    while !outlet.is_closed() {
+    // Until the link is dropped.
+    while !outlet.events.is_abandoned() {
         let len = match input.read(&mut buffer) {
             Ok(0) => {
                 let cut = reader.finish().err().map(|error| format!(": {error}"));

@@ -79,7 +79,7 @@ impl SocketCan {
         };
         match set_up() {
             Ok(None) => Ok(bus),
-            Ok(Some(error)) | Err(error) => Err(bus.failed("set the socket up", error)),
+            Ok(Some(error)) | Err(error) => Err(failed(&bus.interface, "set the socket up")(error)),
         }
     }
 
@@ -91,7 +91,7 @@ impl SocketCan {
     /// [`CanError::Io`] if the kernel gives no echoes.
     pub fn confirm_sending(&mut self, syncs_max: usize) -> Result<(), CanError> {
         let asked = self.socket.set_recv_own_msgs(true);
-        asked.map_err(|error| self.failed("ask for echoes", error))?;
+        asked.map_err(failed(&self.interface, "ask for echoes"))?;
         self.unconfirmed = Some(Unconfirmed::new(syncs_max));
         Ok(())
     }
@@ -113,7 +113,7 @@ impl SocketCan {
             .chain(numbers)
             .map(|number| CanFilter::new(number, NODE_BITS | CAN_EFF_FLAG))
             .collect();
-        self.socket.set_filters(&filters).map_err(|error| self.failed("set filters", error))?;
+        self.socket.set_filters(&filters).map_err(failed(&self.interface, "set filters"))?;
         // A flood that passes the filters would never let this end.
         for _ in 0..DRAIN_MAX {
             if self.receive(Duration::ZERO)?.is_none() {
@@ -136,16 +136,6 @@ impl SocketCan {
                 }
                 false
             }
-        }
-    }
-
-    /// `error` as a [`CanError`].
-    fn failed(&self, action: &'static str, error: io::Error) -> CanError {
-        let interface = self.interface.clone();
-        match errno(&error) {
-            Some(Errno::ENETDOWN) => CanError::Down(interface),
-            Some(Errno::ENODEV) => CanError::Gone(interface),
-            _ => CanError::Io { interface, action, reason: error },
         }
     }
 }
@@ -180,7 +170,7 @@ impl CanBus for SocketCan {
             }
             Err(error) => {
                 self.give_up_unconfirmed();
-                Err(self.failed("send", error))
+                Err(failed(&self.interface, "send")(error))
             }
         }
     }
@@ -191,7 +181,7 @@ impl CanBus for SocketCan {
             let left = timeout.saturating_sub(start.elapsed());
             match self.socket.read_frame_with_timestamps() {
                 Ok((frame, stamps)) => {
-                    let event = event(&frame).map_err(|error| self.failed("receive", error))?;
+                    let event = event(&frame).map_err(failed(&self.interface, "receive"))?;
                     if self.is_echo(&event) {
                         continue;
                     }
@@ -200,11 +190,11 @@ impl CanBus for SocketCan {
                 }
                 Err(error) if !nothing_there(&error) => {
                     self.give_up_unconfirmed();
-                    return Err(self.failed("receive", error));
+                    return Err(failed(&self.interface, "receive")(error));
                 }
                 Err(_) if left.is_zero() => return Ok(None),
                 Err(_) => readable(self.socket.as_fd(), left)
-                    .map_err(|error| self.failed("receive", error))?,
+                    .map_err(failed(&self.interface, "receive"))?,
             }
         }
     }
@@ -215,7 +205,7 @@ impl CanBus for SocketCan {
 
     fn report(&mut self, error: &BusError) -> Result<(), CanError> {
         let sent = self.socket.write_frame(&CanFrame::Error(error.0));
-        sent.map_err(|error| self.failed("put an error frame on the bus", error))
+        sent.map_err(failed(&self.interface, "put an error frame on the bus"))
     }
 
     fn name(&self) -> &str {
@@ -224,12 +214,26 @@ impl CanBus for SocketCan {
 
     fn dropped(&self) -> Result<u64, CanError> {
         let mut info = [0; MEMINFO_BYTES];
-        let read = self.socket.get_socket_option_bytes(SOL_SOCKET, SO_MEMINFO, &mut info);
-        match (read, info.last_chunk()) {
-            (Ok(MEMINFO_BYTES), Some(drops)) => Ok(u32::from_ne_bytes(*drops).into()),
-            (Ok(_), _) => Err(self.failed("count drops", ErrorKind::Unsupported.into())),
-            (Err(error), _) => Err(self.failed("count drops", error)),
+        let failed = failed(&self.interface, "count drops");
+        match self.socket.get_socket_option_bytes(SOL_SOCKET, SO_MEMINFO, &mut info) {
+            Ok(MEMINFO_BYTES) => {
+                let [.., a, b, c, d] = info;
+                Ok(u32::from_ne_bytes([a, b, c, d]).into())
+            }
+            Ok(_) => Err(failed(ErrorKind::Unsupported.into())),
+            Err(error) => Err(failed(error)),
         }
+    }
+}
+
+/// Makes an error of the operating system a [`CanError`]. An interface that vanished is ENODEV once, and ENXIO
+/// at each later frame.
+fn failed(interface: &str, action: &'static str) -> impl FnOnce(io::Error) -> CanError {
+    let interface = interface.to_owned();
+    move |reason| match errno(&reason) {
+        Some(Errno::ENETDOWN) => CanError::Down(interface),
+        Some(Errno::ENODEV | Errno::ENXIO) => CanError::Gone(interface),
+        _ => CanError::Io { interface, action, reason },
     }
 }
 
@@ -294,20 +298,9 @@ fn event(frame: &CanFrame) -> io::Result<BusEvent> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::transport::tests::frames;
     use proptest::prelude::*;
     use socketcan::CanErrorFrame;
-
-    fn frames() -> impl Strategy<Value = Frame> {
-        let id = prop_oneof![
-            (0u16..=0x7FF).prop_map(CanId::Base),
-            (0u32..=0x1FFF_FFFF).prop_map(CanId::Extended),
-        ];
-        let data = prop::collection::vec(any::<u8>(), 0..=8);
-        (id, any::<bool>(), data).prop_map(|(id, remote, data)| {
-            let data = if remote { vec![0; data.len()] } else { data };
-            Frame::from_parts(id, remote, &data).unwrap()
-        })
-    }
 
     proptest! {
         #[test]
@@ -323,6 +316,16 @@ mod tests {
         let frame = CanErrorFrame::new_error(0x244, &data).unwrap();
         let expected = BusEvent::Error(BusError::new(0x244, data));
         assert_eq!(event(&CanFrame::Error(frame)).unwrap(), expected);
+    }
+
+    #[test]
+    fn an_interface_that_vanished_is_gone_at_every_frame() {
+        for errno in [Errno::ENODEV, Errno::ENXIO] {
+            let error = failed("can0", "send")(errno.into());
+            assert_eq!(error.to_string(), "interface can0 is gone, was the adapter unplugged?");
+        }
+        let other = failed("can0", "send")(Errno::EPERM.into()).to_string();
+        assert!(other.starts_with("can0: cannot send: Operation not permitted"), "{other}");
     }
 
     #[test]

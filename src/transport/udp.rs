@@ -45,17 +45,13 @@ impl UdpBus {
     /// it, or this machine has no multicast route.
     pub fn join(group: SocketAddrV4) -> Result<Self, CanError> {
         let name = format!("udp:{group}");
-        let failed = |action| {
-            let interface = name.clone();
-            move |reason: io::Error| CanError::Io { interface, action, reason }
-        };
-        let receiver = shared_socket(group).map_err(failed("bind the group's port"))?;
+        let receiver = shared_socket(group).map_err(failed(&name, "bind the group's port"))?;
         let join = || {
             receiver.join_multicast_v4(group.ip(), &Ipv4Addr::UNSPECIFIED)?;
             receiver.set_nonblocking(true)?;
             setsockopt(&receiver, sockopt::RxqOvfl, &1).map_err(io::Error::from)
         };
-        join().map_err(failed("join the multicast group (is there a route for it)"))?;
+        join().map_err(failed(&name, "join the multicast group (is there a route for it)"))?;
         let open_sender = || {
             let sender = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
             sender.set_multicast_ttl_v4(0)?;
@@ -64,12 +60,9 @@ impl UdpBus {
             let port = sender.local_addr()?.port();
             Ok((sender, port))
         };
-        let (sender, sender_port) = open_sender().map_err(failed("open the sending socket"))?;
+        let (sender, sender_port) =
+            open_sender().map_err(failed(&name, "open the sending socket"))?;
         Ok(UdpBus { name, group, sender, sender_port, receiver, dropped: 0 })
-    }
-
-    fn failed(&self, action: &'static str, reason: io::Error) -> CanError {
-        CanError::Io { interface: self.name.clone(), action, reason }
     }
 
     fn send_event(&self, event: &BusEvent) -> io::Result<()> {
@@ -104,6 +97,12 @@ impl UdpBus {
     }
 }
 
+/// Makes an error of the operating system a [`CanError`].
+fn failed(name: &str, action: &'static str) -> impl FnOnce(io::Error) -> CanError {
+    let interface = name.to_owned();
+    move |reason| CanError::Io { interface, action, reason }
+}
+
 /// A socket on the port of `group` that other programs on this machine may bind too. It is bound to the
 /// group's address, because a socket bound to any address receives every group that the machine joined.
 fn shared_socket(group: SocketAddrV4) -> io::Result<UdpSocket> {
@@ -120,13 +119,13 @@ impl CanBus for UdpBus {
             ErrorKind::WouldBlock => {
                 CanError::TransmitQueueFull { interface: self.name.clone(), frame: *frame }
             }
-            _ => self.failed("send", error),
+            _ => failed(&self.name, "send")(error),
         })
     }
 
     fn report(&mut self, error: &BusError) -> Result<(), CanError> {
         let sent = self.send_event(&BusEvent::Error(*error));
-        sent.map_err(|error| self.failed("put an error frame on the bus", error))
+        sent.map_err(failed(&self.name, "put an error frame on the bus"))
     }
 
     fn receive(&mut self, timeout: Duration) -> Result<Option<BusEvent>, CanError> {
@@ -142,11 +141,10 @@ impl CanBus for UdpBus {
                     if left.is_zero() {
                         return Ok(None);
                     }
-                    readable(self.receiver.as_fd(), left)
-                        .map_err(|error| self.failed("receive", error))?;
+                    readable(self.receiver.as_fd(), left).map_err(failed(&self.name, "receive"))?;
                 }
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
-                Err(error) => return Err(self.failed("receive", error)),
+                Err(error) => return Err(failed(&self.name, "receive")(error)),
             }
         }
     }

@@ -77,7 +77,7 @@ if [ "$status" = 124 ]; then
     echo "vcan: no end after $limit_s s, so the machine was stopped; VCAN_TIMEOUT_S sets the limit" >&2
     exit 124
 fi
-echo "vcan: the machine ended without the command's exit status (QEMU's was $status). Its last words:" >&2
+echo "vcan: the machine ended without the command's exit status (QEMU's was $status). The end of its output:" >&2
 tail -n 40 "$shared/qemu" "$shared/console" >&2 || true
 echo "vcan: if its files are damaged, remove $machine and try again" >&2
 exit 125

@@ -6,6 +6,7 @@ use crate::tracker::{Event, Protocol, Reader};
 use crate::units::Time;
 use std::io;
 use std::net::SocketAddr;
+use std::pin::pin;
 use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -138,6 +139,8 @@ impl<C: Fn() -> Time> End<C> {
         if let Err(reason) = peer.ask().await {
             return reason;
         }
+        let retry = self.settings.retry_first;
+        let mut next_client = pin!(accept(listener, retry));
         loop {
             tokio::select! {
                 read = peer.read() => {
@@ -145,7 +148,7 @@ impl<C: Fn() -> Time> End<C> {
                         return reason;
                     }
                 }
-                Ok((stream, newcomer)) = listener.accept() => {
+                (stream, newcomer) = &mut next_client => {
                     if peer.last_heard.elapsed() >= self.settings.silence_limit {
                         let reason =
                             format!("tracker: {} is silent, and {newcomer} took its place", peer.name);
@@ -157,6 +160,7 @@ impl<C: Fn() -> Time> End<C> {
                          time is read",
                         peer.name
                     );
+                    next_client.set(accept(listener, retry));
                 }
             }
         }
@@ -186,6 +190,19 @@ impl<C: Fn() -> Time> End<C> {
         peer.last_heard = Instant::now();
         let handed_on = self.outlet.hand_on_all(now, &mut peer.reader);
         handed_on.map_err(|reason| format!("tracker: {} {reason}", peer.name))
+    }
+}
+
+/// The next client. After an error, such as no file descriptors left, it tries again, for the first time
+/// after `retry`.
+async fn accept(listener: &TcpListener, mut retry: Duration) -> (TcpStream, SocketAddr) {
+    loop {
+        match listener.accept().await {
+            Ok(accepted) => return accepted,
+            Err(error) => tracing::warn!("tracker: cannot accept a connection: {error}"),
+        }
+        sleep(retry).await;
+        retry = (2 * retry).min(RETRY_MAX);
     }
 }
 

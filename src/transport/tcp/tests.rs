@@ -8,10 +8,12 @@ use crate::tracker::openigtlink::{
 use crate::tracker::{Event, Protocol};
 use crate::transport::link::{Link, LinkSettings};
 use crate::units::Time;
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use std::net::SocketAddr;
+use std::process::Command;
 use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::{TcpListener, TcpStream};
+use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::time::timeout;
 
 const HANGING: Duration = Duration::from_secs(20);
@@ -321,6 +323,45 @@ async fn a_silent_client_gives_way_to_the_next() {
     let _first = push(&address, &position("First", 1.0)).await;
     assert_eq!(until(&mut link, tool_of_sample).await, "First");
     let _second = push(&address, &position("Second", 1.0)).await;
+    let reason = until(&mut link, disconnected).await;
+    assert!(reason.contains("took its place"), "{reason}");
+    assert_eq!(until(&mut link, tool_of_sample).await, "Second");
+}
+
+/// No file descriptors are left while the client is silent. Their limit is that of a process, so this test runs
+/// once more in one of its own.
+#[test]
+fn a_silent_client_gives_way_although_a_connection_was_not_accepted() {
+    const OF_ITS_OWN: &str = "NEEDLE_TEST_PROCESS";
+    if std::env::var_os(OF_ITS_OWN).is_some() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+        return runtime.expect("a runtime").block_on(a_client_without_a_file_descriptor());
+    }
+    let name = "a_silent_client_gives_way_although_a_connection_was_not_accepted";
+    let output = Command::new(std::env::current_exe().expect("a program"))
+        .args(["--exact", &format!("transport::tcp::tests::{name}")])
+        .env(OF_ITS_OWN, "1")
+        .output()
+        .expect("started");
+    let said = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success() && said.contains("1 passed"), "{said}");
+}
+
+async fn a_client_without_a_file_descriptor() {
+    let settings = LinkSettings { silence_limit: Duration::ZERO, ..quick() };
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("loopback");
+    let address = listener.local_addr().expect("bound");
+    let mut link = Link::listen(listener, settings, clock);
+    let _first = push(&address.to_string(), &position("First", 1.0)).await;
+    assert_eq!(until(&mut link, tool_of_sample).await, "First");
+    let second = TcpSocket::new_v4().expect("a socket");
+    let (soft, hard) = getrlimit(Resource::RLIMIT_NOFILE).expect("a limit");
+    setrlimit(Resource::RLIMIT_NOFILE, 0, hard).expect("lowered");
+    let mut second = second.connect(address).await.expect("listening");
+    // The link's task runs meanwhile, and cannot accept.
+    tokio::time::sleep(Duration::from_millis(20)).await;
+    setrlimit(Resource::RLIMIT_NOFILE, soft, hard).expect("as before");
+    second.write_all(&encode(&position("Second", 1.0))).await.expect("sent");
     let reason = until(&mut link, disconnected).await;
     assert!(reason.contains("took its place"), "{reason}");
     assert_eq!(until(&mut link, tool_of_sample).await, "Second");

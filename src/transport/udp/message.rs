@@ -98,6 +98,7 @@ fn frame(fields: &Fields<'_>) -> Option<BusEvent> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::transport::tests::frames;
     use proptest::prelude::*;
 
     fn hex(text: &str) -> Vec<u8> {
@@ -166,18 +167,6 @@ mod tests {
         }
         let unknown = [&[0x81, 0xA1, b'x'][..], &[0x91; 2000]].concat();
         assert_eq!(decode(&unknown), None);
-    }
-
-    fn frames() -> impl Strategy<Value = Frame> {
-        let id = prop_oneof![
-            (0u16..=0x7FF).prop_map(CanId::Base),
-            (0u32..=0x1FFF_FFFF).prop_map(CanId::Extended),
-        ];
-        let data = prop::collection::vec(any::<u8>(), 0..=8);
-        (id, any::<bool>(), data).prop_map(|(id, remote, data)| {
-            let data = if remote { vec![0; data.len()] } else { data };
-            Frame::from_parts(id, remote, &data).unwrap()
-        })
     }
 
     proptest! {
