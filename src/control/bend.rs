@@ -22,7 +22,7 @@ const FORGETTING: f64 = 2.0;
 pub struct Bend {
     /// The path bends toward this unit vector across the heading, plane frame.
     pub toward: Vector3<f64>,
-    /// By this mean curvature, per mm, 0 or more.
+    /// By this mean curvature, per mm; negative where the path soon bends to the other side.
     pub curvature_per_mm: f64,
     /// How far the path still is, mm.
     pub left_mm: f64,

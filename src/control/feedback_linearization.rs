@@ -1,8 +1,8 @@
 //! The paper's planar control law (Eq. 5 to 7), with its singularities guarded.
 
 use super::spin_guard::{SEARCHING_SPIN_RAD, SpinGuard};
-use super::{Command, ControlError, Controller, state_within};
-use crate::keys::{Rule, over, section, within};
+use super::{Command, ControlError, Controller, RATE, ROTATION, state_within};
+use crate::keys::{over, section, within};
 use crate::math;
 use crate::needle::{Needle, Reduced};
 use crate::observer::Estimate;
@@ -15,11 +15,6 @@ const PITCH_LIMIT_RAD: f64 = 60.0 / 180.0 * std::f64::consts::PI;
 const ROLL_GUARD_RAD: f64 = 80.0 / 180.0 * std::f64::consts::PI;
 /// Insertion allowed with the roll estimate beyond the guard, mm.
 const ROLL_GUARD_DEPTH_MM: f64 = 30.0;
-
-/// The effect of a pole faster than 1 per mm decays within a sample.
-const RATE: Rule = over(0.0, 1.0);
-/// More than a whole turn per mm acts like the remainder.
-const ROTATION: Rule = over(0.0, 360.0);
 
 section! {
     /// `[control.feedback_linearization]`: parameters of the law.

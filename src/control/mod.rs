@@ -9,10 +9,15 @@ pub use bend::{Bend, BendLaw};
 pub use feedback_linearization::{FeedbackLinearization, FeedbackLinearizationConfig};
 pub use nested_saturation::{NestedSaturation, NestedSaturationConfig};
 
-use crate::keys::{choice, section};
+use crate::keys::{Rule, choice, over, section};
 use crate::needle::{Needle, Reduced};
 use crate::observer::Estimate;
 use thiserror::Error;
+
+/// The effect of a pole faster than 1 per mm decays within a sample.
+const RATE: Rule = over(0.0, 1.0);
+/// More than a whole turn per mm acts like the remainder.
+const ROTATION: Rule = over(0.0, 360.0);
 
 /// A controller's command for the next step.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -2,8 +2,8 @@
 //! shaft's torsion.
 
 use super::spin_guard::{SEARCHING_SPIN_RAD, SpinGuard};
-use super::{Command, ControlError, Controller, state_within};
-use crate::keys::{Rule, over, section, within};
+use super::{Command, ControlError, Controller, RATE, ROTATION, state_within};
+use crate::keys::{over, section, within};
 use crate::math;
 use crate::needle::{Needle, Reduced};
 use crate::observer::{Estimate, Shaft, Slack};
@@ -17,11 +17,6 @@ const SLACK_MIN_RAD: f64 = 0.02;
 /// At least this part of the outstanding turn is expected within a step. Inverting a slower creep would
 /// amplify noise.
 const FOLLOWED_MIN: f64 = 0.5;
-
-/// The effect of a pole faster than 1 per mm decays within a sample.
-const RATE: Rule = over(0.0, 1.0);
-/// More than a whole turn per mm acts like the remainder.
-const ROTATION: Rule = over(0.0, 360.0);
 
 section! {
     /// `[control.nested_saturation]`: parameters of the law.
@@ -82,7 +77,13 @@ impl NestedSaturation {
     }
 
     pub(super) fn transmission(&self, estimate: &Estimate, step_mm: f64) -> Transmission {
-        Transmission::new(estimate, self.config.caution, step_mm)
+        let shaft = estimate.belief.map_or(Shaft::RIGID, |belief| belief.shaft);
+        let followed = if shaft.creep_mm > 0.0 {
+            (-math::exp_m1(-step_mm / shaft.creep_mm)).max(FOLLOWED_MIN)
+        } else {
+            1.0
+        };
+        Transmission { shaft, followed, demand_gain: estimate.demand_gain(self.config.caution) }
     }
 
     /// The fastest rotation, rad/mm.
@@ -99,7 +100,8 @@ impl NestedSaturation {
         let most = self.config.pitch_demand_max_rad;
         let (demand, slope) = if linear.min(brake) >= most {
             (most, 0.0)
-        } else if linear <= brake {
+        } else if linear <= brake || (brake == 0.0 && bend > 0.0) {
+            // The second: so near to the plane that `1 - bend * distance_mm` rounds to 1.
             (linear, rate_per_mm)
         } else {
             (brake, bend / (1.0 - cos_brake * cos_brake).sqrt())
@@ -161,16 +163,6 @@ pub(super) struct Transmission {
 }
 
 impl Transmission {
-    fn new(estimate: &Estimate, caution: f64, step_mm: f64) -> Self {
-        let shaft = estimate.belief.map_or(Shaft::RIGID, |belief| belief.shaft);
-        let followed = if shaft.creep_mm > 0.0 {
-            (-math::exp_m1(-step_mm / shaft.creep_mm)).max(FOLLOWED_MIN)
-        } else {
-            1.0
-        };
-        Transmission { shaft, followed, demand_gain: estimate.demand_gain(caution) }
-    }
-
     /// The excess over the band that turns the tip by `turn_rad` within the step, rad.
     fn push(&self, turn_rad: f64) -> f64 {
         turn_rad / self.followed - self.shaft.backlog_rad
@@ -376,6 +368,22 @@ mod tests {
         estimate.belief.as_mut().unwrap().roll_agreement = 0.0;
         let unsure = law().command(&estimate, 1.0).unwrap().rotation_rad_per_mm;
         assert!((sure + 0.5).abs() < 1e-9 && (unsure - 0.5 * sure).abs() < 1e-9);
+    }
+
+    /// Nearer than 1e-14 mm, where the arc into the plane rounds to nothing.
+    #[test]
+    fn commands_as_near_to_the_plane_as_may_be() {
+        let at = |x_mm, pitch_rad| {
+            let estimate = Estimate::of_pose(pose(x_mm, pitch_rad, 0.1));
+            law().command(&estimate, 1.0).map(|command| command.rotation_rad_per_mm)
+        };
+        for pitch_rad in [0.0, 0.05] {
+            let in_plane = at(0.0, pitch_rad).unwrap();
+            for x_mm in [1e-300, -1e-16, 7e-15, -1e-14, 1e-13] {
+                let near = at(x_mm, pitch_rad).unwrap();
+                assert!((near - in_plane).abs() < 1e-9, "{x_mm}: {near} {in_plane}");
+            }
+        }
     }
 
     #[test]
