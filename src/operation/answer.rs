@@ -4,10 +4,6 @@
 //! in which it does, seen along the insertion, is the sense of the base: a mirrored tracker axis or a
 //! stage of the wrong sign shows at once, before anything is inserted.
 
-use std::time::Duration;
-
-use nalgebra::Vector3;
-
 use super::moving::{Move, Moving};
 use super::{AnswerSettings, Goal};
 use crate::math;
@@ -17,6 +13,8 @@ use crate::session::{
 use crate::stage::{Feedback, SetPoint, StageConfig, StageEvent};
 use crate::tracker::{Event, GateCounts, Refusal, Sample};
 use crate::units::Time;
+use nalgebra::Vector3;
+use std::time::Duration;
 
 /// Rest before each mean, and the time over which it is taken.
 const SETTLE: Duration = Duration::from_millis(300);
@@ -90,7 +88,10 @@ pub(super) struct Answering {
     sync_period: Duration,
     counts: GateCounts,
     leg: Leg,
+    /// Of the rests that are over.
     means: Vec<Mean>,
+    /// Of this rest, or the last.
+    mean: Mean,
     /// Why the last position was refused.
     refused: Option<Refusal>,
     /// What the run is stopped for once the base is back.
@@ -104,7 +105,8 @@ impl Answering {
             settings,
             counts: GateCounts::default(),
             leg: Leg::Resting { since: None },
-            means: vec![Mean::default()],
+            means: Vec::new(),
+            mean: Mean::default(),
             refused: None,
             failed: None,
         }
@@ -114,20 +116,15 @@ impl Answering {
     fn take_sample(&mut self, shell: &mut Shell, sample: Sample) {
         let admitted = self.settings.gate.admit(&sample);
         self.counts.count(admitted.as_ref().err());
-        let refused = admitted.as_ref().err().cloned();
-        shell.record(Record::Sample(SampleRecord {
-            refused: refused.clone(),
-            ..SampleRecord::received(sample)
-        }));
-        let Leg::Resting { since: Some(since) } = self.leg else { return };
-        if shell.now < since + SETTLE {
-            return;
+        let is_resting =
+            matches!(self.leg, Leg::Resting { since: Some(since) } if shell.now >= since + SETTLE);
+        match &admitted {
+            _ if !is_resting => {}
+            Ok(position_mm) => self.mean.add(*position_mm),
+            Err(refusal) => self.refused = Some(refusal.clone()),
         }
-        match (admitted, self.means.last_mut()) {
-            (Ok(position_mm), Some(mean)) => mean.add(position_mm),
-            (Err(_), _) => self.refused = refused,
-            (Ok(_), None) => {}
-        }
+        let refused = admitted.err();
+        shell.record(Record::Sample(SampleRecord { refused, ..SampleRecord::received(sample) }));
     }
 
     /// One SYNC.
@@ -147,7 +144,7 @@ impl Answering {
             }
             Leg::Turning(_) => {
                 self.leg = Leg::Resting { since: None };
-                self.means.push(Mean::default());
+                self.mean = Mean::default();
                 self.refused = None;
                 Ok(())
             }
@@ -164,7 +161,8 @@ impl Answering {
     /// After the third rest, or one without enough positions, the base is turned back.
     fn end_rest(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
         let turn = self.settings.turn;
-        let is_seen = self.means.last().is_some_and(|mean| mean.count >= POSITIONS_MIN);
+        let is_seen = self.mean.count >= POSITIONS_MIN;
+        self.means.push(self.mean);
         if is_seen && self.means.len() < 3 {
             self.leg = Leg::Turning(Box::new(Moving::new(turn, feedback.commanded)?));
             return Ok(());
@@ -183,7 +181,7 @@ impl Answering {
     }
 
     fn too_few(&self) -> String {
-        let count = self.means.last().map_or(0, |mean| mean.count);
+        let count = self.mean.count;
         let why = match &self.refused {
             Some(refusal) => refusal.to_string(),
             None => "the stream is silent, or has another tool".to_owned(),

@@ -1,12 +1,11 @@
 //! One axis on its way, the other held.
 
-use std::time::Duration;
-
 use crate::session::{Done, Profile, Record, Shell, State, Task};
 use crate::stage::{Axis, Feedback, SetPoint, StageConfig, StageEvent};
 use crate::units::Time;
+use std::time::Duration;
 
-/// How long the axis may take to come near to where its set-points have ended.
+/// Time after the last set-point by which the axis must be within its arrival tolerance.
 const ARRIVAL_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// A way to go, in mm or rad.
@@ -76,11 +75,6 @@ impl Moving {
             Axis::Rotation => at.rotation_rad += distance,
         }
         at
-    }
-
-    /// Where the move began.
-    pub(super) fn from(&self) -> SetPoint {
-        self.from
     }
 
     /// Where it ends.
@@ -155,7 +149,7 @@ impl MoveOneAxis {
             Some(moving) => moving,
             None => {
                 let moving = self.from(shell, feedback.commanded)?;
-                let (axis, from) = (self.way.axis, moving.from().along(self.way.axis));
+                let (axis, from) = (self.way.axis, feedback.commanded.along(self.way.axis));
                 self.done.push(Done { axis, from: Some(from), to: from });
                 shell.state(State::Moving);
                 moving

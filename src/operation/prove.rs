@@ -1,18 +1,18 @@
-//! The bench falls silent on purpose: whether each drive notices, after how long, and whether it stops.
-
-use std::time::Duration;
+//! The bench stops its heartbeat on purpose: whether each drive notices, after how long, and whether it
+//! stops.
 
 use crate::canopen::Frame;
 use crate::canopen::emcy::EmcyCode;
 use crate::session::{Lane, PROVED, Record, Severity, Shell, State, Task};
 use crate::stage::{Axis, Dialogue, Halt, PerAxis, StageConfig, StageEvent};
 use crate::units::Time;
+use std::time::Duration;
 
 /// A drive may notice a timeout this much later than its configured time.
 const MARGIN: Duration = Duration::from_millis(200);
 
-/// A silence under way. The drives are looked at by SDO: those that notice leave Operational as a
-/// rule, and send no PDO any more.
+/// A silence under way. The drives are read by SDO: a drive that notices the silence usually leaves
+/// Operational, and then sends no PDO.
 #[derive(Debug)]
 struct Silence {
     since: Time,
