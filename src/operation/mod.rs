@@ -1,5 +1,5 @@
 //! Operations: what the stage does without a needle to steer. Home, jog, withdraw, prove.
-//! One alone needs a tracker, the check of handedness; the others record what a tracker sends.
+//! Only the check of handedness needs a tracker; the others record what a tracker sends.
 //!
 //! An operation is a task of a [`Session`], as an insertion is: the same bring-up, supervision,
 //! limits, stops and teardown, and the same record. What would stop a run stops an operation.
@@ -17,7 +17,7 @@ use self::answer::Answering;
 use self::home::Homing;
 use self::moving::MoveOneAxis;
 use self::prove::Prove;
-use crate::session::{Session, SessionConfig, SessionError, Task};
+use crate::session::{Session, SessionConfig, Task};
 use crate::stage::{Axis, PerAxis, Stage, StageConfig};
 use crate::tracker::Gate;
 use crate::units::Time;
@@ -30,7 +30,7 @@ pub enum Operation {
     Home(PerAxis<bool>),
     /// Move one axis, the other held.
     Move(Move),
-    /// Hold both axes and fall silent, as a bench that has died: both drives must notice.
+    /// Hold both axes and stop the bench's heartbeat, as if the bench had died: both drives must notice.
     Prove,
     /// Turn the base in air and see that a sensor off its axis turns the same way.
     Answer(Box<AnswerSettings>),
@@ -43,7 +43,7 @@ pub struct AnswerSettings {
     pub gate: Gate,
     /// Direction of insertion in the bench frame W, of length 1.
     pub axis: Vector3<f64>,
-    /// The turn, made twice and then back: between a few degrees and 90.
+    /// The turn, made twice and then back: well over 15 degrees, by which it may be off, and up to 90.
     pub turn: Move,
 }
 
@@ -79,9 +79,10 @@ impl OperationConfig {
     pub fn begin(self, now: Time) -> Result<Session, String> {
         let OperationConfig { stage: config, operation } = self;
         let stage = match operation {
-            Operation::Home(axes) => Stage::for_homing(config.clone(), axes, now)?,
-            _ => Stage::new(config.clone(), now)?,
+            Operation::Home(axes) => Stage::for_homing(config.clone(), axes, now),
+            _ => Stage::new(config.clone(), now),
         };
+        let stage = stage.map_err(|error| format!("stage: {error}"))?;
         let task: Box<dyn Task> = match operation {
             Operation::Home(axes) => Box::new(Homing::new(&config, axes)),
             Operation::Move(way) => Box::new(MoveOneAxis::new(&config, way)),
@@ -105,11 +106,11 @@ impl Plan {
     /// The run as a session that begins at `now`.
     ///
     /// # Errors
-    /// [`SessionError`] where an observer or the stage refuses its configuration.
-    pub fn begin(self, now: Time) -> Result<Session, SessionError> {
+    /// Where an observer or the stage refuses its configuration.
+    pub fn begin(self, now: Time) -> Result<Session, String> {
         match self {
             Plan::Insertion(config) => Session::new(*config, now),
-            Plan::Operation(config) => config.begin(now).map_err(SessionError::Stage),
+            Plan::Operation(config) => config.begin(now),
         }
     }
 }

@@ -6,23 +6,11 @@ use crate::control::ControlConfig;
 use crate::geometry::Pose;
 use crate::keys::{choice, over, section, within};
 use crate::needle::{Needle, Torsion};
-use crate::observer::{InvariantConfig, ObserverConfig, ObserverError, PositionNoise};
+use crate::observer::{InvariantConfig, ObserverConfig, PositionNoise};
 use crate::stage::StageConfig;
 use crate::tracker::{AcquisitionClock, Gate, TrackSettings};
 use nalgebra::Vector3;
 use std::time::Duration;
-use thiserror::Error;
-
-/// A configuration that a session cannot start with.
-#[derive(Debug, Clone, PartialEq, Error)]
-pub enum SessionError {
-    /// An observer refuses it.
-    #[error("observer: {0}")]
-    Observer(#[from] ObserverError),
-    /// The stage refuses it.
-    #[error("stage: {0}")]
-    Stage(String),
-}
 
 /// Everything a run needs to know, in internal units.
 #[derive(Debug, Clone)]
@@ -52,16 +40,16 @@ pub struct SessionConfig {
 }
 
 impl SessionConfig {
-    /// Says now what [`Session::new`](super::Session::new) would refuse, before a run folder is
-    /// made.
+    /// Checks what [`Session::new`](super::Session::new) would refuse, before a run folder is made.
     ///
     /// # Errors
     /// As [`Session::new`](super::Session::new).
-    pub fn check(&self) -> Result<(), SessionError> {
+    pub fn check(&self) -> Result<(), String> {
         for observer in std::iter::once(&self.observer).chain(&self.shadows) {
-            observer.build(self.needle, self.needle_torsion)?;
+            let built = observer.build(self.needle, self.needle_torsion);
+            built.map_err(|error| format!("observer: {error}"))?;
         }
-        self.stage.validate().map_err(SessionError::Stage)
+        self.stage.validate().map_err(|error| format!("stage: {error}"))
     }
 
     /// Whether the depth suffices to reach the plane from a tip at `tip_mm` in the plane frame, and a path

@@ -10,18 +10,13 @@ use crate::units::Time;
 use nalgebra::{Matrix3, Vector3};
 use std::time::Duration;
 
-/// A depth in the stage's own coordinates. An [insertion](super::insertion::Insertion) counts its
-/// depth from where it began.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct StageDepth {
-    pub(crate) mm: f64,
-}
-
 /// A tip position in the plane frame, with the time and the depth at which the tip was there.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Measurement {
     pub(crate) acquisition_time: Time,
-    pub(crate) stage_depth_meas: StageDepth,
+    /// In the stage's own coordinates. An [insertion](super::insertion::Insertion) counts its depth from
+    /// where it began.
+    pub(crate) stage_insertion_meas_mm: f64,
     pub(crate) tip_meas: TipPosition,
     /// Tracked positions of which it is the mean.
     pub(crate) positions: u32,
@@ -85,9 +80,9 @@ impl Batch {
     }
 }
 
-/// A tip that goes on from an estimate by the needle's kinematics alone. Over the millimetre from
-/// one correction to the next that is what the observer itself says, but for its doubts on the
-/// needle: 0.002 mm for a curvature of 1/122 per mm that is 50% off.
+/// The tip carried on from an estimate by the needle's kinematics alone. Over the millimetre from one
+/// correction to the next this differs from the observer's own prediction only by what the observer has
+/// learnt about the needle: 0.002 mm for a curvature of 1/122 per mm that is 50% off.
 #[derive(Debug, Clone, Copy)]
 struct Expected {
     x_pb: Pose,
@@ -107,9 +102,8 @@ impl Expected {
 
 impl Estimation {
     pub(crate) fn new(config: &SessionConfig) -> Result<Self, ObserverError> {
-        let steering = Steering::new(config)?;
         Ok(Estimation {
-            steering,
+            steering: Steering::new(config)?,
             at: None,
             needle: config.needle,
             expected: None,
@@ -132,13 +126,13 @@ impl Estimation {
         measurement: &Measurement,
         history: &StageHistory,
     ) -> Result<(), String> {
-        if self.at.is_some_and(|at| at >= measurement.acquisition_time) {
+        let time = measurement.acquisition_time;
+        if self.at.is_some_and(|at| at >= time) {
             return Ok(());
         }
-        self.carry_to(measurement.acquisition_time, history)?;
-        self.at = Some(measurement.acquisition_time);
+        self.carry_to(time, history)?;
+        self.at = Some(time);
         // The positions of a mean come at the pace of the stream.
-        let time = measurement.acquisition_time;
         let since = self.corrected_at.map_or(f64::INFINITY, |last| time.seconds_after(last));
         let spacing_s = if measurement.positions > 1 { self.spacing_s } else { since };
         self.corrected_at = Some(time);
@@ -162,7 +156,7 @@ impl Estimation {
             self.spacing_s = time.seconds_after(last);
         }
         // It cannot go back to one that comes very late.
-        if self.watched.is_none_or(|watched| watched < measurement.acquisition_time) {
+        if self.watched.is_none_or(|watched| watched < time) {
             self.batch.add(measurement);
         }
     }
@@ -234,7 +228,7 @@ impl Estimation {
         if let Some(at) = self.at.filter(|at| *at >= time) {
             let by_s = at.seconds_after(time);
             let why =
-                format!("acquired {by_s:.3} s before the measurement taken last, it came too late");
+                format!("came too late: the observers have passed its acquisition by {by_s:.3} s");
             return Err(Refusal::new(GateName::Pairing, why));
         }
         let increments = self.increments(time, history);

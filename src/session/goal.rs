@@ -50,7 +50,8 @@ impl Goal {
         Ok(Goal { world, problem, curvature_margin, path, tool: None })
     }
 
-    /// The target is there, plane frame, mm. In the plane a path leads to the point of it that is nearest.
+    /// Sets where the target is, plane frame, mm. A path in the plane leads to the point of the plane that is
+    /// nearest to it.
     pub(super) fn set_target(&mut self, target_mm: Vector3<f64>) {
         let x_mm = if self.problem.in_plane { 0.0 } else { target_mm.x };
         self.problem.target_mm = Vector3::new(x_mm, target_mm.y, target_mm.z);
@@ -111,8 +112,10 @@ pub(super) struct Pursuit {
     goal: Goal,
     /// Where the target is, plane frame, mm; it may be off the plane.
     target_mm: Vector3<f64>,
-    /// Depth at the last step, mm.
-    planned_at_mm: Option<f64>,
+    /// Depth up to which the replanner knows of the insertion, mm.
+    planned_at_mm: f64,
+    /// The needle's curvature as configured, per mm.
+    curvature_per_mm: f64,
 }
 
 impl Pursuit {
@@ -127,11 +130,12 @@ impl Pursuit {
             law: BendLaw::new(needle, control.nested_saturation),
             target_mm: goal.problem.target_mm,
             goal,
-            planned_at_mm: None,
+            planned_at_mm: 0.0,
+            curvature_per_mm: needle.curvature_per_mm(),
         })
     }
 
-    /// The target is there, plane frame, mm.
+    /// Sets where the target is, plane frame, mm.
     pub(super) fn set_target(&mut self, target_mm: Vector3<f64>) {
         self.target_mm = target_mm;
         self.goal.set_target(target_mm);
@@ -173,10 +177,9 @@ impl Pursuit {
         estimate: &Estimate,
         depth_mm: f64,
         step_mm: f64,
-        needle: Needle,
     ) -> (Approach, Result<Option<Command>, String>) {
         let heading = estimate.x_pb.rotation * Vector3::z();
-        let told_per_mm = needle.curvature_per_mm();
+        let told_per_mm = self.curvature_per_mm;
         let curvature_per_mm =
             estimate.belief.map_or(told_per_mm, |belief| belief.curvature_per_mm);
         let known = plan::Estimate {
@@ -186,7 +189,8 @@ impl Pursuit {
             position_sd_mm: estimate.sd.map_or(0.0, |[x, y, z, ..]| x.max(y).max(z)),
             heading_sd_rad: estimate.sd.map_or(0.0, |[.., yaw, pitch, _]| yaw.max(pitch)),
         };
-        let inserted_mm = depth_mm - self.planned_at_mm.replace(depth_mm).unwrap_or(depth_mm);
+        let inserted_mm = depth_mm - self.planned_at_mm;
+        self.planned_at_mm = depth_mm;
         let end = self.end(estimate);
         if let Err(error) = self.check_target() {
             return (end, Err(error));

@@ -1,7 +1,7 @@
 //! One insertion under way: which step is next, and where the set-point is.
 
 use super::config::{InsertionConfig, InsertionMode, Samples};
-use super::estimation::{Measurement, StageDepth};
+use super::estimation::Measurement;
 use super::profile::Profile;
 use crate::needle::TipPosition;
 use crate::stage::SetPoint;
@@ -9,11 +9,11 @@ use crate::units::Time;
 use nalgebra::Vector3;
 use std::time::Duration;
 
-/// A step is due this little before its depth, mm: encoders count in steps of their own.
+/// A step is due when the measured depth is this near to its depth, mm: an encoder has whole counts.
 const DUE_TOLERANCE_MM: f64 = 1e-3;
-/// How long an axis is given to come on to the last depth itself before near is near enough.
+/// Time after the last set-point from which a position within `insertion.arrival_mm` counts as arrived.
 const ARRIVAL_PATIENCE: Duration = Duration::from_millis(300);
-/// How long an axis may take to come near to where its set-points have ended.
+/// Time after the last set-point by which the axis must be within its arrival tolerance.
 const ARRIVAL_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Where a stepwise insertion is within its step.
@@ -46,7 +46,7 @@ pub(crate) struct Insertion {
     newest: Option<Measurement>,
     /// The tip was seen since the insertion began.
     is_seen: bool,
-    /// Since when the set-points have ended and the measured depth has not.
+    /// Since when the set-points have been at their end while the measured depth has not.
     short_since: Option<Time>,
 }
 
@@ -93,8 +93,8 @@ impl Insertion {
         (f64::from(step) * self.config.step_mm).min(self.config.depth_mm)
     }
 
-    /// Takes a measurement that is paired with the stage's depth. Gives it back where it is to
-    /// correct the observers at once.
+    /// Takes a measurement that is paired with the stage's depth. Gives it back if it is to correct the
+    /// observers at once.
     pub(crate) fn measure(&mut self, measurement: Measurement) -> Option<Measurement> {
         self.is_seen = true;
         match (self.config.mode, &mut self.pause) {
@@ -126,8 +126,8 @@ impl Insertion {
     /// Inserts at this speed from now on, mm/s.
     ///
     /// # Errors
-    /// Where it is not within the limits: the configured speed is the highest, as everything else is
-    /// checked for that one.
+    /// Where it is not within the limits. The configured speed is the highest: everything else was checked
+    /// for it.
     pub(crate) fn set_speed(&mut self, speed_mm_per_s: f64) -> Result<(), String> {
         let max = self.config.speed_mm_per_s;
         if !(speed_mm_per_s > 0.0 && speed_mm_per_s <= max) {
@@ -141,7 +141,7 @@ impl Insertion {
     pub(crate) fn to_go_s(&self) -> f64 {
         let pauses = match self.config.mode {
             InsertionMode::Continuous => 0,
-            InsertionMode::Stepwise => self.last_step + 1 - self.next_step,
+            InsertionMode::Stepwise => (self.last_step + 1).saturating_sub(self.next_step),
         };
         self.left_mm() / self.profile.speed_max_mm_per_s
             + f64::from(pauses) * self.config.settle.as_secs_f64()
@@ -153,8 +153,8 @@ impl Insertion {
         self.profile.is_at_rest() && off_mm <= self.config.arrival_mm
     }
 
-    /// The needle must come to where its set-points end: a run that waits there would never end.
-    /// An error is the reason to stop for.
+    /// Checks that the needle arrives where its set-points end; otherwise the run would wait there for
+    /// ever. An error is the reason to stop for.
     pub(crate) fn check_arrival(
         &mut self,
         time: Time,
@@ -204,9 +204,9 @@ impl Insertion {
         Some(DueStep { step, measurement, is_last: step >= self.last_step })
     }
 
-    /// A measured depth, counted from where the insertion began, mm.
-    pub(crate) fn depth_mm(&self, measured: StageDepth) -> f64 {
-        measured.mm - self.origin_meas.insertion_mm
+    /// A measured depth of the stage, counted from where the insertion began, mm.
+    pub(crate) fn depth_mm(&self, stage_insertion_meas_mm: f64) -> f64 {
+        stage_insertion_meas_mm - self.origin_meas.insertion_mm
     }
 
     /// True when the set-points have ended a while ago and the needle stands as near to their end
@@ -221,7 +221,7 @@ impl Insertion {
         let standing = self.profile.position_mm() == goal_mm
             && (insertion_meas_mm - goal_mm).abs() <= self.config.arrival_mm;
         match self.pause.clone() {
-            // Moved on by something else: what was sampled is not of one place.
+            // The needle has moved: the samples are not of one place.
             Pause::Settling { .. } | Pause::Sampling { .. } if !standing => {
                 self.pause = Pause::Moving;
             }
@@ -240,16 +240,11 @@ impl Insertion {
         None
     }
 
-    /// Depth at which the insertion ends, mm.
-    pub(crate) fn end_mm(&self) -> f64 {
-        self.config.depth_mm
-    }
-
-    /// Ends the insertion at `depth_mm`, or where the needle can be stopped.
-    pub(crate) fn end_at(&mut self, depth_mm: f64) {
-        let depth_mm = depth_mm.min(self.depth_max_mm);
+    /// Ends the insertion at `depth_mm`, or where the needle can be stopped; gives the depth of that, mm.
+    pub(crate) fn end_at(&mut self, depth_mm: f64) -> f64 {
         self.config.depth_mm = depth_mm.max(self.profile.stops_at_mm()).min(self.depth_max_mm);
         self.last_step = last_step(&self.config);
+        self.config.depth_mm
     }
 
     /// Sets the rotation rate from the present set-point on, and lets the needle move on to the

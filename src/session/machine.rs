@@ -1,12 +1,12 @@
 //! The run machine.
 
+use super::SessionConfig;
 use super::insert::Insert;
 use super::outcome::{Left, Outcome};
 use super::record::{Direction, Lane, Record, Severity};
 use super::shell::{Power, Shell};
 use super::state::State;
 use super::task::Task;
-use super::{SessionConfig, SessionError};
 use crate::canopen::Frame;
 use crate::stage::{Axis, Counters, Stage, StageConfig, StageEvent};
 use crate::tracker::{Event, GateCounts};
@@ -25,15 +25,15 @@ pub enum Input {
     Frame(Frame),
     /// The bus failed: bus off, interface down, a frame not taken. The text says which.
     BusFault(String),
-    /// The bus complains and goes on.
+    /// The bus reports a problem and keeps working.
     BusWarning(String),
-    /// A tip position, or other news of the tracker's link.
+    /// A tip position, or another event of the tracker's link.
     Tracker(Event),
-    /// The operator, or the runtime in his name, ends the run for the reason given.
+    /// The operator or the runtime ends the run for this reason.
     Stop(String),
     /// The operator asks for something other than a stop.
     Operator(OperatorCommand),
-    /// Nothing but the time: to be given at [`Machine::deadline`].
+    /// Only the time has passed: to be given at [`Machine::deadline`].
     Tick,
 }
 
@@ -119,19 +119,19 @@ pub trait Machine {
     /// Takes one input at `now`.
     fn handle(&mut self, now: Time, input: Input);
 
-    /// The next thing to leave the machine; `None` when it has nothing more to say for now.
+    /// The next frame or record to leave the machine; `None` when there is no more for now.
     fn poll(&mut self) -> Option<Output>;
 
     /// When to call [`handle`](Self::handle) with [`Input::Tick`] if nothing comes before.
     fn deadline(&self) -> Time;
 
-    /// How it ended; `None` while it goes on.
+    /// How the run ended; `None` while it goes on.
     fn outcome(&self) -> Option<&Outcome>;
 
-    /// How far it is.
+    /// How far the run is.
     fn progress(&self) -> Progress;
 
-    /// What did not go as it should on the stage's bus, and did no harm.
+    /// Counts of what went wrong on the stage's bus without harm.
     fn stage_counters(&self) -> Counters;
 
     /// The longest that the bench may stall, for whatever reason: the drives' heartbeat timeout, or during an
@@ -139,7 +139,7 @@ pub trait Machine {
     /// they are being stopped.
     fn silence_max(&self) -> Option<Duration>;
 
-    /// What it has left of the stage.
+    /// What the run has left of the stage.
     fn left(&self) -> Left {
         Left::default()
     }
@@ -168,11 +168,12 @@ impl Session {
     /// An insertion that begins at `now`.
     ///
     /// # Errors
-    /// [`SessionError`] where an observer or the stage refuses its configuration.
-    pub fn new(config: SessionConfig, now: Time) -> Result<Self, SessionError> {
+    /// Where an observer or the stage refuses its configuration.
+    pub fn new(config: SessionConfig, now: Time) -> Result<Self, String> {
         let stage_config = config.stage.clone();
-        let task = Insert::new(config, now)?;
-        let stage = Stage::new(stage_config.clone(), now).map_err(SessionError::Stage)?;
+        let task = Insert::new(config, now).map_err(|error| format!("observer: {error}"))?;
+        let stage = Stage::new(stage_config.clone(), now);
+        let stage = stage.map_err(|error| format!("stage: {error}"))?;
         Ok(Session::begin(stage, stage_config, Box::new(task), now))
     }
 
@@ -203,12 +204,12 @@ impl Session {
         }
     }
 
-    /// Everything the stage has to say, acted upon.
+    /// Acts on every event of the stage.
     fn drain_stage(&mut self) {
         while let Some(event) = self.shell.poll_stage() {
             self.shell.take_stage_event(&event);
             if let StageEvent::Stopped { standing, off } = event {
-                // What it still sends belongs to the run, whose end is the last word.
+                // What the stage still sends is recorded before the end of the run.
                 self.drain_stage();
                 let outcome = self.shell.outcome_of_stop(standing, off);
                 self.finish(outcome);
@@ -219,7 +220,7 @@ impl Session {
         }
     }
 
-    /// The answer to every command is an event: what comes of it, or why it is refused.
+    /// Answers every command with an event: its effect, or why it is refused.
     fn take_operator(&mut self, command: OperatorCommand) {
         let answer = match self.shell.is_running() {
             true => self.task.take_operator(&mut self.shell, command),

@@ -28,7 +28,7 @@ pub use crate::control::ControlConfig;
 pub use crate::observer::ObserverConfig;
 pub use config::{
     HoldConfig, InsertionConfig, InsertionMode, PlaneOutOfReach, Resume, Samples, SessionConfig,
-    SessionError, TrackerConfig,
+    TrackerConfig,
 };
 pub use goal::{Approach, Goal};
 pub use machine::{Done, HELD_UP, Input, Machine, OperatorCommand, Output, Progress, Session};

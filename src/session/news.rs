@@ -1,4 +1,4 @@
-//! What of the events of the stage and of the tracker's link is for the operator to read.
+//! The texts for the operator about events of the stage and of the tracker's link.
 
 use super::Severity;
 use crate::stage::StageEvent;
@@ -26,7 +26,7 @@ pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
              and its display for why"
         ),
         StageEvent::Flood(frames) => {
-            format!("a flood on the bus: {frames} frames within 100 ms that no run is made of")
+            format!("a flood on the bus: {frames} unexpected frames within 100 ms")
         }
         StageEvent::Ignored { why, count, frame } => {
             format!("{why}, {count} so far, the newest {frame}")

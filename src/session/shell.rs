@@ -10,8 +10,8 @@ use crate::units::Time;
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
-/// The stage has its own timeouts for standstill and for power off. If it has reported nothing this long
-/// after them, the run is closed.
+/// The stage has its own timeouts for standstill and for power off. If it has reported nothing for this
+/// long after them, the run is closed.
 const STOP_MARGIN: Duration = Duration::from_secs(1);
 
 /// Maximum number of follow-up reasons that are reported.
@@ -22,7 +22,7 @@ const THEN_MAX: usize = 8;
 enum Phase {
     /// The stage is brought up, or the task goes on.
     Running,
-    /// The drives are stopped, in order or after a fault; the run will have ended as `outcome`.
+    /// The drives are being stopped, in order or after a fault; the run will end as `outcome`.
     Stopping { outcome: Outcome, since: Time },
     /// Over; nothing is sent any more.
     Over(Outcome),
@@ -31,13 +31,13 @@ enum Phase {
 /// How far the stage is on its way to power.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Power {
-    /// The drives are brought up.
+    /// The drives are being brought up.
     Off,
-    /// They are ready for power since then.
+    /// They have been ready for power since then.
     Awaited(Time),
     /// They are being enabled.
     ComingOn,
-    /// They are enabled since then.
+    /// They have been enabled since then.
     On(Time),
 }
 
@@ -50,7 +50,7 @@ pub(crate) struct Shell {
     config: StageConfig,
     phase: Phase,
     power: Power,
-    /// The bench sends no heartbeat any more, on purpose.
+    /// The bench has stopped sending its heartbeat on purpose.
     is_silent: bool,
     /// The state each part is in.
     states: BTreeMap<Lane, State>,
@@ -80,7 +80,7 @@ impl Shell {
         self.outputs.push_back(Output::Record(record));
     }
 
-    /// Records that a part of the bench is in `state`, where that is news.
+    /// Records that a part of the bench is in `state`, unless it was before.
     pub(crate) fn state(&mut self, state: State) {
         self.state_at(self.now, state);
     }
@@ -155,7 +155,7 @@ impl Shell {
         self.stage.home(self.now, axis).map_err(|error| format!("stage: {error}"))
     }
 
-    /// Sends no heartbeat any more, as a bench that has died.
+    /// Stops sending the bench's heartbeat, as if the bench had died.
     pub(crate) fn fall_silent(&mut self) {
         self.is_silent = true;
         self.stage.fall_silent();
@@ -171,9 +171,9 @@ impl Shell {
     /// Records an event of the stage.
     pub(super) fn take_stage_event(&mut self, event: &StageEvent) {
         let is_expected = match event {
-            // Refused where the axes stand, in the event before: they stay without power.
+            // The task refused the position in the event before: the axes stay without power.
             StageEvent::Progress(Progress::Enabling) => !self.is_running(),
-            // An answer to the task, which looks at the drives while the bench is silent.
+            // An answer to the task, which reads the drives while the bench is silent.
             StageEvent::Ignored { frame, .. } => self.is_silent && self.is_sdo_answer(frame),
             _ => false,
         };
@@ -209,7 +209,7 @@ impl Shell {
     pub(crate) fn stop(&mut self, reason: String) {
         match &self.phase {
             Phase::Over(_) | Phase::Stopping { outcome: Outcome::Stopped(_), .. } => {
-                // A bus that is gone says so at every frame.
+                // A bus that is down reports it at every frame.
                 if self.then.len() < THEN_MAX && !self.then.contains(&reason) {
                     self.event(Lane::Session, Severity::Warning, format!("then: {reason}"));
                     self.then.push(reason);
@@ -236,7 +236,7 @@ impl Shell {
         self.begin_stopping(Outcome::Completed);
     }
 
-    /// The task is done, and the drives have stopped by themselves: they are past an orderly end.
+    /// The task is done, and the drives have stopped by themselves, so an orderly end is not possible.
     pub(crate) fn complete_by_quick_stop(&mut self) {
         self.stage.quick_stop(self.now);
         self.begin_stopping(Outcome::Completed);
@@ -263,8 +263,8 @@ impl Shell {
         }
     }
 
-    /// How the run has ended, where the stage has done what it can to take power off. Nothing that
-    /// may still have power is a success.
+    /// The outcome once the stage has done what it can to take power off. A run whose drives may still
+    /// have power is not completed.
     pub(super) fn outcome_of_stop(&mut self, standing: bool, off: bool) -> Outcome {
         self.state(State::PowerOff);
         let unknown = self.tell_left_unknown(standing, off);
@@ -277,7 +277,7 @@ impl Shell {
         }
     }
 
-    /// Tells what a stop has left unknown of drives that had power.
+    /// Reports what a stop has left unknown of drives that had power.
     fn tell_left_unknown(&mut self, standing: bool, off: bool) -> Option<&'static str> {
         let unknown = left_unknown(standing, off).filter(|_| self.had_power())?;
         self.event(Lane::Stage, Severity::Warning, unknown.to_owned());
@@ -285,11 +285,14 @@ impl Shell {
         Some(unknown)
     }
 
+    /// The bench gave the drives power, or something else did.
     fn had_power(&self) -> bool {
+        let reports = self.stage.drive_reports();
         matches!(self.power, Power::ComingOn | Power::On(_))
+            || Axis::BOTH.into_iter().any(|axis| reports[axis].says_power())
     }
 
-    /// What the run has left.
+    /// What the run has left of the stage.
     pub(super) fn left(&self) -> Left {
         Left {
             had_power: self.had_power(),
@@ -299,7 +302,7 @@ impl Shell {
         }
     }
 
-    /// How the run has ended, where the stage says nothing for longer than a stop may take.
+    /// The outcome if the stage has reported nothing for longer than a stop may take.
     pub(super) fn outcome_of_silence(&mut self) -> Option<Outcome> {
         let timeout = self.stop_timeout();
         let Phase::Stopping { outcome, since } = &self.phase else { return None };
@@ -326,7 +329,7 @@ impl Shell {
         self.phase = Phase::Over(outcome);
     }
 
-    /// The next thing that the stage has to say, its frames sent.
+    /// The next event of the stage; the frames before it are sent.
     pub(super) fn poll_stage(&mut self) -> Option<StageEvent> {
         loop {
             match self.stage.poll()? {

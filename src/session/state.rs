@@ -6,14 +6,14 @@ use super::record::Lane;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, derive_more::Display)]
 #[display("{}", self.as_str())]
 pub enum State {
-    /// The run: the stage is brought up, and a tip awaited.
+    /// The run: the stage is brought up, and the bench waits for a tip.
     #[default]
     Preparing,
     /// The run: the needle is steered.
     Inserting,
-    /// The run: the insertion is held, because the tip is not seen.
+    /// The run: the insertion is held, because no tip position is accepted.
     Holding,
-    /// The run: the insertion is held, because the operator wants it.
+    /// The run: the insertion is held by the operator.
     HeldByOperator,
     /// The run: the needle makes a single step that the operator asked for.
     Stepping,
@@ -23,39 +23,39 @@ pub enum State {
     Homing,
     /// The run: an axis moves to where it was sent.
     Moving,
-    /// The run: the bench says nothing, to see whether the drives notice.
+    /// The run: the bench sends no heartbeat, to see whether the drives notice.
     Silent,
     /// The run: the base turns in air.
     TurningInAir,
-    /// The run: the drives stand down.
+    /// The run: the drives are being stopped.
     Stopping,
-    /// The run: over, and done.
+    /// The run: completed.
     Completed,
-    /// The run: over, for a reason.
+    /// The run: ended before it was completed.
     Stopped,
     /// The stage: both axes have power and follow their targets.
     Enabled,
     /// The stage: both axes were told to take power off.
     PowerOff,
-    /// The tracker: no tip was seen yet.
+    /// The tracker: no tip has been found yet.
     AwaitingTip,
-    /// The tracker: the tip is seen.
+    /// The tracker: positions are accepted.
     Tracking,
-    /// The tracker: the tip is not seen just now.
+    /// The tracker: no position has come for some periods of the stream.
     Coasting,
-    /// The tracker: what is seen is not believed to be the tip.
+    /// The tracker: too many positions were refused; only the model can find the tip again.
     Lost,
     /// The tracker: there is no link.
     Disconnected,
     /// The observer that steers: it has no estimate yet.
     NoEstimate,
-    /// The observer that steers: it has an estimate but for the roll.
+    /// The observer that steers: it has an estimate, but the roll is not known.
     RollUnknown,
     /// The observer that steers: it has an estimate.
     Estimating,
     /// The controller: its demand is within its limits.
     Steering,
-    /// The controller: it asks for more than its limits let through.
+    /// The controller: it demands more than its limits allow.
     Saturated,
 }
 

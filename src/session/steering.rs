@@ -3,7 +3,7 @@
 use super::config::{Samples, SessionConfig};
 use super::goal::{Approach, Pursuit};
 use crate::control::{Command, Controller};
-use crate::needle::{Increment, Needle, TipPosition};
+use crate::needle::{Increment, TipPosition};
 use crate::observer::{Estimate, HandednessWatch, Observer, ObserverError, Whiteness};
 use nalgebra::Vector3;
 
@@ -17,7 +17,6 @@ pub struct Steering {
     shadows: Vec<(String, Box<dyn Observer>)>,
     control: Box<dyn Controller>,
     pursuit: Option<Pursuit>,
-    needle: Needle,
     /// Depth at which the observers stand, from where they began, mm.
     depth_mm: f64,
     handedness: HandednessWatch,
@@ -27,8 +26,8 @@ pub struct Steering {
     step_mm: f64,
 }
 
-/// Between the steps only the mean of the positions is known: at most every second one counts as
-/// independent.
+/// With one correction a step, the correlation of the positions between two steps is not known: at most
+/// every second one counts as independent.
 const UNSEEN_INFLATION: f64 = 2.0;
 
 /// The result of a step.
@@ -77,7 +76,6 @@ impl Steering {
                 .goal
                 .clone()
                 .and_then(|goal| Pursuit::new(goal, config.needle, &config.control)),
-            needle: config.needle,
             depth_mm: 0.0,
             handedness,
             samples: config.insertion.corrected_by,
@@ -129,7 +127,7 @@ impl Steering {
         self.handedness.correct(tip_meas, f64::from(positions) / inflation);
     }
 
-    /// The target, if there is one, is there, plane frame, mm.
+    /// Sets where the target is, if there is one, plane frame, mm.
     pub fn set_target(&mut self, target_mm: Vector3<f64>) {
         if let Some(pursuit) = &mut self.pursuit {
             pursuit.set_target(target_mm);
@@ -170,8 +168,8 @@ impl Steering {
         }
     }
 
-    /// A lost observer and a stream of the wrong hand end a run; which of them shows first is
-    /// chance, and the stream's is the cause.
+    /// A lost observer and a stream of the wrong handedness end a run. The stream comes first: it may be
+    /// the cause of the other.
     fn check(&self) -> Result<(), String> {
         self.handedness.check().map_err(|error| format!("tracker: {error}"))?;
         self.observer.check().map_err(|error| format!("observer: {error}"))
@@ -187,8 +185,7 @@ impl Steering {
         match &mut self.pursuit {
             Some(pursuit) if is_last => (Some(pursuit.end(estimate)), Ok(None)),
             Some(pursuit) => {
-                let (approach, command) =
-                    pursuit.step(estimate, depth_mm, self.step_mm, self.needle);
+                let (approach, command) = pursuit.step(estimate, depth_mm, self.step_mm);
                 (Some(approach), command)
             }
             None if is_last => (None, Ok(None)),

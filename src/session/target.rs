@@ -5,7 +5,9 @@ use super::record::SampleRecord;
 use crate::geometry::Pose;
 use crate::tracker::gate::is_tool;
 use crate::tracker::refusal::short;
-use crate::tracker::{AcquisitionClock, Fix, Gate, GateName, Prediction, Refusal, Sample, Track};
+use crate::tracker::{
+    AcquisitionClock, Fix, Gate, GateName, Prediction, Refusal, Sample, Track, TrackState,
+};
 use crate::units::Time;
 use nalgebra::{Matrix3, Vector3};
 use std::collections::VecDeque;
@@ -47,20 +49,10 @@ impl MovingMean {
         while self.newest.pop_front_if(|(time, _)| *time < oldest).is_some() {}
     }
 
-    /// Positions in the mean.
-    pub fn len(&self) -> usize {
-        self.newest.len()
-    }
-
-    /// True before the first position.
-    pub fn is_empty(&self) -> bool {
-        self.newest.is_empty()
-    }
-
     /// The mean, mm; `None` before the first position.
     pub fn mean_mm(&self) -> Option<Vector3<f64>> {
         let sum: Vector3<f64> = self.newest.iter().map(|(_, position_mm)| position_mm).sum();
-        (!self.is_empty()).then(|| sum / self.len() as f64)
+        (!self.newest.is_empty()).then(|| sum / self.newest.len() as f64)
     }
 }
 
@@ -166,8 +158,9 @@ impl TargetTracking {
 
     /// Where the target is expected to be seen next: where it was.
     fn prediction(&self) -> Option<Prediction> {
-        let variance_mm2 = self.noise_sd_mm.powi(2) / self.mean.len().max(1) as f64;
-        self.mean.mean_mm().map(|position_mm| Prediction {
+        let position_mm = self.mean.mean_mm()?;
+        let variance_mm2 = self.noise_sd_mm.powi(2) / self.mean.newest.len() as f64;
+        Some(Prediction {
             position_mm,
             heading: Vector3::zeros(),
             covariance_mm2: Some(Matrix3::identity() * variance_mm2),
@@ -190,6 +183,9 @@ impl TargetTracking {
         let limit_s = self.hold_after.as_secs_f64();
         let trouble = match self.last_acquisition().map(|last| now.seconds_after(last)) {
             None => "the target has not been seen".to_owned(),
+            _ if self.track.state(now) == TrackState::Waiting => {
+                "the target is not found yet: too few positions agree".to_owned()
+            }
             _ if !self.track.is_held() => {
                 format!("the target is lost, {} refused in a row", self.track.refused_in_a_row())
             }

@@ -11,25 +11,19 @@ use std::time::Duration;
 /// A task: an insertion, or an operation of the stage alone.
 ///
 /// The [`Session`](super::Session) around it brings the stage up, supervises it, stops it and takes
-/// power off. A task decides what to do between [`StageEvent::Ready`] and the stop. An error of any
-/// method is the reason to stop for.
+/// power off. A task decides what to do between [`StageEvent::Ready`] and the stop. An error of a
+/// method is the reason to stop for, except where it says otherwise.
 pub(crate) trait Task {
     /// The run begins.
     fn begin(&mut self, _shell: &mut Shell) {}
 
     /// Whether the axes may be given power now; asked after every input until they are.
-    ///
-    /// # Errors
-    /// The reason to stop for.
     fn permits_power(&mut self, _shell: &mut Shell) -> Result<bool, String> {
         Ok(true)
     }
 
     /// Takes an event of the stage. Feedback comes while the axes are stopped, too; everything else
     /// comes before.
-    ///
-    /// # Errors
-    /// The reason to stop for.
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String>;
 
     /// Takes an event of the tracker's link. A task that does not use the tracker records the events, and
@@ -56,17 +50,11 @@ pub(crate) trait Task {
 
     /// Does what the last input left to do, once the frames that answer it may have left; called before
     /// the next one. Until then [`deadline`](Self::deadline) is past.
-    ///
-    /// # Errors
-    /// The reason to stop for.
     fn catch_up(&mut self) -> Result<(), String> {
         Ok(())
     }
 
     /// Does what is due; called after every input.
-    ///
-    /// # Errors
-    /// The reason to stop for.
     fn handle_timeout(&mut self, _shell: &mut Shell) -> Result<(), String> {
         Ok(())
     }

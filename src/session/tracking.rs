@@ -1,7 +1,7 @@
 //! The tracker stream as the session believes it: gated, registered, dated, paired and judged.
 
 use super::config::{SessionConfig, TrackerConfig};
-use super::estimation::{Estimation, Measurement, StageDepth};
+use super::estimation::{Estimation, Measurement};
 use super::record::{Record, SampleRecord, Severity};
 use crate::geometry::Pose;
 use crate::needle::TipPosition;
@@ -16,10 +16,10 @@ use crate::units::Time;
 use std::collections::VecDeque;
 use std::time::Duration;
 
-/// Positions waiting for the stage's next feedback, at most; the oldest make room.
+/// Maximum number of samples that wait for the stage's next feedback; the oldest position is then refused.
 const PENDING_MAX: usize = 256;
-/// Once a run is being stopped, a position that no feedback has come for waits no longer than this, or
-/// two SYNC periods: what is heard of the tracker is recorded as it comes, to the end.
+/// Once a run is being stopped, a position waits no longer than this, or two SYNC periods, for the
+/// stage's feedback, so that samples are recorded as they come until the end.
 const UNPAIRED_MAX: Duration = Duration::from_millis(100);
 /// Why a position that still waits at the end is refused.
 const NEVER_PAIRED: &str = "the stage gave no position at its acquisition before the run ended";
@@ -93,8 +93,8 @@ impl Tracking {
         }
     }
 
-    /// Notes what happened on the link, samples apart.
-    pub(crate) fn note(&mut self, event: &Event) {
+    /// Notes what happened on the link. A sample is counted only: [`Tracking::take`] judges it.
+    pub(crate) fn note(&mut self, now: Time, event: &Event) {
         self.census.note(event);
         match event {
             Event::Connected { .. } => {
@@ -107,31 +107,37 @@ impl Tracking {
             }
             Event::Status { status, .. } => self.status_is_ok = status.code == Status::OK,
             Event::Malformed(error) => self.malformed = Some(error.clone()),
-            Event::Sample(_) | Event::SawTool { .. } | Event::PassedOver { .. } => {}
+            Event::PassedOver { dropped, .. } => self.count_dropped(now, *dropped),
+            Event::Sample(_) | Event::SawTool { .. } => {}
         }
     }
 
-    /// Counts samples that the link dropped. Gives a message at the first, and at each doubling of the
-    /// count.
-    pub(crate) fn count_dropped(&mut self, dropped: u64) -> Option<String> {
+    /// Counts samples that the link dropped. Warns at the first, and at each doubling of the count.
+    fn count_dropped(&mut self, now: Time, dropped: u64) {
         let before = self.dropped;
         self.dropped += dropped;
-        let is_reported = self.dropped.checked_ilog2() > before.checked_ilog2();
-        is_reported.then(|| {
-            format!(
+        if self.dropped.checked_ilog2() > before.checked_ilog2() {
+            let text = format!(
                 "{} samples dropped so far: they come faster than the bench takes them; the newest \
                  are used; lower the tracker's rate",
                 self.dropped
-            )
-        })
+            );
+            self.warn(now, text);
+        }
+    }
+
+    fn warn(&mut self, time: Time, text: String) {
+        let (lane, severity) = (Lane::Tracker, Severity::Warning);
+        self.records.push_back(Record::Event { time, lane, severity, text });
     }
 
     /// Takes one sample. While no insertion goes on it is judged at once; during one it waits for
     /// [`Tracking::judge`].
     pub(crate) fn take(&mut self, now: Time, sample: Sample, is_inserting: bool) {
         let admitted = self.admit(&sample);
-        self.report_clock(now);
-        self.census.note(&Event::Sample(sample.clone()));
+        if let Some(text) = self.clock.news() {
+            self.warn(now, text);
+        }
         let mut record = SampleRecord::received(sample);
         let mut position = None;
         match admitted {
@@ -159,7 +165,6 @@ impl Tracking {
 
     /// Records a sample of the target, which was judged elsewhere, in the order of receipt.
     pub(crate) fn pass(&mut self, record: SampleRecord) {
-        self.census.note(&Event::Sample(record.received.clone()));
         self.waiting.push_back(Waiting { record, is_target: true, position: None });
         self.release();
     }
@@ -192,19 +197,16 @@ impl Tracking {
             sample.position = None;
             let judged =
                 self.judge_one(&sample.record, acquisition_time, &tip_meas, history, estimation);
-            match judged {
-                Ok(insertion_meas_mm) => {
-                    self.travel.take(insertion_meas_mm, &tip_meas.mm());
-                    believed.push(Measurement {
-                        acquisition_time,
-                        stage_depth_meas: StageDepth { mm: insertion_meas_mm },
-                        tip_meas,
-                        positions: 1,
-                    });
-                    self.decide(now, &mut sample.record, None);
-                }
-                Err(refusal) => self.decide(now, &mut sample.record, Some(refusal)),
+            if let Ok(stage_insertion_meas_mm) = judged {
+                self.travel.take(stage_insertion_meas_mm, &tip_meas.mm());
+                believed.push(Measurement {
+                    acquisition_time,
+                    stage_insertion_meas_mm,
+                    tip_meas,
+                    positions: 1,
+                });
             }
+            self.decide(now, &mut sample.record, judged.err());
         }
         self.waiting = waiting;
         self.release();
@@ -269,8 +271,7 @@ impl Tracking {
             let text = format!(
                 "two positions in a row do not fit the model (pair {pairs} of this run): {refusal}"
             );
-            let (lane, severity) = (Lane::Tracker, Severity::Warning);
-            self.records.push_back(Record::Event { time, lane, severity, text });
+            self.warn(time, text);
         }
     }
 
@@ -307,14 +308,6 @@ impl Tracking {
         self.waiting = waiting;
     }
 
-    /// Records what the sender's clock did.
-    fn report_clock(&mut self, time: Time) {
-        if let Some(text) = self.clock.news() {
-            let (lane, severity) = (Lane::Tracker, Severity::Warning);
-            self.records.push_back(Record::Event { time, lane, severity, text });
-        }
-    }
-
     /// Refuses the samples that wait for a feedback that does not come, now that the run is being
     /// stopped.
     pub(crate) fn refuse_unpaired(&mut self, now: Time) {
@@ -325,13 +318,13 @@ impl Tracking {
         self.release();
     }
 
-    /// Nothing is judged any more: what still waits is recorded as it is.
+    /// The run is over: positions that still wait are refused, and all samples recorded.
     pub(crate) fn close(&mut self, now: Time) {
         self.refuse_oldest(now, usize::MAX, NEVER_PAIRED);
         self.release();
     }
 
-    /// Lets go of the records up to the first sample that is not decided.
+    /// Releases the records up to the first sample that is not decided.
     fn release(&mut self) {
         while let Some(decided) = self.waiting.pop_front_if(|sample| sample.position.is_none()) {
             self.records.push_back(match decided.is_target {
@@ -355,6 +348,11 @@ impl Tracking {
     /// Seconds since the newest believed position was acquired; `None` before the first.
     pub(crate) fn age_s(&self, now: Time) -> Option<f64> {
         self.last_acquisition().map(|acquired| now.seconds_after(acquired))
+    }
+
+    /// True while the tip is found, not lost, and was seen lately.
+    pub(crate) fn is_seen(&self, now: Time) -> bool {
+        self.track.is_held() && self.is_fresh(now)
     }
 
     /// True while the newest believed position is young enough to steer by.

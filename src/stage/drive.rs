@@ -24,6 +24,13 @@ pub struct DriveReport {
     pub error: Option<EmcyCode>,
 }
 
+impl DriveReport {
+    /// True if the drive has said that its motor may have power.
+    pub fn says_power(&self) -> bool {
+        self.state.is_some() && may_have_power(self.state)
+    }
+}
+
 /// The one reset of a drive that was found in Fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Reset {

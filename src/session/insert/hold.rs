@@ -5,8 +5,7 @@ use super::Insert;
 use crate::session::config::Resume;
 use crate::session::insertion::Insertion;
 use crate::session::shell::Shell;
-use crate::session::{Lane, OperatorCommand, Severity, State};
-use crate::stage::SetPoint;
+use crate::session::{Lane, Severity, State};
 use crate::text::clipped;
 use crate::units::Time;
 use std::time::Duration;
@@ -16,8 +15,8 @@ pub(super) const MESSAGE_MAX: usize = 200;
 /// What to look at when the stream contradicts the model.
 const JUMP_ADVICE: &str = "check the tracker, and needle.radius_mm";
 /// Why a command comes too soon.
-const NOT_BEGUN: &str = "the insertion has not begun";
-/// Why a hold by the tracker cannot be lasted or ended.
+pub(super) const NOT_BEGUN: &str = "the insertion has not begun";
+/// Why the operator can neither keep nor end a hold by the tracker.
 const ENDS: &str = "the tracker holds it, and the run ends once the needle stands (tracker.resume)";
 
 /// An insertion that is held: set-points brake to a standstill, and both axes stay enabled.
@@ -64,10 +63,10 @@ impl Insert {
         &mut self,
         shell: &mut Shell,
         now: Time,
-        at: SetPoint,
+        insertion_meas_mm: f64,
         insertion: &mut Insertion,
     ) -> Result<(), String> {
-        let found = self.cause(now, at, insertion);
+        let found = self.cause(now, insertion_meas_mm, insertion);
         let Some(hold) = &self.hold else {
             if let Some((cause, why)) = found {
                 let text = format!("{cause}; insertion held; {why}");
@@ -88,7 +87,7 @@ impl Insert {
         };
         let HeldBy::Tracker { cause, why, in_step } = &hold.by else { return Ok(()) };
         let tracker = &self.config.tracker;
-        let is_standing = insertion.is_standing(at.insertion_mm);
+        let is_standing = insertion.is_standing(insertion_meas_mm);
         if tracker.hold.resume == Resume::Automatic
             && is_standing
             && found.is_none()
@@ -133,30 +132,8 @@ impl Insert {
         shell.event_at(now, Lane::Session, Severity::Info, text);
     }
 
-    /// Does what the operator asks for, and says what comes of it.
-    ///
-    /// # Errors
-    /// Why it is refused; everything stays as it was.
-    pub(super) fn obey(
-        &mut self,
-        shell: &mut Shell,
-        command: OperatorCommand,
-    ) -> Result<String, String> {
-        match command {
-            OperatorCommand::Hold => self.hold_for_operator(shell),
-            OperatorCommand::Resume => self.go_on(shell, None),
-            OperatorCommand::Step { mm } => self.go_on(shell, Some(mm)),
-            OperatorCommand::Speed { mm_per_s } => {
-                let insertion = self.insertion.as_mut().ok_or(NOT_BEGUN)?;
-                let was = insertion.profile.speed_max_mm_per_s;
-                insertion.set_speed(mm_per_s)?;
-                Ok(format!("{command}, was {was:.3}"))
-            }
-        }
-    }
-
     /// Holds the insertion; one that has not begun will begin held.
-    fn hold_for_operator(&mut self, shell: &mut Shell) -> Result<String, String> {
+    pub(super) fn hold_for_operator(&mut self, shell: &mut Shell) -> Result<String, String> {
         match self.hold.as_ref().map(|hold| &hold.by) {
             Some(HeldBy::Operator) => return Ok("hold: it is held already".to_owned()),
             Some(HeldBy::Tracker { .. }) if self.config.tracker.hold.resume == Resume::Stop => {
@@ -175,7 +152,11 @@ impl Insert {
 
     /// Ends a hold on purpose: the insertion goes on, by a single step where one is asked for. It needs
     /// a standing needle and a tip that would not be held for again at once.
-    fn go_on(&mut self, shell: &mut Shell, step_mm: Option<f64>) -> Result<String, String> {
+    pub(super) fn go_on(
+        &mut self,
+        shell: &mut Shell,
+        step_mm: Option<f64>,
+    ) -> Result<String, String> {
         let hold = self.hold.as_ref().ok_or("the insertion is not held; hold it first")?;
         match (&hold.by, self.config.tracker.hold.resume) {
             (HeldBy::Tracker { .. }, Resume::Stop) => return Err(ENDS.to_owned()),
@@ -185,7 +166,7 @@ impl Insert {
             _ => {}
         }
         let held_s = shell.now.seconds_after(hold.since);
-        if !self.tracking.track.is_held() || !self.tracking.is_fresh(shell.now) {
+        if !self.tracking.is_seen(shell.now) {
             let limit_s = self.config.tracker.hold.after.as_secs_f64();
             let last = match self.tracking.age_s(shell.now) {
                 Some(_) if self.tracking.is_fresh(shell.now) => {
@@ -208,8 +189,7 @@ impl Insert {
         if !insertion.is_standing(insertion_mm) {
             return Err("the needle still brakes; ask again once it stands".to_owned());
         }
-        let at = SetPoint { insertion_mm, rotation_rad: 0.0 };
-        if let Some((cause, why)) = self.cause(shell.now, at, insertion) {
+        if let Some((cause, why)) = self.cause(shell.now, insertion_mm, insertion) {
             return Err(clipped(&format!("{cause}; {why}"), MESSAGE_MAX).into_owned());
         }
         let left_mm = insertion.left_mm();
@@ -227,11 +207,16 @@ impl Insert {
     }
 
     /// What calls for a hold, and why it came to that or what to look at.
-    fn cause(&self, now: Time, at: SetPoint, insertion: &Insertion) -> Option<(String, String)> {
+    fn cause(
+        &self,
+        now: Time,
+        insertion_meas_mm: f64,
+        insertion: &Insertion,
+    ) -> Option<(String, String)> {
         if let Some(jump) = &self.tracking.jump {
             return Some((jump.clone(), JUMP_ADVICE.to_owned()));
         }
-        if let Some(blindness) = self.blindness(now, at, insertion) {
+        if let Some(blindness) = self.blindness(now, insertion_meas_mm, insertion) {
             return Some((blindness, self.tracking.explain_silence()));
         }
         self.target.as_ref()?.trouble(now)
@@ -239,18 +224,22 @@ impl Insert {
 
     /// How long and how far the insertion has gone on blind, where that calls for a hold: by age,
     /// or because the needle would otherwise not stand before the limit.
-    fn blindness(&self, now: Time, at: SetPoint, insertion: &Insertion) -> Option<String> {
+    fn blindness(
+        &self,
+        now: Time,
+        insertion_meas_mm: f64,
+        insertion: &Insertion,
+    ) -> Option<String> {
         let tracker = &self.config.tracker;
         let seen_at_mm = self.tracking.track.last().and_then(|fix| fix.insertion_mm);
-        let seen_at_mm = seen_at_mm.unwrap_or(f64::NEG_INFINITY);
-        let seen_at = SetPoint { insertion_mm: seen_at_mm, rotation_rad: 0.0 };
-        let seen_at_mm = insertion.measured(seen_at).insertion_mm.max(0.0);
+        let seen_at_mm = seen_at_mm.map_or(0.0, |mm| insertion.depth_mm(mm).max(0.0));
         let stands_at_mm = insertion
             .profile
             .held_at_mm(tracker.hold.braking_mm_per_s2, self.config.stage.bus.sync_period());
         let (age_s, limit_s) =
             (self.tracking.age_s(now).unwrap_or(f64::INFINITY), tracker.hold.after.as_secs_f64());
-        let (blind_mm, braking_mm) = (at.insertion_mm - seen_at_mm, stands_at_mm - at.insertion_mm);
+        let (blind_mm, braking_mm) =
+            (insertion_meas_mm - seen_at_mm, stands_at_mm - insertion_meas_mm);
         let is_blind = age_s > limit_s || blind_mm + braking_mm > tracker.hold.after_mm;
         is_blind.then(|| {
             format!(

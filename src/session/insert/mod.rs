@@ -1,6 +1,8 @@
 //! The task of steering: one insertion, from the first tip seen to the depth.
 
 mod hold;
+#[cfg(test)]
+mod tests;
 
 use self::hold::{EndedHold, Hold};
 use super::config::{PlaneOutOfReach, SessionConfig};
@@ -14,10 +16,9 @@ use super::steering::Decision;
 use super::target::{MovingMean, TargetTracking};
 use super::task::Task;
 use super::tracking::Tracking;
-use super::{OperatorCommand, Progress, SessionError, tracker_news};
+use super::{OperatorCommand, Progress, tracker_news};
 use crate::geometry::coordinates;
-use crate::observer::Estimate;
-use crate::plan::Path;
+use crate::observer::{Estimate, ObserverError};
 use crate::stage::{Feedback, SetPoint, StageEvent};
 use crate::text::clipped;
 use crate::tracker::{Event, GateCounts, StageHistory, StagePoint};
@@ -25,9 +26,9 @@ use crate::units::Time;
 use nalgebra::Vector3;
 use std::time::Duration;
 
-/// Kept of the stage's past beyond what a measurement can come from.
+/// The stage's positions are kept for longer by this than a measurement can be old.
 const HISTORY_MARGIN: Duration = Duration::from_secs(1);
-/// A start is refused by the mean of the positions over this long: one position has the noise of one.
+/// A start is refused by the mean of the positions over this time: a single one may be off by its noise.
 const START_AVERAGE: Duration = Duration::from_millis(500);
 
 /// An insertion and what it is steered by.
@@ -53,15 +54,15 @@ pub(super) struct Insert {
     ended_hold: Option<EndedHold>,
     /// Measurements that the observers have not been told.
     untold: Vec<Measurement>,
-    /// The time of the feedback after which they are to be told.
+    /// The time of the feedback after which the observers are to be told.
     catches_up: Option<Time>,
     progress: Progress,
 }
 
 impl Insert {
     /// # Errors
-    /// [`SessionError`] where an observer refuses its configuration.
-    pub(super) fn new(config: SessionConfig, now: Time) -> Result<Self, SessionError> {
+    /// Where an observer refuses its configuration.
+    pub(super) fn new(config: SessionConfig, now: Time) -> Result<Self, ObserverError> {
         Ok(Insert {
             begun: now,
             tip_believed: false,
@@ -190,38 +191,28 @@ impl Insert {
         if self.config.tracker.judges_stream {
             self.tracking.travel.check().map_err(|error| format!("tracker: {error}"))?;
         }
-        self.watch_tip(shell, feedback.time, at, insertion)?;
+        self.watch_tip(shell, feedback.time, at.insertion_mm, insertion)?;
         insertion.check_arrival(feedback.time, at.insertion_mm)?;
         if let Some(due) = insertion.due(feedback.time, at.insertion_mm) {
             self.correct(feedback.time)?;
-            let command = self.step(shell, feedback.time, at, insertion, &due)?;
-            match command {
-                Some((rotation_rad_per_mm, left_mm)) => {
-                    if let Some(left_mm) = left_mm {
-                        insertion.end_at(at.insertion_mm + left_mm);
-                        self.progress.depth_mm = insertion.end_mm();
-                    }
-                    insertion.steer(rotation_rad_per_mm);
-                }
-                None => {
-                    shell.complete();
-                    return Ok(());
-                }
-            }
+            self.step(shell, feedback.time, at, insertion, &due)?;
         }
-        shell.command(insertion.advance(self.config.stage.bus.sync_period()))
+        match shell.is_running() {
+            true => shell.command(insertion.advance(self.config.stage.bus.sync_period())),
+            false => Ok(()),
+        }
     }
 
-    /// Takes one step: observe, decide, record. Gives the rotation rate for the next step, and with a
-    /// target how far to insert, mm; `None` after the last.
+    /// Takes one step: observe, decide, record, and steer on. After the last the insertion is complete.
+    /// An error is the reason to stop for.
     fn step(
         &mut self,
         shell: &mut Shell,
         time: Time,
         at: SetPoint,
-        insertion: &Insertion,
+        insertion: &mut Insertion,
         due: &DueStep,
-    ) -> Result<Option<(f64, Option<f64>)>, String> {
+    ) -> Result<(), String> {
         let history = &self.history;
         if let Some(measurement) = &due.measurement {
             self.estimation.take(measurement, history)?;
@@ -239,7 +230,7 @@ impl Insert {
             refused,
         } = self.estimation.decide(time, history, due.is_last)?;
         let path = approach.as_ref().and_then(|approach| approach.path.as_ref());
-        let left_mm = path.map(Path::length_mm);
+        let end_mm = path.map(|path| at.insertion_mm + path.length_mm());
         let observer = match &estimate {
             None => State::NoEstimate,
             Some(estimate) if !estimate.is_roll_known() => State::RollUnknown,
@@ -260,27 +251,36 @@ impl Insert {
             command_saturated,
             tip_positions: corrections.map_or(0, |corrections| corrections.positions),
             tip_meas_mm: newest.map(|m| m.tip_meas.mm()),
-            tip_meas_insertion_mm: newest.map(|m| insertion.depth_mm(m.stage_depth_meas)),
+            tip_meas_insertion_mm: newest.map(|m| insertion.depth_mm(m.stage_insertion_meas_mm)),
             tip_meas_age_s: newest.map(|m| time.seconds_after(m.acquisition_time)),
             innovation_mm: corrections.and_then(|corrections| corrections.innovation_mm),
             estimate,
             shadows,
             approach,
         })));
-        match refused {
-            Some(reason) => Err(reason),
-            None => Ok(rotation_cmd_rad_per_mm.map(|rate| (rate, left_mm))),
+        if let Some(reason) = refused {
+            return Err(reason);
         }
+        let Some(rotation_rad_per_mm) = rotation_cmd_rad_per_mm else {
+            shell.complete();
+            return Ok(());
+        };
+        if let Some(end_mm) = end_mm {
+            self.progress.depth_mm = insertion.end_at(end_mm);
+        }
+        insertion.steer(rotation_rad_per_mm);
+        Ok(())
     }
 
     /// True while the tip is believed, and the target where that is a tool of its own.
     fn is_seen(&self, now: Time) -> bool {
         let has_target = self.target.as_ref().is_none_or(|target| target.trouble(now).is_none());
-        self.tracking.track.is_held() && self.tracking.is_fresh(now) && has_target
+        self.tracking.is_seen(now) && has_target
     }
 
-    /// When, before the insertion, a tip to begin with is awaited no longer: some time after the
-    /// last was seen, and once nothing but the tip is awaited, some time after that whatever is seen.
+    /// When the run gives up waiting for a tip to begin with: some time after the last was seen; once
+    /// nothing but the tip is awaited, some time after that, whatever is seen. A start in doubt is decided
+    /// first.
     fn tip_due(&self, power: Power) -> Time {
         let tip = self.tracking.last_acquisition();
         let target = self.target.as_ref().map_or(tip, TargetTracking::last_acquisition);
@@ -289,25 +289,28 @@ impl Insert {
             Power::Off | Power::ComingOn => heard,
             Power::Awaited(since) | Power::On(since) => since.min(heard),
         };
-        since + self.config.tracker.timeout
+        let due = since + self.config.tracker.timeout;
+        self.start_in_doubt.as_ref().map_or(due, |(doubted, _)| due.max(*doubted + START_AVERAGE))
     }
 
     /// Why there is no tip to begin with.
     fn explain_no_tip(&self, now: Time) -> String {
         let limit_s = self.config.tracker.timeout.as_secs_f64();
-        let has_tip = self.tracking.track.is_held() && self.tracking.is_fresh(now);
-        let trouble = self.target.as_ref().filter(|_| has_tip);
-        if let Some((trouble, why)) = trouble.and_then(|target| target.trouble(now)) {
-            let text = format!("tracker: no target within {limit_s:.1} s; {trouble}; {why}");
-            return clipped(&text, hold::MESSAGE_MAX).into_owned();
-        }
-        let silence = self.tracking.explain_silence();
-        let fresh_s = self.config.tracker.hold.after.as_secs_f64();
-        let seen = match self.tracking.age_s(now) {
-            Some(age_s) => format!("the last was {age_s:.2} s old (limit {fresh_s:.2}); "),
-            None => String::new(),
+        let target = self.target.as_ref().filter(|_| self.tracking.is_seen(now));
+        let text = match target.and_then(|target| target.trouble(now)) {
+            Some((trouble, why)) => {
+                format!("tracker: no target within {limit_s:.1} s; {trouble}; {why}")
+            }
+            None => {
+                let fresh_s = self.config.tracker.hold.after.as_secs_f64();
+                let seen = self
+                    .tracking
+                    .age_s(now)
+                    .map(|age_s| format!("the last was {age_s:.2} s old (limit {fresh_s:.2}); "));
+                let (seen, silence) = (seen.unwrap_or_default(), self.tracking.explain_silence());
+                format!("tracker: no tip within {limit_s:.1} s; {seen}{silence}")
+            }
         };
-        let text = format!("tracker: no tip within {limit_s:.1} s; {seen}{silence}");
         clipped(&text, hold::MESSAGE_MAX).into_owned()
     }
 }
@@ -366,6 +369,7 @@ impl Task for Insert {
 
     fn take_tracker_event(&mut self, shell: &mut Shell, event: Event) {
         let text = tracker_news(&event);
+        self.tracking.note(shell.now, &event);
         match event {
             Event::Sample(sample) => match &mut self.target {
                 Some(target) if target.is_own(&sample) => {
@@ -376,18 +380,9 @@ impl Task for Insert {
                 _ => self.tracking.take(shell.now, sample, self.insertion.is_some()),
             },
             Event::Connected { .. } => {
-                self.tracking.note(&event);
                 self.target.iter_mut().for_each(TargetTracking::reconnected);
             }
-            Event::PassedOver { dropped, .. } => {
-                self.tracking.note(&event);
-                let text = self.tracking.count_dropped(dropped);
-                text.into_iter().for_each(|text| {
-                    shell.event(Lane::Tracker, Severity::Warning, text);
-                });
-                return;
-            }
-            _ => self.tracking.note(&event),
+            _ => {}
         }
         self.drain_tracking(shell);
         if let Some((severity, text)) = text {
@@ -422,7 +417,17 @@ impl Task for Insert {
         shell: &mut Shell,
         command: OperatorCommand,
     ) -> Result<String, String> {
-        self.obey(shell, command)
+        match command {
+            OperatorCommand::Hold => self.hold_for_operator(shell),
+            OperatorCommand::Resume => self.go_on(shell, None),
+            OperatorCommand::Step { mm } => self.go_on(shell, Some(mm)),
+            OperatorCommand::Speed { mm_per_s } => {
+                let insertion = self.insertion.as_mut().ok_or(hold::NOT_BEGUN)?;
+                let was = insertion.profile.speed_max_mm_per_s;
+                insertion.set_speed(mm_per_s)?;
+                Ok(format!("{command}, was {was:.3}"))
+            }
+        }
     }
 
     fn progress(&self, now: Time) -> Progress {

@@ -1,0 +1,146 @@
+//! Insertions on the virtual stage, with a tracker of the test's own.
+
+use crate::canopen::Frame;
+use crate::config::Config;
+use crate::emulator::{StageOutput, VirtualStage};
+use crate::session::{Input, Machine, Output, Record, Session};
+use crate::tracker::{Event, Sample, Validity};
+use crate::units::Time;
+use nalgebra::Vector3;
+use std::time::Duration;
+
+struct Bench {
+    now: Time,
+    session: Session,
+    stage: VirtualStage,
+    tool: String,
+    /// Where the tip is seen, 40 times a second from `next_sample` on.
+    tip_mm: Vector3<f64>,
+    next_sample: Time,
+    samples: u32,
+    /// RPDO1 and SDO requests do not reach the insertion drive.
+    is_deaf: bool,
+    events: Vec<String>,
+}
+
+impl Bench {
+    fn new(sets: &[&str]) -> Self {
+        let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+        let config = Config::from_sources(&[], &sets).unwrap();
+        let now = Time::ZERO;
+        Bench {
+            now,
+            session: Session::new(config.session().unwrap(), now).unwrap(),
+            stage: VirtualStage::new(config.virtual_stage().unwrap(), now),
+            tool: config.tracker.tool,
+            tip_mm: Vector3::zeros(),
+            next_sample: Time::NEVER,
+            samples: 0,
+            is_deaf: false,
+            events: Vec::new(),
+        }
+    }
+
+    fn settle(&mut self) {
+        loop {
+            while let Some(output) = self.session.poll() {
+                match output {
+                    Output::Transmit { frame, .. } => {
+                        let is_lost = matches!(frame.cob_id(), Some(0x201 | 0x601));
+                        if !(self.is_deaf && is_lost) {
+                            self.stage.handle_frame(self.now, &frame);
+                        }
+                    }
+                    Output::Record(Record::Event { text, .. }) => self.events.push(text),
+                    Output::Record(_) => {}
+                }
+            }
+            match self.stage.poll() {
+                Some(StageOutput::Frame(frame)) => {
+                    self.session.handle(self.now, Input::Frame(frame));
+                }
+                Some(_) => {}
+                None => return,
+            }
+        }
+    }
+
+    fn step(&mut self) {
+        self.settle();
+        let due = self.session.deadline().min(self.stage.deadline());
+        self.now = self.now.max(due.min(self.next_sample));
+        self.stage.handle_timeout(self.now);
+        let input = if self.now < self.next_sample {
+            Input::Tick
+        } else {
+            self.next_sample = self.now + Duration::from_millis(25);
+            self.samples += 1;
+            Input::Tracker(Event::Sample(Sample {
+                tool: self.tool.clone(),
+                receive_time: self.now,
+                source_unix_ns: None,
+                position_mm: self.tip_mm + Vector3::z() * 1e-3 * f64::from(self.samples % 7),
+                orientation: None,
+                validity: Validity::Valid,
+            }))
+        };
+        self.session.handle(self.now, input);
+        self.settle();
+    }
+
+    fn run_until(&mut self, event: &str) {
+        while !self.events.iter().any(|text| text.contains(event)) {
+            assert_eq!(self.session.outcome(), None);
+            self.step();
+        }
+    }
+
+    fn run_for(&mut self, time: Duration) {
+        let end = self.now + time;
+        while self.now < end {
+            self.step();
+        }
+    }
+
+    fn reason(&mut self) -> String {
+        while self.session.outcome().is_none() {
+            self.step();
+        }
+        self.session.outcome().unwrap().stop_reason().expect("stopped").to_owned()
+    }
+}
+
+const CONFIGURED: &str = "both drives are configured";
+
+/// The mean that decides takes 0.5 s, and the run waits 0.3 s for a tip.
+#[test]
+fn a_start_in_doubt_is_decided_before_the_tip_times_out() {
+    let mut bench = Bench::new(&["tracker.timeout_s=0.3", "insertion.depth_mm=150"]);
+    bench.tip_mm = Vector3::new(-100.0, 3.0, -2.0);
+    bench.run_until(CONFIGURED);
+    bench.next_sample = bench.now + Duration::from_millis(200);
+    let reason = bench.reason();
+    assert!(reason.starts_with("insertion: the plane is out of reach"), "{reason}");
+}
+
+/// The bench has given it no power, but must not claim that it has none.
+#[test]
+fn a_drive_that_keeps_power_from_elsewhere_is_told_at_the_end() {
+    let mut bench = Bench::new(&[]);
+    bench.run_until(CONFIGURED);
+    bench.is_deaf = true;
+    for controlword in [0x06, 0x07, 0x0F] {
+        let write = Frame::new(0x601, &[0x2B, 0x40, 0x60, 0, controlword, 0, 0, 0]);
+        bench.stage.handle_frame(bench.now, &write);
+        bench.run_for(Duration::from_millis(200));
+    }
+    let reason = bench.reason();
+    assert!(
+        reason.starts_with("stage: insertion: the drive has power before the bench gave it any"),
+        "{reason}"
+    );
+    let left = bench.session.left();
+    let unknown = left.unknown.unwrap_or("nothing");
+    assert!(left.had_power && unknown.contains("press the emergency stop"), "{unknown}");
+    assert!(bench.events.iter().any(|text| text == unknown), "{:?}", bench.events);
+}
