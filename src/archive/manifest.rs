@@ -1,5 +1,6 @@
 //! `manifest.json`: what was run, with what, and how it ended.
 
+use super::file;
 use crate::session::Outcome;
 use derive_more::Display;
 use serde::{Deserialize, Serialize};
@@ -43,6 +44,19 @@ pub struct Counts {
     /// Lines of `events.log`.
     #[serde(default)]
     pub events: u64,
+}
+
+impl Counts {
+    /// Those of text files that have so many `lines`, by name.
+    pub fn of_lines(lines: impl Fn(&str) -> u64) -> Self {
+        Counts {
+            can_frames: lines(file::CAN),
+            tracker_samples: lines(file::TRACKER),
+            // Without the header.
+            steps: lines(file::STEPS).saturating_sub(1),
+            events: lines(file::EVENTS),
+        }
+    }
 }
 
 /// How many records are in no file, whatever became of them: a full queue, a full disk, a dead writer.

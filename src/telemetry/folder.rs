@@ -3,8 +3,8 @@
 use super::TelemetryError;
 use crate::archive::{Manifest, compact, file};
 use nix::sys::statvfs::statvfs;
-use std::fs::{self, File, Metadata, OpenOptions, TryLockError};
-use std::io::ErrorKind::{InvalidInput, Unsupported};
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io::ErrorKind::{AlreadyExists, InvalidInput, Unsupported};
 use std::io::{self, Write as _};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -28,14 +28,14 @@ pub(super) fn create(
     let mut path = parent.join(&base);
     for n in 2..=COLLISIONS_MAX {
         match fs::create_dir(&path) {
-            Ok(()) => return Ok(path),
-            Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {
-                path = parent.join(format!("{base}-{n}"));
+            Err(error) if error.kind() == AlreadyExists => {
+                path = parent.join(format!("{base}-{n}"))
             }
             Err(error) => return Err(TelemetryError::folder(&path)(error)),
+            Ok(()) => return Ok(path),
         }
     }
-    Err(TelemetryError::folder(&path)(io::ErrorKind::AlreadyExists.into()))
+    Err(TelemetryError::folder(&path)(AlreadyExists.into()))
 }
 
 /// Room reserved for the last manifest, which must be written even if the disk is full. It has figures
@@ -80,30 +80,16 @@ pub(super) fn reserve_manifest(dir: &Path) -> Result<(), TelemetryError> {
     reserve().map_err(TelemetryError::file(&path))
 }
 
-/// Identifies a file, independent of its name.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Identity {
-    device: u64,
-    inode: u64,
-}
-
-impl Identity {
-    /// The identity of the file with this `metadata`.
-    pub(super) fn of(metadata: &Metadata) -> Self {
-        Identity { device: metadata.dev(), inode: metadata.ino() }
+/// Checks that the open `file` is still at `path`.
+///
+/// # Errors
+/// The system's, or that another file has taken its place.
+pub(super) fn is_at(file: &File, path: &Path) -> io::Result<()> {
+    let (open, found) = (file.metadata()?, fs::symlink_metadata(path)?);
+    if (open.dev(), open.ino()) == (found.dev(), found.ino()) {
+        return Ok(());
     }
-
-    /// Checks that the file is still at `path`: writing to a file that was removed or renamed does not
-    /// fail.
-    ///
-    /// # Errors
-    /// The system's, or that another file has taken its place.
-    pub(super) fn is_at(self, path: &Path) -> io::Result<()> {
-        if Identity::of(&fs::symlink_metadata(path)?) == self {
-            return Ok(());
-        }
-        Err(io::Error::other("another file has taken its place"))
-    }
+    Err(io::Error::other("another file has taken its place"))
 }
 
 /// Marks the run folder `dir` as being written while the returned file is open, by a lock on its
@@ -138,9 +124,8 @@ const FULL_KB: u64 = 256;
 /// # Errors
 /// Too little room, or the check fails.
 pub fn check_room(dir: &Path, free_mb_min: u32) -> Result<(), TelemetryError> {
-    let free = fs::create_dir_all(dir).and_then(|()| free_bytes(dir));
-    let free_mb = free.map_err(TelemetryError::folder(dir))?.map(|bytes| bytes / BYTES_PER_MB);
-    match free_mb {
+    let free = fs::create_dir_all(dir).and_then(|()| free_mb(dir));
+    match free.map_err(TelemetryError::folder(dir))? {
         Some(free_mb) if free_mb < u64::from(free_mb_min) => {
             let path = dir.display();
             Err(TelemetryError::Recording(format!(

@@ -6,27 +6,26 @@
 //! its own, which may block.
 
 use super::TelemetryError;
-use super::folder::{self, Identity, check_not_full};
-use super::worker::{Backpressure, Left, Sink, Worker};
+use super::folder::{self, check_not_full, is_at};
+use super::worker::{Backpressure, Sink, Worker};
 use crate::archive::{Manifest, file};
 use rtrb::{Consumer, Producer, RingBuffer};
 use std::collections::BTreeSet;
-use std::fs::{self, File};
-use std::io;
+use std::fs::File;
 use std::path::PathBuf;
 use std::time::Duration;
 
 /// The keeper's name in messages.
 pub(super) const KEEPER: &str = "run folder";
-/// Manifests that wait to be written: one when the drives are known.
+/// Manifests that wait to be written: one for each drive that is found.
 const QUEUE_MANIFESTS: usize = 8;
 const QUEUE_TROUBLES: usize = 64;
 
-/// A file of the folder by its name, to check while the writer writes to it.
-pub(super) type Kept = (&'static str, File);
+/// An open file or folder, and its path.
+pub(super) type Kept = (PathBuf, File);
 
-/// Keeps the run folder `dir` and `files` in it, by name, on a thread of its own, which writes each
-/// manifest that it is given. Troubles with the folder are reported to the receiver, each once.
+/// Keeps the run folder `dir` and `files` in it, the text files first, on a thread of its own, which writes
+/// each manifest that it is given. Troubles with the folder are reported to the receiver, each once.
 ///
 /// # Errors
 /// The folder cannot be opened, or no thread can be started.
@@ -42,16 +41,13 @@ pub(super) fn keep(
 
 /// A run folder and the files in it that are checked.
 struct Folder {
-    dir: PathBuf,
-    identity: Identity,
+    dir: Kept,
     files: Vec<Kept>,
     /// The number of checks so far.
     checks: usize,
     /// Troubles so far.
     known: BTreeSet<String>,
     told: Producer<String>,
-    /// Those that the last manifest did not have.
-    added: Vec<String>,
 }
 
 impl Folder {
@@ -60,70 +56,59 @@ impl Folder {
         files: Vec<Kept>,
         told: Producer<String>,
     ) -> Result<Self, TelemetryError> {
-        let found = fs::metadata(&dir).map_err(TelemetryError::file(&dir))?;
-        let (identity, known, added) = (Identity::of(&found), BTreeSet::new(), Vec::new());
-        Ok(Folder { dir, identity, files, checks: 0, known, told, added })
+        let opened = File::open(&dir).map_err(TelemetryError::file(&dir))?;
+        Ok(Folder { dir: (dir, opened), files, checks: 0, known: BTreeSet::new(), told })
     }
 
     /// Syncs one of the text files, the next at each check, and checks the folder, its files and the
     /// free space. Returns the troubles.
     fn look_after(&mut self) -> Vec<TelemetryError> {
-        let lines = self.files.iter().filter(|(name, _)| file::LINES.contains(name));
-        let turn = lines.cycle().nth(self.checks % file::LINES.len());
+        let turn = self.files.iter().cycle().nth(self.checks % file::LINES.len());
         self.checks += 1;
-        let synced = turn.map(|(name, file)| self.named(name, file.sync_data()));
-        let in_place = match self.is_in_place() {
+        let synced = turn.map(|(path, file)| file.sync_data().map_err(TelemetryError::file(path)));
+        let checked = match is_in_place(&self.dir) {
             // Without the folder, its files are not checked.
             Err(gone) => vec![Err(gone)],
-            Ok(()) => self.files.iter().map(|kept| self.holds(kept)).collect(),
+            Ok(()) => {
+                let in_place = self.files.iter().map(is_in_place);
+                in_place.chain([check_not_full(&self.dir.0)]).collect()
+            }
         };
-        let is_there = in_place.iter().any(Result::is_ok);
-        let room = is_there.then(|| check_not_full(&self.dir));
-        synced.into_iter().chain(in_place).chain(room).filter_map(Result::err).collect()
+        synced.into_iter().chain(checked).filter_map(Result::err).collect()
     }
 
     /// Reports the troubles that are new.
     fn tell(&mut self, troubles: impl IntoIterator<Item = TelemetryError>) {
-        for trouble in troubles.into_iter().map(|trouble| trouble.to_string()) {
+        for trouble in troubles.into_iter().map(|trouble| format!("{KEEPER}: {trouble}")) {
             if self.known.insert(trouble.clone()) {
                 let _ = self.told.push(trouble);
             }
         }
     }
 
-    /// Writing to a folder that was removed or renamed does not fail.
-    fn is_in_place(&self) -> Result<(), TelemetryError> {
-        self.identity.is_at(&self.dir).map_err(TelemetryError::file(&self.dir))
-    }
-
-    fn holds(&self, (name, file): &Kept) -> Result<(), TelemetryError> {
-        let found = file.metadata();
-        self.named(name, found.and_then(|file| Identity::of(&file).is_at(&self.dir.join(name))))
-    }
-
-    fn named(&self, name: &str, result: io::Result<()>) -> Result<(), TelemetryError> {
-        result.map_err(TelemetryError::file(&self.dir.join(name)))
-    }
-
     /// Writes `manifest`, and reserves room for the next one.
     fn write_manifest(&self, manifest: &Manifest) -> Result<(), TelemetryError> {
-        self.is_in_place()?;
-        folder::write_manifest(&self.dir, manifest)?;
-        folder::reserve_manifest(&self.dir)
+        is_in_place(&self.dir)?;
+        folder::write_manifest(&self.dir.0, manifest)?;
+        folder::reserve_manifest(&self.dir.0)
     }
 
     /// Writes the last manifest, but never into another folder that has taken this one's place. It has
     /// all troubles so far, and those of a last check.
     fn write_last(&mut self, mut manifest: Manifest) -> Result<(), TelemetryError> {
-        self.is_in_place()?;
-        let lost: Vec<_> = self.files.iter().filter_map(|kept| self.holds(kept).err()).collect();
+        is_in_place(&self.dir)?;
+        let lost: Vec<_> = self.files.iter().filter_map(|kept| is_in_place(kept).err()).collect();
         self.tell(lost);
-        let is_new =
-            |trouble: &&String| !manifest.faults.iter().any(|fault| fault.contains(*trouble));
-        self.added = self.known.iter().filter(is_new).cloned().collect();
-        manifest.faults.extend(self.added.iter().cloned());
-        folder::write_manifest(&self.dir, &manifest)
+        let added = self.known.iter().filter(|trouble| !manifest.faults.contains(trouble));
+        let added: Vec<String> = added.cloned().collect();
+        manifest.faults.extend(added);
+        folder::write_manifest(&self.dir.0, &manifest)
     }
+}
+
+/// Writing to a file or folder that was removed or renamed does not fail.
+fn is_in_place((path, file): &Kept) -> Result<(), TelemetryError> {
+    is_at(file, path).map_err(TelemetryError::file(path))
 }
 
 impl Sink for Folder {
@@ -146,23 +131,21 @@ impl Sink for Folder {
     fn close(&mut self, manifest: &Manifest, _: &dyn Fn()) -> Result<(), String> {
         self.write_last(manifest.clone()).map_err(|error| error.to_string())
     }
-
-    fn left(&self) -> Left {
-        Left { faults: self.added.clone(), ..Left::default() }
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::telemetry::tests::Scratch;
+    use std::fs;
     use std::path::Path;
     use std::thread;
     use std::time::Instant;
 
     fn folder(dir: &Path) -> Folder {
-        let files = vec![(file::STEPS, File::create(dir.join(file::STEPS)).unwrap())];
-        Folder::open(dir.to_path_buf(), files, RingBuffer::new(1).0).unwrap()
+        let path = dir.join(file::STEPS);
+        let file = File::create(&path).unwrap();
+        Folder::open(dir.to_path_buf(), vec![(path, file)], RingBuffer::new(1).0).unwrap()
     }
 
     fn said(folder: &mut Folder) -> Vec<String> {
@@ -186,10 +169,10 @@ mod tests {
         assert!(said(&mut folder)[0].ends_with(replaced), "{:?}", said(&mut folder));
         let manifest = Manifest::new("x", String::new());
         folder.write_last(manifest).unwrap();
-        let troubles = folder.left().faults;
-        assert!(troubles[0].ends_with(replaced), "{troubles:?}");
         let manifest = fs::read_to_string(scratch.0.join(file::MANIFEST)).unwrap();
-        assert_eq!(Manifest::from_text(&manifest).unwrap().faults, troubles);
+        let troubles = Manifest::from_text(&manifest).unwrap().faults;
+        assert!(troubles[0].ends_with(replaced), "{troubles:?}");
+        assert!(troubles.iter().eq(&folder.known), "{troubles:?}");
     }
 
     /// For example another run's folder.
@@ -220,8 +203,9 @@ mod tests {
         let scratch = Scratch::new("keeper-troubles");
         let dir = scratch.0.join("run");
         fs::create_dir(&dir).unwrap();
-        let file = File::create(dir.join(file::STEPS)).unwrap();
-        let (keeper, mut troubles) = keep(dir.clone(), vec![(file::STEPS, file)]).unwrap();
+        let path = dir.join(file::STEPS);
+        let file = File::create(&path).unwrap();
+        let (keeper, mut troubles) = keep(dir.clone(), vec![(path, file)]).unwrap();
         let mut next = || {
             let end = Instant::now() + Duration::from_secs(60);
             loop {

@@ -1,10 +1,10 @@
 //! The recorder: a run folder and the threads that fill it.
 
-use super::keeper::{KEEPER, keep};
+use super::keeper::keep;
 use super::recording::live;
 use super::text::{TEXT_FILES, TextFiles};
-use super::vitals::{RecordNews, Watch};
-use super::worker::{Backpressure, Worker};
+use super::vitals::RecordNews;
+use super::worker::{Backpressure, Left, Worker};
 use super::{Entry, Scene, TelemetryError, folder, utc_text};
 use crate::archive::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex, unix_us_of,
@@ -45,7 +45,6 @@ pub struct Recorder {
     keeper: Worker<Box<Manifest>>,
     /// Troubles that the keeper found.
     troubles: Consumer<String>,
-    watches: [Watch; 2],
     faults: Vec<String>,
     /// Tells other processes that the folder is being written.
     lock: Option<File>,
@@ -67,39 +66,31 @@ impl Recorder {
         let run_dir = folder::create(parent, started_unix_us, &manifest.name)?;
         let config_sha256 = sha256_hex(config_toml.as_bytes());
         let manifest = Manifest { config_sha256, ..manifest };
-        let recorder = Self::fill(run_dir.clone(), manifest, config_toml, backpressure);
-        recorder.inspect_err(|_| discard(&run_dir))
-    }
-
-    fn fill(
-        run_dir: PathBuf,
-        manifest: Manifest,
-        config_toml: String,
-        backpressure: Backpressure,
-    ) -> Result<Recorder, TelemetryError> {
-        let path = run_dir.join(file::CONFIG);
-        fs::write(&path, &config_toml).map_err(TelemetryError::file(&path))?;
-        let lock = folder::lock(&run_dir)?;
-        folder::write_manifest(&run_dir, &manifest)?;
-        folder::reserve_manifest(&run_dir)?;
-        let (files, mut kept) = TextFiles::create(&run_dir, &manifest)?;
-        kept.push((file::CONFIG, File::open(&path).map_err(TelemetryError::file(&path))?));
-        let text = Worker::start(TEXT_FILES, QUEUE_ENTRIES, backpressure, || Ok(files))?;
-        let (keeper, troubles) = keep(run_dir.clone(), kept)?;
-        let now = Instant::now();
-        let watches = [Watch::new(TEXT_FILES, true, now), Watch::new(KEEPER, false, now)];
-        Ok(Recorder {
-            run_dir,
-            config_toml,
-            manifest,
-            text,
-            live: None,
-            keeper,
-            troubles,
-            watches,
-            faults: Vec::new(),
-            lock,
-        })
+        let fill = |run_dir: PathBuf| {
+            let path = run_dir.join(file::CONFIG);
+            fs::write(&path, &config_toml).map_err(TelemetryError::file(&path))?;
+            let lock = folder::lock(&run_dir)?;
+            folder::write_manifest(&run_dir, &manifest)?;
+            folder::reserve_manifest(&run_dir)?;
+            let (files, mut kept) = TextFiles::create(&run_dir, &manifest)?;
+            let config = File::open(&path).map_err(TelemetryError::file(&path))?;
+            kept.push((path, config));
+            let text = Worker::start(TEXT_FILES, QUEUE_ENTRIES, backpressure, || Ok(files))?;
+            let (keeper, troubles) = keep(run_dir.clone(), kept)?;
+            let (live, faults) = (None, Vec::new());
+            Ok(Recorder {
+                run_dir,
+                config_toml,
+                manifest,
+                text,
+                live,
+                keeper,
+                troubles,
+                faults,
+                lock,
+            })
+        };
+        fill(run_dir.clone()).inspect_err(|_| discard(&run_dir))
     }
 
     /// Serves the run to viewers at `address` from now on, with what `scene` shows; call it before the
@@ -139,14 +130,10 @@ impl Recorder {
     /// second: then a full or stalled disk or a lost folder is reported within a second.
     pub fn news(&mut self) -> Option<RecordNews> {
         let now = Instant::now();
-        let [text, keeper] = &mut self.watches;
-        let news = text
-            .look(&self.text.vitals, self.text.dropped, now)
-            .or_else(|| keeper.look(&self.keeper.vitals, 0, now))
-            .or_else(|| {
-                let trouble = format!("{KEEPER}: {}", self.troubles.pop().ok()?);
-                Some(RecordNews::Failed(TelemetryError::Recording(trouble)))
-            })?;
+        let news = self.text.news(now).or_else(|| self.keeper.news(now)).or_else(|| {
+            let trouble = self.troubles.pop().ok()?;
+            Some(RecordNews::Failed(TelemetryError::Recording(trouble)))
+        })?;
         if let RecordNews::Failed(error) = &news {
             self.faults.push(error.to_string());
         }
@@ -179,58 +166,48 @@ impl Recorder {
         if let Some(live) = &mut self.live {
             live.leave(&self.manifest, live::FAREWELL_MAX);
         }
-        let (left, fault) = match closed {
-            Ok((left, fault)) => (left, fault),
-            Err(silent) => {
-                // The manifest as it was, if it can be written.
-                let dropped = Some(self.dropped(self.text.dropped));
-                self.note(&silent);
-                let faults = self.faults.clone();
-                let open = Manifest { faults, dropped, ..open };
-                let _ = self.keeper.close(&open, MANIFEST_LIMIT);
-                self.stay_locked();
-                return Err(silent);
-            }
+        let (left, fault) = match &closed {
+            Ok((left, fault)) => (Some(left), fault.as_ref()),
+            Err(silent) => (None, Some(silent)),
         };
-        fault.iter().for_each(|fault| self.note(fault));
+        let fault = fault.map(ToString::to_string).filter(|fault| !self.faults.contains(fault));
+        self.faults.extend(fault);
         // An entry that is not in the files is lost, for whatever reason.
-        let dropped = self.dropped(self.text.given.saturating_sub(left.entries));
-        self.manifest.counts = Some(left.counts);
-        self.manifest.dropped = Some(dropped);
-        self.manifest.faults.clone_from(&self.faults);
-        self.manifest.files = left.files;
-        let config = FileSeal::of(self.config_toml.as_bytes());
-        self.manifest.files.insert(file::CONFIG.to_owned(), config);
-        match self.keeper.close(&self.manifest, MANIFEST_LIMIT) {
-            Ok((kept, None)) => self.faults.extend(kept.faults),
-            Ok((_, Some(error))) | Err(error) => {
-                self.stay_locked();
-                return Err(error);
-            }
-        }
-        let Recorder { run_dir, faults, .. } = self;
-        Ok(Finished { run_dir, counts: left.counts, dropped, faults })
-    }
-
-    fn dropped(&self, text_files: u64) -> Dropped {
-        Dropped {
-            text_files,
+        let lost = left.map(|left| self.text.given.saturating_sub(left.entries));
+        let dropped = Dropped {
+            text_files: lost.unwrap_or(self.text.dropped),
             recording: 0,
             live: self.live.as_ref().map_or(0, |live| live.dropped),
+        };
+        // The record stays open if it is unknown what the text files hold.
+        let mut manifest = match left {
+            None => open,
+            Some(Left { counts, files, .. }) => {
+                let config = FileSeal::of(self.config_toml.as_bytes());
+                self.manifest.counts = Some(*counts);
+                self.manifest.files.clone_from(files);
+                self.manifest.files.insert(file::CONFIG.to_owned(), config);
+                self.manifest
+            }
+        };
+        manifest.dropped = Some(dropped);
+        manifest.faults.clone_from(&self.faults);
+        let kept = self.keeper.close(&manifest, MANIFEST_LIMIT).map(|(_, fault)| fault);
+        match (closed, kept) {
+            (Ok((left, _)), Ok(None)) => {
+                // What the keeper has added to the manifest.
+                while let Ok(trouble) = self.troubles.pop() {
+                    self.faults.push(trouble);
+                }
+                let Recorder { run_dir, faults, .. } = self;
+                Ok(Finished { run_dir, counts: left.counts, dropped, faults })
+            }
+            (Err(error), _) | (_, Err(error) | Ok(Some(error))) => {
+                // A writer that was given up may still write: the folder is locked until the process ends.
+                std::mem::forget(self.lock);
+                Err(error)
+            }
         }
-    }
-
-    /// Adds a fault, unless it is known.
-    fn note(&mut self, fault: &TelemetryError) {
-        let fault = fault.to_string();
-        if !self.faults.contains(&fault) {
-            self.faults.push(fault);
-        }
-    }
-
-    /// Keeps the lock until the process ends: a writer that was given up may still write.
-    fn stay_locked(&mut self) {
-        std::mem::forget(self.lock.take());
     }
 }
 

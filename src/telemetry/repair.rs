@@ -4,10 +4,11 @@ use super::run_folder::seal_of;
 use super::{RunFolder, TelemetryError, folder, utc_text};
 use crate::archive::{Counts, RecordedColumns, file};
 use crate::session::Outcome;
+use std::collections::BTreeMap;
 use std::fmt;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufRead as _, BufReader};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::SystemTime;
 
 /// The result of a repair.
@@ -60,28 +61,21 @@ pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
         return Err(TelemetryError::record(dir, reason));
     }
     run.verify()?;
-    let missing: Vec<&str> =
-        file::LINES.into_iter().filter(|name| !dir.join(name).exists()).collect();
-    let mut cuts = Vec::new();
-    let mut lines = |name: &str| -> Result<u64, TelemetryError> {
-        let path = dir.join(name);
-        let (lines, cut) = cut_last_line(&path).map_err(TelemetryError::file(&path))?;
-        cuts.extend((cut > 0).then(|| (name.to_owned(), cut)));
-        Ok(lines)
-    };
-    let header = 1;
-    let counts = Counts {
-        steps: lines(file::STEPS)?.saturating_sub(header),
-        can_frames: lines(file::CAN)?,
-        tracker_samples: lines(file::TRACKER)?,
-        events: lines(file::EVENTS)?,
-    };
-    // Its lines are not counted, but its partial line is moved like the others'.
-    lines(file::INPUTS)?;
-    let last_step = if missing.contains(&file::STEPS) {
-        format!("{} is missing", file::STEPS)
-    } else {
-        last_step(&run.text(file::STEPS)?)
+    let (mut lines, mut cuts, mut missing) = (BTreeMap::new(), Vec::new(), Vec::new());
+    for name in file::LINES {
+        let cut = cut_last_line(dir, name).map_err(TelemetryError::file(&dir.join(name)));
+        match cut? {
+            None => missing.push(name),
+            Some((whole, cut)) => {
+                lines.insert(name, whole);
+                cuts.extend((cut > 0).then(|| (name.to_owned(), cut)));
+            }
+        }
+    }
+    let counts = Counts::of_lines(|name| lines.get(name).copied().unwrap_or_default());
+    let last_step = match lines.contains_key(file::STEPS) {
+        true => last_step(&run.text(file::STEPS)?),
+        false => format!("{} is missing", file::STEPS),
     };
     let stop_reason = format!("the bench ended without closing its record; {last_step}");
     let mut manifest = run.manifest().clone();
@@ -117,14 +111,15 @@ fn cut_name(name: &str) -> String {
     format!("{name}.cut")
 }
 
-/// Moves what follows the last newline of `path` to `path.cut`. Returns the number of whole lines, and
-/// the number of bytes in `path.cut`, which an earlier, interrupted repair may have moved. Both are 0 for
-/// a missing file.
-fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
-    if !is_regular(path)? {
-        return Ok((0, 0));
+/// Moves what follows the last newline of the file `name` to its `.cut` file. Returns the number of whole
+/// lines, and of bytes in the `.cut` file, which an earlier, interrupted repair may have moved; `None` for a
+/// missing file.
+fn cut_last_line(dir: &Path, name: &str) -> io::Result<Option<(u64, u64)>> {
+    let (path, cut_path) = (dir.join(name), dir.join(cut_name(name)));
+    if !is_regular(&path)? {
+        return Ok(None);
     }
-    let mut file = BufReader::new(File::open(path)?);
+    let mut file = BufReader::new(File::open(&path)?);
     let (mut lines, mut whole_bytes, mut line) = (0, 0, Vec::new());
     while file.read_until(b'\n', &mut line)? > 0 && line.ends_with(b"\n") {
         lines += 1;
@@ -132,26 +127,20 @@ fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
         line.clear();
     }
     let partial_line = line;
-    let mut cut_path = path.as_os_str().to_owned();
-    cut_path.push(".cut");
-    let cut_path = PathBuf::from(cut_path);
     let existing = if is_regular(&cut_path)? { fs::read(&cut_path)? } else { Vec::new() };
-    let mut cut_bytes = existing.len() as u64;
-    if !partial_line.is_empty() {
-        // An interrupted repair may have left the beginning of the partial line there.
-        if !partial_line.starts_with(&existing) {
-            let name = cut_path.display();
-            return Err(io::Error::other(format!(
-                "{name} exists with other content; move it away"
-            )));
-        }
-        // The copy comes first, so that an interruption loses nothing.
-        fs::write(&cut_path, &partial_line)?;
-        File::open(&cut_path)?.sync_all()?;
-        OpenOptions::new().write(true).open(path)?.set_len(whole_bytes)?;
-        cut_bytes = partial_line.len() as u64;
+    if partial_line.is_empty() {
+        return Ok(Some((lines, existing.len() as u64)));
     }
-    Ok((lines, cut_bytes))
+    // An interrupted repair may have left the beginning of the partial line there.
+    if !partial_line.starts_with(&existing) {
+        let name = cut_path.display();
+        return Err(io::Error::other(format!("{name} exists with other content; move it away")));
+    }
+    // The copy comes first, so that an interruption loses nothing.
+    fs::write(&cut_path, &partial_line)?;
+    File::open(&cut_path)?.sync_all()?;
+    OpenOptions::new().write(true).open(path)?.set_len(whole_bytes)?;
+    Ok(Some((lines, partial_line.len() as u64)))
 }
 
 /// True for a file, false where there is nothing. A link may lead to a file outside this record.
@@ -244,7 +233,7 @@ mod tests {
     #[test]
     fn an_interrupted_repair_can_be_repeated() {
         let scratch = open_record("repair-again");
-        cut_last_line(&scratch.0.join(file::STEPS)).unwrap();
+        cut_last_line(&scratch.0, file::STEPS).unwrap();
         let repaired = repair(&scratch.0).unwrap();
         assert_eq!(repaired.cuts, [("steps.csv".to_owned(), 9)]);
         let run = RunFolder::open(&scratch.0).unwrap();

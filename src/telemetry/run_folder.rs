@@ -55,22 +55,19 @@ impl RunFolder {
     /// # Errors
     /// [`TelemetryError::Record`] with every file that differs, and [`TelemetryError::File`].
     pub fn verify(&self) -> Result<(), TelemetryError> {
+        let files = &self.manifest.files;
         let mut changes = Vec::new();
-        for (name, sealed) in &self.manifest.files {
-            changes.extend(self.change(name, sealed)?);
+        for (name, FileSeal { bytes, sha256 }) in files {
+            changes.extend(self.change(name, Some(*bytes), sha256)?);
         }
         if self.is_closed() {
-            let unsealed = file::LINES.into_iter().filter(|name| {
-                !self.manifest.files.contains_key(*name) && self.dir.join(name).exists()
-            });
+            let unsealed = file::LINES
+                .into_iter()
+                .filter(|name| !files.contains_key(*name) && self.dir.join(name).exists());
             changes.extend(unsealed.map(|name| format!("{name} has no seal in the closed record")));
         }
-        if !self.manifest.files.contains_key(file::CONFIG) {
-            match seal_of(&self.dir, file::CONFIG)? {
-                Some(now) if now.sha256 == self.manifest.config_sha256 => {}
-                Some(_) => changes.push(edited(file::CONFIG)),
-                None => changes.push(gone(file::CONFIG)),
-            }
+        if !files.contains_key(file::CONFIG) {
+            changes.extend(self.change(file::CONFIG, None, &self.manifest.config_sha256)?);
         }
         if changes.is_empty() {
             return Ok(());
@@ -82,16 +79,25 @@ impl RunFolder {
         Err(TelemetryError::record(&self.dir, reason))
     }
 
-    /// How the file `name` differs from its seal; `None` if it does not.
-    fn change(&self, name: &str, sealed: &FileSeal) -> Result<Option<String>, TelemetryError> {
-        Ok(match seal_of(&self.dir, name)? {
-            Some(now) if now == *sealed => None,
-            Some(FileSeal { bytes, .. }) if bytes != sealed.bytes => Some(format!(
-                "{name} had {} bytes when the record was closed and has {bytes} now",
-                sealed.bytes
+    /// How the file `name` differs from its hash and, where it is known, its size; `None` if it does not.
+    fn change(
+        &self,
+        name: &str,
+        bytes: Option<u64>,
+        sha256: &str,
+    ) -> Result<Option<String>, TelemetryError> {
+        let Some(now) = seal_of(&self.dir, name)? else {
+            return Ok(Some(format!("{name} is gone")));
+        };
+        Ok(match bytes {
+            Some(bytes) if bytes != now.bytes => Some(format!(
+                "{name} had {bytes} bytes when the record was closed and has {} now",
+                now.bytes
             )),
-            Some(_) => Some(edited(name)),
-            None => Some(gone(name)),
+            _ if now.sha256 != sha256 => {
+                Some(format!("{name} was edited: its SHA-256 is not the one in manifest.json"))
+            }
+            _ => None,
         })
     }
 
@@ -111,14 +117,6 @@ impl RunFolder {
         let path = self.dir.join(name);
         read_text(&path).map_err(TelemetryError::file(&path))
     }
-}
-
-fn edited(name: &str) -> String {
-    format!("{name} was edited: its SHA-256 is not the one in manifest.json")
-}
-
-fn gone(name: &str) -> String {
-    format!("{name} is gone")
 }
 
 /// Opens the file `path`. A pipe or a device is refused, because reading it may never end.

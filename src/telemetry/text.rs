@@ -10,7 +10,7 @@ use crate::archive::{
 };
 use crate::session::Record;
 use sha2::{Digest, Sha256};
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -28,7 +28,7 @@ pub(super) struct TextFiles {
 }
 
 impl TextFiles {
-    /// Makes the files in `dir`; gives them, and their handles by name for the keeper.
+    /// Makes the files in `dir`; gives them, and their handles for the keeper.
     pub(super) fn create(
         dir: &Path,
         manifest: &Manifest,
@@ -36,10 +36,10 @@ impl TextFiles {
         let (mut files, mut kept) = (Vec::new(), Vec::new());
         for name in file::LINES {
             let path = dir.join(name);
-            let storage = OpenOptions::new().write(true).create_new(true).open(&path);
-            let storage = storage.map_err(TelemetryError::file(&path))?;
-            kept.push((name, storage.try_clone().map_err(TelemetryError::file(&path))?));
-            files.push(TextFile::new(path, storage));
+            let storage = File::create_new(&path).map_err(TelemetryError::file(&path))?;
+            let same = storage.try_clone().map_err(TelemetryError::file(&path))?;
+            kept.push((path.clone(), same));
+            files.push(TextFile::new(name, path, storage));
         }
         let mut files = TextFiles {
             files,
@@ -47,10 +47,8 @@ impl TextFiles {
             started_unix_us: unix_us_of(&manifest.started_utc).unwrap_or_default(),
         };
         files.line(file::STEPS, &steps_csv_header());
-        match files.tick() {
-            Ok(()) => Ok((files, kept)),
-            Err(reason) => Err(TelemetryError::writer_failed(TEXT_FILES, reason)),
-        }
+        files.tick().map_err(|reason| TelemetryError::writer_failed(TEXT_FILES, reason))?;
+        Ok((files, kept))
     }
 
     /// Whether `record` leaves a line in a text file.
@@ -60,8 +58,9 @@ impl TextFiles {
 
     /// Adds a line to the file `name`.
     fn line(&mut self, name: &str, line: &str) {
-        let files = file::LINES.iter().zip(&mut self.files);
-        files.filter(|(known, _)| **known == name).for_each(|(_, file)| file.line(line));
+        if let Some(file) = self.files.iter_mut().find(|file| file.name == name) {
+            file.line(line);
+        }
     }
 }
 
@@ -102,54 +101,39 @@ impl Sink for TextFiles {
 
     fn close(&mut self, _: &Manifest, alive: &dyn Fn()) -> Result<(), String> {
         self.tick()?;
-        self.files.iter_mut().try_for_each(|file| {
+        for file in &self.files {
             alive();
-            file.sync()
-        })
+            file.storage.sync_all().map_err(|error| file.explain(&error))?;
+        }
+        Ok(())
     }
 
     fn left(&self) -> Left {
-        let header = 1;
-        let named = || file::LINES.into_iter().zip(&self.files);
-        let lines =
-            |name| named().find(|(known, _)| *known == name).map_or(0, |(_, file)| file.lines);
-        let counts = Counts {
-            can_frames: lines(file::CAN),
-            tracker_samples: lines(file::TRACKER),
-            steps: lines(file::STEPS).saturating_sub(header),
-            events: lines(file::EVENTS),
+        let lines = |name: &str| {
+            self.files.iter().filter(|file| file.name == name).map(|file| file.lines).sum()
         };
         // A line an entry, and the header.
-        let lines: u64 = self.files.iter().map(|file| file.lines).sum();
-        Left {
-            counts,
-            files: named().map(|(name, file)| (name.to_owned(), file.seal())).collect(),
-            entries: lines.saturating_sub(header),
-            ..Left::default()
-        }
+        let entries = self.files.iter().map(|file| file.lines).sum::<u64>().saturating_sub(1);
+        let seals = self.files.iter().map(|file| (file.name.to_owned(), file.seal()));
+        Left { counts: Counts::of_lines(lines), files: seals.collect(), entries }
     }
 }
 
-/// Storage of a text file.
-trait Storage: Write + Send {
+/// What a text file is written to.
+trait Storage: Write {
     /// Truncates to the first `bytes`.
-    fn cut(&mut self, bytes: u64) -> io::Result<()>;
-    /// Returns after everything is on the disk.
-    fn sync(&mut self) -> io::Result<()>;
+    fn truncate(&self, bytes: u64) -> io::Result<()>;
 }
 
 impl Storage for File {
-    fn cut(&mut self, bytes: u64) -> io::Result<()> {
+    fn truncate(&self, bytes: u64) -> io::Result<()> {
         self.set_len(bytes)
-    }
-
-    fn sync(&mut self) -> io::Result<()> {
-        self.sync_all()
     }
 }
 
 /// Lines that are collected, handed over together, and hashed.
 struct TextFile<S> {
+    name: &'static str,
     path: PathBuf,
     storage: S,
     /// Whole lines that were not handed over yet.
@@ -161,10 +145,10 @@ struct TextFile<S> {
 }
 
 impl<S: Storage> TextFile<S> {
-    /// The file at `path`, which is empty and kept in `storage`.
-    fn new(path: PathBuf, storage: S) -> Self {
+    /// The file `name` at `path`, which is empty and kept in `storage`.
+    fn new(name: &'static str, path: PathBuf, storage: S) -> Self {
         let (waiting, hash) = (String::new(), Sha256::new());
-        TextFile { path, storage, waiting, hash, bytes: 0, lines: 0 }
+        TextFile { name, path, storage, waiting, hash, bytes: 0, lines: 0 }
     }
 
     /// Adds a line, which waits for [`TextFile::hand_over`].
@@ -179,31 +163,20 @@ impl<S: Storage> TextFile<S> {
     /// # Errors
     /// The system's error, with the file's name; the lines that were not taken are lost.
     fn hand_over(&mut self) -> Result<(), String> {
-        let waiting = std::mem::take(&mut self.waiting);
-        let bytes = waiting.as_bytes();
+        let bytes = self.waiting.as_bytes();
         let (taken, result) = write_until_error(&mut self.storage, bytes);
-        let (mut kept, _) = bytes.split_at(taken.min(bytes.len()));
+        let mut kept = &bytes[..taken];
         if result.is_err() {
             let whole = kept.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
-            if self.storage.cut(self.bytes + whole as u64).is_ok() {
+            if self.storage.truncate(self.bytes + whole as u64).is_ok() {
                 kept = &kept[..whole];
             }
         }
         self.hash.update(kept);
         self.bytes += kept.len() as u64;
         self.lines += kept.iter().filter(|byte| **byte == b'\n').count() as u64;
-        // Keep its allocation.
-        self.waiting = waiting;
         self.waiting.clear();
-        result.map_err(|e| self.explain(&e))
-    }
-
-    /// Returns when everything handed over is on the disk.
-    ///
-    /// # Errors
-    /// The system's, with the file's name.
-    fn sync(&mut self) -> Result<(), String> {
-        self.storage.sync().map_err(|e| self.explain(&e))
+        result.map_err(|error| self.explain(&error))
     }
 
     /// The seal of the bytes that were handed over.
@@ -219,8 +192,8 @@ impl<S: Storage> TextFile<S> {
 /// Writes `bytes`; returns how many were taken, and the error that ended it.
 fn write_until_error(storage: &mut impl Write, bytes: &[u8]) -> (usize, io::Result<()>) {
     let mut taken = 0;
-    while let Some(rest) = bytes.get(taken..).filter(|rest| !rest.is_empty()) {
-        match storage.write(rest) {
+    while taken < bytes.len() {
+        match storage.write(&bytes[taken..]) {
             Ok(0) => return (taken, Err(ErrorKind::WriteZero.into())),
             Ok(n) => taken += n,
             Err(e) if e.kind() == ErrorKind::Interrupted => {}
@@ -263,14 +236,11 @@ mod tests {
     }
 
     impl Storage for SmallDisk {
-        fn cut(&mut self, bytes: u64) -> io::Result<()> {
+        fn truncate(&self, bytes: u64) -> io::Result<()> {
             if !self.can_cut {
                 return Err(ErrorKind::ReadOnlyFilesystem.into());
             }
             self.content.lock().unwrap().truncate(bytes as usize);
-            Ok(())
-        }
-        fn sync(&mut self) -> io::Result<()> {
             Ok(())
         }
     }
@@ -279,7 +249,7 @@ mod tests {
     fn a_disk_that_fills_keeps_whole_lines_and_the_seal_is_theirs() {
         for (can_cut, left) in [(true, "first\nsecond\n"), (false, "first\nsecond\nthi")] {
             let disk = SmallDisk { can_cut, ..SmallDisk::new(16) };
-            let mut file = TextFile::new(PathBuf::from("run/steps.csv"), disk.clone());
+            let mut file = TextFile::new(file::STEPS, "run/steps.csv".into(), disk.clone());
             file.line("first");
             file.hand_over().unwrap();
             file.line("second");

@@ -1,6 +1,7 @@
 //! Signs of life of the recording threads, and what is reported when they stop.
 
 use super::TelemetryError;
+use std::mem;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -50,7 +51,8 @@ const LOOK_MAX: Duration = Duration::from_millis(50);
 pub(super) struct Silence {
     beats: u64,
     looked: Instant,
-    lasted: Duration,
+    /// The time without a sign of life, by the last look.
+    pub(super) lasted: Duration,
 }
 
 impl Silence {
@@ -59,20 +61,13 @@ impl Silence {
         Silence { beats, looked: now, lasted: Duration::ZERO }
     }
 
-    /// A look at `now` at a thread that has shown `beats` signs of life. If any is new, returns how long
-    /// the thread had been silent.
-    pub(super) fn look(&mut self, beats: u64, now: Instant) -> Option<Duration> {
-        let since = now.saturating_duration_since(std::mem::replace(&mut self.looked, now));
-        if std::mem::replace(&mut self.beats, beats) != beats {
-            return Some(std::mem::take(&mut self.lasted));
+    /// A look at `now` at a thread that has shown `beats` signs of life.
+    pub(super) fn look(&mut self, beats: u64, now: Instant) {
+        let since = now.saturating_duration_since(mem::replace(&mut self.looked, now));
+        match mem::replace(&mut self.beats, beats) == beats {
+            true => self.lasted += since.min(LOOK_MAX),
+            false => self.lasted = Duration::ZERO,
         }
-        self.lasted += since.min(LOOK_MAX);
-        None
-    }
-
-    /// How long it has been silent.
-    pub(super) fn lasted(&self) -> Duration {
-        self.lasted
     }
 }
 
@@ -85,33 +80,32 @@ pub enum RecordNews {
     Failed(TelemetryError),
 }
 
+/// The condition of a thread, better ones first.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+enum Condition {
+    Alive,
+    Silent,
+    GivenUp,
+    Failed,
+}
+
 /// Watches one recording thread.
 #[derive(Debug)]
 pub(super) struct Watch {
     writer: &'static str,
-    /// True for the text files, of which nothing may be lost.
-    is_record: bool,
     silence: Silence,
-    /// Its silence was reported.
-    told: bool,
-    /// It failed or was given up, and that was reported.
-    failed: bool,
+    /// The condition that was reported.
+    condition: Condition,
+    /// Lost records that were reported, and when.
     dropped: u64,
     drops_told: Option<Instant>,
 }
 
 impl Watch {
     /// Watches `writer` from `now` on.
-    pub(super) fn new(writer: &'static str, is_record: bool, now: Instant) -> Self {
-        Watch {
-            writer,
-            is_record,
-            silence: Silence::new(0, now),
-            told: false,
-            failed: false,
-            dropped: 0,
-            drops_told: None,
-        }
+    pub(super) fn new(writer: &'static str, now: Instant) -> Self {
+        let (silence, condition) = (Silence::new(0, now), Condition::Alive);
+        Watch { writer, silence, condition, dropped: 0, drops_told: None }
     }
 
     /// The next change by `now`, with `dropped` records lost to its queue so far. Call it until it returns
@@ -122,51 +116,45 @@ impl Watch {
         dropped: u64,
         now: Instant,
     ) -> Option<RecordNews> {
-        let news = match vitals.fault() {
-            Some(reason) => self.take_fault(reason),
-            None => self.take_beats(vitals.beats(), now),
+        self.condition_news(vitals, now).or_else(|| self.drop_news(dropped, now))
+    }
+
+    fn condition_news(&mut self, vitals: &Vitals, now: Instant) -> Option<RecordNews> {
+        let before_s = self.silence.lasted.as_secs_f64();
+        self.silence.look(vitals.beats(), now);
+        let (writer, lasted) = (self.writer, self.silence.lasted);
+        let condition = match vitals.fault() {
+            Some(_) => Condition::Failed,
+            None if lasted > SILENCE_LIMIT => Condition::GivenUp,
+            None if lasted > TELL_AFTER => Condition::Silent,
+            None => Condition::Alive,
         };
-        news.or_else(|| self.take_drops(dropped, now))
-    }
-
-    fn take_fault(&mut self, reason: &str) -> Option<RecordNews> {
-        let is_known = std::mem::replace(&mut self.failed, true);
-        let failed = || RecordNews::Failed(TelemetryError::writer_failed(self.writer, reason));
-        (!is_known).then(failed)
-    }
-
-    fn take_beats(&mut self, beats: u64, now: Instant) -> Option<RecordNews> {
-        if let Some(silent) = self.silence.look(beats, now) {
-            self.failed = false;
-            let silent_s = silent.as_secs_f64();
-            return std::mem::take(&mut self.told).then(|| {
-                let writer = self.writer;
-                RecordNews::Warning(format!("{writer}: alive again after {silent_s:.1} s"))
-            });
+        if mem::replace(&mut self.condition, condition) == condition {
+            return None;
         }
-        let silent = self.silence.lasted();
-        if silent > SILENCE_LIMIT && !std::mem::replace(&mut self.failed, true) {
-            return Some(RecordNews::Failed(self.silent()));
-        }
-        if silent > TELL_AFTER && !std::mem::replace(&mut self.told, true) {
-            return Some(RecordNews::Warning(self.silent().to_string()));
-        }
-        None
+        let silent = TelemetryError::writer_silent(writer, lasted, SILENCE_LIMIT);
+        Some(match condition {
+            Condition::Alive => {
+                RecordNews::Warning(format!("{writer}: alive again after {before_s:.1} s"))
+            }
+            Condition::Silent => RecordNews::Warning(silent.to_string()),
+            Condition::GivenUp => RecordNews::Failed(silent),
+            Condition::Failed => {
+                let reason = vitals.fault().unwrap_or_default();
+                RecordNews::Failed(TelemetryError::writer_failed(writer, reason))
+            }
+        })
     }
 
-    fn silent(&self) -> TelemetryError {
-        TelemetryError::writer_silent(self.writer, self.silence.lasted(), SILENCE_LIMIT)
-    }
-
-    fn take_drops(&mut self, dropped: u64, now: Instant) -> Option<RecordNews> {
+    fn drop_news(&mut self, dropped: u64, now: Instant) -> Option<RecordNews> {
         let waits = |told: Instant| now.saturating_duration_since(told) < DROPS_EVERY;
         if dropped == self.dropped || self.drops_told.is_some_and(waits) {
             return None;
         }
-        let more = dropped - std::mem::replace(&mut self.dropped, dropped);
+        let more = dropped - mem::replace(&mut self.dropped, dropped);
         let is_first = self.drops_told.replace(now).is_none();
         let writer = self.writer;
-        if self.is_record && is_first && !self.failed {
+        if is_first && self.condition < Condition::GivenUp {
             return Some(RecordNews::Failed(TelemetryError::Recording(format!(
                 "{writer}: {dropped} records lost, its queue is full; is the disk too slow for this run?"
             ))));
@@ -193,7 +181,7 @@ mod tests {
             let now = Instant::now();
             Watched {
                 vitals: Vitals::default(),
-                watch: Watch::new("text files", false, now),
+                watch: Watch::new("text files", now),
                 now,
                 every_ms,
             }
@@ -259,7 +247,6 @@ mod tests {
     #[test]
     fn what_the_record_lacks_is_a_failure_once() {
         let mut watched = Watched::new(50);
-        watched.watch.is_record = true;
         watched.vitals.beat();
         let heard = watched.hear(100, 3);
         let said = "failed: text files: 3 records lost, its queue is full; is the disk too slow for \
@@ -285,10 +272,25 @@ mod tests {
         assert_eq!(
             said,
             [
-                "text files: 1 records more are lost, 1 in all",
+                "failed: text files: 1 records lost, its queue is full; is the disk too slow for this \
+                 run?",
                 "text files: 10 records more are lost, 11 in all",
             ]
         );
+    }
+
+    /// The disk of a stalled writer may turn out to be broken.
+    #[test]
+    fn a_fault_after_a_silence_is_said_too() {
+        let mut watched = Watched::new(5);
+        let given_up = watched.hear(6000, 0).pop().expect("given up").1;
+        assert!(
+            given_up.starts_with("failed: text files: no sign of life for 5.0 s"),
+            "{given_up}"
+        );
+        watched.vitals.fail("Input/output error".to_owned());
+        let said = "failed: text files: Input/output error; what follows is not recorded";
+        assert_eq!(watched.hear(1000, 0), [(5, said.to_owned())]);
     }
 
     #[test]
@@ -296,12 +298,12 @@ mod tests {
         let ms = Duration::from_millis;
         let begin = Instant::now();
         let mut silence = Silence::new(7, begin);
-        assert_eq!(silence.look(7, begin + ms(30)), None);
-        assert_eq!(silence.lasted(), ms(30));
+        silence.look(7, begin + ms(30));
+        assert_eq!(silence.lasted, ms(30));
         // The watcher was suspended for ten seconds.
-        assert_eq!(silence.look(7, begin + ms(10_030)), None);
-        assert_eq!(silence.lasted(), ms(80));
-        assert_eq!(silence.look(8, begin + ms(10_040)), Some(ms(80)));
-        assert_eq!(silence.lasted(), ms(0));
+        silence.look(7, begin + ms(10_030));
+        assert_eq!(silence.lasted, ms(80));
+        silence.look(8, begin + ms(10_040));
+        assert_eq!(silence.lasted, ms(0));
     }
 }

@@ -2,7 +2,7 @@
 //! viewers.
 
 use super::TelemetryError;
-use super::vitals::{SILENCE_LIMIT, Silence, Vitals};
+use super::vitals::{RecordNews, SILENCE_LIMIT, Silence, Vitals, Watch};
 use crate::archive::{Counts, FileSeal, Manifest};
 use rtrb::{Consumer, Producer, PushError, RingBuffer};
 use std::collections::BTreeMap;
@@ -56,8 +56,6 @@ pub(super) struct Left {
     pub(super) files: BTreeMap<String, FileSeal>,
     /// Entries that are in its files.
     pub(super) entries: u64,
-    /// Faults that it wrote into the manifest in addition to those that it was given.
-    pub(super) faults: Vec<String>,
 }
 
 enum Message<T> {
@@ -78,6 +76,7 @@ pub(super) struct Worker<T> {
     /// Items that did not reach the writer.
     pub(super) dropped: u64,
     pub(super) vitals: Arc<Vitals>,
+    watch: Watch,
     done: Receiver<(Left, Result<(), String>)>,
 }
 
@@ -106,6 +105,7 @@ impl<T: Send + 'static> Worker<T> {
         let (opened_tx, opened) = channel();
         let (done_tx, done) = channel();
         let vitals = Arc::new(Vitals::default());
+        let watch = Watch::new(writer, Instant::now());
         let of_thread = Arc::clone(&vitals);
         let run = move || {
             let sink = open();
@@ -123,7 +123,13 @@ impl<T: Send + 'static> Worker<T> {
         let thread = thread::Builder::new().name(writer.replace(' ', "-")).spawn(run);
         let thread = Waker(thread.map_err(|e| failed(e.to_string()))?.thread().clone());
         opened.recv().unwrap_or_else(|_| Err("its thread panicked".to_owned())).map_err(failed)?;
-        Ok(Worker { writer, queue, thread, backpressure, given: 0, dropped: 0, vitals, done })
+        let (given, dropped) = (0, 0);
+        Ok(Worker { writer, queue, thread, backpressure, given, dropped, vitals, watch, done })
+    }
+
+    /// The next change in its condition. Call it until it returns `None`.
+    pub(super) fn news(&mut self, now: Instant) -> Option<RecordNews> {
+        self.watch.look(&self.vitals, self.dropped, now)
     }
 
     /// Gives `item` to the writer, or counts it as dropped.
@@ -154,7 +160,7 @@ impl<T: Send + 'static> Worker<T> {
                 return false;
             }
             silence.look(self.vitals.beats(), Instant::now());
-            if silence.lasted() > SILENCE_LIMIT {
+            if silence.lasted > SILENCE_LIMIT {
                 let limit_s = SILENCE_LIMIT.as_secs_f64();
                 self.vitals.fail(format!("took nothing for {limit_s:.1} s; is the disk stalled?"));
                 return false;
@@ -194,7 +200,7 @@ impl<T: Send + 'static> Worker<T> {
                 return Ok((left, result.err().map(failed)));
             }
             silence.look(self.vitals.beats(), Instant::now());
-            let silent = silence.lasted();
+            let silent = silence.lasted;
             if silent > WARN_AFTER && !std::mem::replace(&mut is_told, true) {
                 let limit_s = limit.as_secs();
                 tracing::warn!(
