@@ -5,40 +5,13 @@ use crate::session::Direction;
 use crate::units::Time;
 use std::fmt;
 
-/// One frame as `candump -L -x` writes it: `(1700000000.123456) vcan0 601#2F60600008000000 T`.
+/// A line of `can.log`, as `candump -L -x` writes it: `(1700000000.123456) vcan0 601#2F60600008000000 T`.
 ///
-/// The stamp is UTC in seconds with six decimals, as canplayer requires: a [`Time`] is rounded down to
-/// a whole microsecond. The last letter is the direction as seen from the bench: `T` sent, `R`
-/// received.
-pub struct CandumpLine<'a> {
-    /// UTC of the run's origin, µs since 1970.
-    pub started_unix_us: i64,
-    /// Interface.
-    pub interface: &'a str,
-    /// When the frame was sent or received.
-    pub time: Time,
-    /// Sent or received, as seen from the bench.
-    pub direction: Direction,
-    /// The frame.
-    pub frame: &'a Frame,
-}
-
-impl fmt::Display for CandumpLine<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let unix_us = self.started_unix_us.saturating_add(self.time.as_nanos().div_euclid(1000));
-        let (s, us) = (unix_us.div_euclid(1_000_000), unix_us.rem_euclid(1_000_000));
-        let direction = match self.direction {
-            Direction::Sent => 'T',
-            Direction::Received => 'R',
-        };
-        write!(f, "({s:010}.{us:06}) {} {} {direction}", self.interface, self.frame)
-    }
-}
-
-/// A line of `can.log` as it is read back.
+/// The stamp is UTC in seconds with six decimals, as canplayer requires. The last letter is the direction
+/// as seen from the bench: `T` sent, `R` received.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct LoggedFrame<'a> {
-    /// Its stamp, UTC, µs since 1970.
+pub struct CandumpLine<'a> {
+    /// UTC, µs since 1970.
     pub unix_us: i64,
     /// Interface.
     pub interface: &'a str,
@@ -48,8 +21,29 @@ pub struct LoggedFrame<'a> {
     pub frame: Frame,
 }
 
-impl<'a> LoggedFrame<'a> {
-    /// Parses a line that [`CandumpLine`] wrote; `None` for any other text.
+/// UTC of `time` in a run that began at `started_unix_us`, µs since 1970, rounded down.
+pub fn unix_us(started_unix_us: i64, time: Time) -> i64 {
+    started_unix_us.saturating_add(time.as_nanos().div_euclid(1000))
+}
+
+impl fmt::Display for CandumpLine<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (s, us) = (self.unix_us.div_euclid(1_000_000), self.unix_us.rem_euclid(1_000_000));
+        let direction = match self.direction {
+            Direction::Sent => 'T',
+            Direction::Received => 'R',
+        };
+        write!(f, "({s:010}.{us:06}) {} {} {direction}", self.interface, self.frame)
+    }
+}
+
+impl<'a> CandumpLine<'a> {
+    /// When the frame was sent or received in a run that began at `started_unix_us`.
+    pub fn time(&self, started_unix_us: i64) -> Time {
+        Time::from_nanos(self.unix_us.saturating_sub(started_unix_us).saturating_mul(1000))
+    }
+
+    /// Parses a line; `None` for any other text.
     pub fn parse(line: &'a str) -> Option<Self> {
         let mut words = line.split(' ');
         let stamp = words.next()?.strip_prefix('(')?.strip_suffix(')')?;
@@ -62,7 +56,7 @@ impl<'a> LoggedFrame<'a> {
             _ => return None,
         };
         let unix_us = s.checked_mul(1_000_000)?.checked_add(us)?;
-        Some(LoggedFrame { unix_us, interface, direction, frame })
+        Some(CandumpLine { unix_us, interface, direction, frame })
     }
 }
 
@@ -78,14 +72,8 @@ mod tests {
     use crate::canopen::CanId;
 
     fn line(time_ns: i64, direction: Direction, frame: Frame) -> String {
-        CandumpLine {
-            started_unix_us: 1_700_000_000_000_000,
-            interface: "vcan0",
-            time: Time::from_nanos(time_ns),
-            direction,
-            frame: &frame,
-        }
-        .to_string()
+        let unix_us = unix_us(1_700_000_000_000_000, Time::from_nanos(time_ns));
+        CandumpLine { unix_us, interface: "vcan0", direction, frame }.to_string()
     }
 
     /// Do not edit: python-can and canplayer read these lines.
@@ -112,13 +100,14 @@ mod tests {
         let frame = Frame::new(0x601, &[0x2F, 0x60]);
         let text = line(123_456_000, Direction::Sent, frame);
         let (unix_us, interface) = (1_700_000_000_123_456, "vcan0");
-        let expected = LoggedFrame { unix_us, interface, direction: Direction::Sent, frame };
-        assert_eq!(LoggedFrame::parse(&text), Some(expected));
+        let expected = CandumpLine { unix_us, interface, direction: Direction::Sent, frame };
+        assert_eq!(CandumpLine::parse(&text), Some(expected));
+        assert_eq!(expected.time(1_700_000_000_000_000), Time::from_nanos(123_456_000));
         for broken in ["", "(1.5) vcan0 080# R", "(1.000000) vcan0 080#", "(1.000000) vcan0 08# R"]
         {
-            assert_eq!(LoggedFrame::parse(broken), None, "{broken}");
+            assert_eq!(CandumpLine::parse(broken), None, "{broken}");
         }
-        assert_eq!(LoggedFrame::parse("(1.000000) vcan0 080# T x"), None);
+        assert_eq!(CandumpLine::parse("(1.000000) vcan0 080# T x"), None);
     }
 
     #[test]

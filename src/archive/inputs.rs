@@ -22,7 +22,6 @@ use crate::tracker::openigtlink::Status;
 use crate::units::Time;
 use serde_json::{Value, json};
 use std::io;
-use thiserror::Error;
 
 /// Raised when a line changes its meaning.
 const FORMAT: u32 = 1;
@@ -97,35 +96,27 @@ pub struct Inputs {
     lines: Lines,
 }
 
-/// Why an `inputs.log` cannot be read.
-#[derive(Debug, Error)]
-#[error("inputs.log{0}")]
-pub struct InputsError(String);
-
 impl Inputs {
     /// Begins to read the `lines` of an `inputs.log`.
     ///
     /// # Errors
-    /// [`InputsError`] if there is no header, or the first line is no header.
-    pub fn read(mut lines: Lines) -> Result<Self, InputsError> {
-        let header = lines.next().ok_or_else(|| {
-            InputsError(
-                " holds no input: the bench was killed at once, or an earlier bench recorded a \
-                 `needle-bench stage` operation"
-                    .to_owned(),
-            )
-        })?;
+    /// The file holds nothing, or its first line is no header.
+    pub fn read(mut lines: Lines) -> Result<Self, String> {
+        let header = lines.next().ok_or(
+            "inputs.log holds no input: the bench was killed at once, or an earlier bench recorded a \
+             `needle-bench stage` operation",
+        )?;
         let begun = begun(&header.map_err(unreadable)?)?;
         Ok(Inputs { begun, newest: begun, line: 1, lines })
     }
 
-    fn parse(&mut self, text: &str) -> Result<(Time, RecordedInput), InputsError> {
+    fn parse(&mut self, text: &str) -> Result<(Time, RecordedInput), String> {
         let line = self.line;
         let (time, input) = parse_line(text)
-            .ok_or_else(|| InputsError(format!(" line {line}: {text:?} is no input")))?;
+            .ok_or_else(|| format!("inputs.log line {line}: {text:?} is no input"))?;
         if time < self.newest {
             let by_ns = self.newest.as_nanos().saturating_sub(time.as_nanos());
-            return Err(InputsError(format!(" line {line}: its time goes back by {by_ns} ns")));
+            return Err(format!("inputs.log line {line}: its time goes back by {by_ns} ns"));
         }
         self.newest = time;
         Ok((time, input))
@@ -133,7 +124,7 @@ impl Inputs {
 }
 
 impl Iterator for Inputs {
-    type Item = Result<(Time, RecordedInput), InputsError>;
+    type Item = Result<(Time, RecordedInput), String>;
 
     fn next(&mut self) -> Option<Self::Item> {
         let text = self.lines.next()?;
@@ -142,21 +133,21 @@ impl Iterator for Inputs {
     }
 }
 
-fn unreadable(error: io::Error) -> InputsError {
-    InputsError(format!(": {error}"))
+fn unreadable(error: io::Error) -> String {
+    format!("inputs.log: {error}")
 }
 
-fn begun(header: &str) -> Result<Time, InputsError> {
+fn begun(header: &str) -> Result<Time, String> {
     let not_inputs = || {
         let start: String = header.chars().take(80).collect();
-        InputsError(format!(" begins with {start:?}: not the inputs of a session"))
+        format!("inputs.log begins with {start:?}: not the inputs of a session")
     };
     let (format, begun) =
         header.strip_prefix(TITLE).and_then(|rest| rest.split_once(',')).ok_or_else(not_inputs)?;
     if format != FORMAT.to_string() {
-        return Err(InputsError(format!(
-            " has format {format}, this bench reads format {FORMAT}; use the bench it was made by"
-        )));
+        return Err(format!(
+            "inputs.log has format {format}, this bench reads format {FORMAT}; use the bench it was made by"
+        ));
     }
     let begun = begun.strip_prefix(" begun ").and_then(|ns| ns.parse().ok());
     begun.map(Time::from_nanos).ok_or_else(not_inputs)
@@ -313,7 +304,7 @@ mod tests {
         for (text, said) in cases {
             let all = Inputs::read(Lines::new(Cursor::new(text)))
                 .and_then(|inputs| inputs.collect::<Result<Vec<_>, _>>());
-            let error = all.unwrap_err().to_string();
+            let error = all.unwrap_err();
             assert!(error.starts_with(said), "{error}");
         }
     }

@@ -13,17 +13,15 @@ mod text;
 mod tracker_ndjson;
 mod utc;
 
-pub use crate::geometry::coordinates;
-pub use crate::text::is_unprintable;
-pub use candump::{CandumpLine, LoggedFrame, interface_name};
+pub use candump::{CandumpLine, interface_name, unix_us};
 pub use events::{EventKind, EventLine, proof};
-pub use inputs::{Inputs, InputsError, RecordedInput, input_line, inputs_header};
+pub use inputs::{Inputs, RecordedInput, input_line, inputs_header};
 pub use manifest::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,
     VerdictKind, hex, sha256_hex,
 };
 pub use steps_csv::{
-    RecordedColumns, STEP_COLUMNS, StepCells, StepColumn, StepRow, is_of_truth, steps_csv_header,
+    RecordedColumns, STEP_COLUMNS, StepColumn, StepRow, is_of_truth, steps_csv_header,
 };
 pub use steps_table::StepsTable;
 pub use text::Lines;

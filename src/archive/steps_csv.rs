@@ -8,34 +8,36 @@ use crate::units::Time;
 use nalgebra::Vector3;
 use std::fmt;
 
-/// The data of a row.
-pub struct StepCells<'a> {
+/// A row of `steps.csv`.
+///
+/// Its text has no line's end. Numbers are printed with the fewest digits that read back to the same
+/// `f64`; what is unknown is empty; NaN and infinity, which should not be there, are printed as `NaN`,
+/// `inf`, `-inf`.
+pub struct StepRow<'a> {
     step: &'a StepRecord,
+    approach: Option<&'a Approach>,
     estimate: Option<[f64; 6]>,
     sd: Option<[f64; 6]>,
     truth: Option<[f64; 6]>,
     target_true: Option<Vector3<f64>>,
 }
 
-impl<'a> StepCells<'a> {
-    /// The cells of `step`, with the truth at it where the run is emulated.
+impl<'a> StepRow<'a> {
+    /// The row of `step`, with the truth at it where the run is emulated.
     pub fn new(step: &'a StepRecord, truth: Option<&Truth>) -> Self {
-        StepCells {
+        StepRow {
             step,
+            approach: step.approach.as_ref(),
             estimate: step.estimate.map(|e| coordinates(&e.x_pb)),
             sd: step.estimate.and_then(|e| e.sd),
             truth: truth.map(|t| coordinates(t.x_pb())),
             target_true: truth.and_then(|t| t.target_mm().copied()),
         }
     }
-
-    fn approach(&self) -> Option<&Approach> {
-        self.step.approach.as_ref()
-    }
 }
 
 /// A column: its name, and its value in a row; `None` if it is unknown.
-pub type StepColumn = (&'static str, fn(&StepCells<'_>) -> Option<f64>);
+pub type StepColumn = (&'static str, fn(&StepRow<'_>) -> Option<f64>);
 
 /// Columns of whole numbers.
 const COUNTS: [&str; 2] = ["step", "tip_positions"];
@@ -71,12 +73,12 @@ pub const STEP_COLUMNS: [StepColumn; 36] = [
     ("pitch_true_rad", |c| c.truth.map(|t| t[4])),
     ("roll_true_rad", |c| c.truth.map(|t| t[5])),
     ("tip_positions", |c| Some(c.step.tip_positions.into())),
-    ("target_distance_mm", |c| c.approach().map(|a| a.distance_mm)),
-    ("target_error_pred_mm", |c| c.approach().map(|a| a.error_mm)),
-    ("path_left_mm", |c| c.approach().and_then(|a| a.path.as_ref()).map(Path::length_mm)),
-    ("target_x_mm", |c| c.approach().map(|a| a.target_mm.x)),
-    ("target_y_mm", |c| c.approach().map(|a| a.target_mm.y)),
-    ("target_z_mm", |c| c.approach().map(|a| a.target_mm.z)),
+    ("target_distance_mm", |c| c.approach.map(|a| a.distance_mm)),
+    ("target_error_pred_mm", |c| c.approach.map(|a| a.error_mm)),
+    ("path_left_mm", |c| c.approach.and_then(|a| a.path.as_ref()).map(Path::length_mm)),
+    ("target_x_mm", |c| c.approach.map(|a| a.target_mm.x)),
+    ("target_y_mm", |c| c.approach.map(|a| a.target_mm.y)),
+    ("target_z_mm", |c| c.approach.map(|a| a.target_mm.z)),
     ("target_x_true_mm", |c| c.target_true.map(|p| p.x)),
     ("target_y_true_mm", |c| c.target_true.map(|p| p.y)),
     ("target_z_true_mm", |c| c.target_true.map(|p| p.z)),
@@ -87,23 +89,11 @@ pub fn steps_csv_header() -> String {
     STEP_COLUMNS.map(|(name, _)| name).join(",")
 }
 
-/// A row of `steps.csv`, without the line's end.
-///
-/// Numbers are printed with the fewest digits that read back to the same `f64`; what is unknown
-/// is empty; NaN and infinity, which should not be there, are printed as `NaN`, `inf`, `-inf`.
-pub struct StepRow<'a> {
-    /// The step.
-    pub step: &'a StepRecord,
-    /// The truth at the step, of emulated runs.
-    pub truth: Option<&'a Truth>,
-}
-
 impl fmt::Display for StepRow<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let cells = StepCells::new(self.step, self.truth);
         STEP_COLUMNS.iter().enumerate().try_for_each(|(n, (name, value))| {
             let comma = if n == 0 { "" } else { "," };
-            match value(&cells) {
+            match value(self) {
                 Some(count) if COUNTS.contains(name) => write!(f, "{comma}{count}"),
                 // Adding zero turns the −0 of an angle into 0.
                 Some(number) => write!(f, "{comma}{:?}", number + 0.0),
@@ -185,7 +175,7 @@ mod tests {
 
     #[test]
     fn what_is_unknown_is_empty() {
-        let row = StepRow { step: &step(), truth: None }.to_string();
+        let row = StepRow::new(&step(), None).to_string();
         assert_eq!(row, format!("7,7.3,7.001,-0.1{},0{}", ",".repeat(22), ",".repeat(9)));
     }
 
@@ -214,7 +204,7 @@ mod tests {
         let target_mm = Some(Vector3::new(0.0, 8.5, 90.5));
         let truth = Truth::new(pose(1.0, angles.to_rotation())).with_target(target_mm);
         assert_eq!(
-            StepRow { step: &full, truth: Some(&truth) }.to_string(),
+            StepRow::new(&full, Some(&truth)).to_string(),
             "7,7.3,7.001,-0.1,0.30000000000000004,1.5,NaN,-inf,1.25,-2.0,1e-9,0.0,0.0,0.0,\
              0.5,0.5,0.5,0.125,0.125,3.0,1.0,-2.0,1e-9,0.0,0.5,0.0,1,3.5,0.25,,0.0,8.0,90.5,0.0,8.5,90.5"
         );
@@ -226,7 +216,7 @@ mod tests {
         let pose =
             Pose { rotation: angles.to_rotation(), translation: Vector3::new(1.0, 2.0, 3.0) };
         let truth = Truth::new(pose).with_target(Some(Vector3::new(0.0, 8.5, 90.5)));
-        let rows = [Some(&truth), None].map(|truth| StepRow { step: &step(), truth }.to_string());
+        let rows = [Some(&truth), None].map(|truth| StepRow::new(&step(), truth).to_string());
         let columns = RecordedColumns::of(&steps_csv_header());
         assert_eq!(columns.time(&rows[0]), Some(step().time));
         let read = columns.truth(&rows[0]).expect("is there");

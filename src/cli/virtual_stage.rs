@@ -4,7 +4,7 @@ use super::arguments::{Configured, number_in};
 use super::output::tell;
 use super::perform::open_bus;
 use super::{Failure, io_runtime};
-use crate::archive::{CandumpLine, interface_name};
+use crate::archive::{CandumpLine, interface_name, unix_us};
 use crate::canopen::Frame;
 use crate::emulator::{VirtualStage, VirtualStageConfig};
 use crate::runtime::{Clock, Interrupt, TipServer, serve_stage};
@@ -100,8 +100,8 @@ fn frame_log(
     let interface = interface_name(interface).to_owned();
     Ok(move |direction, frame: &Frame| {
         let Some((out, path)) = &mut file else { return };
-        let (time, interface) = (clock.now(), &interface);
-        let line = CandumpLine { started_unix_us, interface, time, direction, frame };
+        let (unix_us, interface) = (unix_us(started_unix_us, clock.now()), &interface);
+        let line = CandumpLine { unix_us, interface, direction, frame: *frame };
         if let Err(error) = writeln!(out, "{line}") {
             tracing::warn!("{path}: {error}; frames are no longer logged");
             file = None;

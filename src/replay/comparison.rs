@@ -1,10 +1,10 @@
 //! What leaves a session, set against what the record holds.
 
 use super::inputs::unsent_unix_us;
-use super::recorded::{Entries, Logged, Recorded, unix_us};
+use super::recorded::{Entries, Logged, Recorded};
 use crate::archive::{
-    CandumpLine, LoggedFrame, RecordedColumns, StepRow, file, is_of_truth, steps_csv_header,
-    tracker_line,
+    CandumpLine, RecordedColumns, StepRow, file, is_of_truth, steps_csv_header, tracker_line,
+    unix_us,
 };
 use crate::canopen::Frame;
 use crate::session::{Direction, Input, Outcome, SampleRecord, StepRecord};
@@ -81,10 +81,10 @@ impl<'a> Comparison<'a> {
         input: Option<&Input>,
     ) -> Result<(), String> {
         let recorded = self.sent.next();
-        let logged = recorded.and_then(|logged| LoggedFrame::parse(&logged.text));
+        let logged = recorded.and_then(|logged| CandumpLine::parse(&logged.text));
         let interface = logged.map_or("can", |logged| logged.interface);
-        let (started_unix_us, direction) = (self.started_unix_us, Direction::Sent);
-        let line = CandumpLine { started_unix_us, interface, time, direction, frame }.to_string();
+        let (unix_us, direction) = (unix_us(self.started_unix_us, time), Direction::Sent);
+        let line = CandumpLine { unix_us, interface, direction, frame: *frame }.to_string();
         match recorded {
             Some(logged) if logged.text == line => drop(self.sent.take()?),
             _ if self.was_refused(time, input) => {}
@@ -126,7 +126,7 @@ impl<'a> Comparison<'a> {
 
     /// A step that the session takes; gives its row, as recorded.
     pub(super) fn step(&mut self, step: &StepRecord) -> Result<Option<String>, String> {
-        let replayed = StepRow { step, truth: None }.to_string();
+        let replayed = StepRow::new(step, None).to_string();
         // The header is line 1.
         let line = self.rows.taken + 2;
         let Some(recorded) = self.rows.take()? else {

@@ -1,7 +1,7 @@
 //! What a session was given, from `inputs.log` and the files that it refers to.
 
-use super::recorded::{Entries, Logged, Recorded, unix_us};
-use crate::archive::{Inputs, RecordedInput, file};
+use super::recorded::{Entries, Logged, Recorded};
+use crate::archive::{Inputs, RecordedInput, file, unix_us};
 use crate::session::{Direction, HELD_UP, Input};
 use crate::tracker::ndjson;
 use crate::tracker::{Event, Sample};
@@ -48,8 +48,7 @@ impl RecordedInputs {
 
     /// The next input; `None` after the last.
     pub(super) fn next(&mut self) -> Result<Option<Next>, String> {
-        let next = self.inputs.next().transpose().map_err(|error| error.to_string())?;
-        let Some((time, given)) = next else { return Ok(None) };
+        let Some((time, given)) = self.inputs.next().transpose()? else { return Ok(None) };
         self.line += 1;
         Ok(Some(match given {
             RecordedInput::Input(input) => Next::Input(time, input),
@@ -99,7 +98,7 @@ pub(super) fn unsent_unix_us(recorded: &Recorded<'_>) -> Result<Vec<i64>, String
     let started_unix_us = recorded.started_unix_us()?;
     let mut unsent = Vec::new();
     for input in recorded.inputs()? {
-        let (time, given) = input.map_err(|error| error.to_string())?;
+        let (time, given) = input?;
         let is_fault = match given {
             RecordedInput::Input(Input::BusFault(_)) => true,
             RecordedInput::Input(Input::Stop(reason)) => reason.starts_with(HELD_UP),

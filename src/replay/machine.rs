@@ -224,7 +224,7 @@ impl Replay<'_> {
             step.estimate = estimate;
             self.what_if.take(&step, truth.as_ref());
         }
-        let row = StepRow { step: &step, truth: None }.to_string();
+        let row = StepRow::new(&step, None).to_string();
         self.steps.push(with_recorded_truth(&row, &recorded));
         Ok(truth)
     }

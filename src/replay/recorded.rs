@@ -1,7 +1,7 @@
 //! What a run folder holds of a run, read along with its replay.
 
 use crate::archive::{
-    Inputs, Lines, LoggedFrame, Manifest, RecordedColumns, RunOutcome, file, unix_us_of,
+    CandumpLine, Inputs, Lines, Manifest, RecordedColumns, RunOutcome, file, unix_us_of,
 };
 use crate::canopen::Frame;
 use crate::operation::Plan;
@@ -28,7 +28,7 @@ impl Recorded<'_> {
 
     /// What the session was given.
     pub(super) fn inputs(&self) -> Result<Inputs, String> {
-        Inputs::read(self.lines(file::INPUTS)?).map_err(|error| error.to_string())
+        Inputs::read(self.lines(file::INPUTS)?)
     }
 
     /// The lines of the file `name` with their numbers, from 1.
@@ -49,8 +49,8 @@ impl Recorded<'_> {
     pub(super) fn frames(&self, way: Direction) -> Result<Entries<Logged>, String> {
         let frames = self.numbered(file::CAN)?.map(|numbered| {
             let (line, text) = numbered?;
-            match LoggedFrame::parse(&text) {
-                Some(LoggedFrame { unix_us, direction, frame, .. }) => {
+            match CandumpLine::parse(&text) {
+                Some(CandumpLine { unix_us, direction, frame, .. }) => {
                     Ok((direction, Logged { line, unix_us, frame, text }))
                 }
                 None => Err(format!(
@@ -83,16 +83,13 @@ impl Recorded<'_> {
         let last = |name| -> Result<Option<String>, String> {
             Ok(self.numbered(name)?.last().transpose()?.map(|(_, text)| text))
         };
-        let frame = last(file::CAN)?.and_then(|line| Some(LoggedFrame::parse(&line)?.unix_us));
-        let frame = frame.map(|unix_us| {
-            Time::from_nanos(unix_us.saturating_sub(started_unix_us).saturating_mul(1000))
-        });
+        let frame = last(file::CAN)?;
+        let frame = frame.and_then(|line| Some(CandumpLine::parse(&line)?.time(started_unix_us)));
         let sample = last(file::TRACKER)?.and_then(|line| ndjson::recorded(1, &line).ok());
         let step = last(file::STEPS)?.and_then(|row| columns.time(&row));
         let inputs = self.inputs()?;
         let begun = inputs.begun;
-        let input = inputs.last().transpose().map_err(|error| error.to_string())?;
-        let input = input.map(|(time, _)| time);
+        let input = inputs.last().transpose()?.map(|(time, _)| time);
         let times = [frame, sample.map(|sample| sample.receive_time), step, input];
         Ok(times.into_iter().flatten().fold(begun, Time::max))
     }
@@ -100,11 +97,6 @@ impl Recorded<'_> {
 
 /// Lines of a file with their numbers, from 1.
 type NumberedLines = Box<dyn Iterator<Item = Result<(usize, String), String>>>;
-
-/// When `time` of a run that began at `started_unix_us` is in UTC, as `can.log` has it: µs since 1970.
-pub(super) fn unix_us(started_unix_us: i64, time: Time) -> i64 {
-    started_unix_us.saturating_add(time.as_nanos().div_euclid(1000))
-}
 
 /// A frame of `can.log` with its line.
 pub(super) struct Logged {

@@ -1,7 +1,7 @@
 //! How the axes moved, from the frames of a record: an operation takes no steps.
 
 use super::run::Folder;
-use crate::archive::{LoggedFrame, unix_us_of};
+use crate::archive::{CandumpLine, unix_us_of};
 use crate::canopen::{Frame, NodeId, cob};
 use crate::config::{Config, Source};
 use crate::stage::{Axis, PerAxis, StageConfig, Unwrapper};
@@ -26,7 +26,7 @@ pub struct Motion {
 
 /// The frame in a `line` of `can.log`; `None` for any other text.
 pub fn stamped(line: &str) -> Option<Stamped> {
-    LoggedFrame::parse(line).map(|logged| (logged.unix_us, logged.frame))
+    CandumpLine::parse(line).map(|line| (line.unix_us, line.frame))
 }
 
 impl Motion {

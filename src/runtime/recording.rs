@@ -2,7 +2,7 @@
 //! leaves the session is logged, with the frames and events of the text files.
 
 use super::sink::{Operator, RunReport};
-use crate::archive::{EventKind, EventLine, Lines, LoggedFrame, Manifest, file, unix_us_of};
+use crate::archive::{CandumpLine, EventKind, EventLine, Lines, Manifest, file, unix_us_of};
 use crate::operation::Plan;
 use crate::replay::{Recorded, replay_to};
 use crate::session::{Lane, Record, Severity, State};
@@ -196,8 +196,8 @@ fn time_of(record: &Record) -> Option<Time> {
 fn frames(lines: Lines, manifest: &Manifest) -> TimedRecords {
     let started_unix_us = unix_us_of(&manifest.started_utc).unwrap_or_default();
     Box::new(lines.map_while(Result::ok).filter_map(move |line| {
-        let LoggedFrame { unix_us, direction, frame, .. } = LoggedFrame::parse(&line)?;
-        let time = Time::from_nanos(unix_us.saturating_sub(started_unix_us).saturating_mul(1000));
+        let line = CandumpLine::parse(&line)?;
+        let (time, direction, frame) = (line.time(started_unix_us), line.direction, line.frame);
         Some((time, Record::Can { time, direction, frame }))
     }))
 }

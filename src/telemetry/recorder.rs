@@ -126,8 +126,9 @@ impl Recorder {
         }
     }
 
-    /// The next change in the state of the recording. Call it until it returns `None`, at least ten times a
-    /// second: then a full or stalled disk or a lost folder is reported within a second.
+    /// The next change in the state of the recording. Call it until it returns `None`, at least twenty times
+    /// a second: then a full or stalled disk or a lost folder is reported within a second. Of the time
+    /// between two calls at most 50 ms count as silence of a thread.
     pub fn news(&mut self) -> Option<RecordNews> {
         let now = Instant::now();
         let news = self.text.news(now).or_else(|| self.keeper.news(now)).or_else(|| {

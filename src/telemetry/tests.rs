@@ -5,7 +5,7 @@ mod recording;
 pub(in crate::telemetry) mod synthetic;
 
 use super::*;
-use crate::archive::{EventLine, Manifest, StepRow, coordinates, file, steps_csv_header};
+use crate::archive::{EventLine, Manifest, StepRow, file, steps_csv_header};
 use crate::canopen::NodeId;
 use crate::session::{Outcome, Record};
 use crate::stage::{AxisConfig, AxisLimits, CountsRatio};
@@ -117,7 +117,7 @@ fn a_run_leaves_every_file() {
     assert_eq!(text("config.toml"), CONFIG_TOML);
 
     let rows = entries.iter().filter_map(|entry| match &entry.record {
-        Record::Step(step) => Some(StepRow { step, truth: entry.truth.as_ref() }.to_string()),
+        Record::Step(step) => Some(StepRow::new(step, entry.truth.as_ref()).to_string()),
         _ => None,
     });
     let expected: Vec<String> = [steps_csv_header()].into_iter().chain(rows).collect();

@@ -6,7 +6,7 @@ use super::worker::{Left, Sink};
 use super::{Entry, TelemetryError};
 use crate::archive::{
     CandumpLine, Counts, EventLine, FileSeal, Manifest, StepRow, file, hex, input_line,
-    inputs_header, interface_name, steps_csv_header, tracker_line, unix_us_of,
+    inputs_header, interface_name, steps_csv_header, tracker_line, unix_us, unix_us_of,
 };
 use crate::session::Record;
 use sha2::{Digest, Sha256};
@@ -74,9 +74,9 @@ impl Sink for TextFiles {
             Record::Begun { time } => (file::INPUTS, inputs_header(*time)),
             Record::Input { time, input } => (file::INPUTS, input_line(*time, input)),
             Record::Can { time, direction, frame } => {
-                let (started_unix_us, interface) = (self.started_unix_us, &*self.interface);
-                let (time, direction) = (*time, *direction);
-                let line = CandumpLine { started_unix_us, interface, time, direction, frame };
+                let unix_us = unix_us(self.started_unix_us, *time);
+                let (interface, direction, frame) = (&*self.interface, *direction, *frame);
+                let line = CandumpLine { unix_us, interface, direction, frame };
                 (file::CAN, line.to_string())
             }
             Record::Sample(sample) | Record::Target(sample) => {
@@ -84,7 +84,7 @@ impl Sink for TextFiles {
                 (file::TRACKER, line)
             }
             Record::Step(step) => {
-                (file::STEPS, StepRow { step, truth: entry.truth.as_ref() }.to_string())
+                (file::STEPS, StepRow::new(step, entry.truth.as_ref()).to_string())
             }
             record => match EventLine::of(record) {
                 Some(line) => (file::EVENTS, line.to_string()),

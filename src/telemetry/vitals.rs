@@ -80,9 +80,9 @@ pub enum RecordNews {
     Failed(TelemetryError),
 }
 
-/// The condition of a thread, better ones first.
+/// How a thread is, better first.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
-enum Condition {
+enum Health {
     Alive,
     Silent,
     GivenUp,
@@ -94,8 +94,8 @@ enum Condition {
 pub(super) struct Watch {
     writer: &'static str,
     silence: Silence,
-    /// The condition that was reported.
-    condition: Condition,
+    /// The health that was reported.
+    health: Health,
     /// Lost records that were reported, and when.
     dropped: u64,
     drops_told: Option<Instant>,
@@ -104,8 +104,8 @@ pub(super) struct Watch {
 impl Watch {
     /// Watches `writer` from `now` on.
     pub(super) fn new(writer: &'static str, now: Instant) -> Self {
-        let (silence, condition) = (Silence::new(0, now), Condition::Alive);
-        Watch { writer, silence, condition, dropped: 0, drops_told: None }
+        let (silence, health) = (Silence::new(0, now), Health::Alive);
+        Watch { writer, silence, health, dropped: 0, drops_told: None }
     }
 
     /// The next change by `now`, with `dropped` records lost to its queue so far. Call it until it returns
@@ -116,30 +116,30 @@ impl Watch {
         dropped: u64,
         now: Instant,
     ) -> Option<RecordNews> {
-        self.condition_news(vitals, now).or_else(|| self.drop_news(dropped, now))
+        self.health_news(vitals, now).or_else(|| self.drop_news(dropped, now))
     }
 
-    fn condition_news(&mut self, vitals: &Vitals, now: Instant) -> Option<RecordNews> {
+    fn health_news(&mut self, vitals: &Vitals, now: Instant) -> Option<RecordNews> {
         let before_s = self.silence.lasted.as_secs_f64();
         self.silence.look(vitals.beats(), now);
         let (writer, lasted) = (self.writer, self.silence.lasted);
-        let condition = match vitals.fault() {
-            Some(_) => Condition::Failed,
-            None if lasted > SILENCE_LIMIT => Condition::GivenUp,
-            None if lasted > TELL_AFTER => Condition::Silent,
-            None => Condition::Alive,
+        let health = match vitals.fault() {
+            Some(_) => Health::Failed,
+            None if lasted > SILENCE_LIMIT => Health::GivenUp,
+            None if lasted > TELL_AFTER => Health::Silent,
+            None => Health::Alive,
         };
-        if mem::replace(&mut self.condition, condition) == condition {
+        if mem::replace(&mut self.health, health) == health {
             return None;
         }
         let silent = TelemetryError::writer_silent(writer, lasted, SILENCE_LIMIT);
-        Some(match condition {
-            Condition::Alive => {
+        Some(match health {
+            Health::Alive => {
                 RecordNews::Warning(format!("{writer}: alive again after {before_s:.1} s"))
             }
-            Condition::Silent => RecordNews::Warning(silent.to_string()),
-            Condition::GivenUp => RecordNews::Failed(silent),
-            Condition::Failed => {
+            Health::Silent => RecordNews::Warning(silent.to_string()),
+            Health::GivenUp => RecordNews::Failed(silent),
+            Health::Failed => {
                 let reason = vitals.fault().unwrap_or_default();
                 RecordNews::Failed(TelemetryError::writer_failed(writer, reason))
             }
@@ -154,7 +154,7 @@ impl Watch {
         let more = dropped - mem::replace(&mut self.dropped, dropped);
         let is_first = self.drops_told.replace(now).is_none();
         let writer = self.writer;
-        if is_first && self.condition < Condition::GivenUp {
+        if is_first && self.health < Health::GivenUp {
             return Some(RecordNews::Failed(TelemetryError::Recording(format!(
                 "{writer}: {dropped} records lost, its queue is full; is the disk too slow for this run?"
             ))));

@@ -77,7 +77,7 @@ pub(super) struct Worker<T> {
     pub(super) dropped: u64,
     pub(super) vitals: Arc<Vitals>,
     watch: Watch,
-    done: Receiver<(Left, Result<(), String>)>,
+    done: Receiver<Left>,
 }
 
 /// The thread to wake. It is woken a last time when this is dropped.
@@ -114,11 +114,11 @@ impl<T: Send + 'static> Worker<T> {
             let run = AssertUnwindSafe(|| serve(&mut sink, items, &of_thread));
             let result =
                 catch_unwind(run).unwrap_or_else(|_| Err("the writer panicked".to_owned()));
-            if let Err(reason) = &result {
-                of_thread.fail(reason.clone());
+            if let Err(reason) = result {
+                of_thread.fail(reason);
             }
             // Report first: dropping a failed sink may block.
-            let _ = done_tx.send((sink.left(), result));
+            let _ = done_tx.send(sink.left());
         };
         let thread = thread::Builder::new().name(writer.replace(' ', "-")).spawn(run);
         let thread = Waker(thread.map_err(|e| failed(e.to_string()))?.thread().clone());
@@ -127,7 +127,7 @@ impl<T: Send + 'static> Worker<T> {
         Ok(Worker { writer, queue, thread, backpressure, given, dropped, vitals, watch, done })
     }
 
-    /// The next change in its condition. Call it until it returns `None`.
+    /// The next change in its health. Call it until it returns `None`.
     pub(super) fn news(&mut self, now: Instant) -> Option<RecordNews> {
         self.watch.look(&self.vitals, self.dropped, now)
     }
@@ -192,12 +192,12 @@ impl<T: Send + 'static> Worker<T> {
         let (mut is_told, mut is_close_sent) = (false, false);
         let mut silence = Silence::new(self.vitals.beats(), Instant::now());
         let writer = self.writer;
-        let failed = |reason| TelemetryError::writer_failed(writer, reason);
         loop {
             is_close_sent =
                 is_close_sent || self.push(Message::Close(Box::new(manifest.clone()))).is_ok();
-            if let Ok((left, result)) = self.done.recv_timeout(RETRY) {
-                return Ok((left, result.err().map(failed)));
+            if let Ok(left) = self.done.recv_timeout(RETRY) {
+                let failed = |reason| TelemetryError::writer_failed(writer, reason);
+                return Ok((left, self.vitals.fault().map(failed)));
             }
             silence.look(self.vitals.beats(), Instant::now());
             let silent = silence.lasted;

@@ -8,10 +8,10 @@ use super::compare::drive;
 use super::figures::{Figure, last_third};
 use super::run::{Run, utc};
 use super::summary::{doubts, tracker};
-use crate::archive::{EventKind, RunOutcome, is_unprintable};
+use crate::archive::{EventKind, RunOutcome};
 use crate::session::Severity;
 use crate::study::TipError;
-use crate::text::fixed;
+use crate::text::{fixed, is_unprintable};
 use minijinja::value::Serde;
 use minijinja::{
     AutoEscape, Environment, Error, UndefinedBehavior, Value, context, escape_formatter,

@@ -40,7 +40,7 @@ pub(super) fn builder(manifest: &Manifest) -> RecordingStreamBuilder {
 
 /// Logs the records of a run. Bound to the thread that opened it: time lines are thread-local.
 pub(super) struct Content {
-    stream: RecordingStream,
+    pub(super) stream: RecordingStream,
     /// The scene, until a step shows where the needle starts.
     scene_until_start: Option<Scene>,
     step: u32,
@@ -88,11 +88,6 @@ impl Content {
         })
     }
 
-    /// The rerun stream.
-    pub(super) fn stream(&self) -> &RecordingStream {
-        &self.stream
-    }
-
     /// Everything logged from here on is at `time`, the newest step and the depth reached.
     fn at(&self, time: Time) {
         let nanos = TimeCell::from_duration_nanos(time.as_nanos());
@@ -101,19 +96,14 @@ impl Content {
         self.stream.set_time(INSERTION_DEPTH, TimeCell::from_sequence(self.depth_um));
     }
 
-    /// Moves on to the measured depth `insertion_mm` where it is deeper and a number.
-    fn advance_to(&mut self, insertion_mm: f64) {
-        self.depth_um = reached_um(self.depth_um, insertion_mm);
-    }
-
     /// Logs a record.
     pub(super) fn take(&mut self, Entry { record, truth }: Entry) -> Logged {
         match record {
             Record::Begun { .. } | Record::Input { .. } => Ok(()),
             Record::Can { time, direction, frame } => {
                 if let Some((axis, state)) = self.frames.entered(&frame) {
-                    let state_name = state.to_string();
-                    self.enter(time, &drive_lane(axis), &state_name, Meaning::of_drive(state))?;
+                    let meaning = Meaning::of_drive(state);
+                    self.enter(time, &drive_lane(axis), &state.to_string(), meaning)?;
                 }
                 if let Some((axis, emcy)) = self.frames.emergency(&frame)
                     && self.now.emergency(time, axis, &emcy)
@@ -135,13 +125,13 @@ impl Content {
                 log_refused(&self.stream, &sample)
             }
             Record::Stage(stage) => {
-                self.advance_to(stage.measured.insertion_mm);
+                self.depth_um = reached_um(self.depth_um, stage.measured.insertion_mm);
                 self.at(stage.time);
                 self.motion.log(&self.stream, &stage)
             }
             Record::Step(step) => {
                 self.step = step.step;
-                self.advance_to(step.insertion_meas_mm);
+                self.depth_um = reached_um(self.depth_um, step.insertion_meas_mm);
                 self.at(step.time);
                 self.move_view_to_needle(&step)?;
                 self.steps.log(&self.stream, &step, truth.as_ref())?;
@@ -171,7 +161,7 @@ impl Content {
     fn enter(&mut self, time: Time, lane: &str, state: &str, meaning: Meaning) -> Logged {
         self.at(time);
         self.states.log(&self.stream, lane, state, meaning)?;
-        self.now.enter(time, lane, state);
+        self.now.enter(time, lane, state, meaning);
         self.log_now(time)
     }
 
@@ -188,13 +178,9 @@ impl Content {
         let estimated_mm = step.estimate.as_ref().map(|estimate| estimate.x_pb.translation);
         let Some(start_mm) = step.tip_meas_mm.or(estimated_mm) else { return Ok(()) };
         let Some(scene) = self.scene_until_start.take() else { return Ok(()) };
-        match Reach::of(&scene).moved_to(&start_mm) {
-            None => Ok(()),
-            Some(reach) => {
-                layout::send(&self.stream, &scene, &reach)?;
-                scene::log_sheet(&self.stream, &reach)
-            }
-        }
+        let Some(reach) = Reach::of(&scene).moved_to(&start_mm) else { return Ok(()) };
+        layout::send(&self.stream, &scene, &reach)?;
+        scene::log_sheet(&self.stream, &reach)
     }
 
     fn line(&self, path: &str, level: &'static str, text: String) -> Logged {

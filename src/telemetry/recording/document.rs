@@ -24,16 +24,14 @@ pub(super) fn manifest(manifest: &Manifest) -> String {
 fn rows(page: &mut String, key: &str, value: &Value) {
     let text = match value {
         Value::Object(parts) => {
-            return parts
-                .iter()
-                .for_each(|(part, value)| rows(page, &format!("{key} {part}"), value));
+            let rows = |(part, value): (&String, _)| rows(page, &format!("{key} {part}"), value);
+            return parts.iter().for_each(rows);
         }
         Value::Array(parts) => {
-            let parts = parts.iter().zip(1..);
-            return parts.for_each(|(value, n)| rows(page, &format!("{key} {n}"), value));
+            let rows = |(value, n)| rows(page, &format!("{key} {n}"), value);
+            return parts.iter().zip(1..).for_each(rows);
         }
-        // Cells of a Markdown table end at a bar and at a line's end.
-        Value::String(text) => text.replace('|', "\\|").replace('\n', " "),
+        Value::String(text) => cell(text),
         Value::Number(number) if number.is_f64() => {
             format!("{:.4}", number.as_f64().unwrap_or(f64::NAN))
         }
@@ -41,6 +39,11 @@ fn rows(page: &mut String, key: &str, value: &Value) {
         other => other.to_string(),
     };
     let _ = writeln!(page, "| {key} | {text} |");
+}
+
+/// `text` in a cell of a Markdown table, which ends at a bar and at a line's end.
+pub(super) fn cell(text: &str) -> String {
+    text.replace('|', "\\|").replace('\n', " ")
 }
 
 #[cfg(test)]

@@ -56,7 +56,7 @@ impl Recording {
     ) -> Result<Self, TelemetryError> {
         let path = dir.join(file::RECORDING);
         let new_path = path.with_extension("rrd.new");
-        let create = || -> Result<_, Box<dyn Error + Send + Sync>> {
+        let create = || -> Result<Recording, Box<dyn Error + Send + Sync>> {
             let options = EncodingOptions::PROTOBUF_COMPRESSED;
             let file = BufWriter::new(File::create(&new_path)?);
             let encoder = Encoder::new_eager(CrateVersion::LOCAL, options, file)?;
@@ -71,15 +71,13 @@ impl Recording {
             let stream = builder(manifest).batcher_config(batches).buffered()?;
             stream.set_sink(Box::new(CallbackSink::new(move |messages| write(&sink, messages))));
             let content = Content::open(stream, manifest, config_toml, scene)?;
-            Ok((content, written))
+            let (new_path, path) = (new_path.clone(), path.clone());
+            Ok(Recording { content, written, new_path, path })
         };
-        match create() {
-            Ok((content, written)) => Ok(Recording { content, written, new_path, path }),
-            Err(error) => {
-                let _ = fs::remove_file(&new_path);
-                Err(failed(&path, error.as_ref()))
-            }
-        }
+        create().map_err(|error| {
+            let _ = fs::remove_file(&new_path);
+            failed(&path, error.as_ref())
+        })
     }
 
     /// Adds a record.
@@ -98,7 +96,7 @@ impl Recording {
     pub fn finish(self) -> Result<(), TelemetryError> {
         let finish = || -> Result<(), Box<dyn Error + Send + Sync>> {
             self.content.end()?;
-            self.content.stream().flush_blocking()?;
+            self.content.stream.flush_blocking()?;
             let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
             let (mut encoder, _) = mem::replace(&mut *written, Err(EncodeError::AlreadyFinished))?;
             encoder.finish()?;

@@ -83,13 +83,8 @@ fn parts(scene: &Scene, reach: &Reach) -> Result<Part, Box<dyn Error>> {
 /// Embeds the layout in the recording and makes it the active one: a layout that the viewer kept
 /// from another recording would win otherwise.
 pub(super) fn send(stream: &RecordingStream, scene: &Scene, reach: &Reach) -> Logged {
-    let parts = match parts(scene, reach) {
-        Ok(parts) => parts,
-        Err(error) => {
-            tracing::error!("layout.toml: {error}; the recording has no layout");
-            return Ok(());
-        }
-    };
+    let failed = |error| tracing::error!("layout.toml: {error}; the recording has no layout");
+    let Ok(parts) = parts(scene, reach).map_err(failed) else { return Ok(()) };
     let builder = RecordingStreamBuilder::new(APPLICATION).blueprint().enabled(true);
     let (layout, storage) = builder.memory()?;
     let logged = log(&layout, &parts);
@@ -98,11 +93,7 @@ pub(super) fn send(stream: &RecordingStream, scene: &Scene, reach: &Reach) -> Lo
     layout.disconnect();
     logged?;
     let Some(first) = messages.first() else { return Ok(()) };
-    let command = BlueprintActivationCommand {
-        blueprint_id: first.store_id().clone(),
-        make_active: true,
-        make_default: true,
-    };
+    let command = BlueprintActivationCommand::make_active(first.store_id().clone());
     stream.send_blueprint(messages, command);
     Ok(())
 }

@@ -37,23 +37,16 @@ pub(in crate::telemetry) fn serve(
     };
     // The server would say so only on its own thread.
     TcpListener::bind(address).map_err(|e| failed(e.to_string()))?;
-    let open =
-        move || open(address, &manifest, &config_toml, &scene).map_err(|error| error.to_string());
+    let open = move || -> Logged<Content> {
+        let memory_limit = MemoryLimit::from_bytes(HISTORY_BYTES);
+        let options = ServerOptions { memory_limit, ..ServerOptions::default() };
+        let (ip, port) = (address.ip().to_string(), address.port());
+        let stream = builder(&manifest).serve_grpc_opts(ip, port, options)?;
+        Content::open(stream, &manifest, &config_toml, &scene)
+    };
+    let open = move || open().map_err(|error| error.to_string());
     Worker::start("live view", QUEUE_ENTRIES, Backpressure::DropAndCount, open)
         .map_err(|error| failed(error.to_string()))
-}
-
-fn open(
-    address: SocketAddr,
-    manifest: &Manifest,
-    config_toml: &str,
-    scene: &Scene,
-) -> Logged<Content> {
-    let memory_limit = MemoryLimit::from_bytes(HISTORY_BYTES);
-    let options = ServerOptions { memory_limit, ..ServerOptions::default() };
-    let (ip, port) = (address.ip().to_string(), address.port());
-    let stream = builder(manifest).serve_grpc_opts(ip, port, options)?;
-    Content::open(stream, manifest, config_toml, scene)
 }
 
 impl Sink for Content {
@@ -69,8 +62,8 @@ impl Sink for Content {
 
     /// Before the stream is dropped, which waits for viewers that are frozen.
     fn close(&mut self, manifest: &Manifest, _: &dyn Fn()) -> Result<(), String> {
-        let ended = self.end().and_then(|()| log_manifest(self.stream(), manifest));
-        let _ = self.stream().flush_with_timeout(FAREWELL);
+        let ended = self.end().and_then(|()| log_manifest(&self.stream, manifest));
+        let _ = self.stream.flush_with_timeout(FAREWELL);
         thread::sleep(FAREWELL);
         ended.map_err(|error| error.to_string())
     }

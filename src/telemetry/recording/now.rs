@@ -1,6 +1,8 @@
 //! The states at the time cursor, as a page. The lanes of states stand still while the cursor moves.
 
 use super::Logged;
+use super::document::cell;
+use super::states::Meaning;
 use crate::canopen::emcy::Emcy;
 use crate::session::{Lane, Severity, State};
 use crate::stage::Axis;
@@ -29,12 +31,12 @@ struct Row {
 }
 
 impl Now {
-    /// `lane` has entered `state`. What was said before explains it, unless the needle goes on.
-    pub(super) fn enter(&mut self, time: Time, lane: &str, state: &str) {
+    /// `lane` has entered `state`. What was said before explains it, unless the state is as it should be.
+    pub(super) fn enter(&mut self, time: Time, lane: &str, state: &str, meaning: Meaning) {
         let row = self.row(lane);
         (row.state, row.since) = (state.to_owned(), time);
-        let goes_on = [State::Inserting, State::Stepping].iter().any(|on| on.as_str() == state);
-        row.why.take_if(|(said, _)| goes_on && *said < time || time.since(*said) > REASON_MAX);
+        let is_over = |said| meaning == Meaning::Good && said < time;
+        row.why.take_if(|(said, _)| is_over(*said) || time.since(*said) > REASON_MAX);
     }
 
     /// Takes an event: a warning, a fault, or what the operator asked for. True where the page has changed.
@@ -86,9 +88,7 @@ impl Now {
     fn page(&self) -> String {
         let mut page = "| | state | since | why |\n|---|---|---|---|\n".to_owned();
         for Row { lane, state, since, why } in &self.0 {
-            let why = why.as_ref().map_or("", |(_, why)| why);
-            // Cells end at a bar and at a line's end.
-            let why = why.replace('|', "\\|").replace('\n', " ");
+            let why = why.as_ref().map_or(String::new(), |(_, why)| cell(why));
             let since_s = since.as_secs_f64();
             // Writing to a string cannot fail.
             let _ = writeln!(page, "| {lane} | **{state}** | {since_s:.2} s | {why} |");
@@ -105,6 +105,7 @@ pub(super) fn drive_lane(axis: Axis) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::canopen::cia402::DriveState;
     use crate::canopen::emcy::EmcyCode;
 
     fn at(s: f64) -> Time {
@@ -114,30 +115,41 @@ mod tests {
     #[test]
     fn a_state_has_the_reason_that_came_with_it() {
         let mut now = Now::default();
-        now.enter(at(0.0), "session", State::Inserting.as_str());
-        now.enter(at(0.0), "drive_insertion", "operation enabled");
+        let enter = |now: &mut Now, s, state: State| {
+            now.enter(at(s), &state.lane().to_string(), state.as_str(), Meaning::of(state));
+        };
+        let drive = |now: &mut Now, s, state: DriveState| {
+            now.enter(at(s), "drive_insertion", &state.to_string(), Meaning::of_drive(state));
+        };
+        enter(&mut now, 0.0, State::Inserting);
+        drive(&mut now, 0.0, DriveState::OperationEnabled);
         let info = |now: &mut Now, text| now.explain(at(1.0), Lane::Session, Severity::Info, text);
         assert!(!info(&mut now, "at 10 mm"));
         // The tracker says why, after the state of the run.
-        now.enter(at(2.0), "session", State::Holding.as_str());
+        enter(&mut now, 2.0, State::Holding);
         let warning =
             |now: &mut Now, s, text| now.explain(at(s), Lane::Tracker, Severity::Warning, text);
         assert!(warning(&mut now, 2.0, "no tip | held"));
         assert!(!warning(&mut now, 2.1, "no tip | held"), "said already");
         assert_eq!(now.page().matches("| no tip \\| held |").count(), 2, "{}", now.page());
-        now.enter(at(3.0), "session", State::Inserting.as_str());
+        enter(&mut now, 2.0, State::Coasting);
+        assert!(now.page().contains("| tracker | **coasting** | 2.00 s | no tip \\| held |"));
+        // The tip is seen again.
+        enter(&mut now, 3.0, State::Tracking);
+        assert!(now.page().contains("| tracker | **tracking** | 3.00 s |  |"), "{}", now.page());
+        enter(&mut now, 3.0, State::Inserting);
         assert!(now.page().contains("| session | **inserting** | 3.00 s |  |"), "{}", now.page());
         // A fault is said before the state that it leads to.
         let emcy = Emcy { code: EmcyCode::FOLLOWING_ERROR, register: 0x21, manufacturer: [0; 5] };
         assert!(now.emergency(at(4.0), Axis::Insertion, &emcy));
         assert!(now.explain(at(4.0), Lane::Session, Severity::Fault, "stage: insertion: fault"));
-        now.enter(at(4.0), "session", State::Stopping.as_str());
-        now.enter(at(4.5), "session", State::Stopped.as_str());
-        now.enter(at(4.5), "drive_insertion", "fault");
+        enter(&mut now, 4.0, State::Stopping);
+        enter(&mut now, 4.5, State::Stopped);
+        drive(&mut now, 4.5, DriveState::Fault);
         let page = now.page();
         assert!(page.contains("| session | **stopped** | 4.50 s | stage: insertion: fault |"));
         assert!(page.contains("| **fault** | 4.50 s | 0x8611 following error (register 0x21) |"));
-        now.enter(at(60.0), "drive_insertion", "switch on disabled");
+        drive(&mut now, 60.0, DriveState::SwitchOnDisabled);
         assert!(now.page().contains("| **switch on disabled** | 60.00 s |  |"), "{}", now.page());
     }
 }

@@ -81,10 +81,7 @@ pub(super) fn log(stream: &RecordingStream, scene: &Scene) -> Logged {
             .with_radii([0.4])
             .with_labels(["x", "y", "z"]),
     )?;
-    match &scene.goal {
-        Some((world, problem)) => log_goal(stream, world, problem),
-        None => Ok(()),
-    }
+    scene.goal.as_ref().map_or(Ok(()), |(world, problem)| log_goal(stream, world, problem))
 }
 
 /// Logs the part of the plane within `reach`: a translucent sheet, a line every 10 mm, and depths.

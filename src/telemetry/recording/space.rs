@@ -79,14 +79,12 @@ impl Space {
             self.estimate.log(stream, &estimate.x_pb)?;
             log_ellipsoid(stream, estimate)?;
         }
-        let approach = step.approach.as_ref();
-        if let Some(path) = approach.and_then(|approach| approach.path.as_ref()) {
-            let points = path.points_mm(PLANNED_STEP_MM);
-            let points: Vec<_> = points.iter().map(point).collect();
-            let strip = LineStrips3D::new([points]).with_colors([COMMANDED]);
-            stream.log(PLANNED_PATH, &strip)?;
-        }
-        if let Some(approach) = approach {
+        if let Some(approach) = &step.approach {
+            if let Some(path) = &approach.path {
+                let points: Vec<_> = path.points_mm(PLANNED_STEP_MM).iter().map(point).collect();
+                let strip = LineStrips3D::new([points]).with_colors([COMMANDED]);
+                stream.log(PLANNED_PATH, &strip)?;
+            }
             let seen = Points3D::new([point(&approach.target_mm)])
                 .with_colors([MEASURED])
                 .with_radii([0.5]);
@@ -112,13 +110,9 @@ impl Space {
         step: &StepRecord,
         target_mm: &Vector3<f64>,
     ) -> Logged {
-        let Some(((world, problem), estimate)) = self.goal.as_ref().zip(step.estimate) else {
-            return Ok(());
-        };
-        let Pose { rotation, translation } = estimate.x_pb;
-        if !estimate.x_pb.is_finite() {
-            return Ok(());
-        }
+        let x_pb = step.estimate.map(|estimate| estimate.x_pb).filter(Pose::is_finite);
+        let Some(((world, problem), x_pb)) = self.goal.as_ref().zip(x_pb) else { return Ok(()) };
+        let Pose { rotation, translation } = x_pb;
         let tip = PlanTip { position_mm: translation, heading: rotation * Vector3::z() };
         let problem = Problem { target_mm: *target_mm, ..problem.clone() };
         let points = reach_around(world, &problem, &tip);
@@ -183,12 +177,10 @@ impl Tip {
 
 /// Logs the 95 % ellipsoid of the estimated position, where the estimate has one.
 fn log_ellipsoid(stream: &RecordingStream, estimate: &Estimate) -> Logged {
-    let covariance_mm2 = estimate
-        .position_covariance_mm2()
-        .filter(|covariance_mm2| covariance_mm2.iter().all(|c| c.is_finite()));
-    let Some(covariance_mm2) = covariance_mm2.filter(|_| estimate.x_pb.is_finite()) else {
-        return Ok(());
-    };
+    let covariance_mm2 = estimate.position_covariance_mm2().filter(|covariance_mm2| {
+        estimate.x_pb.is_finite() && covariance_mm2.iter().all(|c| c.is_finite())
+    });
+    let Some(covariance_mm2) = covariance_mm2 else { return Ok(()) };
     let (half_sizes_mm, rotation) = principal(&covariance_mm2);
     let (centre, half_sizes) = (point(&estimate.x_pb.translation), point(&half_sizes_mm));
     let ellipsoid = Ellipsoids3D::from_centers_and_half_sizes([centre], [half_sizes])

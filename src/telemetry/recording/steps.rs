@@ -1,8 +1,9 @@
 //! The tables of the steps: state, bounds, errors, command and measurement.
 
 use super::{Logged, log_row};
-use crate::archive::{STEP_COLUMNS, StepCells, StepColumn, coordinates, is_of_truth};
+use crate::archive::{STEP_COLUMNS, StepRow, is_of_truth};
 use crate::emulator::Truth;
+use crate::geometry::coordinates;
 use crate::observer::Estimate;
 use crate::plan::Path;
 use crate::session::StepRecord;
@@ -21,8 +22,6 @@ pub(super) const COORDINATES: [(&str, &str); 6] =
 /// Indices of the reduced coordinates x, pitch and roll: those that matter for the plane.
 pub(super) const REDUCED: [usize; 3] = [0, 4, 5];
 const ROLL: usize = 5;
-/// The columns of the band of the predicted error at the target.
-pub(super) const TARGET_BAND: [&str; 2] = ["target_error_low_mm", "target_error_high_mm"];
 const UNKNOWN: [f64; 6] = [f64::NAN; 6];
 
 /// The column of coordinate `n` with this provenance: `x_est_mm`.
@@ -31,18 +30,8 @@ pub(super) fn column(n: usize, provenance: &str) -> String {
     format!("{name}_{provenance}_{unit}")
 }
 
-/// The columns of `steps.csv` that are also in the table. The viewer has the step's number, time and
-/// stage position elsewhere; the columns of the truth are included if `has_truth`.
-fn table_columns(has_truth: bool) -> impl Iterator<Item = &'static StepColumn> {
-    let elsewhere = ["step", "time_s", "insertion_mm", "rotation_rad"];
-    let columns = STEP_COLUMNS.iter().filter(move |(name, _)| !elsewhere.contains(name));
-    columns.filter(move |(name, _)| has_truth || !is_of_truth(name))
-}
-
-/// The name in the viewer of a column of `steps.csv`: the viewer shows angles in degrees.
-fn shown_name(name: &str) -> String {
-    name.replace("_rad", "_deg")
-}
+/// Columns of `steps.csv` that the viewer has elsewhere.
+const ELSEWHERE: [&str; 4] = ["step", "time_s", "insertion_mm", "rotation_rad"];
 
 /// Logs records of steps as rows.
 pub(super) struct Steps {
@@ -81,8 +70,11 @@ impl Steps {
             let row = (0..6).map(|n| (column(n, "est"), shown[n])).chain(errors(estimate));
             log_row(stream, &format!("{SHADOWS}/{name}"), row)?;
         }
-        let cells = StepCells::new(step, known_truth);
-        let recorded = table_columns(self.has_truth).map(|(name, value)| {
+        let cells = StepRow::new(step, known_truth);
+        let recorded = STEP_COLUMNS
+            .iter()
+            .filter(|(name, _)| !ELSEWHERE.contains(name) && (has_truth || !is_of_truth(name)));
+        let recorded = recorded.map(|(name, value)| {
             let value = value(&cells).unwrap_or(f64::NAN);
             let shown = match *name {
                 "roll_est_rad" => shown[ROLL].to_degrees(),
@@ -90,7 +82,7 @@ impl Steps {
                 name if name.contains("_rad") => value.to_degrees(),
                 _ => value,
             };
-            (shown_name(name), shown)
+            (name.replace("_rad", "_deg"), shown)
         });
         let sd = in_degrees(step.estimate.and_then(|e| e.sd).unwrap_or(UNKNOWN));
         let shown = in_degrees(shown);
@@ -103,8 +95,7 @@ impl Steps {
         let age_ms = step.tip_meas_age_s.map_or(f64::NAN, |age_s| age_s * 1e3);
         let age = [("tip_meas_age_ms".to_owned(), age_ms)];
         let row = recorded.chain(bounds).chain(innovation).chain(age).chain(errors(estimate));
-        let row = row.chain(target_band(step));
-        log_row(stream, STEPS, row)
+        log_row(stream, STEPS, row.chain(target_band(step)))
     }
 
     /// Removes the jumps of the roll at ±180°: shifts it by whole turns to the value nearest to the roll
@@ -127,7 +118,7 @@ fn target_band(step: &StepRecord) -> Vec<(String, f64)> {
     let left_mm = approach.path.as_ref().map_or(0.0, Path::length_mm);
     let sd_mm = x.max(y).max(z).hypot(yaw.max(pitch) * left_mm);
     let [low_mm, high_mm] = [-2.0, 2.0].map(|sds| (approach.error_mm + sds * sd_mm).max(0.0));
-    vec![(TARGET_BAND[0].to_owned(), low_mm), (TARGET_BAND[1].to_owned(), high_mm)]
+    vec![("target_error_low_mm".to_owned(), low_mm), ("target_error_high_mm".to_owned(), high_mm)]
 }
 
 /// `angle_rad` plus or minus whole turns, within half a turn of `shown_rad`.

@@ -1,6 +1,7 @@
 //! `run.rrd`, read back with rerun's own reader.
 
 use super::*;
+use crate::geometry::coordinates;
 use crate::session::{Record, StepRecord};
 use rerun::Component as _;
 use rerun::external::re_log_encoding::DecoderApp;
