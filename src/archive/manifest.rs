@@ -15,7 +15,7 @@ const FORMAT: u32 = 2;
 /// The key of the seal.
 const SEAL: &str = "seal_sha256";
 
-/// Who a drive says it is (CiA 301 object 1018h), with the name the bench uses.
+/// The identity that a drive reports (CiA 301 object 1018h), and the axis that it moves.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DriveIdentity {
     /// Axis: `insertion` or `rotation`.
@@ -171,7 +171,7 @@ pub struct Manifest {
     pub started_utc: String,
     /// When the record was closed, RFC 3339.
     pub ended_utc: Option<String>,
-    /// Length of the run on its own time line, s; in virtual time not what a clock on the wall says.
+    /// Length of the run on its own time line, s. In virtual time this is not the time that passed.
     pub duration_s: Option<f64>,
     /// How the run ended.
     pub outcome: Option<RunOutcome>,
@@ -236,11 +236,11 @@ impl Manifest {
         self.stop_reason = outcome.stop_reason().map(str::to_owned);
     }
 
-    /// The manifest as text, with a seal over all of it: a hash that tells of a change made by
-    /// hand, and no signature.
+    /// The manifest as text, with a hash over all of it, the seal. It shows a change made by hand; it is
+    /// no signature.
     ///
     /// # Errors
-    /// None of a manifest of this program's making: numbers in its figures are finite.
+    /// The manifest cannot be JSON; none that this program makes.
     pub fn to_text(&self) -> Result<String, serde_json::Error> {
         let mut value = serde_json::to_value(self)?;
         let seal = seal_of(&value);

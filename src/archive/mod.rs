@@ -1,7 +1,7 @@
 //! The formats of a run folder, written and read: pure text and types.
 //!
 //! `telemetry` fills a folder and opens one; replay and review read it through the types here. A
-//! file's writer and its reader stand side by side, so that they cannot come apart.
+//! file's writer and its reader stand side by side, so that a change of one is not made without the other.
 
 mod candump;
 mod events;
@@ -34,7 +34,7 @@ pub mod file {
     pub const CONFIG: &str = "config.toml";
     /// The settings of the run, and how it ended.
     pub const MANIFEST: &str = "manifest.json";
-    /// The next manifest: room for it while the run goes on, so that a full disk has it.
+    /// Room for the next manifest, reserved while the run goes on, so that it can be written on a full disk.
     pub const NEW_MANIFEST: &str = "manifest.json.new";
     /// One row a step.
     pub const STEPS: &str = "steps.csv";
@@ -48,8 +48,8 @@ pub mod file {
     pub const EVENTS: &str = "events.log";
     /// The run for the rerun viewer.
     pub const RECORDING: &str = "run.rrd";
-    /// The page that a review makes; no part of the record.
+    /// The page that a review makes. It is not part of the record.
     pub const REPORT: &str = "report.html";
-    /// Those of them that are text and are written as the run goes on: a kill cuts a line at most.
+    /// The text files that are written while the run goes on, in the order in which they are written.
     pub const LINES: [&str; 5] = [CAN, TRACKER, INPUTS, STEPS, EVENTS];
 }

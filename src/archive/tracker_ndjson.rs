@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize, Serializer};
 
 /// A sample as a line of `tracker.ndjson`, without its end.
 ///
-/// Times are whole nanoseconds. JSON has no NaN and no infinity, and a stream that sends them is
-/// worth evidence: they are the strings `"NaN"`, `"inf"`, `"-inf"`, which Rust's `f64::from_str`
-/// and Python's `float` both read.
+/// Times are whole nanoseconds. JSON has no NaN and no infinity, but a stream may send them: they are
+/// written as the strings `"NaN"`, `"inf"`, `"-inf"`, which Rust's `f64::from_str` and Python's `float`
+/// both read.
 pub fn line(sample: &SampleRecord) -> Result<String, serde_json::Error> {
     let SampleRecord { received, position_plane_mm, acquisition_time, refused } = sample;
     let orientation = received.orientation.map(|q| [q.w, q.i, q.j, q.k].map(Number));

@@ -1,4 +1,4 @@
-//! What leaves a session, set against what the record holds.
+//! Compares what leaves a replayed session with what the record holds.
 
 use super::inputs::unsent_unix_us;
 use super::recorded::{Entries, Logged, Recorded};
@@ -10,7 +10,7 @@ use crate::canopen::Frame;
 use crate::session::{Direction, Input, Outcome, SampleRecord, StepRecord};
 use crate::units::Time;
 
-/// Compares in the order in which things leave; the first difference stands.
+/// Compares frames, samples and steps in the order in which they leave, and keeps the first difference.
 pub(super) struct Comparison<'a> {
     recorded: &'a Recorded<'a>,
     started_unix_us: i64,
@@ -21,9 +21,9 @@ pub(super) struct Comparison<'a> {
     pub(super) samples: Entries<String>,
     pub(super) columns: RecordedColumns,
     pub(super) rows: Entries<String>,
-    /// The first thing that comes out different, as text.
+    /// The first difference, in words.
     pub(super) difference: Option<String>,
-    /// Of a record that was cut: the first file that holds no more, and since when.
+    /// Of a record that was cut: the first file that ended, and the time of what it lacks.
     pub(super) ended: Option<(Time, &'static str)>,
 }
 

@@ -31,14 +31,9 @@ pub struct Cut {
 }
 
 impl Cut {
-    /// How long before the record's end the first file's is, s.
-    pub fn apart_s(&self) -> f64 {
-        self.end.seconds_after(self.file_end).max(0.0)
-    }
-
-    /// The difference it makes that a file lacks more than a cut takes.
+    /// The difference, if a file lacks more than a cut takes.
     fn difference(&self) -> Option<String> {
-        let (file, apart_s) = (self.file, self.apart_s());
+        let (file, apart_s) = (self.file, self.end.seconds_after(self.file_end));
         (apart_s > APART_MAX_S).then(|| {
             format!(
                 "{file} ends {apart_s:.3} s before the record does: a cut leaves its files within \
@@ -48,7 +43,7 @@ impl Cut {
     }
 }
 
-/// What a replay came to.
+/// The result of a replay.
 #[derive(Debug, Clone)]
 pub struct Replayed {
     /// The first difference from the record; `None` where there is none.
@@ -110,8 +105,8 @@ pub fn replay(
     }
 }
 
-/// What takes the records that leave a replayed session, steps with their truth as recorded.
-pub type TakeRecord<'a> = &'a mut dyn FnMut(Record, Option<Truth>);
+/// Takes the records that leave a replayed session, steps with their truth as recorded.
+type TakeRecord<'a> = &'a mut dyn FnMut(Record, Option<Truth>);
 
 /// As [`replay`], with every record that leaves the session handed to `take`, up to the first
 /// difference. Where records were dropped that is as far as the replay is the run.

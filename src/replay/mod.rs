@@ -14,5 +14,5 @@ mod inputs;
 mod machine;
 mod recorded;
 
-pub use machine::{Cut, Replayed, TakeRecord, replay, replay_to};
+pub use machine::{Cut, Replayed, replay, replay_to};
 pub use recorded::Recorded;

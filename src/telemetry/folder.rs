@@ -114,7 +114,6 @@ pub fn is_being_written(dir: &Path) -> bool {
     config.is_ok_and(|config| matches!(config.try_lock_shared(), Err(TryLockError::WouldBlock)))
 }
 
-const BYTES_PER_MB: u64 = 1_000_000;
 /// With less than this, some seconds of a run, a disk counts as full.
 const FULL_KB: u64 = 256;
 
@@ -151,13 +150,14 @@ pub(super) fn check_not_full(dir: &Path) -> Result<(), TelemetryError> {
     }
 }
 
-/// Free space for this user where `dir` is or will be, MB; `None` if the file system does not count it.
+/// Free space for this user where `dir` is or will be, MB (10⁶ bytes); `None` if the file system does not
+/// count it.
 ///
 /// # Errors
 /// The system's.
 pub fn free_mb(dir: &Path) -> io::Result<Option<u64>> {
     let there = dir.ancestors().find(|dir| dir.is_dir()).unwrap_or(Path::new("."));
-    Ok(free_bytes(there)?.map(|bytes| bytes / BYTES_PER_MB))
+    Ok(free_bytes(there)?.map(|bytes| bytes / 1_000_000))
 }
 
 /// Free bytes for this user on the file system of `path`; `None` if it does not count its blocks, as some

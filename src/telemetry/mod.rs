@@ -14,7 +14,7 @@
 //! - if the bench is killed: the last 50 ms of the text files, and at most a part of the last line; the
 //!   manifest has no outcome until [`repair`] closes the record;
 //! - if the machine loses power: 1.25 s more;
-//! - if the disk fills or stalls: what comes after, counted in the manifest, for which room is
+//! - if the disk fills or stalls: what comes after. It is counted in the manifest, for which room is
 //!   reserved.
 
 mod error;

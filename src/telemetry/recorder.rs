@@ -200,8 +200,8 @@ impl Recorder {
                 while let Ok(trouble) = self.troubles.pop() {
                     self.faults.push(trouble);
                 }
-                let Recorder { run_dir, faults, .. } = self;
-                Ok(Finished { run_dir, counts: left.counts, dropped, faults })
+                let (run_dir, counts, faults) = (self.run_dir, left.counts, self.faults);
+                Ok(Finished { run_dir, counts, dropped, faults })
             }
             (Err(error), _) | (_, Err(error) | Ok(Some(error))) => {
                 // A writer that was given up may still write: the folder is locked until the process ends.

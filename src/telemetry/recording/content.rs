@@ -1,4 +1,4 @@
-//! The content of a run for viewers, in its file or while it goes on.
+//! Logs a run for viewers: to its file, or to the live view.
 
 use super::motion::Motion;
 use super::now::{Now, drive_lane};

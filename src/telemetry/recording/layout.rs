@@ -24,11 +24,8 @@ use std::error::Error;
 
 /// The viewer's path for the properties that linked views share.
 const SHARED: &str = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc";
-/// The classes of views that have properties.
+/// rerun's class of a plot.
 const PLOT: &str = "TimeSeries";
-const LANES: &str = "StateTimeline";
-const LINES: &str = "TextLog";
-const SPACE: &str = "3D";
 /// Size of a dot, in points of the screen.
 const DOT: f32 = 1.8;
 
@@ -139,7 +136,7 @@ fn log_part(layout: &RecordingStream, part: &Part, id: Uuid) -> Logged<String> {
         .with_space_origin(format!("/{}", part.origin));
     layout.log(path.as_str(), &view)?;
     layout.log(format!("{path}/ViewContents"), &blueprint::ViewContents::new(shows))?;
-    if [PLOT, LANES].contains(&class) {
+    if [PLOT, "StateTimeline"].contains(&class) {
         // Moving the time axis of one moves all. With an axis of its own a view of lanes keeps the time
         // range with which it was opened, and shows no more of a run that goes on.
         let axis = blueprint::TimeAxis::new().with_link(LinkAxis::LinkToGlobal);
@@ -151,7 +148,7 @@ fn log_part(layout: &RecordingStream, part: &Part, id: Uuid) -> Logged<String> {
             layout.log(format!("{path}/PlotLegend"), &legend)?;
             log_series(layout, part, &path)?;
         }
-        LINES => {
+        "TextLog" => {
             // The lines say themselves where they come from.
             let columns = [TextLogColumnKind::LogLevel, TextLogColumnKind::Body];
             let columns = columns.map(|kind| TextLogColumn { visible: true.into(), kind });
@@ -160,7 +157,7 @@ fn log_part(layout: &RecordingStream, part: &Part, id: Uuid) -> Logged<String> {
             let format = blueprint::TextLogFormat::new().with_monospace_body(true);
             layout.log(format!("{path}/TextLogFormat"), &format)?;
         }
-        SPACE => log_space(layout, part, &path)?,
+        "3D" => log_space(layout, part, &path)?,
         _ => {}
     }
     Ok(path)

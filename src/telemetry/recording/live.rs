@@ -1,4 +1,4 @@
-//! The run for viewers while it goes on: a lossy tap.
+//! Shows the run to viewers while it goes on. What its queue cannot take is dropped and counted.
 
 use super::Logged;
 use super::content::{Content, builder, log_manifest};

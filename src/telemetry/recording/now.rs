@@ -1,4 +1,4 @@
-//! The states at the time cursor, as a page. The lanes of states stand still while the cursor moves.
+//! The states at the time cursor, as a page: the lanes of states show a time range, not the cursor's moment.
 
 use super::Logged;
 use super::document::cell;
