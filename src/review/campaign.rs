@@ -162,8 +162,10 @@ fn when(line: &Line) -> (bool, &str, &str) {
 fn exclude_copies(lines: &mut [Line]) {
     let is_invalid = |line: &Line| matches!(line.excluded, Some((Exclusion::Invalid, _)));
     // All runs without a frame have the same seal.
-    let seal = |run: &Folder| Some(run.manifest.files.get(file::CAN)?.clone());
-    let seal = |run: &Folder| seal(run).filter(|seal| seal.bytes > 0).map(|seal| seal.sha256);
+    let seal = |run: &Folder| {
+        let seal = run.manifest.files.get(file::CAN)?;
+        (seal.bytes > 0).then(|| seal.sha256.clone())
+    };
     // A copy may be older than the verdict, so the runs judged invalid come first.
     let (first, rest): (Vec<&mut Line>, Vec<&mut Line>) =
         lines.iter_mut().partition(|line| is_invalid(line));

@@ -141,7 +141,7 @@ pub(super) fn drive(drive: &DriveIdentity) -> String {
 
 /// Every key of a configuration with its value in TOML. Tables in arrays are numbered:
 /// `emulator.fault[0].kind`.
-pub type Keys = BTreeMap<String, String>;
+pub(super) type Keys = BTreeMap<String, String>;
 
 /// The two values of a key; `None` if missing.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -153,7 +153,7 @@ pub struct Difference {
 }
 
 /// The keys with different values in two configurations.
-pub type Differences = BTreeMap<String, Difference>;
+pub(super) type Differences = BTreeMap<String, Difference>;
 
 /// The keys of `toml`.
 ///

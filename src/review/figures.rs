@@ -2,7 +2,7 @@
 
 use super::run::{Folder, Run};
 use crate::archive::{RunOutcome, StepsTable};
-use crate::config::{Config, ConfigError, GoalKind, Source};
+use crate::config::{Config, ConfigError, GoalKind};
 use crate::stage::Axis;
 use crate::study::{FigureReport, OFF_PLANE_LIMIT_MM, RunFigures, TipError};
 use crate::text::fixed;
@@ -42,28 +42,28 @@ pub(super) const BLIND_DEPTH: &str = "blind_mm_max";
 pub(super) const GOAL: &str = "depth_mm";
 
 /// The limits of figures, by the figures' keys, and the depth to reach.
-pub type Limits = BTreeMap<&'static str, f64>;
+pub(super) type Limits = BTreeMap<&'static str, f64>;
 
 /// One figure of a run.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Figure {
+pub(super) struct Figure {
     /// Its key in JSON, unit included.
-    pub key: String,
+    pub(super) key: String,
     /// Its name in words.
-    pub label: String,
+    pub(super) label: String,
     /// Its unit; empty for counts.
-    pub unit: &'static str,
+    pub(super) unit: &'static str,
     /// Digits shown after the point.
-    pub decimals: usize,
+    pub(super) decimals: usize,
     /// `None` if it is not known.
-    pub value: Option<f64>,
+    pub(super) value: Option<f64>,
     /// Its limit, if it has one.
-    pub limit: Option<f64>,
+    pub(super) limit: Option<f64>,
 }
 
 impl Figure {
     /// True if the figure is known and outside its limit.
-    pub fn is_outside(&self) -> bool {
+    pub(super) fn is_outside(&self) -> bool {
         let is_within =
             |value, limit| if self.key == DEPTH { value >= limit } else { value <= limit };
         self.value.zip(self.limit).is_some_and(|(value, limit)| !is_within(value, limit))
@@ -81,13 +81,11 @@ impl Figure {
     }
 }
 
-/// The limits that a run was under, from its `config.toml`.
+/// The limits that a run of `config` was under.
 ///
 /// # Errors
-/// A configuration that this version cannot read; another version may have written it.
-pub(super) fn limits(config_toml: &str) -> Result<Limits, ConfigError> {
-    let source = Source { name: "config.toml", text: config_toml };
-    let config = Config::from_sources(&[source], &[])?;
+/// A stage that this version refuses.
+pub(super) fn limits(config: &Config) -> Result<Limits, ConfigError> {
     let stage = config.stage.to_stage(&config.can)?;
     let following = |axis| stage.axis(axis).following_error_limit(stage.bus.sync_period());
     let (insertion, tracker) = (&config.insertion, &config.tracker);
@@ -112,7 +110,7 @@ pub(super) fn limits(config_toml: &str) -> Result<Limits, ConfigError> {
 }
 
 /// The figures of a run with their limits. An operation of the stage without a needle has fewer.
-pub fn figures(folder: &Folder, report: &FigureReport, limits: &Limits) -> Vec<Figure> {
+fn figures(folder: &Folder, report: &FigureReport, limits: &Limits) -> Vec<Figure> {
     let is_insertion = folder.manifest.operation.is_none();
     let values = serde_json::to_value(report).unwrap_or_default();
     let of_report = |&(key, label, unit, decimals): &(&'static str, &str, _, _)| Figure {
@@ -124,7 +122,7 @@ pub fn figures(folder: &Folder, report: &FigureReport, limits: &Limits) -> Vec<F
         limit: limits.get(key).copied().filter(|_| is_insertion || key != DEPTH),
     };
     let mut all: Vec<Figure> = FIGURES.iter().map(of_report).collect();
-    let known = if report.final_error.is_some() { "true" } else { "estimated" };
+    let known = if folder.is_emulated() { "true" } else { "estimated" };
     for figure in all.iter_mut().filter(|figure| figure.key == OFF_PLANE) {
         figure.label = format!("off plane ({known}), RMS over {}", last_third(folder, report));
     }
@@ -228,6 +226,7 @@ impl Run {
 mod tests {
     use super::super::run::tests::{run, steps_csv};
     use super::{figures_of_steps, limits};
+    use crate::config::Config;
     use crate::session::Outcome;
 
     #[test]
@@ -272,13 +271,22 @@ mod tests {
     /// 10 mm/s and 360 deg/s, 30 ms of servo lag and two SYNC of 10 ms.
     #[test]
     fn limits_are_those_that_the_run_was_under() {
-        let limits = limits("insertion.depth_mm = 120.0\ntracker.hold_after_s = 0.25\n").unwrap();
+        let sets = ["insertion.depth_mm=120.0", "tracker.hold_after_s=0.25"].map(str::to_owned);
+        let limits = limits(&Config::from_sources(&[], &sets).unwrap()).unwrap();
         assert_eq!(limits["depth_mm"], 120.0);
         let arrival_mm = 120.0 - limits["insertion_mm"];
         assert!(arrival_mm > 0.0 && arrival_mm < 0.1, "{arrival_mm}");
         assert_eq!((limits["tip_age_s_max"], limits["tip_lag_mm_max"]), (0.25, 1.0));
         assert!((limits["following_error_mm_max"] - 0.5).abs() < 1e-12);
         assert!((limits["following_error_deg_max"] - 18.0).abs() < 1e-12);
-        assert!(super::limits("insertion.depth_mn = 120.0").is_err());
+    }
+
+    /// The truth of an emulated run is known, also where its last step has no estimate.
+    #[test]
+    fn a_distance_from_the_plane_is_named_true_where_the_truth_is_recorded() {
+        let mut run = run();
+        run.folder.manifest.bus = "memory".to_owned();
+        let labels: Vec<String> = run.limited_figures().into_iter().map(|f| f.label).collect();
+        assert!(labels.iter().any(|label| label.starts_with("off plane (true), ")), "{labels:?}");
     }
 }

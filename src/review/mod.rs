@@ -12,11 +12,10 @@ mod report;
 mod run;
 mod summary;
 
-pub use campaign::{Campaign, Exclusion, Line};
-pub use compare::{Comparison, Difference, Differences, Keys, differences, keys};
-pub use figures::{Figure, Limits, figures, figures_of_steps};
-pub use group::{Group, MedianInterval, Proportion};
-pub use motion::{Motion, Stamped, stamped};
+pub use campaign::{Campaign, Line};
+pub use compare::{Comparison, differences, keys};
+pub use figures::figures_of_steps;
+pub use motion::{Motion, stamped};
 pub use report::{GENERATOR, html};
-pub use run::{Condition, Folder, Run, StateChange, event};
-pub use summary::{to_json, to_text, warnings};
+pub use run::{Condition, Folder, Run, event};
+pub use summary::{to_json, to_text};

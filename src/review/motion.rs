@@ -3,14 +3,13 @@
 use super::run::Folder;
 use crate::archive::{CandumpLine, unix_us_of};
 use crate::canopen::{Frame, NodeId, cob};
-use crate::config::{Config, Source};
 use crate::stage::{Axis, PerAxis, StageConfig, Unwrapper};
 
 /// The least time between two points of a curve, s.
 const POINT_EVERY_S: f64 = 0.02;
 
 /// A frame of `can.log`, and when it came, UTC, µs since 1970.
-pub type Stamped = (i64, Frame);
+pub(super) type Stamped = (i64, Frame);
 
 /// Times, s since the start of the run, with positions in mm or degrees.
 type Course = Vec<(f64, f64)>;
@@ -33,7 +32,8 @@ impl Motion {
     /// The motion in the `frames` of the run in `folder`; none where its configuration or the time of its
     /// start cannot be read.
     pub fn new(frames: &[Stamped], folder: &Folder) -> Self {
-        let stage = folder.config_toml.as_deref().and_then(stage);
+        let config = folder.config().ok();
+        let stage = config.and_then(|config| config.stage.to_stage(&config.can).ok());
         let started_us = unix_us_of(&folder.manifest.started_utc);
         let Some((stage, started_us)) = stage.zip(started_us) else { return Motion::default() };
         Motion {
@@ -41,12 +41,6 @@ impl Motion {
             measured: PerAxis::from_fn(|axis| course(frames, started_us, &stage, axis, cob::tpdo)),
         }
     }
-}
-
-fn stage(config_toml: &str) -> Option<StageConfig> {
-    let source = Source { name: "config.toml", text: config_toml };
-    let config = Config::from_sources(&[source], &[]).ok()?;
-    config.stage.to_stage(&config.can).ok()
 }
 
 /// The targets or positions of `axis` in the PDOs that its node sends or takes under the identifier
@@ -69,7 +63,7 @@ fn course(
         let reading = i32::from_le_bytes([c0, c1, c2, c3]);
         let position = counts.get_or_insert(Unwrapper::new(reading)).unwrap(reading);
         let scale = scale.get_or_insert_with(|| config.scale(axis, position));
-        let time_s = (unix_us - started_us) as f64 * 1e-6;
+        let time_s = unix_us.saturating_sub(started_us) as f64 * 1e-6;
         if course.last().is_none_or(|(last_s, _)| time_s - last_s >= POINT_EVERY_S) {
             course.push((time_s, axis.in_unit(scale.value(position)).0));
         }
@@ -101,6 +95,8 @@ mod tests {
             line(130, "185#3702DC050000"),
             line(145, "185#3702DD050000"),
             line(160, "185#3702C4090000"),
+            // As no bench stamps it: the file was edited.
+            "(-9223372036854.000000) vcan0 185#3702C4090000 R".to_owned(),
         ];
         let frames: Vec<Stamped> = lines.iter().filter_map(|line| stamped(line)).collect();
         assert_eq!(frames.len(), lines.len());

@@ -4,7 +4,7 @@ use super::compare::{Keys, keys};
 use super::figures::{Limits, limits};
 use super::motion::Motion;
 use crate::archive::{EventKind, EventLine, Manifest, RunOutcome, StepsTable, TrackerTimes};
-use crate::config::CanInterface;
+use crate::config::{CanInterface, Config, Source};
 use crate::session::{Lane, Severity, State};
 use crate::study::{FigureReport, PlanStatus};
 use crate::text::escaped;
@@ -43,13 +43,13 @@ pub struct Folder {
 
 /// The run entered a state.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct StateChange {
+pub(super) struct StateChange {
     /// Time since the start of the run, s.
-    pub time_s: f64,
+    pub(super) time_s: f64,
     /// Depth at that time, mm; `None` before the insertion.
-    pub insertion_mm: Option<f64>,
+    pub(super) insertion_mm: Option<f64>,
     /// The state.
-    pub state: String,
+    pub(super) state: String,
 }
 
 /// A run with all of its text files.
@@ -71,17 +71,12 @@ pub struct Run {
 
 impl Run {
     /// The figures of its folder.
-    pub fn figures(&self) -> FigureReport {
+    pub(super) fn figures(&self) -> FigureReport {
         self.folder.figures().unwrap_or_default()
     }
 
-    /// Depth at `time_s`, mm, linear between two steps; after the last as fast as before it, up to the
-    /// depth to which the needle got; none before the first.
-    pub fn insertion_mm_at(&self, time_s: f64) -> Option<f64> {
-        self.depth_over_time()(time_s)
-    }
-
-    /// [`insertion_mm_at`](Self::insertion_mm_at) of any time.
+    /// The depth, mm, at a time in s: linear between two steps; after the last as fast as before it, up to the
+    /// depth to which the needle got; `None` before the first.
     pub(super) fn depth_over_time(&self) -> impl Fn(f64) -> Option<f64> {
         let (times, depths) = (self.steps.column("time_s"), self.steps.column("insertion_mm"));
         let steps: Vec<(f64, f64)> =
@@ -103,12 +98,13 @@ impl Run {
     }
 
     /// The states that the run itself went through.
-    pub fn states(&self) -> Vec<StateChange> {
+    pub(super) fn states(&self) -> Vec<StateChange> {
+        let depth_mm = self.depth_over_time();
         let is_state =
             |line: &&EventLine<'_>| line.lane == Lane::Session && line.kind == EventKind::State;
         let change = |line: &EventLine<'_>| StateChange {
             time_s: line.time.as_secs_f64(),
-            insertion_mm: self.insertion_mm_at(line.time.as_secs_f64()),
+            insertion_mm: depth_mm(line.time.as_secs_f64()),
             state: line.text.clone().into_owned(),
         };
         self.events.iter().filter(is_state).map(change).collect()
@@ -123,7 +119,7 @@ impl Run {
     }
 
     /// The events of at least this severity.
-    pub fn events_from(&self, least: Severity) -> impl Iterator<Item = &EventLine<'static>> {
+    pub(super) fn events_from(&self, least: Severity) -> impl Iterator<Item = &EventLine<'static>> {
         self.events.iter().filter(
             move |line| matches!(line.kind, EventKind::Event(severity) if severity >= least),
         )
@@ -144,17 +140,13 @@ pub(super) fn utc(rfc3339: &str) -> String {
     }
 }
 
-fn gone<T>() -> Result<T, String> {
-    Err("config.toml is missing".to_owned())
-}
-
 fn first_line(error: impl Display) -> String {
     error.to_string().lines().next().unwrap_or_default().to_owned()
 }
 
 impl Folder {
     /// What became of it; `whole` is a record that holds all of its run.
-    pub fn condition_name(&self) -> &'static str {
+    pub(super) fn condition_name(&self) -> &'static str {
         match self.condition {
             Condition::Whole if self.is_incomplete() => "incomplete",
             Condition::Whole => "whole",
@@ -170,7 +162,7 @@ impl Folder {
     }
 
     /// Whether something of the run is not in the record, by the record's own account.
-    pub fn is_incomplete(&self) -> bool {
+    pub(super) fn is_incomplete(&self) -> bool {
         let manifest = &self.manifest;
         let lost = manifest.dropped.unwrap_or_default();
         let is_repaired = manifest.repaired_utc.is_some();
@@ -178,7 +170,7 @@ impl Folder {
     }
 
     /// A reason for caution with the record; `None` for a whole one.
-    pub fn caution(&self) -> Option<String> {
+    pub(super) fn caution(&self) -> Option<String> {
         let dir = &self.dir;
         match &self.condition {
             Condition::Whole => None,
@@ -193,7 +185,7 @@ impl Folder {
     }
 
     /// How its run ended, with the reason where it was stopped.
-    pub fn ending(&self) -> String {
+    pub(super) fn ending(&self) -> String {
         let Manifest { outcome, stop_reason, .. } = &self.manifest;
         match (outcome, stop_reason) {
             _ if self.condition == Condition::BeingWritten => "going on".to_owned(),
@@ -207,12 +199,25 @@ impl Folder {
         }
     }
 
+    fn toml(&self) -> Result<&str, String> {
+        self.config_toml.as_deref().ok_or_else(|| "config.toml is missing".to_owned())
+    }
+
+    /// Its configuration.
+    ///
+    /// # Errors
+    /// Why it cannot be read, in a line; another version may have written it.
+    pub(super) fn config(&self) -> Result<Config, String> {
+        let source = Source { name: "config.toml", text: self.toml()? };
+        Config::from_sources(&[source], &[]).map_err(first_line)
+    }
+
     /// Every key of its configuration.
     ///
     /// # Errors
     /// Why they are not known, in words.
     pub(super) fn keys(&self) -> Result<Keys, String> {
-        self.config_toml.as_deref().map_or_else(gone, |toml| keys(toml).map_err(first_line))
+        keys(self.toml()?).map_err(first_line)
     }
 
     /// The limits that its run was under.
@@ -220,7 +225,7 @@ impl Folder {
     /// # Errors
     /// Why they are not known, in words.
     pub(super) fn limits(&self) -> Result<Limits, String> {
-        self.config_toml.as_deref().map_or_else(gone, |toml| limits(toml).map_err(first_line))
+        limits(&self.config()?).map_err(first_line)
     }
 
     /// `goal.tolerance_mm` of a run to a target; `None` for another run, and without its configuration.
@@ -235,7 +240,7 @@ impl Folder {
     }
 
     /// The figures that the manifest keeps, or else those that the steps tell.
-    pub fn figures(&self) -> Option<FigureReport> {
+    pub(super) fn figures(&self) -> Option<FigureReport> {
         self.figures_of_manifest().or_else(|| self.figures_of_steps.clone())
     }
 

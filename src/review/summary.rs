@@ -100,11 +100,12 @@ fn key_value(figure: &Figure) -> (String, Value) {
 }
 
 /// The warnings of `run`, the most serious first; its events with their times come last.
-pub fn warnings(run: &Run) -> Vec<String> {
+fn warnings(run: &Run) -> Vec<String> {
     let mut all = doubts(run);
+    let depth_mm = run.depth_over_time();
     all.extend(run.events_from(Severity::Warning).map(|line| {
         let time_s = line.time.as_secs_f64();
-        let depth = run.insertion_mm_at(time_s).map(|mm| format!(" at {mm:.1} mm"));
+        let depth = depth_mm(time_s).map(|mm| format!(" at {mm:.1} mm"));
         format!("{time_s:.3} s{}, {}: {}", depth.unwrap_or_default(), line.lane, line.text)
     }));
     all

@@ -45,7 +45,7 @@ impl TrialNees {
 pub enum Verdict {
     /// They are as large.
     Consistent,
-    /// They are larger than it says.
+    /// They are larger than it says, or not finite.
     OverConfident,
     /// They are smaller than it says.
     UnderConfident,
@@ -80,7 +80,8 @@ impl Consistency {
         Self::of_means(values, POSITION_FREEDOM)
     }
 
-    /// From means over correlated steps: the bounds follow from the spread of the trials.
+    /// From means over correlated steps: the bounds follow from the spread of the trials, taken as normally
+    /// distributed. They are too narrow for a few trials.
     fn of_means(values: &[f64], freedom: f64) -> Option<Self> {
         let mean = mean(values.iter().copied())?;
         let spread = rms(values.iter().map(|value| value - mean))?;
@@ -93,12 +94,12 @@ impl Consistency {
     }
 
     fn judge(mean: f64, lo95: f64, hi95: f64) -> Self {
-        let verdict = if mean > hi95 {
-            Verdict::OverConfident
+        let verdict = if (lo95..=hi95).contains(&mean) {
+            Verdict::Consistent
         } else if mean < lo95 {
             Verdict::UnderConfident
         } else {
-            Verdict::Consistent
+            Verdict::OverConfident
         };
         Consistency { mean, lo95, hi95, verdict }
     }
@@ -139,6 +140,12 @@ mod tests {
         let verdict = |values: &[f64]| Consistency::of_innovations(values).map(|c| c.verdict);
         assert_eq!(verdict(&[9.0]), Some(Verdict::Consistent));
         assert_eq!(verdict(&[9.0, 9.1]), Some(Verdict::OverConfident));
+    }
+
+    #[test]
+    fn errors_that_are_no_numbers_are_not_consistent() {
+        let nees = Consistency::of_independent(&[6.0, f64::NAN]).unwrap();
+        assert_eq!(nees.verdict, Verdict::OverConfident);
     }
 
     /// Errors `scale` times as large as their covariance says.

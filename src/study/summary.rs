@@ -14,8 +14,8 @@ pub fn trial_seed(seed: u64, trial: u64) -> u64 {
     counted(seed, trial) >> 11
 }
 
-/// Order statistics of the off-plane RMS, mm. A stopped trial counts as infinitely far out. Infinite
-/// values are null in JSON.
+/// Order statistics of a distance, mm. A stopped trial counts as infinitely far off. In JSON infinite values
+/// are null, and so are those of no trials, which are NaN.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct OffPlane {
     /// Half of the trials are better.
@@ -24,6 +24,21 @@ pub struct OffPlane {
     pub p95: f64,
     /// The worst.
     pub max: f64,
+}
+
+impl OffPlane {
+    fn of(distances_mm: &[f64]) -> Self {
+        OffPlane {
+            median: order_statistic(distances_mm, 0.5),
+            p95: order_statistic(distances_mm, 0.95),
+            max: order_statistic(distances_mm, 1.0),
+        }
+    }
+}
+
+/// The `q`-quantile; NaN for no values.
+fn order_statistic(values: &[f64], q: f64) -> f64 {
+    quantile(values, q).unwrap_or(f64::NAN)
 }
 
 /// Order statistics of the settling depth, mm; a trial that does not settle counts as infinite.
@@ -35,11 +50,11 @@ pub struct Settling {
     pub p95: f64,
 }
 
-/// The median alone, mm.
+/// The median alone, mm; a start from which the plane is out of reach counts as infinite.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Median {
     /// Half of the trials have less.
-    pub median: Option<f64>,
+    pub median: f64,
 }
 
 /// A trial that did not settle.
@@ -119,26 +134,20 @@ impl Targets {
         }
         let begun: Vec<_> = all.iter().filter(|target| !target.is_refused).collect();
         let part = |some: usize, of: usize| some as f64 / of as f64;
-        // Where every trial was refused there is no number.
-        let of_begun = |values: &[f64], share| quantile(values, share).unwrap_or(f64::NAN);
         let errors: Vec<f64> =
             begun.iter().map(|target| target.error_mm.unwrap_or(f64::INFINITY)).collect();
         let clearances: Vec<f64> = begun.iter().map(|target| target.clearance_mm).collect();
         let touched = clearances.iter().filter(|mm| **mm <= 0.0).count();
         Some(Targets {
-            target_error_mm: OffPlane {
-                median: of_begun(&errors, 0.5),
-                p95: of_begun(&errors, 0.95),
-                max: of_begun(&errors, 1.0),
-            },
+            target_error_mm: OffPlane::of(&errors),
             reached_fraction: part(
                 begun.iter().filter(|target| target.is_reached).count(),
                 begun.len(),
             ),
             refused_fraction: part(all.len() - begun.len(), all.len()),
             clearance_mm_min: Clearance {
-                p5: of_begun(&clearances, 0.05),
-                min: of_begun(&clearances, 0.0),
+                p5: order_statistic(&clearances, 0.05),
+                min: order_statistic(&clearances, 0.0),
             },
             touched_fraction: part(touched, begun.len()),
         })
@@ -148,6 +157,9 @@ impl Targets {
 impl StudySummary {
     /// The figures of these trials; `None` for no trials.
     pub fn of(trials: &[TrialResult]) -> Option<Self> {
+        if trials.is_empty() {
+            return None;
+        }
         let completed = |pick: fn(&FigureReport) -> Option<f64>| -> Vec<f64> {
             let of = |trial: &TrialResult| match trial.outcome {
                 Outcome::Completed => pick(&trial.figures).unwrap_or(f64::INFINITY),
@@ -157,7 +169,8 @@ impl StudySummary {
         };
         let off_plane = completed(|figures| figures.off_plane_rms_mm);
         let settling = completed(|figures| figures.settling_mm);
-        let shortest: Vec<f64> = trials.iter().filter_map(|t| t.shortest_settling_mm).collect();
+        let shortest = trials.iter().map(|trial| trial.shortest_settling_mm);
+        let shortest: Vec<f64> = shortest.map(|mm| mm.unwrap_or(f64::INFINITY)).collect();
         let errors = trials.iter().filter_map(|trial| trial.figures.estimate_rms);
         let nis = trials.iter().filter_map(|trial| trial.nis);
         let failed = trials.iter().filter(|trial| !trial.is_settled());
@@ -165,16 +178,12 @@ impl StudySummary {
         Some(StudySummary {
             trials: trials.len(),
             settled_fraction: settled as f64 / trials.len() as f64,
-            off_plane_rms_mm: OffPlane {
-                median: quantile(&off_plane, 0.5)?,
-                p95: quantile(&off_plane, 0.95)?,
-                max: quantile(&off_plane, 1.0)?,
-            },
+            off_plane_rms_mm: OffPlane::of(&off_plane),
             settling_mm: Settling {
-                median: quantile(&settling, 0.5)?,
-                p95: quantile(&settling, 0.95)?,
+                median: order_statistic(&settling, 0.5),
+                p95: order_statistic(&settling, 0.95),
             },
-            shortest_settling_mm: Median { median: quantile(&shortest, 0.5) },
+            shortest_settling_mm: Median { median: order_statistic(&shortest, 0.5) },
             estimate_rms: TipError::by_coordinate(&errors.collect::<Vec<_>>(), |values| {
                 quantile(&values, 0.5)
             }),
@@ -248,6 +257,18 @@ mod tests {
         assert_eq!(json["off_plane_rms_mm"]["max"], serde_json::Value::Null);
         assert_eq!(json["settling_mm"]["p95"], serde_json::Value::Null);
         assert_eq!(StudySummary::of(&[]), None);
+    }
+
+    #[test]
+    fn a_start_out_of_reach_counts_as_never_in_the_plane() {
+        let reach = |shortest_settling_mm| TrialResult {
+            shortest_settling_mm,
+            ..trial(0.1, 0.1, Outcome::Completed)
+        };
+        let median =
+            |trials: &[TrialResult]| StudySummary::of(trials).unwrap().shortest_settling_mm.median;
+        assert_eq!(median(&[reach(Some(40.0)), reach(Some(50.0)), reach(None)]), 50.0);
+        assert_eq!(median(&[reach(Some(40.0)), reach(None), reach(None)]), f64::INFINITY);
     }
 
     #[test]

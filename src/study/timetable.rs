@@ -16,8 +16,15 @@ pub(super) struct SampleDue {
     pub(super) insertion_meas_mm: f64,
 }
 
+impl SampleDue {
+    /// How many positions it is the mean of.
+    pub(super) fn positions(&self) -> u32 {
+        u32::try_from(self.numbers.end() - self.numbers.start() + 1).unwrap_or(u32::MAX)
+    }
+}
+
 /// One step.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) struct StepDue {
     /// What corrects the observers since the step before, in order.
     pub(super) samples: Vec<SampleDue>,
@@ -29,11 +36,8 @@ pub(super) struct StepDue {
     pub(super) command_mm: f64,
 }
 
-/// The depths at which an insertion measures positions and makes steps, and from which its commands
-/// are in force.
-///
-/// The timetable comes from the records of one whole session on the emulated stage. Commands turn
-/// the needle but do not change the insertion, so one session gives the times of all trials.
+/// The steps of an insertion, from the records of one whole session on the emulated stage. Commands turn
+/// the needle but do not change the insertion, so one session gives the depths of all trials.
 #[derive(Debug, Clone, Default)]
 pub struct Timetable {
     pub(super) steps: Vec<StepDue>,
@@ -134,11 +138,9 @@ impl TimetableBuilder {
     fn due(&self, received: Time, insertion_meas_mm: f64) -> SampleDue {
         // The true latency, which may differ from the one that the session assumes.
         let sent_s = (received - self.tracker.latency).as_secs_f64();
-        let period_s = self.tracker.period.as_secs_f64();
-        let sent = (sent_s / period_s).round() as u64;
+        let sent = (sent_s / self.tracker.period.as_secs_f64()).round() as u64;
         // A repeated position was measured when it was first sent.
-        let times_sent = u64::from(self.tracker.repeats) + 1;
-        let number = sent / times_sent;
+        let number = sent / self.times_sent();
         SampleDue {
             numbers: (number + 1).saturating_sub(u64::from(self.averaged))..=number,
             insertion_true_mm: self.measured_at_mm(number),
@@ -160,22 +162,39 @@ impl TimetableBuilder {
 
     /// Depth of the tip when the position of this number was measured, mm.
     fn measured_at_mm(&self, number: u64) -> f64 {
-        let times_sent = u64::from(self.tracker.repeats) + 1;
         let period_s = self.tracker.period.as_secs_f64();
-        self.insertion_at(Time::from_secs_f64((number * times_sent) as f64 * period_s))
+        self.insertion_at(Time::from_secs_f64((number * self.times_sent()) as f64 * period_s))
     }
 
-    /// Depth at `time`, on the line between two SYNCs; 0 before the insertion began.
+    /// How often the tracker sends each position.
+    fn times_sent(&self) -> u64 {
+        u64::from(self.tracker.repeats) + 1
+    }
+
+    /// Depth at `time`, on the line between two SYNCs; 0 before the first, and as at the last after it.
     fn insertion_at(&self, time: Time) -> f64 {
         let after = self.stage.partition_point(|&(sync, _)| sync < time);
-        let later = self.stage.get(after).or(self.stage.last());
-        let earlier = after.checked_sub(1).and_then(|before| self.stage.get(before));
-        match (earlier, later) {
-            (Some(&(from, from_mm)), Some(&(to, to_mm))) if to > from => {
-                let span = to.seconds_after(from);
-                from_mm + (to_mm - from_mm) * (time.seconds_after(from) / span).min(1.0)
-            }
-            _ => 0.0,
-        }
+        let Some(&(from, from_mm)) = after.checked_sub(1).and_then(|at| self.stage.get(at)) else {
+            return 0.0;
+        };
+        let Some(&(to, to_mm)) = self.stage.get(after) else { return from_mm };
+        from_mm + (to_mm - from_mm) * (time.seconds_after(from) / to.seconds_after(from))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+
+    #[test]
+    fn the_depth_is_that_between_two_syncs_and_stays_after_the_last() {
+        let config = Config::from_sources(&[], &[]).unwrap();
+        let (session, stage) = (config.session().unwrap(), config.virtual_stage().unwrap());
+        let mut builder = TimetableBuilder::new(&session.insertion, stage.tracker);
+        let at = |ms: i64| Time::from_nanos(ms * 1_000_000);
+        builder.stage = vec![(at(10), 0.0), (at(20), 0.5)];
+        let depths = [0, 10, 15, 20, 25].map(|ms| builder.insertion_at(at(ms)));
+        assert_eq!(depths, [0.0, 0.0, 0.25, 0.5, 0.5]);
     }
 }

@@ -1,15 +1,16 @@
 //! One emulated insertion without drives, bytes or time. A study makes thousands of them.
 
 use super::base_path::BasePath;
-use super::timetable::{SampleDue, StepDue, Timetable};
+use super::timetable::{SampleDue, Timetable};
 use crate::emulator::{TargetModel, Tissue, Truth, VirtualStageConfig};
 use crate::needle::TipPosition;
 use crate::observer::ObserverError;
-use crate::session::{Decision, MovingMean, Outcome, SessionConfig, Steering, StepRecord};
+use crate::session::{
+    Decision, MovingMean, Outcome, SessionConfig, Steering, StepRecord, TargetTool,
+};
 use crate::stage::Axis;
 use crate::units::Time;
 use nalgebra::Vector3;
-use std::ops::RangeInclusive;
 
 /// Inserts the needle of `stage` as a session with the configuration `session` would, and passes
 /// each step with its truth to `take`.
@@ -32,35 +33,37 @@ pub fn insert(
     let mut needle = EmulatedNeedle::new(stage);
     let (mut seen_mm, mut watched_mm) = (0.0, 0.0);
     let interval_s = stage.tracker.interval().as_secs_f64();
+    let target_tool = session.goal.as_ref().and_then(|goal| goal.tool.as_ref());
     let mut corrected: Option<u64> = None;
     for (step, due) in timetable.steps.iter().enumerate() {
         needle.insert_to(due.insertion_mm);
         let (mut measured, mut innovation_mm, mut tip_positions) = (None, None, 0);
         for sample in &due.samples {
-            let SampleDue { numbers, insertion_true_mm, insertion_meas_mm } = sample;
-            let Some(tip_meas) = needle.mean(stage, numbers, *insertion_true_mm) else { continue };
-            let path = needle.base.between(seen_mm, *insertion_meas_mm);
+            let Some(tip_meas) = needle.measure(sample) else { continue };
+            let path = needle.base.between(seen_mm, sample.insertion_meas_mm);
             path.into_iter().for_each(|increment| steering.predict(increment));
-            let positions = count(numbers);
-            let last = corrected.replace(*numbers.end());
-            let since =
-                last.map_or(f64::INFINITY, |last| (numbers.end() - last) as f64 * interval_s);
+            let (positions, newest) = (sample.positions(), *sample.numbers.end());
+            let since = corrected
+                .replace(newest)
+                .map_or(f64::INFINITY, |last| (newest - last) as f64 * interval_s);
             let spacing_s = if positions > 1 { interval_s } else { since };
             innovation_mm = steering.correct(&tip_meas, positions, spacing_s);
-            seen_mm = seen_mm.max(*insertion_meas_mm);
+            seen_mm = seen_mm.max(sample.insertion_meas_mm);
             tip_positions += positions;
-            measured = Some((*insertion_meas_mm, tip_meas));
+            measured = Some((sample.insertion_meas_mm, tip_meas));
         }
         if let Some(mean) = due.mean.as_ref().filter(|_| !steering.handedness().is_decided())
-            && let Some(tip_meas) = needle.mean(stage, &mean.numbers, mean.insertion_true_mm)
+            && let Some(tip_meas) = needle.measure(mean)
         {
             let watch = steering.handedness();
             let path = needle.base.between(watched_mm, mean.insertion_meas_mm);
             path.into_iter().for_each(|increment| watch.predict(increment));
             watched_mm = watched_mm.max(mean.insertion_meas_mm);
-            steering.watch(&tip_meas, count(&mean.numbers), interval_s);
+            steering.watch(&tip_meas, mean.positions(), interval_s);
         }
-        needle.see_target(stage, session, &due.samples);
+        if let Some(tool) = target_tool {
+            needle.see_target(tool, &due.samples);
+        }
         needle.seen_target_mm().into_iter().for_each(|target_mm| steering.set_target(target_mm));
         let is_last = step + 1 == timetable.steps.len();
         let ahead = needle.base.between(seen_mm, due.insertion_mm);
@@ -74,9 +77,9 @@ pub fn insert(
             tip_meas_mm: measured.map(|(_, tip_meas)| tip_meas.mm()),
             tip_meas_insertion_mm: measured.map(|(insertion_meas_mm, _)| insertion_meas_mm),
             innovation_mm,
-            ..record(step, due, &needle.base, decision)
+            ..record(step, due.insertion_mm, &needle.base, decision)
         };
-        take(&record, &needle.truth(stage, due.insertion_mm));
+        take(&record, &needle.truth(due.insertion_mm));
         if let Some(error) = refused {
             return Ok(Outcome::Stopped(error.to_string()));
         }
@@ -94,61 +97,47 @@ pub fn insert(
         }
         let next_mm = timetable.steps.get(step + 1).map(|next| next.insertion_mm);
         if let Some(end_mm) = end_mm.filter(|end_mm| next_mm.is_some_and(|next| *end_mm < next)) {
-            let due = StepDue { insertion_mm: end_mm, command_mm: end_mm, ..StepDue::default() };
             needle.insert_to(end_mm);
             let decision = steering.decide(&needle.base.between(seen_mm, end_mm), true);
-            take(
-                &self::record(step + 1, &due, &needle.base, decision),
-                &needle.truth(stage, end_mm),
-            );
+            let last = self::record(step + 1, end_mm, &needle.base, decision);
+            take(&last, &needle.truth(end_mm));
             break;
         }
     }
     Ok(Outcome::Completed)
 }
 
-fn count(numbers: &RangeInclusive<u64>) -> u32 {
-    u32::try_from(numbers.end() - numbers.start() + 1).unwrap_or(u32::MAX)
-}
-
-/// The true needle and its base.
-struct EmulatedNeedle {
+/// The true needle of `stage` and its base.
+struct EmulatedNeedle<'a> {
+    stage: &'a VirtualStageConfig,
     tissue: Tissue,
     base: BasePath,
     /// Where the tracker has seen the target, where it does.
     target: Option<MovingMean>,
 }
 
-impl EmulatedNeedle {
-    fn new(stage: &VirtualStageConfig) -> Self {
+impl<'a> EmulatedNeedle<'a> {
+    fn new(stage: &'a VirtualStageConfig) -> Self {
         let tissue = Tissue::new(stage.needle, stage.torsion, stage.start);
-        EmulatedNeedle { tissue, base: BasePath::new(), target: None }
+        EmulatedNeedle { stage, tissue, base: BasePath::new(), target: None }
     }
 
     fn insert_to(&mut self, insertion_mm: f64) {
         self.tissue.advance(insertion_mm, self.base.rotation_at(insertion_mm));
     }
 
-    fn truth(&self, stage: &VirtualStageConfig, insertion_mm: f64) -> Truth {
-        let target_mm = stage.target.map(|target| target.position_mm(insertion_mm));
+    fn truth(&self, insertion_mm: f64) -> Truth {
+        let target_mm = self.stage.target.map(|target| target.position_mm(insertion_mm));
         Truth::new(*self.tissue.tip_true()).with_target(target_mm)
     }
 
     /// Sees the target whenever it sees the tip; before the insertion, long enough for a mean.
-    fn see_target(
-        &mut self,
-        stage: &VirtualStageConfig,
-        session: &SessionConfig,
-        samples: &[SampleDue],
-    ) {
-        let tool = session.goal.as_ref().and_then(|goal| goal.tool.as_ref());
-        let (Some(target), Some(tool), Some(first)) = (stage.target, tool, samples.first()) else {
-            return;
-        };
-        let model = TargetModel::seen_by(stage.tracker);
+    fn see_target(&mut self, tool: &TargetTool, samples: &[SampleDue]) {
+        let (Some(target), Some(first)) = (self.stage.target, samples.first()) else { return };
+        let model = TargetModel::seen_by(self.stage.tracker);
         let interval_s = model.interval().as_secs_f64();
         let see = |mean: &mut MovingMean, number: u64, insertion_mm: f64| {
-            let noise_mm = stage.x_tp.rotation.inverse() * model.noise_mm(number);
+            let noise_mm = self.stage.x_tp.rotation.inverse() * model.noise_mm(number);
             let time = Time::from_secs_f64(number as f64 * interval_s);
             mean.take(time, target.position_mm(insertion_mm) + noise_mm);
         };
@@ -169,33 +158,24 @@ impl EmulatedNeedle {
         self.target.as_ref()?.mean_mm()
     }
 
-    /// The mean of the positions with these numbers, as the tracker measures them at this depth, in
-    /// the plane frame.
-    fn mean(
-        &self,
-        stage: &VirtualStageConfig,
-        numbers: &RangeInclusive<u64>,
-        insertion_true_mm: f64,
-    ) -> Option<TipPosition> {
-        let tip_true = self.tissue.cut_at(insertion_true_mm)?;
-        let tracker = &stage.tracker;
-        let noise = numbers.clone().map(|number| tracker.noise_mm(number));
-        let (count, sum) =
-            noise.fold((0u32, Vector3::zeros()), |(count, sum), n| (count + 1, sum + n));
-        let noise_mm = stage.x_tp.rotation.inverse() * (sum / f64::from(count));
-        TipPosition::new(tip_true.translation + noise_mm)
+    /// The tracker's position, or mean of positions, in the plane frame.
+    fn measure(&self, sample: &SampleDue) -> Option<TipPosition> {
+        let tip_true = self.tissue.cut_at(sample.insertion_true_mm)?;
+        let noise = sample.numbers.clone().map(|number| self.stage.tracker.noise_mm(number));
+        let mean_mm = noise.sum::<Vector3<f64>>() / f64::from(sample.positions());
+        TipPosition::new(tip_true.translation + self.stage.x_tp.rotation.inverse() * mean_mm)
     }
 }
 
 /// The record of a step as a session makes it; a study has no times.
-fn record(step: usize, due: &StepDue, base: &BasePath, decision: Decision) -> StepRecord {
+fn record(step: usize, insertion_mm: f64, base: &BasePath, decision: Decision) -> StepRecord {
     let Decision {
         estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, approach, ..
     } = decision;
     StepRecord {
         step: u32::try_from(step).unwrap_or(u32::MAX),
-        insertion_meas_mm: due.insertion_mm,
-        rotation_meas_rad: base.rotation_at(due.insertion_mm),
+        insertion_meas_mm: insertion_mm,
+        rotation_meas_rad: base.rotation_at(insertion_mm),
         rotation_cmd_rad_per_mm,
         command_saturated,
         estimate,

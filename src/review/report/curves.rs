@@ -304,7 +304,7 @@ mod tests {
 
     #[test]
     fn what_a_run_does_not_have_is_not_drawn() {
-        let limits = crate::review::figures::limits("").unwrap();
+        let limits = run().folder.limits().unwrap();
         let titles = |run: &Run| curves(run, &limits).iter().map(|c| c.title).collect::<Vec<_>>();
         let mut run = run();
         let all = titles(&run);

@@ -86,11 +86,12 @@ fn error_row((label, error): (&str, Option<TipError>)) -> Option<(String, Vec<St
 
 /// The warnings and faults, with the depth at which they came.
 fn hazards(run: &Run) -> Vec<Value> {
+    let depth_mm = run.depth_over_time();
     let events = run.events_from(Severity::Warning).map(|line| {
         let time_s = line.time.as_secs_f64();
         context! {
             time_s,
-            insertion_mm => run.insertion_mm_at(time_s),
+            insertion_mm => depth_mm(time_s),
             part => line.lane.to_string(),
             is_fault => line.kind == EventKind::Event(Severity::Fault),
             text => line.text.as_ref(),
