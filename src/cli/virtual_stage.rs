@@ -68,7 +68,7 @@ pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let (address, tool) = (&config.tracker.address, &config.tracker.tool);
     let target = config.goal.tool.clone();
     let tips = TipServer::bind(&runtime, address, tool, target, clock, arguments.truth.as_deref())
-        .map_err(|error| Failure::environment(format!("tracker server at {address}: {error}")))?;
+        .map_err(Failure::environment)?;
     let until = arguments.seconds.map(|s| clock.now() + Duration::from_secs_f64(s));
     let stage = VirtualStage::new(stage, clock.now());
     tell(format_args!(

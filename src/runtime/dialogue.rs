@@ -1,4 +1,4 @@
-//! A dialogue with the drives, on a bus or on the virtual stage.
+//! Runs a dialogue with the drives, on a bus or on the virtual stage.
 
 use std::thread;
 use std::time::Duration;
@@ -10,13 +10,13 @@ use crate::stage::Dialogue;
 use crate::transport::can::{BusEvent, CanBus, CanError};
 use crate::units::Time;
 
-/// Between two attempts to send a frame that the bus refused.
+/// Interval between two attempts to send a frame that the bus refused.
 const RETRY_PERIOD: Duration = Duration::from_millis(100);
 
-/// Holds `dialogue` on `bus` to its end.
+/// Runs `dialogue` on `bus` to its end.
 ///
 /// # Errors
-/// What the bus says: off, down, or a frame that it does not take.
+/// The bus is off or down, or refuses a frame.
 pub fn talk_live(
     dialogue: &mut dyn Dialogue,
     bus: &mut dyn CanBus,
@@ -42,7 +42,7 @@ pub fn talk_live(
     }
 }
 
-/// The bus errors of a dialogue that was held in spite of them.
+/// The bus errors of a dialogue that went on in spite of them.
 #[derive(Debug, Default)]
 pub struct BusTrouble {
     /// Attempts to send that the bus refused.
@@ -60,17 +60,13 @@ impl BusTrouble {
             if let Err(error) = bus.send(&frame) {
                 self.refused += 1;
                 self.unsent.push(frame);
-                self.note(error);
+                self.first.get_or_insert(error);
             }
         }
     }
-
-    fn note(&mut self, error: CanError) {
-        self.first.get_or_insert(error);
-    }
 }
 
-/// Holds `dialogue` on `bus` to its end, whatever errors the bus reports. A frame that the bus
+/// Runs `dialogue` on `bus` to its end, whatever errors the bus reports. A frame that the bus
 /// refuses is sent again, ten times a second, until the dialogue is over and `give_up` has passed.
 pub fn talk_despite_errors(
     dialogue: &mut dyn Dialogue,
@@ -107,14 +103,14 @@ pub fn talk_despite_errors(
             Ok(Some(BusEvent::Error(error))) => tracing::warn!("{error}"),
             Ok(None) => {}
             Err(error) => {
-                trouble.note(error);
+                trouble.first.get_or_insert(error);
                 thread::sleep(due.since(now).min(RETRY_PERIOD));
             }
         }
     }
 }
 
-/// Holds `dialogue` with the drives of `stage`, in virtual time, to its end.
+/// Runs `dialogue` with the drives of `stage`, in virtual time, to its end.
 pub fn talk_virtual(dialogue: &mut dyn Dialogue, stage: &mut VirtualStage) {
     let mut now = Time::ZERO;
     while !dialogue.is_over() {

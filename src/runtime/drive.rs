@@ -21,20 +21,20 @@ pub(super) trait Witness {
         None
     }
 
-    /// Why the runtime itself wants the run to end; `None` of a run that `is_asked` to already.
+    /// Why the operator or the record ends the run; `None` once the run `is_asked` to end.
     fn stop_reason(&mut self, _now: Time, _is_asked: bool) -> Option<String> {
         None
     }
 }
 
-/// A run that nobody watches or interrupts: its records go to a function.
+/// The records go to a function; there is no operator.
 impl<F: FnMut(Record, Option<Truth>)> Witness for F {
     fn take(&mut self, record: Record, truth: Option<Truth>) {
         self(record, truth);
     }
 }
 
-/// What a machine is joined to: a bus, a tracker, a clock.
+/// The bus, the tracker and the clock of a run.
 pub(super) trait World {
     fn machine(&mut self) -> &mut dyn Machine;
 
@@ -42,25 +42,26 @@ pub(super) trait World {
 
     fn now(&self) -> Time;
 
-    /// Gives `input` to the machine with the time of now.
+    /// Gives `input` to the machine, now.
     fn give(&mut self, input: Input);
 
-    /// Sends a frame that was made at `made`; false of one that is too old to be sent.
+    /// Sends a frame that was made at `made`; false if it is too old to be sent.
     ///
     /// # Errors
-    /// What the bus says that does not take it.
+    /// Why the bus refuses it.
     fn send(&mut self, made: Time, frame: &Frame) -> Result<bool, CanError>;
 
     fn record(&mut self, record: Record);
 
-    /// Gives the machine what has come since; true when there was anything that may not wait.
+    /// Gives the machine the inputs that have arrived; true if their answers must leave before anything else
+    /// is done.
     fn take_arrived(&mut self) -> bool;
 
-    /// Goes on to the next thing that is due or comes.
+    /// Waits for the next deadline or input, and gives it to the machine.
     fn go_on(&mut self);
 }
 
-/// Carries a run on to its end.
+/// Runs the machine to its end.
 pub(super) fn drive(world: &mut impl World) -> Outcome {
     let mut stop_asked = false;
     loop {
@@ -71,7 +72,7 @@ pub(super) fn drive(world: &mut impl World) -> Outcome {
         if world.take_arrived() {
             continue;
         }
-        // What answers them leaves before anything that is due is done.
+        // The answers leave before anything that is due is done.
         carry_out(world);
         let now = world.now();
         match world.witness().stop_reason(now, stop_asked) {
@@ -80,7 +81,7 @@ pub(super) fn drive(world: &mut impl World) -> Outcome {
                 world.give(Input::Stop(reason));
             }
             None => {
-                // One at a time: however many there are, what is due is done in between.
+                // One command at a time, so that many commands delay nothing that is due.
                 if let Some(command) = world.witness().command() {
                     world.give(Input::Operator(command));
                     carry_out(world);
@@ -91,10 +92,9 @@ pub(super) fn drive(world: &mut impl World) -> Outcome {
     }
 }
 
-/// Sends everything that the machine has to send, and then records everything that it has to say: a
-/// SYNC waits for no record. A frame is recorded as sent if it was. One that the bus does not take is a
-/// fault, which the machine is told once; what was queued behind it is stale and never sent, so that the
-/// frames that stop the axes are the next to be tried.
+/// Sends the machine's frames, and then takes its records: a SYNC waits for no record. A frame is recorded as
+/// sent if it was. If the bus refuses a frame, the machine is told of the fault once. The frames queued behind
+/// the refused one are stale and never sent, so the frames that stop the axes are the next to be tried.
 pub(super) fn carry_out(world: &mut impl World) {
     let (mut records, mut has_failed) = (Vec::new(), false);
     while let Some(output) = world.machine().poll() {
@@ -112,20 +112,14 @@ pub(super) fn carry_out(world: &mut impl World) {
             Err(_) if has_failed => {}
             Err(error) => {
                 has_failed = true;
-                records.extend(left_records(world));
+                while let Some(stale) = world.machine().poll() {
+                    if let Output::Record(record) = stale {
+                        records.push(record);
+                    }
+                }
                 world.give(Input::BusFault(error.to_string()));
             }
         }
     }
     records.into_iter().for_each(|record| world.record(record));
-}
-
-/// The records among what the machine has left to say; the frames among it are forgotten.
-fn left_records(world: &mut impl World) -> Vec<Record> {
-    let left = std::iter::from_fn(|| world.machine().poll());
-    left.filter_map(|output| match output {
-        Output::Record(record) => Some(record),
-        Output::Transmit { .. } => None,
-    })
-    .collect()
 }

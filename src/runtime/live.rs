@@ -94,7 +94,7 @@ impl<'a, W: Witness> Live<'a, W> {
     fn handle(&mut self, now: Time, input: Input) {
         let deadline = self.session.deadline();
         if now >= deadline {
-            self.timing.note_deadline(now.since(deadline));
+            self.timing.deadline_lateness.add_us(now.since(deadline));
             self.met.get_or_insert(deadline);
         }
         self.session.handle(now, input);
@@ -130,7 +130,7 @@ impl<'a, W: Witness> Live<'a, W> {
         match (frame.cob_id(), self.met) {
             (Some(cob::SYNC), Some(due)) => self.timing.note_sync(self.clock.now().since(due)),
             (Some(0x201..=0x27F), None) => {
-                self.timing.note_set_point(self.clock.now().since(made));
+                self.timing.set_point_delay.add_us(self.clock.now().since(made));
             }
             _ => {}
         }

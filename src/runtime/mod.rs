@@ -1,8 +1,8 @@
 //! Clocks, threads and sockets: where a session meets the world.
 //!
-//! [`run_virtual`] joins it to the emulated stage in virtual time, at a [`Pace`] if asked, [`run_live`] to a CAN bus and a
-//! tracker in real time. Both are one loop, which only moves inputs and outputs: every decision is
-//! the session's.
+//! [`run_virtual`] joins it to the emulated stage in virtual time, at a [`Pace`] if asked, [`run_live`] to a
+//! CAN bus and a tracker in real time. Both are one loop, which only moves inputs and outputs: every decision
+//! is the session's.
 
 mod dialogue;
 mod drive;
@@ -23,6 +23,6 @@ pub use realtime::{RealTime, enter_real_time};
 pub use recording::{Describe, RecordedRun, complete_record, make_recording};
 pub use sink::{Holds, Operator, RunReport, Sink, gates_to_json};
 pub use stage_server::{TipServer, serve_stage};
-pub use study::{DrawnGoal, Study};
-pub use timing::{Clock, TimingFigures, TimingReport};
+pub use study::Study;
+pub use timing::Clock;
 pub use virtual_time::{DriveOutcome, EmulationReport, Moment, Pace, TipSource, run_virtual};

@@ -121,6 +121,7 @@ fn make_from_text_files(
     };
     let RecordedRun { plan, scene, config_toml } = describe(manifest)?;
     let mut log = Log {
+        made,
         recording: Recording::create(dir, manifest, &config_toml, &scene)?,
         failed: None,
         frames: frames(open(file::CAN)?, manifest).peekable(),
@@ -133,8 +134,7 @@ fn make_from_text_files(
         let replayed = replay_to(&recorded, None, &mut |record, truth| {
             if let Some(time) = time_of(&record) {
                 log.text_until(time);
-                log.take(Entry { record, truth });
-                made.fetch_max(time.as_nanos(), Ordering::Relaxed);
+                log.take(time, Entry { record, truth });
             }
         });
         why = match replayed {
@@ -151,8 +151,10 @@ fn make_from_text_files(
 }
 
 /// The recording, and what the text files hold for it: frames and events in their order.
-struct Log {
+struct Log<'a> {
     recording: Recording,
+    /// The run's time that is reached, ns.
+    made: &'a AtomicI64,
     failed: Option<TelemetryError>,
     frames: Peekable<TimedRecords>,
     events: Peekable<TimedRecords>,
@@ -161,8 +163,9 @@ struct Log {
 /// The records of a text file, with their times.
 type TimedRecords = Box<dyn Iterator<Item = (Time, Record)>>;
 
-impl Log {
-    fn take(&mut self, entry: Entry) {
+impl Log<'_> {
+    fn take(&mut self, time: Time, entry: Entry) {
+        self.made.fetch_max(time.as_nanos(), Ordering::Relaxed);
         if self.failed.is_none() {
             self.failed = self.recording.take(entry).err();
         }
@@ -175,13 +178,13 @@ impl Log {
                 .map(|lines| lines.peek().map_or(Time::NEVER, |(time, _)| *time));
             let lines = if times[1] <= times[0] { &mut self.events } else { &mut self.frames };
             let next = lines.next_if(|(line_time, _)| *line_time <= time);
-            let Some((_, record)) = next else { return };
-            self.take(Entry::from(record));
+            let Some((time, record)) = next else { return };
+            self.take(time, Entry::from(record));
         }
     }
 }
 
-/// When `record` was, where the text files do not hold all of it.
+/// When `record` was; `None` for the records that the text files hold whole.
 fn time_of(record: &Record) -> Option<Time> {
     match record {
         Record::Sample(sample) | Record::Target(sample) => Some(sample.received.receive_time),
@@ -214,4 +217,35 @@ fn events(lines: Lines) -> TimedRecords {
         };
         Some((time, record))
     }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use crate::session::Outcome;
+    use crate::telemetry::tests::{CONFIG_TOML, manifest, scene};
+    use crate::telemetry::{Backpressure, Recorder};
+
+    /// A run that was killed at once, or that does not replay: its frames and events take long as well, and
+    /// must not be taken for a stalled disk.
+    #[test]
+    fn what_the_text_files_alone_hold_is_progress() {
+        let parent = std::env::temp_dir().join(format!("needle-bench-made-{}", std::process::id()));
+        let mut recorder =
+            Recorder::create(&parent, manifest(), CONFIG_TOML.to_owned(), Backpressure::Block)
+                .unwrap();
+        let (time, text) = (Time::from_secs_f64(7.0), "late".to_owned());
+        let (lane, severity) = (Lane::Session, Severity::Warning);
+        recorder.record(Entry::from(Record::Event { time, lane, severity, text }));
+        let finished = recorder.finish(|manifest| manifest.set_outcome(&Outcome::Completed));
+        let made = AtomicI64::new(0);
+        let describe: Describe = Box::new(|_| {
+            let plan = Plan::from(Config::from_sources(&[], &[])?.session()?);
+            Ok(RecordedRun { plan, scene: scene(), config_toml: CONFIG_TOML.to_owned() })
+        });
+        let why = make_from_text_files(&finished.unwrap().run_dir, describe, &made).unwrap();
+        assert_eq!((why, made.load(Ordering::Relaxed)), (None, time.as_nanos()));
+        std::fs::remove_dir_all(parent).unwrap();
+    }
 }

@@ -32,10 +32,11 @@ pub struct TipServer {
 }
 
 impl TipServer {
-    /// Listens at `address` and names the tip `tool`, the target `target`; the true pose of each tracked tip goes to the CSV file `truth`.
+    /// Listens at `address` and names the tip `tool`, the target `target`. The true pose of each tracked tip
+    /// goes to the new CSV file `truth`.
     ///
     /// # Errors
-    /// The address cannot be bound, or the file not be made.
+    /// The address cannot be bound, or the file cannot be made.
     pub fn bind(
         runtime: &Runtime,
         address: &str,
@@ -43,19 +44,14 @@ impl TipServer {
         target: Option<String>,
         clock: Clock,
         truth: Option<&Path>,
-    ) -> io::Result<Self> {
-        let server = runtime.block_on(TransformServer::bind(address))?;
-        let truth = match truth {
-            None => None,
-            Some(path) => {
-                let mut file = BufWriter::new(File::create_new(path)?);
-                writeln!(
-                    file,
-                    "time_s,x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad"
-                )?;
-                Some(file)
-            }
-        };
+    ) -> Result<Self, String> {
+        let server = runtime.block_on(TransformServer::bind(address));
+        let server = server.map_err(|error| format!("tracker server at {address}: {error}"))?;
+        let truth = truth.map(|path| {
+            let file = truth_file(path);
+            file.map_err(|error| format!("truth file {}: {error}", path.display()))
+        });
+        let truth = truth.transpose()?;
         Ok(TipServer { server, tool: tool.to_owned(), target, clock, truth })
     }
 
@@ -89,8 +85,18 @@ impl TipServer {
     }
 }
 
-/// Reports a fault of the script that begins. Bus off is an error frame, which every program on the bus
-/// receives. An interface is taken down by hand, `ip link set … down`.
+/// A new file for the true poses, with its header.
+fn truth_file(path: &Path) -> io::Result<BufWriter<File>> {
+    let mut file = BufWriter::new(File::create_new(path)?);
+    writeln!(
+        file,
+        "time_s,x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad"
+    )?;
+    Ok(file)
+}
+
+/// Logs a scripted fault that begins. Bus off is an error frame, which every program on the bus receives. An
+/// interface is taken down by hand, `ip link set … down`.
 fn begin_fault(fault: &Fault, bus: &mut dyn CanBus) {
     tracing::warn!("emulated fault: {fault}");
     if fault.kind == FaultKind::BusOff
@@ -148,4 +154,22 @@ pub fn serve_stage(
         }
     }
     tips.truth.as_mut().map_or(Ok(()), Write::flush).map_err(|error| format!("truth file: {error}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_truth_file_that_exists_is_named() {
+        let path = std::env::temp_dir().join(format!("needle-bench-truth-{}", std::process::id()));
+        std::fs::write(&path, "kept").unwrap();
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let clock = Clock::start();
+        let server = TipServer::bind(&runtime, "127.0.0.1:0", "Needle", None, clock, Some(&path));
+        let said = server.err().unwrap();
+        assert_eq!(said, format!("truth file {}: File exists (os error 17)", path.display()));
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), "kept");
+        std::fs::remove_file(path).unwrap();
+    }
 }

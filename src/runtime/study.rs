@@ -29,7 +29,7 @@ pub struct Study<'a> {
 }
 
 /// A target with the path to it, or why there is none.
-pub type DrawnGoal = Result<Option<Goal>, String>;
+pub(super) type DrawnGoal = Result<Option<Goal>, String>;
 
 impl Study<'_> {
     /// Makes the trials with these seeds, in parallel; `done` is called after each. The results are
@@ -146,7 +146,8 @@ impl Study<'_> {
         take: impl FnMut(Record, Option<Truth>),
     ) -> Result<Outcome, String> {
         let stage = VirtualStage::new(stage, Time::ZERO);
-        let target = session_tool(&session);
+        let target = session.goal.as_ref().and_then(|goal| goal.tool.as_ref());
+        let target = target.map(|tool| tool.gate.tool.clone());
         let mut session = Session::new(session, Time::ZERO).map_err(|error| error.to_string())?;
         let tips = TipSource::Emulated { tool: self.tool.to_owned(), target };
         Ok(run_unwatched(&mut session, stage, tips, take))
@@ -155,11 +156,6 @@ impl Study<'_> {
 
 fn refused_trial(seed: u64, reason: &str) -> String {
     format!("trial with seed {seed}: {reason}")
-}
-
-/// The name of the tool that is the target, where that is one.
-fn session_tool(session: &SessionConfig) -> Option<String> {
-    Some(session.goal.as_ref()?.tool.as_ref()?.gate.tool.clone())
 }
 
 #[cfg(test)]

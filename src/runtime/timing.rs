@@ -38,15 +38,15 @@ const SYNC_LATE_LIMIT_US: u32 = 1000;
 /// Timing statistics of the control thread, which sends the SYNCs (with `--realtime` called the SYNC
 /// thread).
 #[derive(Debug, Clone, Default)]
-pub struct TimingFigures {
+pub(super) struct TimingFigures {
     /// How late the thread handled its deadlines, µs.
-    deadline_lateness: DurationHistogram,
+    pub(super) deadline_lateness: DurationHistogram,
     /// How late SYNCs were handed to the bus, µs.
     sync_lateness: DurationHistogram,
     /// SYNCs that left later than [`SYNC_LATE_LIMIT_US`].
     syncs_over_limit: u64,
     /// From the arrival of the feedback to the hand-over of the set-points, µs.
-    set_point_delay: DurationHistogram,
+    pub(super) set_point_delay: DurationHistogram,
 }
 
 /// A histogram of durations in whole µs, or ns, accurate to one part in a thousand.
@@ -67,7 +67,8 @@ impl Default for DurationHistogram {
 }
 
 impl DurationHistogram {
-    fn add_us(&mut self, duration: Duration) {
+    /// Adds a duration in µs.
+    pub(super) fn add_us(&mut self, duration: Duration) {
         self.add(duration.as_micros());
     }
 
@@ -152,25 +153,15 @@ impl TimingReport {
 }
 
 impl TimingFigures {
-    /// Notes a deadline that was handled `late` after it was due.
-    pub fn note_deadline(&mut self, late: Duration) {
-        self.deadline_lateness.add_us(late);
-    }
-
     /// Notes a SYNC that was handed to the bus `late` after it was due.
-    pub fn note_sync(&mut self, late: Duration) {
+    pub(super) fn note_sync(&mut self, late: Duration) {
         self.sync_lateness.add_us(late);
         let limit = Duration::from_micros(SYNC_LATE_LIMIT_US.into());
         self.syncs_over_limit += u64::from(late > limit);
     }
 
-    /// Notes set-points that were handed to the bus `delay` after the feedback arrived.
-    pub fn note_set_point(&mut self, delay: Duration) {
-        self.set_point_delay.add_us(delay);
-    }
-
     /// The figures, with what the stage counted.
-    pub fn report(&self, counters: Counters) -> TimingReport {
+    pub(super) fn report(&self, counters: Counters) -> TimingReport {
         let [deadline_late_us_p50, deadline_late_us_p99, deadline_late_us_max] =
             self.deadline_lateness.figures();
         let [sync_late_us_p50, sync_late_us_p99, sync_late_us_max] = self.sync_lateness.figures();
@@ -191,11 +182,7 @@ impl TimingFigures {
             set_point_us_max,
             syncs_skipped: counters.syncs_skipped,
             feedback_missed: counters.feedback_missed,
-            frames_dropped: None,
-            record_ns_p50: 0,
-            record_ns_p99: 0,
-            record_ns_max: 0,
-            realtime: None,
+            ..TimingReport::default()
         }
     }
 }
@@ -234,9 +221,9 @@ mod tests {
         let mut timing = TimingFigures::default();
         assert_eq!(timing.report(Counters::default()).sync_late_us_max, 0);
         for us in (0..=1000).rev() {
-            timing.note_deadline(Duration::from_micros(2 * us));
+            timing.deadline_lateness.add_us(Duration::from_micros(2 * us));
             timing.note_sync(Duration::from_micros(us + 200));
-            timing.note_set_point(Duration::from_micros(us / 2));
+            timing.set_point_delay.add_us(Duration::from_micros(us / 2));
         }
         let counters = Counters { syncs_skipped: 3, ..Counters::default() };
         let report = timing.report(counters);
@@ -257,12 +244,7 @@ mod tests {
                 set_point_us_p99: 495,
                 set_point_us_max: 500,
                 syncs_skipped: 3,
-                feedback_missed: 0,
-                frames_dropped: None,
-                record_ns_p50: 0,
-                record_ns_p99: 0,
-                record_ns_max: 0,
-                realtime: None,
+                ..TimingReport::default()
             }
         );
         assert_eq!(

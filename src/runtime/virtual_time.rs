@@ -30,38 +30,6 @@ pub enum TipSource {
     Recorded(Replay),
 }
 
-impl TipSource {
-    /// When the next event of the recording is due.
-    fn deadline(&self) -> Time {
-        match self {
-            TipSource::Emulated { .. } => Time::NEVER,
-            TipSource::Recorded(replay) => replay.deadline(),
-        }
-    }
-
-    /// The next event of the recording that is due at `now`.
-    fn poll(&mut self, now: Time) -> Option<Event> {
-        match self {
-            TipSource::Emulated { .. } => None,
-            TipSource::Recorded(replay) => replay.poll(now),
-        }
-    }
-
-    /// The sample that the bench gets for an emulated tip or target: in full precision, since no
-    /// tracker protocol rounds it. `None` if a recording replaces the emulated tracker.
-    fn sample_of(&self, tip: &TrackedTip, is_target: bool, now: Time) -> Option<Sample> {
-        let TipSource::Emulated { tool, target } = self else { return None };
-        Some(Sample {
-            tool: if is_target { target.clone()? } else { tool.clone() },
-            receive_time: now,
-            source_unix_ns: Some(tip.acquisition_time.as_nanos()),
-            position_mm: tip.x_ts.translation,
-            orientation: Some(so3::quaternion(&tip.x_ts.rotation)),
-            validity: Validity::Valid,
-        })
-    }
-}
-
 /// Runs `session`, an insertion or an operation, against `stage` until it ends. Frames and samples
 /// arrive at the moment when they are sent. Time jumps to the earliest deadline of session, stage and
 /// tip source, or with `pace` waits for it. Without `tips` the session has no tracker.
@@ -141,21 +109,37 @@ impl<'a, W: Witness> VirtualRun<'a, W> {
         }
     }
 
-    /// Gives the session what the emulated tracker sees.
-    fn see(&mut self, seen: &TrackedTip, is_target: bool) {
-        let tips = self.tips.as_ref();
-        if let Some(sample) = tips.and_then(|tips| tips.sample_of(seen, is_target, self.now)) {
-            self.give(Input::Tracker(Event::Sample(sample)));
+    /// The recording that replaces the emulated tracker, if there is one.
+    fn replay(&mut self) -> Option<&mut Replay> {
+        match &mut self.tips {
+            Some(TipSource::Recorded(replay)) => Some(replay),
+            _ => None,
         }
     }
 
+    /// Gives the session what the emulated tracker sees of the tip or the target, in full precision: no
+    /// tracker protocol rounds it.
+    fn see(&mut self, seen: &TrackedTip, is_target: bool) {
+        let Some(TipSource::Emulated { tool, target }) = &self.tips else { return };
+        let tool = if is_target { target.as_ref() } else { Some(tool) };
+        let Some(tool) = tool.cloned() else { return };
+        self.give(Input::Tracker(Event::Sample(Sample {
+            tool,
+            receive_time: self.now,
+            source_unix_ns: Some(seen.acquisition_time.as_nanos()),
+            position_mm: seen.x_ts.translation,
+            orientation: Some(so3::quaternion(&seen.x_ts.rotation)),
+            validity: Validity::Valid,
+        })));
+    }
+
     fn begin_fault(&mut self, fault: Fault) {
-        let now = self.now;
-        self.emulated.add_fault(fault.clone(), &self.stage, now);
-        let (lane, severity) = (Lane::Stage, Severity::Warning);
+        let (time, lane, severity) = (self.now, Lane::Stage, Severity::Warning);
         let text = format!("emulated fault: {fault}");
-        self.record(Record::Event { time: now, lane, severity, text });
-        if fault.kind == FaultKind::BusOff {
+        let is_bus_off = fault.kind == FaultKind::BusOff;
+        self.emulated.faults.push((fault, Moment::of(&self.stage, time)));
+        self.record(Record::Event { time, lane, severity, text });
+        if is_bus_off {
             self.give(Input::BusFault(BusError::bus_off().to_string()));
         }
     }
@@ -193,7 +177,7 @@ impl<W: Witness> World for VirtualRun<'_, W> {
 
     fn record(&mut self, record: Record) {
         if let Record::State { state: State::Stopping, .. } = &record {
-            self.emulated.set_stopping(&self.stage, self.now);
+            self.emulated.stopping = Some(Moment::of(&self.stage, self.now));
         }
         self.witness.take(record, Some(self.stage.truth(self.now)));
     }
@@ -217,11 +201,12 @@ impl<W: Witness> World for VirtualRun<'_, W> {
     fn go_on(&mut self) {
         self.witness.progress(self.session.progress());
         self.emulated.update(&self.stage, self.now);
-        let tip_due = self.tips.as_ref().map_or(Time::NEVER, TipSource::deadline);
+        let tip_due = self.replay().map_or(Time::NEVER, |replay| replay.deadline());
         let due = self.session.deadline().min(self.stage.deadline()).min(tip_due);
         let due = self.pace.as_mut().map_or(due, |pace| pace.wait(self.now, due));
         self.now = self.now.max(due);
-        while let Some(event) = self.tips.as_mut().and_then(|tips| tips.poll(self.now)) {
+        let now = self.now;
+        while let Some(event) = self.replay().and_then(|replay| replay.poll(now)) {
             self.give(Input::Tracker(event));
         }
         if self.stage.deadline() <= self.now {
@@ -275,23 +260,15 @@ pub struct EmulationReport {
 
 impl EmulationReport {
     /// The report of a run that begins on `stage`.
-    pub(super) fn new(stage: &VirtualStage, now: Time) -> Self {
+    fn new(stage: &VirtualStage, now: Time) -> Self {
         let drives = stage
             .drives()
             .map(|drive| DriveOutcome { state: drive.state(), left_operation_enabled: None });
         EmulationReport { faults: Vec::new(), stopping: None, drives, end: Moment::of(stage, now) }
     }
 
-    pub(super) fn add_fault(&mut self, fault: Fault, stage: &VirtualStage, now: Time) {
-        self.faults.push((fault, Moment::of(stage, now)));
-    }
-
-    pub(super) fn set_stopping(&mut self, stage: &VirtualStage, now: Time) {
-        self.stopping = Some(Moment::of(stage, now));
-    }
-
     /// Updates the positions and the drive states. Call it after every change of the stage.
-    pub(super) fn update(&mut self, stage: &VirtualStage, now: Time) {
+    fn update(&mut self, stage: &VirtualStage, now: Time) {
         self.end = Moment::of(stage, now);
         for (outcome, drive) in self.drives.iter_mut().zip(stage.drives()) {
             let before = std::mem::replace(&mut outcome.state, drive.state());
@@ -322,7 +299,7 @@ impl Pace {
     }
 
     /// Waits at `now` for `due`, at most a stride. Returns the time that is reached.
-    pub(super) fn wait(&mut self, now: Time, due: Time) -> Time {
+    fn wait(&mut self, now: Time, due: Time) -> Time {
         let reached = due.min(now + STRIDE);
         let at = self.origin + reached.since(Time::ZERO);
         let late = at.elapsed();
