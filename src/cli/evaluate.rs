@@ -30,7 +30,7 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let scoring = config.scoring()?;
     let scored_by = |observer: &ObserverConfig, recording: &Recording| {
         let mut observer = observer.build(needle, torsion).map_err(|error| error.to_string())?;
-        score(observer.as_mut(), recording, &scoring).map_err(|error| error.to_string())
+        score(observer.as_mut(), recording, &scoring)
     };
     for Insertion { path, recording, .. } in &insertions {
         if recording.lacks_roll() {

@@ -3,7 +3,7 @@
 
 use super::{Config, ConfigError};
 use crate::keys::{Rule, choice, named, over, section, within};
-use crate::study::{Mount, Scoring};
+use crate::study::{Scoring, mount};
 
 section! {
     /// `[record]`.
@@ -63,11 +63,11 @@ impl Config {
     /// A mount that spans no plane.
     pub fn scoring(&self) -> Result<Scoring, ConfigError> {
         let EvaluationConfig { axis, bend_axis, score_after_mm } = self.evaluation;
-        let mount = Mount::new(axis.into(), bend_axis.into()).map_err(|error| {
+        let r_sb = mount(axis.into(), bend_axis.into()).map_err(|error| {
             ConfigError::of(format!("evaluation.axis and evaluation.bend_axis: {error}"))
         })?;
         Ok(Scoring {
-            mount,
+            r_sb,
             step_mm: self.insertion.step_mm,
             samples: self.observer.samples,
             position_sd_mm: self.observer.invariant.position_sd_mm,

@@ -66,7 +66,7 @@ fn hear_signals() -> io::Result<()> {
             }
         });
     }
-    // Once listened to it kills no more, heard or not.
+    // With a handler installed the signal no longer kills; nothing has to read it.
     let _ = signal(SignalKind::from_raw(Signal::SIGXFSZ as i32))?;
     drop(in_runtime);
     let hear = move || runtime.block_on(std::future::pending::<()>());

@@ -11,20 +11,19 @@ use crate::transport::link::Link;
 use crate::units::Time;
 use std::time::{Duration, SystemTime};
 
-/// The longest the control thread waits on the bus in one go: tracker news are taken in between.
+/// Longest single wait on the bus; tracker events are taken in between.
 const WAIT_MAX: Duration = Duration::from_millis(5);
 
-/// With `--realtime` the last part before a deadline is not slept but spun: to wake a thread takes the
-/// system tens of microseconds.
+/// With `--realtime` the thread spins instead of sleeping in this last part before a deadline: to wake up takes
+/// tens of microseconds.
 const SPIN: Duration = Duration::from_micros(150);
 
-/// Time between two looks at what the tracker's link keeps back and counts.
+/// Interval between two readings of the counts of the tracker's link.
 const LOOK_PERIOD: Duration = Duration::from_millis(100);
 /// More messages a second than this from the tracker are a flood.
 const FLOOD_PER_S: f64 = 5000.0;
 
-/// A session in real time, its bus and its tracker: everything the session is given goes through
-/// here, with the time of now.
+/// A session in real time, its bus and its tracker. Every input of the session passes through here.
 struct Live<'a, W> {
     session: &'a mut dyn Machine,
     bus: &'a mut dyn CanBus,
@@ -34,7 +33,7 @@ struct Live<'a, W> {
     timing: TimingFigures,
     /// How long before a deadline the thread stops sleeping.
     spin: Duration,
-    /// When the tracker's link was last looked at, and the count of its messages then.
+    /// When the counts of the tracker's link were last read, and its messages then.
     looked: Time,
     counted: u64,
     /// A frame that was made before this is stale.
@@ -53,7 +52,7 @@ impl<'a, W: Witness> Live<'a, W> {
         clock: Clock,
         witness: W,
     ) -> Self {
-        // What waits on the bus came before the session was made, and is given to it afterwards.
+        // Frames that wait on the bus are older than the session; it is given them at its start.
         let last = clock.now();
         let counted = tracker.as_ref().map_or(0, |link| link.messages());
         Live {
@@ -72,16 +71,15 @@ impl<'a, W: Witness> Live<'a, W> {
         }
     }
 
-    /// Gives `input` to the session as of `at`. Where the thread was held up for longer than the
-    /// drives bear, the session is told to stop first: whatever it is given after a gap, it makes no
-    /// set-point of it.
+    /// Gives `input`, which came at `at`, to the session. After a gap longer than [`Machine::silence_max`] the
+    /// session is told to stop first, so that it computes no set-point from the input.
     fn give_at(&mut self, at: Time, input: Input) {
         self.check_gap(self.session.deadline());
         self.handle(at.max(self.last), input);
     }
 
-    /// Tells the session to stop where longer has passed since `since` than the drives bear. What it
-    /// made before and was not sent yet is stale.
+    /// Tells the session to stop if [`Machine::silence_max`] has passed since `since`. Frames that it made before
+    /// and that were not sent yet are stale.
     fn check_gap(&mut self, since: Time) {
         let now = self.clock.now();
         if let Some(reason) = self.held_up(now.since(since)) {
@@ -90,7 +88,7 @@ impl<'a, W: Witness> Live<'a, W> {
         }
     }
 
-    /// What is due is done with the input, so how late that is is noted.
+    /// Gives `input` to the session, which also does what is due; notes how late that is.
     fn handle(&mut self, now: Time, input: Input) {
         let deadline = self.session.deadline();
         if now >= deadline {
@@ -101,7 +99,7 @@ impl<'a, W: Witness> Live<'a, W> {
         self.last = now;
     }
 
-    /// Why a run ends that nothing was done for during `gap`; `None` where the drives bear that.
+    /// Why a run ends after a `gap` in which the bench did nothing; `None` if it is short enough.
     fn held_up(&self, gap: Duration) -> Option<String> {
         let max = self.session.silence_max().filter(|max| gap >= *max)?;
         let messages = self.tracker.as_ref().map_or(0, |link| link.messages() - self.counted);
@@ -115,17 +113,17 @@ impl<'a, W: Witness> Live<'a, W> {
         ))
     }
 
-    /// When the frame arrived that the bus gave last: by the kernel's stamp where there is one, but
-    /// never before anything that the session was told already, and before what is due. A bench that
-    /// was late would otherwise make up, frame by frame, for each SYNC that it missed.
+    /// When the last frame of the bus arrived: by the kernel's stamp if there is one, but not before the last
+    /// input, and before the session's deadline. Otherwise a bench that was late would catch up on the missed
+    /// SYNCs, one with each frame.
     fn arrival(&self) -> Time {
         let age = self.bus.received_at().and_then(|at| SystemTime::now().duration_since(at).ok());
         let arrived = self.clock.now() - age.unwrap_or_default();
         arrived.min(self.session.deadline() - Duration::from_nanos(1)).max(self.last)
     }
 
-    /// Notes how late a frame that was made at `made` and has just left was: a SYNC after its time, a
-    /// set-point after the feedback.
+    /// Notes the delay of a frame that was made at `made` and has just been sent: of a SYNC after its deadline,
+    /// of a set-point after the feedback.
     fn note_sent(&mut self, made: Time, frame: &Frame) {
         match (frame.cob_id(), self.met) {
             (Some(cob::SYNC), Some(due)) => self.timing.note_sync(self.clock.now().since(due)),
@@ -136,14 +134,14 @@ impl<'a, W: Witness> Live<'a, W> {
         }
     }
 
-    /// Takes a portion of what the tracker's link says, and none of it once a deadline is due.
+    /// Takes a portion of the tracker's events, none of them once a deadline is due.
     fn take_events(&mut self) {
         let now = self.clock.now();
         if let Some(link) = &mut self.tracker
             && now.since(self.looked) >= LOOK_PERIOD
         {
             let (messages, passed_over) = (link.messages(), link.passed_over());
-            // What came during a gap is counted from the look before it.
+            // A gap is explained by the messages since the last reading, so it is checked first.
             self.check_gap(self.session.deadline());
             (self.looked, self.counted) = (now, messages);
             if let Some(event) = passed_over {
@@ -160,7 +158,7 @@ impl<'a, W: Witness> Live<'a, W> {
         }
     }
 
-    /// Waits for one event of the bus; false when none came.
+    /// Waits for one event of the bus; false if none came or the bus failed.
     fn take_frame(&mut self, timeout: Duration) -> bool {
         let input = match self.bus.receive(timeout) {
             Ok(None) => return false,
@@ -197,7 +195,7 @@ impl<W: Witness> World for Live<'_, W> {
         self.give_at(self.clock.now(), input);
     }
 
-    /// A frame that was made before a gap longer than the drives bear is never sent.
+    /// A frame that was made before a gap longer than [`Machine::silence_max`] is never sent.
     fn send(&mut self, made: Time, frame: &Frame) -> Result<bool, CanError> {
         self.check_gap(made);
         if self.stale_before.is_some_and(|before| made < before) {
@@ -212,9 +210,8 @@ impl<W: Witness> World for Live<'_, W> {
         self.witness.take(record, None);
     }
 
-    /// What the bus holds came before what is due and what the tracker says now: as many frames as a
-    /// bus at full load brings in some 30 ms, so that a flood, which never ends, neither holds the
-    /// thread nor keeps the deadline waiting.
+    /// Takes the frames that wait on the bus: they came before what is due and before the tracker's events. At
+    /// most as many as a bus at full load brings in some 30 ms, so that an endless flood delays no deadline.
     fn take_arrived(&mut self) -> bool {
         self.met = None;
         let any = (0..256).take_while(|_| self.take_frame(Duration::ZERO)).count() > 0;
@@ -231,7 +228,7 @@ impl<W: Witness> World for Live<'_, W> {
         self.take_events();
         carry_out(self);
         self.met = None;
-        // Also where more events wait: a thread that never waits is throttled by the system.
+        // Also if more events are queued: the kernel throttles a real-time thread that never sleeps.
         let deadline = self.session.deadline();
         let wait = deadline.since(self.clock.now()).saturating_sub(self.spin).min(WAIT_MAX);
         match wait.is_zero() {
@@ -241,7 +238,7 @@ impl<W: Witness> World for Live<'_, W> {
     }
 }
 
-/// So many messages from the tracker in this time in words, where they are a flood.
+/// Names so many messages from the tracker in this time as the cause of a gap, if they are a flood.
 fn flood(messages: u64, time: Duration) -> Option<String> {
     let per_s = messages as f64 / time.max(LOOK_PERIOD).as_secs_f64();
     (per_s > FLOOD_PER_S)
@@ -251,10 +248,9 @@ fn flood(messages: u64, time: Duration) -> Option<String> {
 /// Runs `session`, an insertion or an operation, until it ends, on the calling thread, which is the
 /// SYNC thread; `realtime` says how that runs, for the record.
 ///
-/// The bus is waited upon until the session's next deadline, which is absolute, so that a late
-/// cycle does not delay the ones after it. Tracker events were dated when they were received; a
-/// bounded portion of them is taken whenever the thread wakes, at least every 5 ms, and only while
-/// no deadline is due.
+/// The thread waits on the bus until the session's next deadline. Deadlines are absolute, so a late cycle does
+/// not delay the ones after it. The link has stamped the tracker's events when it received them; the thread
+/// takes a bounded portion of them whenever it wakes, at least every 5 ms, and only while no deadline is due.
 pub fn run_live(
     session: &mut dyn Machine,
     bus: &mut dyn CanBus,

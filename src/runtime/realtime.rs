@@ -58,8 +58,8 @@ pub fn enter_real_time(cpu: Option<usize>) -> Result<RealTime, String> {
     Ok(RealTime { priority: PRIORITY, cpu })
 }
 
-/// Has the system wake the calling thread when it is due: an ordinary thread is given 50 µs of slack
-/// otherwise, so that timers can be served together (PR_SET_TIMERSLACK).
+/// Reduces the calling thread's timer slack to 1 ns (PR_SET_TIMERSLACK). By default the kernel may wake an
+/// ordinary thread 50 µs late, to serve several timers together.
 pub(super) fn wake_in_time() {
     if let Err(error) = set_timerslack(1) {
         tracing::debug!("the SYNC thread keeps its timer slack: {error}");
@@ -82,8 +82,8 @@ fn bind(cpu: Option<usize>) -> Result<usize, String> {
     })
 }
 
-/// Locks all memory there is and will be. Under a limit, what is asked for later would be refused
-/// in the middle of a run: so it is done without one, or not at all.
+/// Locks present and future memory. Under a limit (RLIMIT_MEMLOCK) a later allocation would fail in the middle
+/// of a run, so a limit is refused here.
 fn lock_memory() -> Result<(), String> {
     let limit = soft_limit(Resource::RLIMIT_MEMLOCK);
     let refused = |reason| memory_refused(reason, limit / 1024);
@@ -93,7 +93,7 @@ fn lock_memory() -> Result<(), String> {
     mlockall(MlockAllFlags::MCL_CURRENT | MlockAllFlags::MCL_FUTURE).map_err(refused)
 }
 
-/// Memory cannot be locked, or not all that may yet be asked for.
+/// The refusal to lock memory, with the next step.
 fn memory_refused(reason: Errno, limit_kb: u64) -> String {
     format!(
         "--realtime: memory cannot be locked: {reason}; {RIGHTS} memlock unlimited in \

@@ -61,7 +61,7 @@ pub struct Sink<'a> {
     interrupt: Interrupt,
 }
 
-/// What a run came to.
+/// The result of a run.
 #[derive(Debug)]
 pub struct RunReport {
     /// How it ended.
@@ -80,7 +80,7 @@ pub struct RunReport {
     pub timing: Option<TimingReport>,
     /// The run folder.
     pub run_dir: PathBuf,
-    /// What telemetry left behind, or why it could not.
+    /// What the closed record holds, or why it could not be closed.
     pub record: Result<Finished, TelemetryError>,
     /// What can be known only of an emulated run.
     pub emulated: Option<EmulationReport>,

@@ -9,11 +9,11 @@ use crate::units::Time;
 use nalgebra::Vector3;
 use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
 
-/// Noise of the insertion that is the timetable's: as good as none, and no two positions alike,
-/// since a tracker that says the same over and over is not believed.
+/// Noise of the insertion that makes the timetable: negligible, but no two positions are equal, since the
+/// bench refuses positions that repeat.
 const TIMETABLE_NOISE: Noise = Noise::Gaussian(1e-6);
 
-/// Insertions to be made again and again.
+/// A Monte Carlo study of insertions.
 pub struct Study<'a> {
     /// The configuration of the bench.
     pub session: SessionConfig,
@@ -42,7 +42,7 @@ impl Study<'_> {
         self.trials(seeds, &self.timetable(first)?, done)
     }
 
-    /// The same at the times of a timetable that is at hand.
+    /// As [`Study::run`], with a timetable that was made before.
     ///
     /// # Errors
     /// As [`Study::run`].
@@ -58,7 +58,7 @@ impl Study<'_> {
         })
     }
 
-    /// The same through whole sessions, drives and CAN frames included: three times slower where every
+    /// As [`Study::run`], through whole sessions, drives and CAN frames included: three times slower where every
     /// position counts.
     ///
     /// # Errors
@@ -116,7 +116,7 @@ impl Study<'_> {
     pub fn timetable(&self, seed: u64) -> Result<Timetable, String> {
         let stage = self.drawn(seed)?;
         let tracker = TrackerModel { noise: TIMETABLE_NOISE, correlated: None, ..stage.tracker };
-        // The needle that the bench believes in: no gate finds fault with it.
+        // The needle of the bench's own model, so that no gate refuses a position.
         let stage = VirtualStageConfig {
             needle: self.session.needle,
             torsion: self.session.needle_torsion,

@@ -50,7 +50,7 @@ pub fn run_virtual(
 }
 
 /// Runs `session` against `stage` until it ends, and passes each record to `take`, with the true pose
-/// at that time. It is for studies: there is no operator, no interrupt and no run folder.
+/// at that time. A study has no operator, no interrupt and no run folder.
 pub(super) fn run_unwatched(
     session: &mut dyn Machine,
     stage: VirtualStage,

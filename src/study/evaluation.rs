@@ -1,6 +1,5 @@
 //! An observer over a recorded insertion, scored against the recorded tip.
 
-use super::mount::Mount;
 use super::recording::{RecordedRow, Recording};
 use super::statistics::{quantile, rms};
 use crate::geometry::{Pose, so3};
@@ -10,34 +9,9 @@ use crate::observer::{Observer, Whiteness};
 use crate::session::Samples;
 use nalgebra::{Rotation3, UnitQuaternion};
 use serde::Serialize;
-use thiserror::Error;
 
 /// How far ahead predictions are scored, mm.
 const AHEAD_MM: f64 = 5.0;
-
-/// Why a recording was not evaluated.
-#[derive(Debug, Clone, PartialEq, Error)]
-pub enum EvaluationError {
-    /// A row has a number far beyond any needle.
-    #[error("line {line}: {source}")]
-    Row {
-        /// Line of the row in the file, from 1.
-        line: usize,
-        /// The reason.
-        source: NeedleError,
-    },
-    /// The recording ends before errors count.
-    #[error(
-        "the insertion is {depth_mm:.1} mm deep, and errors count from {least_mm} mm on \
-         (evaluation.score_after_mm): record a deeper one, or score from less"
-    )]
-    TooShort {
-        /// Its depth, mm.
-        depth_mm: f64,
-        /// Depth from which errors count, mm.
-        least_mm: f64,
-    },
-}
 
 /// The score of one observer on one recording.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -103,8 +77,8 @@ impl Evaluation {
 /// How recordings are evaluated.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Scoring {
-    /// How the sensor sits on the needle.
-    pub mount: Mount,
+    /// How the tip frame B sits in the sensor frame S.
+    pub r_sb: Rotation3<f64>,
     /// Depth between two steps, mm.
     pub step_mm: f64,
     /// Which positions correct the observer.
@@ -127,14 +101,17 @@ struct Step {
 }
 
 /// The rows of `recording` in the plane frame P, which is the tip frame at the first row.
-fn steps(recording: &Recording, mount: &Mount) -> Result<Vec<Step>, EvaluationError> {
+///
+/// # Errors
+/// The line of a row that has a number far beyond any needle.
+fn steps(recording: &Recording, r_sb: &Rotation3<f64>) -> Result<Vec<Step>, String> {
     let first = &recording.rows[0];
     let lacks_roll = recording.lacks_roll();
     // R_PS0: the sensor's first orientation in the plane frame is the inverse of the mount.
-    let r_ps = mount.r_sb.inverse() * first.rotation_true.unwrap_or_default().inverse();
+    let r_ps = r_sb.inverse() * first.rotation_true.unwrap_or_default().inverse();
     let (mut depth_mm, mut rotation_rad) = (0.0, first.rotation_meas_rad);
     let step = |row: &RecordedRow| {
-        let refused = |source| EvaluationError::Row { line: row.line, source };
+        let refused = |error: NeedleError| format!("line {}: {error}", row.line);
         // Insertion never decreases: if the encoder steps back, no tissue is cut.
         let deeper_mm = (row.insertion_meas_mm - first.insertion_meas_mm - depth_mm).max(0.0);
         let turn_rad = row.rotation_meas_rad - rotation_rad;
@@ -146,7 +123,7 @@ fn steps(recording: &Recording, mount: &Mount) -> Result<Vec<Step>, EvaluationEr
             refused(NeedleError::too_large(way, position_mm.amax()))
         })?;
         let rotation_true = row.rotation_true.filter(|_| !lacks_roll);
-        let rotation_true = rotation_true.map(|rotation| r_ps * rotation * mount.r_sb);
+        let rotation_true = rotation_true.map(|rotation| r_ps * rotation * r_sb);
         Ok(Step { increment, depth_mm, tip_meas, rotation_true })
     };
     recording.rows.iter().map(step).collect()
@@ -172,18 +149,21 @@ fn prediction_error_mm(observer: &dyn Observer, steps: &[Step], at: usize) -> Op
 /// The roll error is the rotation about the tip's axis between estimate and record.
 ///
 /// # Errors
-/// [`EvaluationError`] if a row's increment or position is far beyond any needle, or if the
-/// recording ends before errors count.
+/// In words, if a row's increment or position is far beyond any needle, or if the recording ends before
+/// errors count.
 pub fn evaluate(
     observer: &mut dyn Observer,
     recording: &Recording,
     scoring: &Scoring,
-) -> Result<Score, EvaluationError> {
-    let steps = steps(recording, &scoring.mount)?;
-    let (depth_mm, least_mm) =
-        (steps.last().map_or(0.0, |step| step.depth_mm), scoring.score_after_mm);
-    if depth_mm < least_mm {
-        return Err(EvaluationError::TooShort { depth_mm, least_mm });
+) -> Result<Score, String> {
+    let steps = steps(recording, &scoring.r_sb)?;
+    let depth_mm = steps.last().map_or(0.0, |step| step.depth_mm);
+    if depth_mm < scoring.score_after_mm {
+        return Err(format!(
+            "the insertion is {depth_mm:.1} mm deep, and errors count from {} mm on \
+             (evaluation.score_after_mm): record a deeper one, or score from less",
+            scoring.score_after_mm
+        ));
     }
     let (mut next_mm, mut scored) = (0.0, 0);
     let mut whiteness = Whiteness::new(scoring.position_sd_mm);
@@ -213,10 +193,10 @@ pub fn evaluate(
         }
         // One step after a gap, however many it spans.
         next_mm += (((step.depth_mm - next_mm) / scoring.step_mm).floor() + 1.0) * scoring.step_mm;
-        let estimate = observer.estimate();
         if step.depth_mm < scoring.score_after_mm {
             continue;
         }
+        let estimate = observer.estimate();
         scored += usize::from(estimate.is_some());
         if let Some(predicted) = predicted {
             positions.push((predicted.x_pb.translation - step.tip_meas.mm()).norm());
@@ -252,24 +232,18 @@ mod tests {
     use crate::geometry::FixedAngles;
     use crate::needle::Needle;
     use crate::observer::{Coupled, CoupledConfig, Estimate, FiniteDifference, Gains};
+    use crate::study::mount;
     use nalgebra::Vector3;
 
-    fn scoring(mount: Mount, step_mm: f64, score_after_mm: f64) -> Scoring {
-        Scoring {
-            mount,
-            step_mm,
-            samples: Samples::OnePerStep,
-            position_sd_mm: 1.0,
-            score_after_mm,
-        }
+    fn scoring(r_sb: Rotation3<f64>, step_mm: f64, score_after_mm: f64) -> Scoring {
+        Scoring { r_sb, step_mm, samples: Samples::OnePerStep, position_sd_mm: 1.0, score_after_mm }
     }
 
     /// A recording of a needle without torsion, with a tilted sensor, in a frame of its own.
-    fn recording(mount: &Mount) -> Recording {
+    fn recording(r_sb: &Rotation3<f64>) -> Recording {
         let needle = Needle::new(0.0125).unwrap();
         let r_so = FixedAngles { yaw: 0.4, pitch: -0.3, roll: 1.0 }.to_rotation();
-        let mut tip =
-            Pose { rotation: r_so * mount.r_sb, translation: Vector3::new(5.0, 6.0, 7.0) };
+        let mut tip = Pose { rotation: r_so * r_sb, translation: Vector3::new(5.0, 6.0, 7.0) };
         let (mut rows, mut rotation) = (Vec::new(), 2.0);
         for n in 0..800u32 {
             rows.push(RecordedRow {
@@ -277,7 +251,7 @@ mod tests {
                 insertion_meas_mm: 0.1 * f64::from(n),
                 rotation_meas_rad: rotation,
                 position_meas_mm: tip.translation,
-                rotation_true: Some(tip.rotation * mount.r_sb.inverse()),
+                rotation_true: Some(tip.rotation * r_sb.inverse()),
             });
             let turn = 0.02 * (f64::from(n) * 0.01).sin();
             tip = needle.step(&tip, Increment::new(0.1, turn).unwrap());
@@ -289,8 +263,7 @@ mod tests {
     /// The recording of a perfect needle scores nearly zero, in any frame.
     #[test]
     fn a_needle_without_torsion_is_followed() {
-        let mount =
-            Mount::new(Vector3::new(0.03, -0.09, 0.97), Vector3::new(1.0, -1.2, 0.0)).unwrap();
+        let r_sb = mount(Vector3::new(0.03, -0.09, 0.97), Vector3::new(1.0, -1.2, 0.0)).unwrap();
         let needle = Needle::new(0.0125).unwrap();
         let config = CoupledConfig {
             gains: Gains::Placed,
@@ -307,7 +280,7 @@ mod tests {
         ];
         for observer in &mut observers {
             let score =
-                evaluate(observer.as_mut(), &recording(&mount), &scoring(mount, 1.0, 8.0)).unwrap();
+                evaluate(observer.as_mut(), &recording(&r_sb), &scoring(r_sb, 1.0, 8.0)).unwrap();
             assert!(
                 score.steps > 60
                     && score.roll_rms_deg.unwrap() < 1.0
@@ -321,15 +294,15 @@ mod tests {
     /// A tracker that sends positions may put any orientation beside them.
     #[test]
     fn orientations_that_never_change_are_not_scored() {
-        let mount = Mount::new(Vector3::z(), Vector3::x()).unwrap();
-        let mut recording = recording(&mount);
+        let r_sb = mount(Vector3::z(), Vector3::x()).unwrap();
+        let mut recording = recording(&r_sb);
         assert!(!recording.lacks_roll());
         for row in &mut recording.rows {
             row.rotation_true = Some(Rotation3::identity());
         }
         assert!(recording.lacks_roll());
         let mut observer = FiniteDifference::new(Needle::new(0.0125).unwrap(), 2.0).unwrap();
-        let score = evaluate(&mut observer, &recording, &scoring(mount, 1.0, 8.0)).unwrap();
+        let score = evaluate(&mut observer, &recording, &scoring(r_sb, 1.0, 8.0)).unwrap();
         assert!(score.roll_rms_deg.is_none() && score.position_rms_mm.is_some(), "{score:?}");
         recording.rows.iter_mut().for_each(|row| row.rotation_true = None);
         assert!(!recording.lacks_roll(), "there are none");
@@ -365,24 +338,24 @@ mod tests {
 
     #[test]
     fn one_correction_follows_a_gap() {
-        let mount = Mount::new(Vector3::z(), Vector3::x()).unwrap();
+        let r_sb = mount(Vector3::z(), Vector3::x()).unwrap();
         let mut counter = Counter { corrections: 0 };
         let depths_mm = [0.0, 1.0, 2.0, 10.0, 10.2, 10.4, 11.0];
         let score =
-            evaluate(&mut counter, &straight(&depths_mm), &scoring(mount, 1.0, 0.0)).unwrap();
+            evaluate(&mut counter, &straight(&depths_mm), &scoring(r_sb, 1.0, 0.0)).unwrap();
         assert_eq!((counter.corrections, score.steps), (5, 5));
     }
 
     #[test]
     fn a_row_beyond_any_needle_is_refused_by_its_line() {
-        let mount = Mount::new(Vector3::z(), Vector3::x()).unwrap();
+        let r_sb = mount(Vector3::z(), Vector3::x()).unwrap();
         let needle = Needle::new(0.0125).unwrap();
         let mut observer = FiniteDifference::new(needle, 2.0).unwrap();
         let error =
-            evaluate(&mut observer, &straight(&[0.0, 1.0, 1e308]), &scoring(mount, 1.0, 0.0))
+            evaluate(&mut observer, &straight(&[0.0, 1.0, 1e308]), &scoring(r_sb, 1.0, 0.0))
                 .unwrap_err();
         assert_eq!(
-            error.to_string(),
+            error,
             "line 4: insertion increment in mm is 1e308, allowed is up to 1e6 in magnitude"
         );
     }

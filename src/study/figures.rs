@@ -102,32 +102,18 @@ pub struct RunFigures {
     /// Estimated x, mm, at steps with an estimate.
     estimated: ByDepth<f64>,
     saturated: usize,
-    /// Measured depth of the stage, mm.
-    insertion_mm: f64,
-    following_error_mm: Greatest,
-    following_error_deg: Greatest,
-    tip_age_s: Greatest,
-    tip_lag_mm: Greatest,
+    /// The other figures, kept as they come; [`report`](Self::report) adds those above.
+    so_far: FigureReport,
     /// Acquisition time of the newest accepted position.
     tip_seen: Option<Time>,
     /// Times and depths of the stage, from the last one before `tip_seen`.
     path: VecDeque<(Time, f64)>,
-    blind_s: Greatest,
-    blind_mm: Greatest,
-    /// True, if known, and estimated distance from the target at the last step, mm.
-    target: Option<(Option<f64>, f64)>,
-    clearance_mm_min: Option<f64>,
 }
 
-/// The largest magnitude so far.
-#[derive(Debug, Clone, Copy, Default)]
-struct Greatest(Option<f64>);
-
-impl Greatest {
-    fn take(&mut self, value: f64) {
-        if value.is_finite() {
-            self.0 = Some(self.0.unwrap_or(0.0).max(value.abs()));
-        }
+/// Raises `greatest`, the largest magnitude so far, to that of `value`.
+fn raise(greatest: &mut Option<f64>, value: f64) {
+    if value.is_finite() {
+        *greatest = Some(greatest.unwrap_or(0.0).max(value.abs()));
     }
 }
 
@@ -211,19 +197,22 @@ impl RunFigures {
         let error = truth.and_then(|truth| TipError::of(step, truth));
         self.take_scored(step.insertion_meas_mm, x_mm, error);
         self.saturated += usize::from(step.command_saturated);
-        step.tip_meas_age_s.into_iter().for_each(|age_s| self.tip_age_s.take(age_s));
+        if let Some(age_s) = step.tip_meas_age_s {
+            raise(&mut self.so_far.tip_age_s_max, age_s);
+        }
         if let Some(approach) = &step.approach {
             let true_mm = |truth: &Truth| {
                 let target_mm = truth.target_mm().unwrap_or(&approach.target_mm);
                 (truth.x_pb().translation - target_mm).norm()
             };
-            self.target = Some((truth.map(true_mm), approach.distance_mm));
-            let least_mm = self.clearance_mm_min.unwrap_or(f64::INFINITY);
+            self.so_far.target_error_mm = truth.map(true_mm);
+            self.so_far.target_error_est_mm = Some(approach.distance_mm);
+            let least_mm = self.so_far.clearance_mm_min.unwrap_or(f64::INFINITY);
             let least_mm = least_mm.min(approach.clearance_mm);
-            self.clearance_mm_min = Some(least_mm).filter(|mm| mm.is_finite());
+            self.so_far.clearance_mm_min = Some(least_mm).filter(|mm| mm.is_finite());
         }
         if let Some(at_mm) = step.tip_meas_insertion_mm {
-            self.tip_lag_mm.take(step.insertion_meas_mm - at_mm);
+            raise(&mut self.so_far.tip_lag_mm_max, step.insertion_meas_mm - at_mm);
         }
     }
 
@@ -231,7 +220,7 @@ impl RunFigures {
     /// known, else estimated), and the estimate's error.
     pub fn take_scored(&mut self, insertion_mm: f64, x_mm: Option<f64>, error: Option<TipError>) {
         self.steps.push((insertion_mm, (x_mm, error)));
-        self.insertion_mm = insertion_mm;
+        self.so_far.insertion_mm = insertion_mm;
     }
 
     /// Adds a sample of the tracker.
@@ -241,42 +230,35 @@ impl RunFigures {
 
     /// Adds the stage's position at a SYNC.
     pub fn follow(&mut self, stage: &Feedback) {
-        self.insertion_mm = stage.measured.insertion_mm;
+        let figures = &mut self.so_far;
+        figures.insertion_mm = stage.measured.insertion_mm;
         if let Some(seen) = self.tip_seen {
             self.path.push_back((stage.time, stage.measured.insertion_mm));
             while self.path.get(1).is_some_and(|(time, _)| *time <= seen) {
                 self.path.pop_front();
             }
-            self.blind_s.take(stage.time.seconds_after(seen).max(0.0));
+            raise(&mut figures.blind_s_max, stage.time.seconds_after(seen).max(0.0));
             let seen_at_mm = self.path.front().map_or(f64::NAN, |(_, depth_mm)| *depth_mm);
-            self.blind_mm.take(stage.measured.insertion_mm - seen_at_mm);
+            raise(&mut figures.blind_mm_max, stage.measured.insertion_mm - seen_at_mm);
         }
-        self.following_error_mm.take(stage.commanded.insertion_mm - stage.measured.insertion_mm);
+        let behind_mm = stage.commanded.insertion_mm - stage.measured.insertion_mm;
+        raise(&mut figures.following_error_mm_max, behind_mm);
         let behind_rad = stage.commanded.rotation_rad - stage.measured.rotation_rad;
-        self.following_error_deg.take(behind_rad.to_degrees());
+        raise(&mut figures.following_error_deg_max, behind_rad.to_degrees());
     }
 
     /// All figures so far.
     pub fn report(&self) -> FigureReport {
-        let last_third = || last_third(&self.steps, self.insertion_mm);
+        let last_third = || last_third(&self.steps, self.so_far.insertion_mm);
         let errors: Vec<TipError> = last_third().filter_map(|(_, error)| error).collect();
         FigureReport {
-            insertion_mm: self.insertion_mm,
             steps: self.steps.len(),
             steps_saturated: Some(self.saturated),
             off_plane_rms_mm: rms(last_third().filter_map(|(x_mm, _)| x_mm)),
             settling_mm: self.settling_mm(),
             estimate_rms: TipError::by_coordinate(&errors, rms),
             final_error: self.steps.last().and_then(|(_, (_, error))| *error),
-            following_error_mm_max: self.following_error_mm.0,
-            following_error_deg_max: self.following_error_deg.0,
-            tip_age_s_max: self.tip_age_s.0,
-            tip_lag_mm_max: self.tip_lag_mm.0,
-            blind_s_max: self.blind_s.0,
-            blind_mm_max: self.blind_mm.0,
-            target_error_mm: self.target.and_then(|(true_mm, _)| true_mm),
-            target_error_est_mm: self.target.map(|(_, estimated_mm)| estimated_mm),
-            clearance_mm_min: self.clearance_mm_min,
+            ..self.so_far.clone()
         }
     }
 
@@ -284,10 +266,10 @@ impl RunFigures {
     /// the depth. The distance is the estimated one, since a live run has no truth. `None` if it is
     /// at most 1 mm, without an estimate, or with a target.
     pub fn plane_missed_by_mm(&self) -> Option<f64> {
-        if self.target.is_some() {
+        if self.so_far.target_error_est_mm.is_some() {
             return None;
         }
-        let missed_by_mm = rms(last_third(&self.estimated, self.insertion_mm));
+        let missed_by_mm = rms(last_third(&self.estimated, self.so_far.insertion_mm));
         missed_by_mm.filter(|rms_mm| *rms_mm > OFF_PLANE_LIMIT_MM)
     }
 

@@ -16,9 +16,9 @@ mod trial;
 
 pub use bound::{InformationBound, Prior};
 pub use consistency::{Consistency, Nees, TrialNees, Verdict};
-pub use evaluation::{Evaluation, EvaluationError, Quantiles, Score, Scoring, evaluate};
+pub use evaluation::{Evaluation, Quantiles, Score, Scoring, evaluate};
 pub use figures::{FigureReport, OFF_PLANE_LIMIT_MM, PlanStatus, RunFigures, TipError};
-pub use mount::{Mount, MountError};
+pub use mount::mount;
 pub use recording::{RecordedRow, Recording};
 pub use score::{TargetScore, TrialResult, TrialScore};
 pub use statistics::{quantile, rms};

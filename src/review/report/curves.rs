@@ -22,8 +22,6 @@ type Column = Vec<Option<f64>>;
 pub(super) fn curves(run: &Run, limits: &Limits) -> Vec<Chart> {
     let roll = tip(run, "roll", "Roll: where the bevel looks", "roll (deg)");
     let (position, angles) = (["x", "y", "z"], ["yaw", "pitch", "roll"]);
-    let turning = ("rotation_cmd_rad_per_mm", "commanded for the next step", COMMANDED);
-    let rotation = ("rotation_rad", "stage, measured", MEASURED);
     let mut charts = vec![
         off_plane(run, limits),
         tip(run, "y", "Tip in the plane, across the start", "y (mm)"),
@@ -32,8 +30,8 @@ pub(super) fn curves(run: &Run, limits: &Limits) -> Vec<Chart> {
         errors(run, "Errors of the estimated position", "estimate − truth (mm)", position),
         errors(run, "Errors of the estimated angles", "estimate − truth (deg)", angles),
         residuals(run),
-        base(run, "Turning of the base", "turning (deg/mm)", turning),
-        base(run, "Rotation of the base", "rotation (deg)", rotation),
+        turning_of_base(run),
+        rotation_of_base(run),
         target_error(run, limits),
         insertion(run, limits),
         tip_age(run, limits),
@@ -120,15 +118,17 @@ fn residuals(run: &Run) -> Chart {
     Chart::new(title, DEPTH, y, layers.collect())
 }
 
-/// A column of the base's rotation over depth, with its name in the legend and its colour.
-fn base(
-    run: &Run,
-    title: &'static str,
-    y: &'static str,
-    (name, label, colour): (&str, &'static str, &'static str),
-) -> Chart {
-    let values = scaled(run.steps.column(name), f64::to_degrees);
-    Chart::new(title, DEPTH, y, vec![line(label, colour, points(&depth(run), &values))])
+fn turning_of_base(run: &Run) -> Chart {
+    let turning = scaled(run.steps.column("rotation_cmd_rad_per_mm"), f64::to_degrees);
+    let turning = points(&depth(run), &turning);
+    let layers = vec![line("commanded for the next step", COMMANDED, turning)];
+    Chart::new("Turning of the base", DEPTH, "turning (deg/mm)", layers)
+}
+
+fn rotation_of_base(run: &Run) -> Chart {
+    let rotation = scaled(run.steps.column("rotation_rad"), f64::to_degrees);
+    let layers = vec![line("stage, measured", MEASURED, points(&depth(run), &rotation))];
+    Chart::new("Rotation of the base", DEPTH, "rotation (deg)", layers)
 }
 
 /// Depth over time, with the holds.
