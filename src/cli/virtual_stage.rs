@@ -78,8 +78,7 @@ pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
         bus.name(),
         tips.local_addr()
     ));
-    serve_stage(stage, bus.as_mut(), tips, clock, until, &interrupt, log)
-        .map_err(Failure::environment)?;
+    serve_stage(stage, bus.as_mut(), tips, until, &interrupt, log).map_err(Failure::environment)?;
     runtime.shutdown_background();
     Ok(ExitCode::SUCCESS)
 }

@@ -32,7 +32,7 @@ const TIMING: [(&str, &str, &str, usize); 3] = [
     ("sync_late_us_p99", "SYNC late, 99 %", "µs", 0),
     ("sync_late_us_max", "SYNC late, most", "µs", 0),
 ];
-/// The depth reached, with the lower limit of it; every other limit is an upper one.
+/// The depth reached. Its limit is a lower one; every other limit is an upper one.
 const DEPTH: &str = "insertion_mm";
 pub(super) const OFF_PLANE: &str = "off_plane_rms_mm";
 pub(super) const TIP_AGE: &str = "tip_age_s_max";

@@ -66,7 +66,11 @@ pub fn to_json(run: &Run) -> Value {
     let limit = |figure: &Figure| Some((figure.key.clone(), json!(figure.limit?)));
     let limits: Map<String, Value> = figures.iter().filter_map(limit).collect();
     let outside = figures.iter().filter(|figure| figure.is_outside()).map(|figure| &figure.key);
-    let all: Map<String, Value> = run.all_figures().iter().map(key_value).collect();
+    let value = |figure: &Figure| match figure.value {
+        Some(count) if figure.decimals == 0 && figure.unit.is_empty() => json!(count as i64),
+        value => json!(value),
+    };
+    let all = run.all_figures().into_iter().map(|figure| (figure.key.clone(), value(&figure)));
     json!({
         "run_dir": run.folder.dir,
         "name": manifest.name,
@@ -82,21 +86,12 @@ pub fn to_json(run: &Run) -> Value {
         "operator": manifest.operator,
         "phantom": manifest.phantom,
         "note": manifest.note,
-        "figures": all,
+        "figures": all.collect::<Map<_, _>>(),
         "limits": limits,
         "outside": outside.collect::<Vec<_>>(),
         "warnings": warnings(run),
         "states": run.states(),
     })
-}
-
-/// A figure's key and value in JSON.
-fn key_value(figure: &Figure) -> (String, Value) {
-    let value = match figure.value {
-        Some(count) if figure.decimals == 0 && figure.unit.is_empty() => json!(count as i64),
-        value => json!(value),
-    };
-    (figure.key.clone(), value)
 }
 
 /// The warnings of `run`, the most serious first; its events with their times come last.

@@ -116,11 +116,11 @@ pub fn serve_stage(
     mut stage: VirtualStage,
     bus: &mut dyn CanBus,
     mut tips: TipServer,
-    clock: Clock,
     until: Option<Time>,
     interrupt: &Interrupt,
     mut log: impl FnMut(Direction, &Frame),
 ) -> Result<(), String> {
+    let clock = tips.clock;
     while !interrupt.is_raised() && until.is_none_or(|until| clock.now() < until) {
         while let Some(output) = stage.poll() {
             match output {

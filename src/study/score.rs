@@ -46,16 +46,16 @@ pub struct TargetScore {
 }
 
 impl TrialResult {
-    /// True if the trial reached its depth and stayed within 1 mm RMS of the plane over the last
-    /// third.
-    ///
-    /// With a target: true if it was reached.
+    /// True if the trial reached its target; without one, if it reached its depth and stayed within 1 mm RMS of
+    /// the plane over the last third.
     pub fn is_settled(&self) -> bool {
-        if let Some(target) = self.target {
-            return target.is_reached;
+        match self.target {
+            Some(target) => target.is_reached,
+            None => {
+                self.outcome == Outcome::Completed
+                    && self.figures.off_plane_rms_mm.is_some_and(|rms| rms < OFF_PLANE_LIMIT_MM)
+            }
         }
-        self.outcome == Outcome::Completed
-            && self.figures.off_plane_rms_mm.is_some_and(|rms| rms < OFF_PLANE_LIMIT_MM)
     }
 
     /// The result of a trial that was refused before the insertion.
@@ -84,7 +84,7 @@ pub struct TrialScore {
     nees: ByDepth<f64>,
     /// The normalised innovation squared at each step with a position.
     nis: ByDepth<f64>,
-    /// With its tolerance, mm, and the least distance from an obstacle so far, mm.
+    /// The target's obstacles, its tolerance, mm, and the least distance from an obstacle so far, mm.
     goal: Option<(World, f64, f64)>,
 }
 
