@@ -20,7 +20,7 @@ struct Section {
 }
 
 impl Eds {
-    /// Reads the text of a data sheet. Comments and blank lines are left out.
+    /// Reads the text of a data sheet. Lines that are neither a section nor a key are left out.
     pub fn parse(text: &str) -> Self {
         let mut sections: Vec<Section> = Vec::new();
         for line in text.lines() {

@@ -123,7 +123,8 @@ impl PdoMapping {
 pub struct PdoCobId(pub u32);
 
 impl PdoCobId {
-    const INVALID: u32 = 1 << 31;
+    /// Bit 31: the PDO is off.
+    pub const INVALID: u32 = 1 << 31;
     const NO_RTR: u32 = 1 << 30;
     const EXTENDED: u32 = 1 << 29;
 

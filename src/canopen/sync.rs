@@ -22,28 +22,24 @@ pub struct SyncProducer {
     period: Duration,
     /// When the next SYNC is due.
     pub deadline: Time,
-    /// How many SYNCs were skipped because the caller was late.
-    pub missed: u64,
 }
 
 impl SyncProducer {
-    /// A SYNC every `period`, the first at `first`; a period of zero is off.
+    /// A SYNC every `period`, which is over zero, the first at `first`.
     pub fn new(period: Duration, first: Time) -> Self {
-        let deadline = if period.is_zero() { Time::NEVER } else { first };
-        SyncProducer { period, deadline, missed: 0 }
+        SyncProducer { period, deadline: first }
     }
 
-    /// The SYNC to send now, if one is due. SYNCs that were missed are skipped and counted: two SYNCs
+    /// If a SYNC is due, the number of SYNCs that were missed before it. They are skipped: two SYNCs
     /// in a row would make the drives jump.
-    pub fn handle_timeout(&mut self, now: Time) -> Option<Frame> {
+    pub fn handle_timeout(&mut self, now: Time) -> Option<u32> {
         if now < self.deadline {
             return None;
         }
         let late = now.since(self.deadline).as_nanos() / self.period.as_nanos().max(1);
         let missed = u32::try_from(late).unwrap_or(u32::MAX);
-        self.missed += u64::from(missed);
         self.deadline = self.deadline + self.period.saturating_mul(missed) + self.period;
-        Some(sync_frame())
+        Some(missed)
     }
 }
 
@@ -67,10 +63,8 @@ mod tests {
     #[test]
     fn beats_are_absolute_and_missed_ones_are_skipped() {
         let mut sync = SyncProducer::new(Duration::from_millis(10), at(0));
-        assert_eq!(sync.handle_timeout(at(4)), Some(sync_frame()));
-        assert_eq!((sync.deadline, sync.missed), (at(10), 0));
-        assert!(sync.handle_timeout(at(9)).is_none());
-        assert!(sync.handle_timeout(at(35)).is_some());
-        assert_eq!((sync.deadline, sync.missed), (at(40), 2));
+        assert_eq!((sync.handle_timeout(at(4)), sync.deadline), (Some(0), at(10)));
+        assert_eq!(sync.handle_timeout(at(9)), None);
+        assert_eq!((sync.handle_timeout(at(35)), sync.deadline), (Some(2), at(40)));
     }
 }

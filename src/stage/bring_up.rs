@@ -186,7 +186,11 @@ impl Script {
             self.tell(Progress::Skipped(self.axis, object));
             return Ok(None);
         }
-        let hint = if is_absent { "; list it as optional if the drive does without" } else { "" };
+        let hint = if is_absent {
+            "; list it in optional_objects if the bench can do without"
+        } else {
+            ""
+        };
         let attempts = self.config.bus.sdo_attempts;
         Err(match (error, request) {
             (SdoError::Aborted(code), SdoRequest::Download(_, value)) => {

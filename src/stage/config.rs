@@ -316,8 +316,11 @@ impl StageConfig {
 
     /// How long the counts of `axis` are watched to see that it stands.
     pub fn standstill_window(&self, axis: Axis) -> Duration {
-        let counts_per_unit = self.axis(axis).scale(axis, 0).counts_per_unit();
-        Standstill::new(counts_per_unit).window(self.bus.sync_period())
+        self.standstill(axis).window(self.bus.sync_period())
+    }
+
+    pub(super) fn standstill(&self, axis: Axis) -> Standstill {
+        Standstill::new(self.axis(axis).scale(axis, 0).counts_per_unit())
     }
 
     /// The nodes of the drives.
@@ -373,7 +376,7 @@ impl StageConfig {
             return Err(no_homing(axis));
         }
         let values = [
-            (config.following_error_max, "a following error", ""),
+            (Some(config.following_error_window()), "a following error", ""),
             (config.quick_stop_deceleration, "a quick-stop deceleration", "/s²"),
             (homing.and_then(|homing| homing.speed_switch), "a homing speed", "/s"),
             (homing.and_then(|homing| homing.speed_zero), "a homing speed", "/s"),
@@ -443,6 +446,11 @@ mod tests {
         assert!(
             text(|c| c.rotation.following_error_max = Some(0.0))
                 .starts_with("rotation: a following error of 0 deg: ")
+        );
+        // 30 ms at its highest speed are less than half a count.
+        assert!(
+            text(|c| c.insertion.limits.speed_max = 0.01)
+                .starts_with("insertion: a following error of 0.0003 mm: ")
         );
         assert!(
             text(|c| c.insertion.quick_stop_deceleration = Some(1e9))

@@ -2,12 +2,14 @@
 
 use super::drive::Drive;
 use super::machine::Phase;
+use super::supervision::refused_to_switch_on;
 use super::{Axis, Feedback, PerAxis, Progress, SetPoint, Stage, StageEvent};
 use crate::canopen::Frame;
 use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};
 use crate::canopen::nmt::NmtState;
 use crate::canopen::sdo::codec::ServerFrame;
 use crate::canopen::sdo::{SdoReply, SdoRequest};
+use crate::canopen::sync::sync_frame;
 use crate::units::Time;
 use std::time::Duration;
 
@@ -17,8 +19,8 @@ const REPEAT_PERIOD: Duration = Duration::from_millis(100);
 const LOOK_SYNCS: u64 = 10;
 
 impl Stage {
-    /// One SYNC: judges the last, then sends the RPDOs that were not sent ahead, and `sync`.
-    pub(super) fn cycle(&mut self, now: Time, sync: Frame) {
+    /// Judges the last SYNC, then sends the RPDOs that were not sent ahead, and the next SYNC.
+    pub(super) fn cycle(&mut self, now: Time) {
         self.judge_feedback(now);
         match self.phase {
             Phase::Standby { give_up, located } => self.stand_by(now, give_up, located),
@@ -30,16 +32,12 @@ impl Stage {
             }
             Phase::Stopping { quick, give_up } => self.stop(now, quick, give_up),
             Phase::Disabling { quick, standing, give_up } => {
-                if self.drives.all(|drive| drive.is_off()) || quick && now >= give_up {
+                if self.drives.all(Drive::is_off) || quick && now >= give_up {
                     return self.finish(standing);
                 }
                 if now >= give_up {
-                    self.fail_orderly_end(
-                        now,
-                        |drive| !drive.is_off(),
-                        "the drive still has power",
-                        "shutdown",
-                    );
+                    let what = "the drive still has power";
+                    self.fail_orderly_end(now, Drive::is_off, what, "shutdown");
                 }
                 self.repeat_by_sdo(now, |drive| !drive.is_off());
             }
@@ -52,7 +50,7 @@ impl Stage {
             }
             self.drives[axis].fresh = false;
         }
-        self.send(sync);
+        self.send(sync_frame());
         self.sync_time = now;
         self.sync_count += 1;
     }
@@ -60,9 +58,8 @@ impl Stage {
     /// Both positions of this SYNC are in. Nothing moves before both drives' heartbeats
     /// were heard, and say that PDOs are taken.
     pub(super) fn window_complete(&mut self, now: Time) {
-        let enabled = |state| state == Some(DriveState::OperationEnabled);
         if matches!(self.phase, Phase::Enabling { .. })
-            && self.drives.all(|drive| drive.is_armed() && enabled(drive.state()))
+            && self.drives.all(|drive| drive.is_armed() && drive.is_enabled())
             && self.monitors.all(|monitor| monitor.state == Some(NmtState::Operational))
         {
             self.phase = Phase::Ready;
@@ -122,7 +119,7 @@ impl Stage {
         self.counters.feedback_missed += 1;
         if self.missed_in_a_row > missed_max {
             let syncs = self.missed_in_a_row;
-            // The other may merely be late this time.
+            // The other drive may have missed only this SYNC.
             let PerAxis { insertion, rotation } = &self.drives;
             let axis = match rotation.missed_in_a_row > insertion.missed_in_a_row {
                 true => Axis::Rotation,
@@ -143,7 +140,7 @@ impl Stage {
     fn stand_by(&mut self, now: Time, give_up: Time, located: bool) {
         if !self.both_heard() {
             if now >= give_up {
-                self.fail_enabling(now, |drive| drive.statusword.is_none());
+                self.fail_enabling(now);
             }
             return;
         }
@@ -159,39 +156,51 @@ impl Stage {
         }
     }
 
-    /// Enabling has timed out; the first drive that `is_late` is the reason.
-    fn fail_enabling(&mut self, now: Time, is_late: impl Fn(&Drive) -> bool) {
-        let (axis, statusword) = self.first(is_late);
+    /// Enabling has timed out: names a drive that was not heard, else one that is not enabled, else one
+    /// without a heartbeat in Operational.
+    fn fail_enabling(&mut self, now: Time) {
         let timeout_ms = self.config.power.enable_timeout.as_millis();
-        let heard = match statusword {
-            Some(word) => format!("statusword {word}"),
-            None => "no TPDO1 was heard".to_owned(),
+        let first = |is_late: &dyn Fn(&Drive) -> bool| {
+            Axis::BOTH.into_iter().find(|axis| is_late(&self.drives[*axis]))
         };
-        let fault = format!(
-            "{axis}: not in operation enabled within {timeout_ms} ms ({heard}), check power stage, \
-             enable input and brake"
-        );
+        let fault = if let Some(axis) = first(&|drive| drive.statusword.is_none()) {
+            format!(
+                "{axis}: not in operation enabled within {timeout_ms} ms (no TPDO1 was heard), check \
+                 cable and the drive"
+            )
+        } else if let Some(axis) = first(&|drive| !drive.is_enabled()) {
+            let statusword = self.drives[axis].statusword.unwrap_or_default();
+            format!(
+                "{axis}: not in operation enabled within {timeout_ms} ms (statusword {statusword}), \
+                 check power stage, enable input and brake"
+            )
+        } else {
+            let operational = self.monitors.insertion.state == Some(NmtState::Operational);
+            let axis = if operational { Axis::Rotation } else { Axis::Insertion };
+            match self.monitors[axis].state {
+                None => format!(
+                    "{axis}: enabled, but no heartbeat within {timeout_ms} ms, is can.heartbeat_ms longer?"
+                ),
+                Some(state) => format!(
+                    "{axis}: enabled, but NMT state {state} instead of operational after {timeout_ms} ms, \
+                     is there another master?"
+                ),
+            }
+        };
         self.fail(now, fault);
-    }
-
-    /// The first axis whose drive `is_late`, and its statusword.
-    fn first(&self, is_late: impl Fn(&Drive) -> bool) -> (Axis, Option<Statusword>) {
-        let axis = Axis::BOTH.into_iter().find(|axis| is_late(&self.drives[*axis]));
-        let axis = axis.unwrap_or(Axis::Insertion);
-        (axis, self.drives[axis].statusword)
     }
 
     /// Leads both drives to Operation Enabled, the last step together.
     fn enable(&mut self, now: Time, give_up: Time) {
         if now >= give_up {
-            let is_late = |drive: &Drive| drive.state() != Some(DriveState::OperationEnabled);
-            return self.fail_enabling(now, is_late);
+            return self.fail_enabling(now);
         }
         for axis in Axis::BOTH {
             if let Some(statusword) =
                 self.drives[axis].refuses_to_switch_on(self.config.power.state_transition_timeout)
             {
-                return self.fail_switch_on(now, axis, statusword);
+                let fault = refused_to_switch_on(statusword);
+                return self.fail(now, format!("{axis}: {fault}"));
             }
         }
         let both_on = self.drives.all(|drive| {
@@ -211,15 +220,6 @@ impl Stage {
         self.lead_to_enabled();
     }
 
-    /// A drive on its way to Operation Enabled went back, or did not leave a state in time.
-    pub(super) fn fail_switch_on(&mut self, now: Time, axis: Axis, statusword: Statusword) {
-        let fault = format!(
-            "{axis}: the drive refused to switch on (statusword {statusword}); check safety input, \
-             emergency stop and supply, then start again"
-        );
-        self.fail(now, fault);
-    }
-
     /// Sets the controlwords that lead both drives one step on.
     fn lead_to_enabled(&mut self) {
         let next = PerAxis::from_fn(|axis| self.drives[axis].next_controlword());
@@ -233,15 +233,9 @@ impl Stage {
 
     /// Holds, or quick-stops, until both axes stand.
     fn stop(&mut self, now: Time, quick: bool, give_up: Time) {
-        let enabled = |drive: &Drive| drive.state() == Some(DriveState::OperationEnabled);
-        let standing = self.drives.all(|drive| drive.stands() && !(quick && enabled(drive)));
+        let standing = self.drives.all(|drive| drive.stands() && !(quick && drive.is_enabled()));
         if !quick && !standing && now >= give_up {
-            self.fail_orderly_end(
-                now,
-                |drive| !drive.stands(),
-                "not seen to stand",
-                "its last target",
-            );
+            self.fail_orderly_end(now, Drive::stands, "not seen to stand", "its last target");
         } else if standing || now >= give_up {
             let give_up = now + self.config.power.stop_timeout;
             self.phase = Phase::Disabling { quick, standing, give_up };
@@ -253,20 +247,20 @@ impl Stage {
                 self.set_controlwords(Controlword::SHUTDOWN);
             }
         }
-        self.repeat_by_sdo(now, enabled);
+        self.repeat_by_sdo(now, Drive::is_enabled);
     }
 
-    /// An orderly end has timed out; the first drive that `is_late` is the reason.
+    /// An orderly end has timed out; the first drive that is not `done` is the reason.
     fn fail_orderly_end(
         &mut self,
         now: Time,
-        is_late: impl Fn(&Drive) -> bool,
+        done: impl Fn(&Drive) -> bool,
         what: &str,
         since: &str,
     ) {
-        let (axis, statusword) = self.first(is_late);
-        let (statusword, ms) =
-            (statusword.unwrap_or_default(), self.config.power.stop_timeout.as_millis());
+        let axis = if done(&self.drives.insertion) { Axis::Rotation } else { Axis::Insertion };
+        let statusword = self.drives[axis].statusword.unwrap_or_default();
+        let ms = self.config.power.stop_timeout.as_millis();
         let fault = format!(
             "{axis}: {what} {ms} ms after {since} (statusword {statusword}); if it does not stop now, \
              press the emergency stop"
@@ -298,7 +292,8 @@ impl Stage {
         self.command_also_by_sdo(now, Controlword::QUICK_STOP);
     }
 
-    /// By SDO at once too: a drive that left Operational takes no PDOs.
+    /// Sets the controlword of both drives, and sends it by SDO at once: a drive that left Operational takes
+    /// no PDOs.
     fn command_also_by_sdo(&mut self, now: Time, controlword: Controlword) {
         self.set_controlwords(controlword);
         self.send_controlwords(now, |_| true);
@@ -320,7 +315,7 @@ impl Stage {
         self.send_sdo(axis, SdoRequest::Upload(object));
     }
 
-    /// What a drive answers to such a look.
+    /// Takes a drive's answer to [`Stage::look_by_sdo`].
     pub(super) fn take_look(&mut self, axis: Axis, frame: &Frame) {
         let Some(ServerFrame::Reply(object, SdoReply::Uploaded(value))) =
             ServerFrame::decode(frame.data())
@@ -331,15 +326,13 @@ impl Stage {
         if self.drives[axis].asked.take_if(|asked| *asked == object).is_none() {
             return;
         }
-        match (object, value.as_bytes()) {
-            (object::STATUSWORD, &[low, high] | &[low, high, _, _]) => {
-                self.drives[axis].take_statusword(Statusword(u16::from_le_bytes([low, high])));
+        let drive = &mut self.drives[axis];
+        if object == object::STATUSWORD {
+            if let Some(word) = value.at_least(2) {
+                drive.take_statusword(Statusword(word as u16));
             }
-            (object::POSITION_ACTUAL, &[a, b, c, d]) => {
-                let after = self.config.bus.sync_period().saturating_mul(LOOK_SYNCS as u32);
-                self.drives[axis].take_position(i32::from_le_bytes([a, b, c, d]), after);
-            }
-            _ => {}
+        } else if let Some(counts) = value.at_least(4) {
+            drive.take_position(counts as i32, self.sync_count);
         }
     }
 

@@ -35,7 +35,7 @@ pub trait Dialogue {
     /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
     fn deadline(&self) -> Time;
 
-    /// True when there is nothing left to say.
+    /// True when it has come to its end.
     fn is_over(&self) -> bool;
 }
 
@@ -104,8 +104,8 @@ impl Sdo {
         .await
     }
 
-    /// The same; a request that the drive neither answers nor refuses is repeated, up to the configured
-    /// number of attempts.
+    /// As [`Sdo::ask_once`], but a request that the drive neither answers nor refuses is repeated, up to the
+    /// configured number of attempts.
     pub(super) async fn ask(&self, request: SdoRequest) -> Result<SdoReply, SdoError> {
         let attempts_max = self.0.borrow().attempts_max;
         for _ in 1..attempts_max {
@@ -149,7 +149,22 @@ impl Sdo {
     /// # Errors
     /// As [`Sdo::read`].
     pub(super) async fn statusword(&self) -> Result<Statusword, String> {
-        Ok(Statusword(self.read(object::STATUSWORD).await?.to_u32() as u16))
+        Ok(Statusword(self.read_at_least(object::STATUSWORD, 2).await? as u16))
+    }
+
+    /// Reads `object`, of at least `len` bytes.
+    ///
+    /// # Errors
+    /// As [`Sdo::read`].
+    pub(super) async fn read_at_least(
+        &self,
+        object: ObjectAddress,
+        len: u8,
+    ) -> Result<u32, String> {
+        let value = self.read(object).await?;
+        value.at_least(len).ok_or_else(|| {
+            format!("node {} {object} has {} bytes", self.node(), value.as_bytes().len())
+        })
     }
 
     /// Writes `value` to `object`.
@@ -279,6 +294,14 @@ impl<T> WithBothDrives<T> {
     }
 }
 
+impl<T: Clone> WithBothDrives<T> {
+    /// The outcome of the script with the drive of `axis`; `None` while it goes on.
+    pub(super) fn outcome(&self, axis: Axis) -> Option<Result<T, String>> {
+        let outcome = self.axes[axis].outcome()?.clone();
+        Some(outcome.map_err(|error| format!("{axis}: {error}")))
+    }
+}
+
 impl<T> Dialogue for WithBothDrives<T> {
     fn handle_frame(&mut self, now: Time, frame: &Frame) {
         Axis::BOTH.into_iter().for_each(|axis| self.axes[axis].handle_frame(now, frame));
@@ -289,12 +312,16 @@ impl<T> Dialogue for WithBothDrives<T> {
     }
 
     fn poll_transmit(&mut self) -> Option<Frame> {
-        let mut sent = |axis| match self.axes[axis].poll()? {
-            Output::Transmit(frame) => Some(frame),
-            Output::Event(_) => None,
-        };
         let first = self.first.pop_front();
-        first.or_else(|| sent(Axis::Insertion)).or_else(|| sent(Axis::Rotation))
+        first.or_else(|| {
+            let mut outputs = std::iter::from_fn(|| {
+                self.axes.insertion.poll().or_else(|| self.axes.rotation.poll())
+            });
+            outputs.find_map(|output| match output {
+                Output::Transmit(frame) => Some(frame),
+                Output::Event(_) => None,
+            })
+        })
     }
 
     fn deadline(&self) -> Time {

@@ -15,12 +15,12 @@ const RESET_WITHIN: Duration = Duration::from_millis(500);
 /// The bits that a drive on its way to Operation Enabled keeps once it has shown them.
 const BEFORE_POWER: u16 = Statusword::REMOTE | Statusword::VOLTAGE_ENABLED;
 
-/// What a drive has last said of itself.
+/// A drive's last state and error.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct DriveReport {
-    /// Its state; `None` where it has said none, or none that is defined.
+    /// Its state; `None` before its first statusword, or if the profile does not define it.
     pub state: Option<DriveState>,
-    /// The last error that it reported, if it has not reported the end of it.
+    /// The last error that it reported, unless it has reported its end since.
     pub error: Option<EmcyCode>,
 }
 
@@ -34,11 +34,11 @@ impl DriveReport {
 /// The one reset of a drive that was found in Fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Reset {
-    /// Not of this drive, or no longer.
+    /// The drive was not found in Fault, or that fault is over.
     None,
-    /// Of the fault with this code (0x603F), where the drive has it.
+    /// To be sent for the fault with this code (0x603F), if the drive has that object.
     Due(Option<EmcyCode>),
-    /// So many SYNCs ago.
+    /// Sent so many SYNCs ago.
     Sent(u32),
 }
 
@@ -48,7 +48,7 @@ pub(super) struct Drive {
     axis: Axis,
     config: AxisConfig,
     sync_period: Duration,
-    /// It is in homing mode: it follows no target, and where it stands is not known.
+    /// It is in homing mode: it follows no target, and its position is not known.
     pub(super) homes: bool,
     /// Scale and limits, known once the axis's zero is.
     armed: Option<LimitCheck>,
@@ -58,6 +58,8 @@ pub(super) struct Drive {
     /// RPDO1 as it was sent since the last SYNC.
     sent_ahead: Option<Frame>,
     position: Unwrapper,
+    /// The SYNC after which the newest position came.
+    position_sync: u64,
     pub(super) statusword: Option<Statusword>,
     /// Its TPDO1 of the last SYNC has come.
     pub(super) fresh: bool,
@@ -72,20 +74,20 @@ pub(super) struct Drive {
     second: Option<Frame>,
     conflicts: u32,
     was_limited: bool,
-    /// The bits of the statusword that it has shown since it was enabled; of those that count on the way
-    /// there, since it was first heard.
+    /// The bits of the statusword that it has shown since it was enabled; those of `BEFORE_POWER` count from
+    /// its first statusword.
     shown: u16,
-    /// Bit 7 was set, and how often it has come.
+    /// Bit 7 was set in the last statusword, and how often it was set anew.
     was_warned: bool,
     warnings: u64,
-    /// SYNCs in a row without a new target, and how many of them are no commanded acceleration.
+    /// SYNCs in a row without a new target, and how many of them may be due to lost answers.
     held: u32,
     held_max: u32,
     /// The object that it was asked for by SDO while it stops.
     pub(super) asked: Option<ObjectAddress>,
-    /// The fault that ended its bring-up, or was to be reset.
+    /// The fault that it was found in, if its bring-up was ended.
     pub(super) found: Option<FoundFault>,
-    /// The last emergency message, and how often it came in a row.
+    /// The last emergency message, and how many times in a row it came.
     emcy: (Option<Emcy>, u64),
     pub(super) controlword: Controlword,
     standstill: Standstill,
@@ -104,6 +106,7 @@ impl Drive {
             next_counts: None,
             sent_ahead: None,
             position: Unwrapper::new(0),
+            position_sync: 0,
             statusword: None,
             fresh: false,
             missed_in_a_row: 0,
@@ -123,7 +126,7 @@ impl Drive {
             found: None,
             emcy: (None, 0),
             controlword: Controlword::DISABLE_VOLTAGE,
-            standstill: Standstill::new(config.axis(axis).scale(axis, 0).counts_per_unit()),
+            standstill: config.standstill(axis),
         }
     }
 
@@ -133,18 +136,17 @@ impl Drive {
         self.commanded = Commanded { counts: position.into(), step_counts: 0 };
     }
 
-    /// The payload of TPDO1, as [`plan::TPDO`](super::plan::TPDO) maps it.
-    pub(super) fn take_tpdo(&mut self, payload: [u8; 6]) {
+    /// The payload of TPDO1 after a SYNC, as [`plan::TPDO`](super::plan::TPDO) maps it.
+    pub(super) fn take_tpdo(&mut self, payload: [u8; 6], sync: u64) {
         self.taken = payload;
         let [s0, s1, p0, p1, p2, p3] = payload;
         self.take_statusword(Statusword(u16::from_le_bytes([s0, s1])));
-        let counts = self.position.unwrap(i32::from_le_bytes([p0, p1, p2, p3]));
+        self.take_position(i32::from_le_bytes([p0, p1, p2, p3]), sync);
         self.fresh = true;
         // Until the drive is commanded to follow, the target follows it.
         if self.armed.is_none() || self.homes {
-            self.commanded = Commanded { counts, step_counts: 0 };
+            self.commanded = Commanded { counts: self.position.counts(), step_counts: 0 };
         }
-        self.standstill.look(counts, self.sync_period);
     }
 
     /// A statusword, by whatever way it came.
@@ -161,15 +163,18 @@ impl Drive {
         };
     }
 
-    /// A position that came by SDO, so long after the one before.
-    pub(super) fn take_position(&mut self, position: i32, after: Duration) {
+    /// A position, by PDO or SDO, after the SYNC of this number.
+    pub(super) fn take_position(&mut self, position: i32, sync: u64) {
         let counts = self.position.unwrap(position);
-        self.standstill.look(counts, after);
+        let syncs = u32::try_from(sync - self.position_sync).unwrap_or(u32::MAX);
+        self.position_sync = sync;
+        self.standstill.look(counts, self.sync_period.saturating_mul(syncs));
     }
 
-    /// RPDO1 with the next target, to be sent before the SYNC is due.
-    pub(super) fn rpdo_ahead(&mut self) -> Frame {
-        let rpdo = self.rpdo(self.next_counts.unwrap_or(self.commanded.counts));
+    /// RPDO1 with the target for the next SYNC, to be sent before that is due.
+    pub(super) fn rpdo_ahead(&mut self, next_counts: i64) -> Frame {
+        self.next_counts = Some(next_counts);
+        let rpdo = self.rpdo(next_counts);
         self.sent_ahead = Some(rpdo);
         rpdo
     }
@@ -206,13 +211,13 @@ impl Drive {
         controlword
     }
 
-    /// It was found in Fault, with this code, and is to be reset once.
+    /// The drive was found in Fault, with this code: it is to be reset once.
     pub(super) fn allow_reset(&mut self, error_code: Option<EmcyCode>) {
         self.reset = Reset::Due(error_code);
     }
 
-    /// The reset is for the fault that the drive was found in. Once that fault is over, whatever
-    /// ended it, another is a new one.
+    /// The reset is for the fault that the drive was found in. Once that fault is over, by the reset or by
+    /// itself, another fault is a new one, which is not reset.
     fn end_reset(&mut self, state: Option<DriveState>) {
         let same_fault = match self.reset {
             Reset::None => false,
@@ -224,13 +229,13 @@ impl Drive {
         }
     }
 
-    /// An emergency message with this code is of the fault that it was found in, whose reset was
-    /// not sent yet.
+    /// Whether an emergency message with this code belongs to the fault that the drive was found in, whose
+    /// reset was not sent yet.
     pub(super) fn excuses(&self, code: EmcyCode) -> bool {
         self.reset == Reset::Due(Some(code))
     }
 
-    /// The fault that it was found in may not be over yet.
+    /// Whether the fault that the drive was found in may not be over yet.
     pub(super) fn may_be_in_fault(&self) -> bool {
         match self.reset {
             Reset::None => false,
@@ -280,8 +285,8 @@ impl Drive {
         DriveFlag::ALL.into_iter().filter(move |flag| !homes || *flag != DriveFlag::FollowsCommand)
     }
 
-    /// A bit that the drive has set before and has cleared now. While an internal limit is
-    /// active a drive may clear bit 12; the following error is supervised instead.
+    /// A bit that the drive has set before and has cleared now. While an internal limit is active a drive
+    /// may clear bit 12: the limit of the following error then stops the run.
     pub(super) fn lost_flag(&self) -> Option<DriveFlag> {
         let word = self.statusword?;
         self.flags().find(|flag| {
@@ -290,7 +295,7 @@ impl Drive {
         })
     }
 
-    /// The bits that the enabled drive has not set yet: their loss could not be noticed.
+    /// The bits that the enabled drive has not set yet, so that their loss could not be noticed.
     pub(super) fn flags_not_shown(&self) -> impl Iterator<Item = DriveFlag> + use<> {
         let shown = self.shown;
         self.flags().filter(move |flag| shown & *flag as u16 == 0)
@@ -304,7 +309,7 @@ impl Drive {
         (warns && !warned && self.warnings.is_power_of_two()).then_some(self.warnings)
     }
 
-    /// Whether to report `emcy`: if it is the same again, only the 2nd, 4th, 8th … time.
+    /// Whether to report `emcy`: a repeated one is reported only the 2nd, 4th, 8th … time.
     pub(super) fn is_news(&mut self, emcy: Emcy) -> bool {
         let count = if self.emcy.0 == Some(emcy) { self.emcy.1 + 1 } else { 1 };
         self.emcy = (Some(emcy), count);
@@ -339,8 +344,7 @@ impl Drive {
         LimitCheck::new(self.axis, scale, limits, self.sync_period, wraps)
     }
 
-    /// The axis is homed: its position counts from another zero than before. Gives where it stands,
-    /// mm or rad.
+    /// The axis is homed: the drive counts from another zero than before. Returns the position, mm or rad.
     pub(super) fn take_home(&mut self) -> f64 {
         // The last reading is the low half of the position that it led to.
         self.seed(self.position.counts() as i32);
@@ -353,9 +357,9 @@ impl Drive {
         self.limits().check(target, self.commanded)
     }
 
-    /// Makes the next target the present one; without a next one the axis is held. After as many held
-    /// SYNCs as answers may be lost, the next step is compared with the step before the hold: the hold
-    /// is no commanded acceleration.
+    /// Makes the next target the present one; without a next one the axis is held. If it is held for no more
+    /// SYNCs than answers may be lost, the next step is compared with the step before the hold: such a hold is
+    /// no commanded acceleration.
     pub(super) fn advance_target(&mut self) {
         if let Some(counts) = self.next_counts.take() {
             let step_counts = counts - self.commanded.counts;
@@ -383,23 +387,26 @@ impl Drive {
         if self.is_armed() { self.commanded() - self.measured() } else { 0.0 }
     }
 
-    /// The fault of a measured position too far from the target, whatever the drive makes of it. More is
-    /// a blocked axis or a wrong position: steering by it would be blind.
+    /// Why a measured position is too far from the target, whether or not the drive reports it: the axis is
+    /// blocked, or the position is wrong.
     pub(super) fn not_following(&self) -> Option<String> {
-        let (axis, following_error) = (self.axis, self.following_error());
+        let following_error = self.following_error();
         let limit = self.config.following_error_limit(self.sync_period);
         let follows = following_error.abs() <= limit;
         (!follows).then(|| {
-            let (off, limit) = (axis.shown(following_error), axis.in_unit(limit).0);
+            let (off, limit) = (self.axis.shown(following_error), self.axis.in_unit(limit).0);
             format!(
-                "{axis}: following error of {off} (limit {limit:.3}); is the axis blocked, or the \
-                 encoder lost?"
+                "following error of {off} (limit {limit:.3}); is the axis blocked, or the encoder lost?"
             )
         })
     }
 
     pub(super) fn state(&self) -> Option<DriveState> {
         self.statusword.and_then(Statusword::state)
+    }
+
+    pub(super) fn is_enabled(&self) -> bool {
+        self.state() == Some(DriveState::OperationEnabled)
     }
 
     pub(super) fn report(&self) -> DriveReport {

@@ -41,7 +41,7 @@ pub struct Feedback {
 /// How far the stage has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, derive_more::Display)]
 pub enum Progress {
-    /// Nothing is sent yet: is there another master?
+    /// Nothing is sent yet; another master would be heard.
     #[display("listening for another master")]
     Listening,
     /// A part of a drive's bring-up begins.
@@ -100,13 +100,12 @@ pub enum Ignored {
     /// From a drive, but of the wrong length.
     #[display("frame of the wrong length")]
     WrongLength,
-    /// A TPDO1 that no SYNC asked for: before the first SYNC, or a second one after the same SYNC. An SDO answer without a
-    /// request.
+    /// A TPDO1 before the first SYNC, or a second one after the same SYNC; an SDO answer without a request.
     #[display("position without a SYNC, or answer without a question")]
     Unexpected,
 }
 
-/// What did not go as it should and did no harm.
+/// How often something went wrong that stops nothing by itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counters {
     /// Frames without effect, for each [`Ignored`] in the order of its variants.
@@ -156,7 +155,7 @@ pub enum StageEvent {
         /// How often it has begun to.
         count: u64,
     },
-    /// So many frames without effect came within a tenth of a second. Told as it begins.
+    /// A flood begins: so many frames that are no part of the cycle or of the bring-up came within 100 ms.
     Flood(u64),
     /// A frame had no effect. Told at the 1st, 2nd, 4th, 8th … of a kind.
     Ignored {

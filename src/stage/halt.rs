@@ -13,7 +13,6 @@ use super::dialogue::{Conversation, Sdo, WithBothDrives};
 use super::drive::may_have_power;
 use super::standstill::Standstill;
 use super::{Axis, StageConfig, Unwrapper};
-use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};
 use crate::canopen::nmt::{NmtCommand, nmt_frame};
 use crate::canopen::sdo::codec::ClientFrame;
@@ -55,8 +54,7 @@ impl Halt {
     /// # Errors
     /// What was not confirmed.
     pub fn result(&self, axis: Axis) -> Option<Result<i32, String>> {
-        let result = self.axis(axis).outcome()?.clone();
-        Some(result.map_err(|error| format!("{axis}: {error}")))
+        self.outcome(axis)
     }
 }
 
@@ -78,7 +76,7 @@ impl AxisHalt {
             is_unanswered: false,
             give_up,
             off_by: now + config.power.stop_timeout * 2,
-            standstill: Standstill::new(config.axis(axis).scale(axis, 0).counts_per_unit()),
+            standstill: config.standstill(axis),
         }
     }
 
@@ -108,7 +106,8 @@ impl AxisHalt {
         }
         let (mut position, mut seen) = (Unwrapper::new(0), None);
         loop {
-            let counts = self.look(object::POSITION_ACTUAL, 4).await?.to_u32() as i32;
+            let position_actual = self.sdo.read_at_least(object::POSITION_ACTUAL, 4).await;
+            let counts = position_actual.inspect_err(|_| self.is_unanswered = true)? as i32;
             let (position_counts, now) = (position.unwrap(counts), self.sdo.now());
             match seen.replace(now) {
                 Some(before) => self.standstill.look(position_counts, now.since(before)),
@@ -165,20 +164,7 @@ impl AxisHalt {
     }
 
     async fn statusword(&mut self) -> Result<Statusword, String> {
-        let value = self.look(object::STATUSWORD, 2).await?;
-        Ok(Statusword(value.to_u32() as u16))
-    }
-
-    /// Reads `object`, of at least so many bytes. An expedited answer may leave out how many of its four
-    /// bytes are the object's.
-    async fn look(&mut self, object: ObjectAddress, len_min: usize) -> Result<SdoValue, String> {
-        let value = self.sdo.read(object).await.inspect_err(|_| self.is_unanswered = true)?;
-        match value.as_bytes().len() {
-            len if len < len_min => {
-                Err(format!("node {} {object} has {len} bytes", self.sdo.node()))
-            }
-            _ => Ok(value),
-        }
+        self.sdo.statusword().await.inspect_err(|_| self.is_unanswered = true)
     }
 
     /// Waits before the next look. Once there is no more time to look, `trouble` is the error.

@@ -59,9 +59,8 @@ impl HomingConfig {
     }
 }
 
-/// From then on the bits of the statusword are of this homing even where they were never seen to
-/// clear, if the axis stands: some methods take no time at all, and no drive takes this long to
-/// begin.
+/// After this time the bits of the statusword belong to this homing, if the axis stands, even if they were
+/// never seen to clear: some methods take no time at all, and no drive takes this long to begin.
 const BEGUN_AFTER: Duration = Duration::from_secs(1);
 
 /// A homing under way.
@@ -71,7 +70,7 @@ pub(super) struct Homing {
     /// The SYNC that began it, counted from 1.
     began: u64,
     since: Time,
-    /// Its bits have been seen clear: what they say from now on is of this homing.
+    /// Its bits were seen clear, so that from now on they belong to this homing.
     cleared: bool,
     give_up: Time,
 }
@@ -109,8 +108,8 @@ impl Stage {
         }
     }
 
-    /// Judges the statusword of this SYNC. That of the SYNC which began the homing, and whatever it
-    /// says until its bits were seen to clear, may be of the homing before.
+    /// Judges the statusword of this SYNC. Until its bits were seen to clear, they may belong to an earlier
+    /// homing; so may the statusword of the SYNC that began this one.
     pub(super) fn watch_homing(&mut self, now: Time, mut homing: Homing) {
         let Homing { axis, began, since, .. } = homing;
         if self.sync_count <= began {

@@ -21,10 +21,10 @@ use crate::canopen::sync::SyncProducer;
 use crate::canopen::{Frame, cob};
 use crate::units::Time;
 
-/// Where the stage is in its life; it only ever goes on, never back.
+/// What the stage does. It never goes back to an earlier phase, except from `Homing` to `Ready`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Phase {
-    /// Nothing is sent: another master would be heard.
+    /// Nothing is sent, so that another master is heard first.
     Listening {
         until: Time,
     },
@@ -74,9 +74,7 @@ pub struct Stage {
     /// The axes may be given power, see [`Stage::permit_power`].
     pub(super) power_permitted: bool,
     pub(super) counters: Counters,
-    flood: FloodWatch,
-    /// Frames received that are no part of the cycle or of the bring-up.
-    pub(super) beside_cycle: u64,
+    pub(super) flood: FloodWatch,
     outputs: VecDeque<Output>,
 }
 
@@ -127,7 +125,6 @@ impl Stage {
             power_permitted: true,
             counters: Counters::default(),
             flood: FloodWatch::new(now),
-            beside_cycle: 0,
             outputs: VecDeque::new(),
             config,
         };
@@ -138,7 +135,7 @@ impl Stage {
 
     /// Takes a frame received at `now`.
     pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
-        self.beside_cycle += 1;
+        self.flood.frames += 1;
         let Some(cob_id) = frame.cob_id() else { return self.ignore(Ignored::Foreign, frame) };
         self.watch_for_another_master(now, frame);
         for axis in Axis::BOTH {
@@ -175,19 +172,17 @@ impl Stage {
             }
         }
         self.drain_bring_ups(now);
-        let skipped_before = self.sync.missed;
         if self.sync_runs()
-            && let Some(sync) = self.sync.handle_timeout(now)
+            && let Some(skipped) = self.sync.handle_timeout(now).map(u64::from)
         {
-            let skipped = self.sync.missed - skipped_before;
             if skipped > 0 {
-                self.counters.syncs_skipped = self.sync.missed;
+                self.counters.syncs_skipped += skipped;
                 self.tell(StageEvent::SyncSkipped(skipped));
             }
-            self.cycle(now, sync);
+            self.cycle(now);
         }
         // After the SYNC, which must not wait.
-        if let Some(frames) = self.flood.look(now, self.beside_cycle) {
+        if let Some(frames) = self.flood.look(now) {
             self.tell(StageEvent::Flood(frames));
         }
         if let Some(frame) = self.heartbeat.handle_timeout(now, NmtState::Operational) {
@@ -243,13 +238,12 @@ impl Stage {
                 self.sync_count
             ));
         }
-        let PerAxis { insertion, rotation } = &mut self.drives;
-        let insertion_counts = insertion.check(set_point.insertion_mm)?;
-        let rotation_counts = rotation.check(set_point.rotation_rad)?;
-        insertion.next_counts = Some(insertion_counts);
-        rotation.next_counts = Some(rotation_counts);
+        let counts = PerAxis {
+            insertion: self.drives.insertion.check(set_point.insertion_mm)?,
+            rotation: self.drives.rotation.check(set_point.rotation_rad)?,
+        };
         for axis in Axis::BOTH {
-            let rpdo = self.drives[axis].rpdo_ahead();
+            let rpdo = self.drives[axis].rpdo_ahead(counts[axis]);
             self.send(rpdo);
         }
         Ok(())
@@ -294,15 +288,15 @@ impl Stage {
     }
 
     /// Sends no heartbeat any more, as a bench that has died: drives that watch it stop by
-    /// themselves, and their emergency messages tell so. What is a fault otherwise is for the owner
-    /// to judge from here on: nothing but [`quick_stop`](Self::quick_stop) stops the axes.
+    /// themselves, and say so in emergency messages. From here on the stage reports no fault: only
+    /// [`quick_stop`](Self::quick_stop) stops the axes.
     pub fn fall_silent(&mut self) {
         self.faulted = true;
         self.heartbeat =
             HeartbeatProducer::new(self.config.bus.bench_node, Duration::ZERO, Time::NEVER);
     }
 
-    /// What did not go as it should and did no harm.
+    /// Frames without effect, missed answers and skipped SYNCs.
     pub fn counters(&self) -> Counters {
         self.counters
     }
@@ -312,7 +306,7 @@ impl Stage {
         PerAxis::from_fn(|axis| self.drives[axis].report())
     }
 
-    /// Where the axes were last measured; `None` before both drives have said it.
+    /// Where the axes were last measured; `None` before both drives have answered a SYNC.
     pub fn position(&self) -> Option<SetPoint> {
         self.both_heard().then(|| self.both(Drive::measured))
     }
@@ -321,7 +315,7 @@ impl Stage {
         !matches!(self.phase, Phase::Listening { .. } | Phase::BringUp | Phase::Stopped)
     }
 
-    /// Stops for `fault`. The first is the reason; those that follow from it are not reported.
+    /// Reports `fault` and stops. Only the first fault is reported: others follow from it.
     pub(super) fn fail(&mut self, now: Time, fault: String) {
         if self.faulted || self.phase == Phase::Stopped {
             return;
@@ -383,6 +377,8 @@ impl Stage {
         if let Some(fault) = bring_up.and_then(|bring_up| bring_up.so_far().found_in_fault) {
             self.drives[axis].allow_reset(fault.error_code);
         }
+        // Only a heartbeat that comes from here on can say that this stage's start command was obeyed.
+        self.monitors[axis].state = None;
         self.monitors[axis].deadline = now + self.config.bus.heartbeat_timeout();
         if self.bring_ups.all(Option::is_none) {
             for axis in Axis::BOTH {
@@ -390,16 +386,13 @@ impl Stage {
             }
             let give_up = now + self.config.power.enable_timeout;
             self.phase = Phase::Standby { give_up, located: false };
-            self.sync = SyncProducer::new(
-                self.config.bus.sync_period(),
-                now + self.config.bus.sync_period(),
-            );
+            self.sync.deadline = now + self.config.bus.sync_period();
             self.tell(StageEvent::Progress(Progress::Standby));
         }
     }
 
-    /// Ends bring-up. An earlier run may have left a drive enabled: its power is taken off, and the
-    /// supervision it was left with stays. A node that is not known to be ours is not written to.
+    /// Ends bring-up. An earlier run may have left a drive enabled: its power is taken off, and its
+    /// heartbeat consumer stays as that run left it. A node that is not identified is not written to.
     fn abandon(&mut self) {
         for axis in Axis::BOTH {
             let (identified, may_be_supervised) = match self.bring_ups[axis].take() {

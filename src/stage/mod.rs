@@ -2,38 +2,38 @@
 //!
 //! # Contract
 //! Hand a [`Stage`] every frame received ([`Stage::handle_frame`]) and the time at its
-//! [`Stage::deadline`] ([`Stage::handle_timeout`]); after each, drain [`Stage::poll`] to `None`,
-//! sending the frames in order and at once. Hand in all that was received before the time that
-//! has come after it: a bench that was held up must not take frames it did not read for frames
-//! that did not come. The stage touches no clock and no socket.
+//! [`Stage::deadline`] ([`Stage::handle_timeout`]). After each, drain [`Stage::poll`] to `None`, and send
+//! the frames in order and at once. Hand in all frames that were received before the time is: a bench that
+//! was held up would otherwise take unread frames for missing ones. The stage touches no clock and no
+//! socket.
 //!
-//! It listens first, for as long as a heartbeat may be late. If another master commands these drives, it
-//! ends without sending anything; if one begins to do so later, it stops with a fault.
+//! The stage listens first, for as long as a heartbeat may be late. If another master commands these
+//! drives, the stage ends without sending anything; if one begins to do so later, it stops with a fault.
 //!
-//! It brings both drives up over SDO, every object read back; starts SYNC; enables both drives
-//! together with their targets where they stand; and says [`StageEvent::Ready`]. From then on,
-//! at each SYNC deadline: RPDO1 of both axes (controlword and target), then SYNC, on absolute
-//! deadlines. When it is late by whole periods it skips and counts them; it never sends a burst.
-//! Both TPDO1 (statusword and position, latched at that SYNC) are awaited until the next
-//! deadline; when both are in, one [`Feedback`] is given at once.
+//! It brings both drives up over SDO and reads every object back. Then it starts SYNC, enables both drives
+//! together, their targets where they stand, and reports [`StageEvent::Ready`]. From then on it sends
+//! RPDO1 to both axes (controlword and target) and SYNC, at absolute deadlines. If it is late by whole
+//! periods it skips and counts them; it never sends a burst. It awaits both TPDO1 (statusword and position,
+//! latched at that SYNC) until the next deadline. When both are in, it reports one [`Feedback`] at once.
 //!
-//! [`Stage::command`] takes the targets for the next SYNC, for both axes or neither: only while
-//! ready, only while the positions at the last SYNC are known, only within the soft limits.
-//! Without a command the axes are held.
+//! [`Stage::command`] takes the targets for the next SYNC, for both axes or neither: only while the stage is
+//! ready, only while the positions at the last SYNC are known, only within the soft limits. Without a
+//! command the axes are held.
 //!
-//! Any [`StageEvent::Fault`] is reported once and quick-stops both axes; SYNC goes on until they are seen to
-//! stand or a time-out, then power is taken off, the nodes are sent to Pre-operational and
-//! [`StageEvent::Stopped`] is reported. A drive that does not obey is commanded again by SDO every 100 ms. An
-//! orderly end ([`Stage::disable`]) whose time is over is such a fault, too. The stage never moves
-//! again: a new run needs a new stage.
-//! The bench's own heartbeat, which the drives watch, runs from the end of that silence to the last;
-//! drives known to be without power are then configured to watch it no more.
+//! A [`StageEvent::Fault`] is reported once and quick-stops both axes. SYNC goes on until they are seen to
+//! stand, or until a timeout; then power is taken off, the nodes are sent to Pre-operational and
+//! [`StageEvent::Stopped`] is reported. A drive that does not obey is commanded again by SDO every 100 ms.
+//! An orderly end ([`Stage::disable`]) that times out is such a fault, too. The stage never moves again: a
+//! new run needs a new stage.
 //!
-//! Frames of the wrong length, from elsewhere, or without a SYNC have no effect but a count. A
-//! TPDO carries no stamp, so one that comes late, after the next SYNC, is taken for that SYNC's; its
-//! successor is then the one that is counted, and one that says something else, SYNC after SYNC, is
-//! a second sender, which is a fault. A drive whose every answer is late by a whole
-//! period from some SYNC on cannot be told from one that is on time.
+//! The bench's heartbeat, which the drives watch, begins when the listening ends and lasts as long as the
+//! stage. In the end, drives known to be without power are configured to watch it no more.
+//!
+//! Frames of the wrong length, from elsewhere, or without a SYNC are counted and have no other effect. A
+//! TPDO carries no stamp, so one that comes after the next SYNC is taken for that SYNC's answer. The answer
+//! that follows is then the one that is counted; if it differs, SYNC after SYNC, there is a second sender,
+//! which is a fault. A drive whose every answer is late by a whole period cannot be told from one that is
+//! on time.
 
 mod bring_up;
 mod config;

@@ -25,8 +25,6 @@ pub(super) const TPDO: [MappedObject; 2] =
 const DRIVE_PROFILE: u16 = 402;
 /// SYNC is on the usual identifier, and made by the bench alone (bit 30: the node makes it).
 const SYNC_BITS: u32 = 0x4000_07ff;
-/// A PDO with this bit in its COB-ID is off.
-const PDO_OFF: u32 = 1 << 31;
 
 impl Script {
     /// Brings the drive up, to be moved in cyclic synchronous position or to be homed. Gives where the
@@ -186,11 +184,9 @@ impl Script {
 
     /// Writes `value`, in mm or rad (per second, per second squared), in counts; nothing for `None`.
     async fn write_counts(&self, object: ObjectAddress, value: Option<f64>) -> Result<(), String> {
-        let scale = self.drive().scale(self.axis, 0);
-        match value.and_then(|value| unsigned_counts(scale, value)) {
-            Some(counts) => self.write(object, counts).await,
-            None => Ok(()),
-        }
+        let Some(value) = value else { return Ok(()) };
+        let counts = unsigned_counts(self.drive().scale(self.axis, 0), value);
+        self.write(object, counts.ok_or_else(|| unfit(object, value))?).await
     }
 
     async fn supervise(&self) -> Result<(), String> {
@@ -249,7 +245,9 @@ impl Script {
     /// Sets bit 31 of a COB-ID and leaves the others, which may not change while it is clear.
     async fn disable_pdo(&self, object: Object) -> Result<(), String> {
         match self.read(object).await?.map(SdoValue::to_u32) {
-            Some(cob_id) if cob_id & PDO_OFF == 0 => self.write(object, cob_id | PDO_OFF).await,
+            Some(cob_id) if PdoCobId(cob_id).is_valid() => {
+                self.write(object, cob_id | PdoCobId::INVALID).await
+            }
             _ => Ok(()),
         }
     }
@@ -294,11 +292,10 @@ impl Script {
         self.write_counts(drive::HOMING_SPEED_SWITCH, homing.speed_switch).await?;
         self.write_counts(drive::HOMING_SPEED_ZERO, homing.speed_zero).await?;
         self.write_counts(drive::HOMING_ACCELERATION, homing.acceleration).await?;
-        let scale = self.drive().scale(self.axis, 0);
-        match homing.offset.and_then(|offset| scale.relative_counts(offset)) {
-            Some(offset) => self.write(drive::HOME_OFFSET, offset).await,
-            None => Ok(()),
-        }
+        let Some(offset) = homing.offset else { return Ok(()) };
+        let counts = self.drive().scale(self.axis, 0).relative_counts(offset);
+        let object = drive::HOME_OFFSET;
+        self.write(object, counts.ok_or_else(|| unfit(object, offset))?).await
     }
 
     async fn set_mode(&self, mode: Mode) -> Result<(), String> {
@@ -310,9 +307,8 @@ impl Script {
         self.begin("setting its limits and seeding the target");
         let object = drive::POSITION_ACTUAL;
         let position = self.read(object).await?.map_or(Ok(0), |value| {
-            let bytes = value.as_bytes();
-            let counts = bytes.try_into().map(i32::from_le_bytes);
-            counts.map_err(|_| format!("{object}: expected 4 bytes, received {}", bytes.len()))
+            let counts = value.at_least(4).map(|counts| counts as i32);
+            counts.ok_or_else(|| format!("{object}: expected 4 bytes, received {value}"))
         })?;
         let (min, max) = (drive::SOFTWARE_LIMIT_MIN, drive::SOFTWARE_LIMIT_MAX);
         if self.drive().wraps {
@@ -345,4 +341,9 @@ impl Script {
         let fitting = |counts: Option<i64>| counts.and_then(|counts| i32::try_from(counts).ok());
         [fitting(lower).unwrap_or(i32::MIN), fitting(upper).unwrap_or(i32::MAX)]
     }
+}
+
+/// A value, in mm or rad, that `object` cannot hold in counts.
+fn unfit(object: ObjectAddress, value: f64) -> String {
+    format!("{object}: {value} is 0 in counts, or does not fit 32 bits")
 }

@@ -1,10 +1,10 @@
-//! Standing is a speed, over enough time to tell, whatever the scale of the axis.
+//! Standstill: a speed below a limit, over a time in which the counts of the axis can show it.
 
 use std::time::Duration;
 
-/// An axis slower than this stands, mm/s or rad/s: encoder noise, or a servo that hunts.
+/// An axis slower than this stands, mm/s or rad/s: what still moves it is a hunting servo or encoder noise.
 const SPEED_MAX: f64 = 0.04;
-/// Over this time at least, and over so many looks.
+/// It is watched for at least this time, and for at least this number of positions.
 const WINDOW_MIN: Duration = Duration::from_millis(50);
 const LOOKS_MIN: u32 = 5;
 /// A coarse axis is watched until it would have moved by so many counts.

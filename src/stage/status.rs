@@ -63,12 +63,9 @@ impl StatusReader {
     /// # Errors
     /// If the drive does not answer, has no statusword, or was not read to the end.
     pub fn status(&self, axis: Axis) -> Result<AxisStatus, String> {
-        let reader = self.axis(axis);
-        match reader.outcome() {
-            Some(Ok(status)) => Ok(AxisStatus { nmt_state: reader.nmt_state(), ..status.clone() }),
-            Some(Err(trouble)) => Err(format!("{axis}: {trouble}")),
-            None => Err(format!("{axis}: reading the status was interrupted")),
-        }
+        let interrupted = || Err(format!("{axis}: reading the status was interrupted"));
+        let status = self.outcome(axis).unwrap_or_else(interrupted)?;
+        Ok(AxisStatus { nmt_state: self.axis(axis).nmt_state(), ..status })
     }
 }
 
@@ -139,10 +136,8 @@ impl Reset {
     /// # Errors
     /// Why it was not reset: it does not answer, has power, or its cause is still there.
     pub fn result(&self, axis: Axis) -> Result<Statusword, String> {
-        let outcome = self.axis(axis).outcome().cloned();
-        let outcome =
-            outcome.unwrap_or_else(|| Err("the reset did not come to its end".to_owned()));
-        outcome.map_err(|error| format!("{axis}: {error}"))
+        let interrupted = || Err(format!("{axis}: the reset did not come to its end"));
+        self.outcome(axis).unwrap_or_else(interrupted)
     }
 }
 

@@ -10,7 +10,8 @@ use crate::canopen::{Frame, NodeId, cob};
 use crate::units::Time;
 
 impl Stage {
-    /// Stops if another master commands the drives: while this stage listens, and until it stops them.
+    /// Stops if another master commands the drives. While this stage stops them, `needle-bench stop` may do so
+    /// as well.
     pub(super) fn watch_for_another_master(&mut self, now: Time, frame: &Frame) {
         if matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped) {
             return;
@@ -42,7 +43,7 @@ impl Stage {
         }
         match &mut self.bring_ups[axis] {
             Some(bring_up) => {
-                self.beside_cycle -= 1;
+                self.flood.frames -= 1;
                 bring_up.conversation.handle_frame(now, frame);
                 self.drain_bring_ups(now);
             }
@@ -105,7 +106,7 @@ impl Stage {
         if self.drives[axis].is_news(emcy) {
             self.tell(StageEvent::Emergency(axis, emcy));
         }
-        // What was wrong with a drive before it was looked at shows in its statusword.
+        // What was wrong with a drive before bring-up took its power off shows in its statusword.
         let is_watched = self.bring_ups[axis].as_ref().is_none_or(|drive| drive.so_far().disarmed)
             && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped);
         let is_of_the_fault_found = self.drives[axis].excuses(emcy.code);
@@ -128,9 +129,9 @@ impl Stage {
             self.drives[axis].take_second(frame, payload);
             return self.ignore(Ignored::Unexpected, frame);
         }
-        self.beside_cycle -= 1;
+        self.flood.frames -= 1;
         let was = self.drives[axis].state();
-        self.drives[axis].take_tpdo(payload);
+        self.drives[axis].take_tpdo(payload, self.sync_count);
         self.check_statusword(now, axis, was);
         if self.drives.all(|drive| drive.fresh) {
             self.window_complete(now);
@@ -139,19 +140,16 @@ impl Stage {
 
     fn check_statusword(&mut self, now: Time, axis: Axis, was: Option<DriveState>) {
         let Some(statusword) = self.drives[axis].statusword else { return };
+        use DriveState as S;
         let state = statusword.state();
         let standby = matches!(self.phase, Phase::Standby { .. });
         let enabling = matches!(self.phase, Phase::Enabling { .. });
         let must_follow = match self.phase {
             Phase::Ready | Phase::Homing(_) | Phase::Stopping { quick: false, .. } => true,
             // From the first time that it says so, while it waits for the other, too.
-            Phase::Standby { .. } | Phase::Enabling { .. } => {
-                [was, state].contains(&Some(DriveState::OperationEnabled))
-            }
+            Phase::Enabling { .. } => [was, state].contains(&Some(S::OperationEnabled)),
             _ => false,
         };
-        let faulty = state.is_some_and(DriveState::is_fault);
-        use DriveState as S;
         let fell_back = enabling
             && matches!(
                 (was, state),
@@ -160,46 +158,56 @@ impl Stage {
                     Some(S::SwitchOnDisabled | S::NotReadyToSwitchOn)
                 ) | (Some(S::SwitchedOn), Some(S::ReadyToSwitchOn))
             );
+        let has_power =
+            matches!(state, Some(S::SwitchedOn | S::OperationEnabled | S::QuickStopActive));
         if must_follow && self.drives[axis].meets_internal_limit() {
             self.tell(StageEvent::InternalLimit(axis));
         }
         if must_follow && let Some(count) = self.drives[axis].begins_to_warn() {
             self.tell(StageEvent::Warns { axis, statusword, count });
         }
-        if standby && state == Some(DriveState::OperationEnabled) {
-            let fault = format!(
-                "{axis}: the drive has power before the bench gave it any (statusword {statusword}), does \
-                 an input or another tool enable it?"
-            );
-            self.fail(now, fault);
-        } else if faulty && !((standby || enabling) && self.drives[axis].may_be_in_fault()) {
-            self.fail(now, format!("{axis}: drive in fault (statusword {statusword})"));
+        let drive = &self.drives[axis];
+        let fault = if standby && has_power {
+            format!(
+                "the drive has power before the bench gave it any (statusword {statusword}), does an \
+                 input or another tool enable it?"
+            )
+        } else if statusword.is_fault() && !((standby || enabling) && drive.may_be_in_fault()) {
+            format!("drive in fault (statusword {statusword})")
         } else if fell_back {
-            self.fail_switch_on(now, axis, statusword);
-        } else if must_follow && state != Some(DriveState::OperationEnabled) {
-            let fault = format!(
-                "{axis}: drive left operation enabled (statusword {statusword}), was an enable or limit \
-                 switch opened?"
-            );
-            self.fail(now, fault);
+            refused_to_switch_on(statusword)
+        } else if must_follow && state != Some(S::OperationEnabled) {
+            format!(
+                "drive left operation enabled (statusword {statusword}), was an enable or limit switch \
+                 opened?"
+            )
         } else if (must_follow || enabling)
-            && let Some(flag) = self.drives[axis].lost_flag()
+            && let Some(flag) = drive.lost_flag()
         {
-            self.fail(now, format!("{axis}: {}", lost_flag(flag, statusword)));
-        } else if self.drives[axis].homes {
+            lost_flag(flag, statusword)
+        } else if drive.homes {
             // It follows no target, and its bit 13 is of its homing.
-        } else if state == Some(DriveState::OperationEnabled)
-            && statusword.has(Statusword::FOLLOWING_ERROR)
+            return;
+        } else if state == Some(S::OperationEnabled) && statusword.has(Statusword::FOLLOWING_ERROR)
         {
-            let off = axis.shown(self.drives[axis].following_error());
-            let fault = format!(
-                "{axis}: following error reported by the drive; target minus position is {off}"
-            );
-            self.fail(now, fault);
-        } else if must_follow && let Some(fault) = self.drives[axis].not_following() {
-            self.fail(now, fault);
-        }
+            let off = axis.shown(drive.following_error());
+            format!("following error reported by the drive; target minus position is {off}")
+        } else if must_follow && let Some(fault) = drive.not_following() {
+            fault
+        } else {
+            return;
+        };
+        self.fail(now, format!("{axis}: {fault}"));
     }
+}
+
+/// Why a drive that went back on its way to Operation Enabled, or did not leave a state in time, stops the
+/// run.
+pub(super) fn refused_to_switch_on(statusword: Statusword) -> String {
+    format!(
+        "the drive refused to switch on (statusword {statusword}); check safety input, emergency stop and \
+         supply, then start again"
+    )
 }
 
 /// Why a bit of the statusword that the drive cleared while it was enabled stops the run.
@@ -224,8 +232,9 @@ fn lost_flag(flag: DriveFlag, statusword: Statusword) -> String {
 const INITIATE_DOWNLOAD: u8 = 1;
 const BLOCK_DOWNLOAD: u8 = 6;
 
-/// The kind of command to `drives` in `frame`, which was received, or of heartbeat under the node number
-/// of `bench`; `None` for any other frame. Reading an object does no harm, nor does starting a node.
+/// What another master says in a received `frame`: a command to one of `drives`, or a heartbeat under the
+/// node number of `bench`. `None` for any other frame, and for two that change nothing: a request to read
+/// an object, and Start Remote Node.
 fn command_of_another_master(
     frame: &Frame,
     bench: NodeId,

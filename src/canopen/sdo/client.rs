@@ -12,14 +12,14 @@ use crate::canopen::object::communication::{DEVICE_TYPE, ERROR_REGISTER};
 use crate::canopen::{Frame, NodeId, ObjectAddress, cob};
 use crate::units::Time;
 
-/// One of these is read before the next request when an old answer may still come. Every node has
-/// both.
+/// If an old answer may still come, one of these objects, which every node has, is read before the next
+/// request.
 const FENCES: [ObjectAddress; 2] = [ERROR_REGISTER, DEVICE_TYPE];
 
 #[derive(Debug, Clone, Copy)]
 struct Transfer {
     request: SdoRequest,
-    /// The request is sent once this object has been answered for.
+    /// The request is sent once the node has answered for this object.
     fence: Option<ObjectAddress>,
     deadline: Time,
 }

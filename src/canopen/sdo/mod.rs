@@ -92,6 +92,12 @@ impl SdoValue {
         &self.bytes[..usize::from(self.len)]
     }
 
+    /// The value of an object of at least `len` bytes, as an unsigned number; `None` if it has fewer. An
+    /// expedited answer may leave out how many of its four bytes are the object's (CiA 301, 7.2.4.3.6).
+    pub fn at_least(self, len: u8) -> Option<u32> {
+        (self.len >= len).then_some(self.to_u32())
+    }
+
     /// As an unsigned number.
     pub const fn to_u32(self) -> u32 {
         u32::from_le_bytes(self.bytes)

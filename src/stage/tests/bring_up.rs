@@ -9,7 +9,7 @@ use crate::canopen::{ObjectAddress, cob};
 pub(super) fn fault_of(config: StageConfig, spoil: impl FnOnce(&mut Bench)) -> String {
     let mut bench = Bench::new(config);
     spoil(&mut bench);
-    let fault = bench.until_fault().to_string();
+    let fault = bench.until_fault();
     assert!(!bench.until_stopped(), "nobody saw it stand");
     assert!(bench.command(0.0, 0.0).is_err());
     let powered = bench.sent.iter().any(|(_, f)| matches!(f.cob_id(), Some(0x201 | 0x202)));
@@ -105,7 +105,7 @@ fn an_axis_that_stands_outside_its_limits_is_not_enabled() {
     config.insertion.zero = Some(1000 + 2 * COUNTS_PER_MM);
     let mut bench = Bench::new(config);
     assert_eq!(
-        bench.until_fault().to_string(),
+        bench.until_fault(),
         "cannot start: the axis stands outside its limits: insertion: -2.000 mm is under the \
          limit of -1.000 mm (stage.insertion.min_mm); move it back, or correct its limits or zero"
     );
@@ -184,7 +184,8 @@ fn configured_objects_are_written_and_a_refusal_is_named() {
     assert_eq!(
         text,
         "node 1 (insertion): 0x2000:00: writing 0x0007 was refused with SDO abort \
-         0x06020000 object does not exist; list it as optional if the drive does without"
+         0x06020000 object does not exist; list it in \
+         optional_objects if the bench can do without"
     );
 }
 
@@ -232,10 +233,10 @@ fn what_happens_while_power_is_awaited_ends_it() {
     };
     let mut bench = awaiting();
     bench.rotation.off = true;
-    assert!(bench.until_fault().to_string().starts_with("rotation: no TPDO1 for 2 SYNCs in a row"));
+    assert!(bench.until_fault().starts_with("rotation: no TPDO1 for 2 SYNCs in a row"));
     let mut bench = awaiting();
     bench.rotation.state = DriveState::Fault;
-    assert!(bench.until_fault().to_string().starts_with("rotation: drive in fault"));
+    assert!(bench.until_fault().starts_with("rotation: drive in fault"));
     bench.stage.permit_power(true);
     bench.run_for(Duration::from_secs(5));
     assert_eq!((bench.rotation.resets, bench.insertion.state), (0, DriveState::SwitchOnDisabled));
@@ -247,7 +248,7 @@ fn a_drive_that_never_answers_is_not_waited_for() {
     let mut bench = Bench::new(config());
     bench.stage.permit_power(false);
     bench.rotation.tpdos_lost = u32::MAX;
-    let said = bench.until_fault().to_string();
+    let said = bench.until_fault();
     assert!(
         said.starts_with("rotation: not in operation enabled within 3000 ms (no TPDO1 was heard)"),
         "{said}"
@@ -264,7 +265,7 @@ fn a_drive_that_is_not_let_on_ends_it_at_once() {
     bench.insertion.safety_open = true;
     bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
     let begun = bench.now;
-    assert!(bench.until_fault().to_string().starts_with(said));
+    assert!(bench.until_fault().starts_with(said));
     assert!(bench.now.since(begun) < Duration::from_millis(600));
 
     let mut bench = Bench::new(config());
@@ -275,7 +276,7 @@ fn a_drive_that_is_not_let_on_ends_it_at_once() {
     bench.insertion.safety_open = true;
     bench.run_for(Duration::from_millis(20));
     bench.insertion.safety_open = false;
-    assert!(bench.until_fault().to_string().starts_with(said));
+    assert!(bench.until_fault().starts_with(said));
     assert!(!bench.events.contains(&StageEvent::Ready));
 }
 
@@ -284,7 +285,7 @@ fn a_drive_that_keeps_its_power_is_not_configured() {
     let mut bench = Bench::new(config());
     bench.insertion.state = DriveState::OperationEnabled;
     (bench.insertion.ignores_sdo, bench.insertion.ignores_rpdo) = (true, true);
-    let said = bench.until_fault().to_string();
+    let said = bench.until_fault();
     assert!(said.contains("the drive keeps its power (statusword 0x0237"), "{said}");
     assert!(!bench.insertion.configured_under_power);
 }
@@ -292,13 +293,17 @@ fn a_drive_that_keeps_its_power_is_not_configured() {
 /// Nothing but the bench may give it power.
 #[test]
 fn a_drive_enabled_by_something_else_while_power_is_awaited_is_a_fault() {
-    let mut bench = Bench::new(config());
-    bench.stage.permit_power(false);
-    bench.run_until(|event| matches!(event, StageEvent::Located(_)));
-    bench.insertion.state = DriveState::OperationEnabled;
-    (bench.insertion.ignores_rpdo, bench.insertion.ignores_sdo) = (true, true);
-    let said = bench.until_fault().to_string();
-    assert!(said.starts_with("insertion: the drive has power before the bench gave it"), "{said}");
+    for state in [DriveState::SwitchedOn, DriveState::OperationEnabled, DriveState::QuickStopActive]
+    {
+        let mut bench = Bench::new(config());
+        bench.stage.permit_power(false);
+        bench.run_until(|event| matches!(event, StageEvent::Located(_)));
+        bench.insertion.state = state;
+        (bench.insertion.ignores_rpdo, bench.insertion.ignores_sdo) = (true, true);
+        let said = bench.until_fault();
+        let named = said.starts_with("insertion: the drive has power before the bench gave it");
+        assert!(named, "{said}");
+    }
 }
 
 #[test]
@@ -372,7 +377,7 @@ fn a_node_whose_identity_is_not_known_or_wrong_is_not_written_to() {
 fn a_drive_that_cannot_be_enabled_is_named() {
     let mut bench = Bench::new(config());
     bench.rotation.brake_cycles = u32::MAX;
-    let text = bench.until_fault().to_string();
+    let text = bench.until_fault();
     assert!(text.starts_with("rotation: not in operation enabled within 3000 ms"), "{text}");
     bench.until_stopped();
     assert_ne!(bench.insertion.state, DriveState::OperationEnabled);
@@ -439,10 +444,46 @@ fn without_a_heartbeat_the_stage_is_never_ready() {
     let mut bench = Bench::new(config());
     bench.rotation.heartbeat_off = true;
     assert_eq!(
-        bench.until_fault().to_string(),
+        bench.until_fault(),
         "rotation: no heartbeat for 300 ms, is the drive powered and on the bus?"
     );
     assert!(!bench.events.contains(&StageEvent::Ready));
+}
+
+/// The heartbeat of an earlier run may still say that the node is Operational.
+#[test]
+fn a_heartbeat_from_before_the_bring_up_does_not_count() {
+    let mut bench = Bench::new(config());
+    bench.rotation.heartbeat_off = true;
+    bench.now = bench.now + Duration::from_millis(200);
+    bench.receive(heartbeat_frame(bench.rotation.node, NmtState::Operational));
+    let said = bench.until_fault();
+    assert!(said.starts_with("rotation: no heartbeat for 300 ms"), "{said}");
+    assert!(!bench.events.contains(&StageEvent::Ready));
+}
+
+/// Both drives are enabled then, and neither is named for that.
+#[test]
+fn a_node_that_does_not_say_that_it_is_operational_is_named() {
+    for (heard, said) in [
+        (None, "rotation: enabled, but no heartbeat within 3000 ms, is can.heartbeat_ms longer?"),
+        (
+            Some(NmtState::PreOperational),
+            "rotation: enabled, but NMT state pre-operational instead of operational after 3000 ms, is \
+             there another master?",
+        ),
+    ] {
+        let mut config = config();
+        config.bus.heartbeat_timeout_ms = 60_000;
+        let mut bench = Bench::new(config);
+        bench.rotation.heartbeat_off = true;
+        bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+        if let Some(state) = heard {
+            bench.receive(heartbeat_frame(bench.rotation.node, state));
+        }
+        assert_eq!(bench.until_fault(), said);
+        assert!(!bench.events.contains(&StageEvent::Ready));
+    }
 }
 
 /// Comes to the identity, restarts, and so on.
@@ -481,7 +522,7 @@ fn a_drive_that_restarts_again_and_again_is_a_fault() {
     bench.insertion.mute = Some((ObjectAddress::new(0x6040, 0), u32::MAX));
     reboot(&mut bench, 3);
     assert_eq!(
-        bench.until_fault().to_string(),
+        bench.until_fault(),
         "node 1 (insertion): boot-up message while taking power off, looking for faults, is its \
          supply stable?"
     );

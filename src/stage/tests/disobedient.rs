@@ -23,7 +23,7 @@ fn a_drive_that_keeps_its_power_at_the_end_is_a_fault() {
     bench.sent.clear();
     bench.stage.disable(bench.now);
     assert_eq!(
-        bench.until_fault().to_string(),
+        bench.until_fault(),
         "insertion: the drive still has power 2000 ms after shutdown (statusword 0x0237 operation \
          enabled); if it does not stop now, press the emergency stop"
     );
@@ -67,7 +67,7 @@ fn an_axis_that_does_not_come_to_stand_at_the_end_is_a_fault() {
         bench.run_for(Duration::from_millis(10));
     }
     assert_eq!(
-        bench.until_fault().to_string(),
+        bench.until_fault(),
         "insertion: not seen to stand 2000 ms after its last target (statusword 0x0237 operation \
          enabled); if it does not stop now, press the emergency stop"
     );
@@ -99,7 +99,7 @@ fn fault_of_lost(bits: u16) -> String {
     bench.drive_on(10);
     bench.rotation.extra_bits = 0;
     bench.rotation.clear_bits = bits;
-    bench.until_fault().to_string()
+    bench.until_fault()
 }
 
 #[test]
@@ -133,7 +133,7 @@ fn a_drive_that_stops_obeying_on_its_way_to_power_is_enabled_no_further() {
             bench.step();
         }
         (bench.rotation.extra_bits, bench.rotation.clear_bits) = (0, Statusword::REMOTE);
-        let said = bench.until_fault().to_string();
+        let said = bench.until_fault();
         assert!(said.contains("the drive no longer obeys the bus"), "{state:?}: {said}");
         assert!(!bench.events.contains(&StageEvent::Ready), "{state:?}");
     }
@@ -194,7 +194,7 @@ fn an_undefined_statusword_is_no_operation_enabled() {
     // Bits 6, 5, 3, 2, 1, 0 of no state.
     (bench.rotation.extra_bits, bench.rotation.clear_bits) = (0x0040, 0x0005);
     assert_eq!(
-        bench.until_fault().to_string(),
+        bench.until_fault(),
         "rotation: drive left operation enabled (statusword 0x0272 undefined drive state), was an \
          enable or limit switch opened?"
     );
@@ -209,7 +209,7 @@ fn a_position_that_jumps_at_enabling_moves_nothing() {
         bench.step();
     }
     bench.insertion.counts += COUNTS_PER_MM;
-    let said = bench.until_fault().to_string();
+    let said = bench.until_fault();
     assert!(said.starts_with("insertion: following error of -1.000 mm (limit 0."), "{said}");
     let target = |(_, frame): &(Time, Frame)| match (frame.cob_id(), frame.data()) {
         (Some(0x201), [_, _, target @ ..]) => target.try_into().ok().map(i32::from_le_bytes),

@@ -26,7 +26,7 @@ fn a_fault_that_a_reset_does_not_end_is_not_reset_again() {
     let mut bench = Bench::new(resetting_config());
     bench.rotation.state = DriveState::Fault;
     bench.rotation.keeps_its_fault = true;
-    let said = bench.until_fault().to_string();
+    let said = bench.until_fault();
     assert_eq!(said, "rotation: drive in fault (statusword 0x0218 fault)");
     bench.run_for(Duration::from_secs(5));
     assert_eq!(bench.rotation.resets, 1);
@@ -44,7 +44,7 @@ fn a_fault_that_comes_later_is_never_reset() {
         bench.run_until(|event| *event == begun);
         bench.rotation.state = DriveState::Fault;
         bench.receive(bench.rotation.emergency(0x9000));
-        let said = bench.until_fault().to_string();
+        let said = bench.until_fault();
         assert_eq!(said, "rotation: emergency 0x9000 external error (register 0x21)");
         bench.run_for(Duration::from_secs(5));
         assert_eq!(bench.rotation.resets, 0);
@@ -69,7 +69,7 @@ fn what_a_fault_that_was_found_excuses_ends_with_it() {
     bench.run_until(|event| *event == StageEvent::Ready);
     bench.drive_on(5);
     bench.receive(bench.rotation.emergency(0x7320));
-    let said = bench.until_fault().to_string();
+    let said = bench.until_fault();
     assert_eq!(said, "rotation: emergency 0x7320 position sensor (register 0x21)");
 
     for state in [DriveState::Fault, DriveState::FaultReactionActive] {
@@ -78,7 +78,7 @@ fn what_a_fault_that_was_found_excuses_ends_with_it() {
         bench.insertion.charge_cycles = 20;
         bench.run_for(Duration::from_millis(25));
         bench.rotation.state = state;
-        let said = bench.until_fault().to_string();
+        let said = bench.until_fault();
         assert!(said.starts_with("rotation: drive in fault (statusword 0x02"), "{said}");
         bench.run_for(Duration::from_secs(5));
         assert_eq!(bench.rotation.resets, 0);
@@ -95,7 +95,7 @@ fn only_the_fault_that_was_found_is_excused() {
 
     let mut bench = enabling_after_a_fault();
     bench.receive(bench.rotation.emergency(0x9000));
-    let said = bench.until_fault().to_string();
+    let said = bench.until_fault();
     assert_eq!(said, "rotation: emergency 0x9000 external error (register 0x21)");
     bench.run_for(Duration::from_secs(5));
     assert_eq!(bench.rotation.resets, 0);
@@ -105,7 +105,7 @@ fn only_the_fault_that_was_found_is_excused() {
     bench.rotation.objects.remove(&ObjectAddress::new(0x603f, 0));
     bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
     bench.receive(bench.rotation.emergency(0x7320));
-    assert!(bench.until_fault().to_string().contains("emergency 0x7320"), "it may be any fault");
+    assert!(bench.until_fault().contains("emergency 0x7320"), "it may be any fault");
 }
 
 /// A drive that was found in Fault waits in it, and is reset once power may come.

@@ -117,7 +117,7 @@ fn a_homing_that_fails_or_never_ends_stops_the_stage() {
     let mut bench = ready_to_home(|bench| bench.insertion.homing_fails = true);
     home(&mut bench);
     assert_eq!(
-        bench.until_fault().to_string(),
+        bench.until_fault(),
         "insertion: homing failed (statusword 0x2637 operation enabled); check switches, method \
          (0x6098) and speeds"
     );
@@ -126,7 +126,7 @@ fn a_homing_that_fails_or_never_ends_stops_the_stage() {
 
     let mut bench = ready_to_home(|bench| bench.insertion.homing_cycles = u32::MAX);
     home(&mut bench);
-    let text = bench.until_fault().to_string();
+    let text = bench.until_fault();
     assert!(text.starts_with("insertion: not home within 60.0 s (statusword 0x0237"), "{text}");
     bench.until_stopped();
 }
@@ -156,7 +156,7 @@ fn only_an_axis_in_homing_mode_is_homed() {
 fn an_axis_that_needs_homing_is_not_enabled_without_it() {
     let mut bench = Bench::new(homing_config());
     assert_eq!(
-        bench.until_fault().to_string(),
+        bench.until_fault(),
         "node 1 (insertion): not homed (statusword 0x0650 switch on disabled, bit 12 clear), home \
          it first: needle-bench stage home"
     );
@@ -177,7 +177,7 @@ fn a_drive_may_have_a_bit_of_its_own_for_it() {
     let mut config = homing_config();
     config.insertion.homing = Some(HomingConfig { homed_bit: 15, ..homing_by(17) });
     let mut bench = Bench::new(config.clone());
-    assert!(bench.until_fault().to_string().contains("bit 15 clear"));
+    assert!(bench.until_fault().contains("bit 15 clear"));
 
     let mut bench = Bench::new(config);
     bench.insertion.extra_bits = 1 << 15;

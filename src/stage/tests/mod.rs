@@ -3,12 +3,15 @@
 mod bring_up;
 mod disobedient;
 mod drive;
+mod following_error;
 mod found_in_fault;
 mod halt;
 mod homing;
 mod hostile;
 mod other_master;
-mod run;
+mod set_points;
+mod stopping;
+mod supervision;
 
 use std::time::Duration;
 
@@ -111,6 +114,8 @@ struct Bench {
     /// What the stage sent.
     sent: Vec<(Time, Frame)>,
     events: Vec<StageEvent>,
+    /// The number of events up to the one that was waited for last.
+    seen: usize,
 }
 
 impl Bench {
@@ -128,6 +133,7 @@ impl Bench {
             stage,
             sent: Vec::new(),
             events: Vec::new(),
+            seen: 0,
         }
     }
 
@@ -180,15 +186,16 @@ impl Bench {
         }
     }
 
-    /// Runs until an event passes, and forgets the events up to it.
+    /// Runs until an event passes that comes after the one that was waited for last.
     fn run_until(&mut self, mut passes: impl FnMut(&StageEvent) -> bool) -> StageEvent {
         for _ in 0..20_000 {
-            if let Some(at) = self.events.iter().position(&mut passes) {
-                return self.events.drain(..=at).next_back().expect("the one that passed");
+            if let Some(at) = self.events[self.seen..].iter().position(&mut passes) {
+                self.seen += at + 1;
+                return self.events[self.seen - 1].clone();
             }
             self.step();
         }
-        panic!("never happened; events since: {:?}", self.events);
+        panic!("never happened; events since: {:?}", &self.events[self.seen..]);
     }
 
     fn until_fault(&mut self) -> String {

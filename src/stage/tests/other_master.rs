@@ -49,7 +49,7 @@ fn another_master_stops_a_stage_at_its_first_word() {
         let mut bench = Bench::ready();
         bench.drive_on(5);
         bench.receive(word);
-        let said = bench.until_fault().to_string();
+        let said = bench.until_fault();
         assert!(
             said.starts_with(&format!("another master on the bus: {named}; stop it")),
             "{said}"
@@ -66,7 +66,7 @@ fn two_senders_of_one_position_are_told_apart_in_two_syncs() {
         bench.until_feedback();
         bench.receive(Frame::new(0x181, &[0x37, 0x12, 1, 0, 0, 0]));
     }
-    let said = bench.until_fault().to_string();
+    let said = bench.until_fault();
     assert!(said.starts_with("insertion: two TPDO1 that differ after each of 2 SYNCs"), "{said}");
 }
 

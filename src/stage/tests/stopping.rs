@@ -1,0 +1,110 @@
+//! Quick stop and the orderly end: until both axes stand without power.
+
+use super::*;
+use crate::canopen::cia402::DriveState;
+use crate::canopen::nmt::NmtState;
+
+#[test]
+fn quick_stop_brakes_under_power_until_both_axes_stand() {
+    let mut bench = Bench::ready();
+    let before = bench.drive_on(50);
+    bench.stage.quick_stop(bench.now);
+    bench.sent.clear();
+    assert!(bench.until_stopped(), "seen to stand");
+    // From 46 counts a cycle, one less each cycle.
+    let travel =
+        bench.insertion.counts - 1000 - (before.measured.insertion_mm * 4646.0).round() as i32;
+    assert!((1000..=46 * 49 / 2).contains(&travel), "{travel} counts");
+    assert!(bench.insertion.coasted_from <= 3, "power stays on until it stands");
+    assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled);
+    assert_eq!(bench.insertion.nmt, NmtState::PreOperational);
+}
+
+#[test]
+fn an_orderly_end_holds_until_standstill_then_shuts_down() {
+    let mut bench = Bench::ready();
+    let before = bench.drive_on(20);
+    bench.stage.disable(bench.now);
+    assert!(bench.until_stopped());
+    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+    assert_eq!(bench.insertion.state, DriveState::ReadyToSwitchOn);
+    assert_eq!(bench.insertion.value(0x1016, 1), 0, "it may live without the bench now");
+    let held = 1000 + (before.commanded.insertion_mm * f64::from(COUNTS_PER_MM)).round() as i32;
+    assert_eq!(bench.insertion.counts, held);
+    let quick = bench.sent.iter().any(|(_, f)| f.cob_id() == Some(0x201) && f.data()[0] == 0x02);
+    assert!(!quick);
+}
+
+#[test]
+fn a_fault_during_the_orderly_end_makes_it_a_quick_stop() {
+    let mut bench = Bench::ready();
+    bench.stage.disable(bench.now);
+    bench.receive(bench.rotation.emergency(0x8611));
+    assert!(bench.until_fault().starts_with("rotation: emergency 0x8611"));
+    bench.until_stopped();
+    assert!(bench.sent.iter().any(|(_, f)| f.to_string().starts_with("201#0200")));
+}
+
+#[test]
+fn quick_stop_in_bring_up_ends_it() {
+    let mut bench = Bench::new(config());
+    bench.rotation.off = true;
+    bench.run_for(Duration::from_millis(500));
+    bench.stage.quick_stop(bench.now);
+    assert!(!bench.until_stopped());
+    assert!(bench.stage.bring_ups.all(Option::is_none));
+}
+
+/// Five SYNCs of a quick cycle are no time: an axis at 0.4 mm/s moves 2 µm in them.
+#[test]
+fn a_slow_axis_of_a_quick_cycle_does_not_stand() {
+    let mut config = config();
+    config.bus.sync_ms = 1;
+    let mut bench = Bench::new(config);
+    bench.run_until(|event| matches!(event, StageEvent::Feedback(_)));
+    bench.stage.disable(bench.now);
+    let begun = bench.now;
+    bench.run_until(|event| *event == StageEvent::Progress(Progress::Disabling));
+    assert!(bench.now.since(begun) >= Duration::from_millis(50));
+}
+
+/// It hears no PDO any more, but SDOs.
+#[test]
+fn a_drive_that_left_operational_loses_its_power_too() {
+    let mut bench = Bench::ready();
+    bench.drive_on(5);
+    bench.rotation.nmt = NmtState::PreOperational;
+    bench.until_fault();
+    bench.until_stopped();
+    assert_eq!(bench.rotation.state, DriveState::SwitchOnDisabled);
+}
+
+#[test]
+fn a_drive_that_lost_power_does_not_keep_the_stage_from_ending() {
+    let mut bench = Bench::ready();
+    bench.rotation.off = true;
+    bench.until_fault();
+    let began = bench.now;
+    assert!(!bench.until_stopped(), "its standstill was not seen");
+    assert_ne!(bench.rotation.value(0x1016, 1), 0);
+    assert!(bench.now.since(began) <= 2 * Duration::from_secs(2) + Duration::from_millis(20));
+}
+
+/// Positions by SDO count for the time that they took, also between TPDOs: an axis of 100 counts/mm stands
+/// after half a second.
+#[test]
+fn an_axis_whose_positions_come_by_pdo_and_by_sdo_does_not_stand_early() {
+    let mut config = config();
+    config.insertion.ratio = CountsRatio::new(100, 1).expect("not zero");
+    let mut bench = Bench::new(config);
+    bench.until_feedback();
+    bench.stage.quick_stop(bench.now);
+    let begun = bench.now;
+    while !bench.events.contains(&StageEvent::Progress(Progress::Disabling)) {
+        // It is asked for its position after each such SYNC.
+        bench.insertion.tpdos_lost = u32::from(bench.stage.sync_count % 10 == 6);
+        bench.step();
+    }
+    let stood = bench.now.since(begun);
+    assert!((500..=530).contains(&stood.as_millis()), "{stood:?}");
+}

@@ -1,0 +1,135 @@
+//! What comes from the bus in a run, and what of it stops the run.
+
+use super::*;
+use crate::canopen::cia402::DriveState;
+use crate::canopen::nmt::{NmtState, heartbeat_frame};
+
+#[test]
+fn a_limit_inside_a_drive_is_told_once() {
+    let mut bench = Bench::ready();
+    bench.rotation.extra_bits = 1 << 11;
+    bench.run_for(Duration::from_millis(100));
+    let told = StageEvent::InternalLimit(Axis::Rotation);
+    assert_eq!(bench.events.iter().filter(|event| **event == told).count(), 1);
+}
+
+#[test]
+fn one_lost_position_is_tolerated_and_the_second_stops_both_axes() {
+    let mut bench = Bench::ready();
+    for missed in 1..=3 {
+        bench.rotation.tpdos_lost = 1;
+        bench.run_for(Duration::from_millis(50));
+        assert_eq!(bench.stage.counters().feedback_missed, missed);
+    }
+    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+
+    bench.rotation.tpdos_lost = 2;
+    assert_eq!(
+        bench.until_fault(),
+        "rotation: no TPDO1 for 2 SYNCs in a row, check bus load, cable and the drive"
+    );
+    assert!(bench.until_stopped());
+    assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled);
+    assert_eq!(bench.rotation.nmt, NmtState::PreOperational);
+}
+
+#[test]
+fn the_drive_that_is_silent_for_longer_is_named() {
+    let mut bench = Bench::ready();
+    bench.rotation.tpdos_lost = 2;
+    bench.step();
+    bench.insertion.tpdos_lost = 1;
+    assert_eq!(
+        bench.until_fault(),
+        "rotation: no TPDO1 for 2 SYNCs in a row, check bus load, cable and the drive"
+    );
+}
+
+fn fault_in_mid_run(spoil: impl FnOnce(&mut Bench)) -> String {
+    let mut bench = Bench::ready();
+    bench.drive_on(10);
+    spoil(&mut bench);
+    let fault = bench.until_fault();
+    assert!(bench.command(0.1, 0.1).is_err(), "it takes no command after a fault");
+    bench.until_stopped();
+    for drive in [&bench.insertion, &bench.rotation] {
+        assert_ne!(drive.state, DriveState::OperationEnabled, "{fault}");
+    }
+    let faults = bench.events.iter().filter(|event| matches!(event, StageEvent::Fault(_))).count();
+    assert_eq!(faults, 1, "the first fault is the reason");
+    bench.sent.clear();
+    bench.run_for(Duration::from_secs(1));
+    let only_heartbeats = bench.sent.iter().all(|(_, f)| f.to_string() == "77F#05");
+    assert!(only_heartbeats && bench.sent.len() >= 10, "{:?}", bench.sent);
+    fault
+}
+
+#[test]
+fn whatever_a_drive_reports_stops_the_run_by_name() {
+    assert_eq!(
+        fault_in_mid_run(|bench| bench.receive(bench.rotation.emergency(0x8611))),
+        "rotation: emergency 0x8611 following error (register 0x21)"
+    );
+    assert_eq!(
+        fault_in_mid_run(|bench| bench.insertion.state = DriveState::Fault),
+        "insertion: drive in fault (statusword 0x0218 fault)"
+    );
+    assert_eq!(
+        fault_in_mid_run(|bench| bench.insertion.state = DriveState::SwitchedOn),
+        "insertion: drive left operation enabled (statusword 0x0233 switched on), \
+         was an enable or limit switch opened?"
+    );
+    let text = fault_in_mid_run(|bench| bench.rotation.extra_bits = 1 << 13);
+    assert!(text.starts_with("rotation: following error reported by the drive"), "{text}");
+}
+
+#[test]
+fn a_drive_that_falls_silent_restarts_or_leaves_operational_stops_the_run() {
+    assert_eq!(
+        fault_in_mid_run(|bench| bench.insertion.heartbeat_off = true),
+        "insertion: no heartbeat for 300 ms, is the drive powered and on the bus?"
+    );
+    assert_eq!(
+        fault_in_mid_run(|bench| {
+            bench.receive(heartbeat_frame(bench.insertion.node, NmtState::BootUp));
+        }),
+        "insertion: boot-up message in mid-run, the drive restarted; is its supply stable?"
+    );
+    assert_eq!(
+        fault_in_mid_run(|bench| {
+            bench.receive(heartbeat_frame(bench.rotation.node, NmtState::PreOperational));
+        }),
+        "rotation: NMT state pre-operational instead of operational, is there another master?"
+    );
+}
+
+#[test]
+fn the_end_of_an_emergency_is_no_fault() {
+    let mut bench = Bench::ready();
+    bench.receive(bench.rotation.emergency(0x0000));
+    bench.run_for(Duration::from_millis(100));
+    assert!(bench.events.iter().any(|event| matches!(event, StageEvent::Emergency(..))));
+    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+}
+
+#[test]
+fn foreign_and_malformed_frames_are_counted_and_told_ever_more_rarely() {
+    let mut bench = Bench::ready();
+    (bench.events, bench.seen) = (Vec::new(), 0);
+    for _ in 0..9 {
+        bench.receive(Frame::new(0x123, &[1, 2, 3]));
+        bench.receive(Frame::new(0x181, &[0; 5]));
+        bench.receive(Frame::new(0x701, &[]));
+        bench.receive(Frame::new(0x182, &[0; 6]));
+    }
+    let count = |kind| bench.stage.counters().ignored[kind as usize];
+    let counts = [Ignored::Foreign, Ignored::WrongLength, Ignored::Unexpected].map(count);
+    assert_eq!(counts, [9, 18, 9]);
+    let told = |kind| {
+        let is_kind =
+            |event: &&StageEvent| matches!(event, StageEvent::Ignored { why, .. } if *why == kind);
+        bench.events.iter().filter(is_kind).count()
+    };
+    assert_eq!((told(Ignored::Foreign), told(Ignored::WrongLength)), (4, 5));
+    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+}
