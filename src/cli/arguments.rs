@@ -137,6 +137,16 @@ impl RealTimeArguments {
         tried.map_err(|_| Failure::environment("--realtime: the trial ended in a panic"))?.map(drop)
     }
 
+    /// Calls `run`, which may [`enter`](Self::enter) real time: on a thread of its own, with which the priority ends. What
+    /// comes after a run, and the threads that it starts, must not have it.
+    pub(super) fn around<T: Send>(self, run: impl FnOnce() -> T + Send) -> T {
+        if !self.realtime {
+            return run();
+        }
+        let ran = thread::scope(|scope| scope.spawn(run).join());
+        ran.unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+    }
+
     /// Gives this thread, the SYNC thread, its real-time priority if asked. Call it after all other
     /// threads have started.
     pub(super) fn enter(self) -> Result<Option<RealTime>, Failure> {
@@ -160,4 +170,18 @@ pub(super) fn number_in(
 pub(super) fn seed(text: &str) -> Result<u64, String> {
     let seed = text.parse().ok().filter(|seed| *seed <= SEED_MAX);
     seed.ok_or_else(|| format!("a whole number from 0 to {SEED_MAX}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_priority_ends_with_the_run() {
+        let ran_on =
+            |realtime| RealTimeArguments { realtime, cpu: None }.around(|| thread::current().id());
+        let this = thread::current().id();
+        assert_ne!(ran_on(true), this);
+        assert_eq!(ran_on(false), this);
+    }
 }

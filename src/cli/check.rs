@@ -5,12 +5,11 @@ use super::output::{say, show, tell};
 use super::plan::mask_reader;
 use super::preflight::Preflight;
 use super::stage::drive_json;
-use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure};
+use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure, ended};
 use crate::config::Config;
 use crate::preflight::to_text;
 use clap::Args;
 use serde_json::json;
-use std::process::ExitCode;
 use std::time::Duration;
 
 #[derive(Debug, Args)]
@@ -38,20 +37,18 @@ pub(super) struct Arguments {
     pub(super) json: bool,
 }
 
-pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
+pub(super) fn check(arguments: &Arguments) -> Result<(), Failure> {
     if arguments.reference || arguments.schema {
         let text = match arguments.schema {
             true => format!("{:#}", Config::json_schema()),
             false => Config::reference(),
         };
-        say(text.trim_end())?;
-        return Ok(ExitCode::SUCCESS);
+        return say(text.trim_end());
     }
     let (config, warnings) = arguments.configured.load_with_warnings()?;
     check_goal(&config, arguments)?;
     if arguments.print {
-        say(config.to_toml().map_err(Failure::environment)?.trim_end())?;
-        return Ok(ExitCode::SUCCESS);
+        return say(config.to_toml().map_err(Failure::environment)?.trim_end());
     }
     let mut report = json!({
         "configuration": "ok",
@@ -60,11 +57,10 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
         "troubles": [],
     });
     if !arguments.connect {
-        match arguments.json {
-            true => say(report)?,
-            false => say(format_args!("configuration: ok\nname: {}", config.name))?,
-        }
-        return Ok(ExitCode::SUCCESS);
+        return match arguments.json {
+            true => say(report),
+            false => say(format_args!("configuration: ok\nname: {}", config.name)),
+        };
     }
     let preflight = Preflight::inspect(&config, &config, Duration::from_secs_f64(arguments.listen));
     let troubles = preflight.troubles();
@@ -89,11 +85,11 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
     } else {
         show(to_text(&preflight.checks))?;
     }
-    Ok(match (troubles.len(), config.tracker.registration.is_none()) {
-        (0, _) => ExitCode::SUCCESS,
+    ended(match (troubles.len(), config.tracker.registration.is_none()) {
+        (0, _) => 0,
         // The registration that is missing is the only trouble.
-        (1, true) => ExitCode::from(BAD_CONFIGURATION),
-        _ => ExitCode::from(ENVIRONMENT_FAILED),
+        (1, true) => BAD_CONFIGURATION,
+        _ => ENVIRONMENT_FAILED,
     })
 }
 

@@ -9,7 +9,6 @@ use crate::text::screen;
 use clap::Args;
 use minijinja::context;
 use serde_json::json;
-use std::process::ExitCode;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -23,7 +22,7 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
+pub(super) fn evaluate(arguments: &Arguments) -> Result<(), Failure> {
     let observer = arguments.observer.as_ref().map(|kind| format!("observer.kind={kind:?}"));
     let (config, insertions) = arguments.insertions.read(observer)?;
     let (needle, torsion) = (config.believed_needle()?, config.believed_torsion()?);
@@ -57,8 +56,7 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let first = observers.first().cloned().unwrap_or_default();
     let object = with(first, &json!({ "observers": observers }));
     let text = || screen(include_str!("evaluate.txt"), &object, context! {});
-    give(arguments.json, &object, text)?;
-    Ok(ExitCode::SUCCESS)
+    give(arguments.json, &object, text)
 }
 
 /// The score of `observer`, and of the same observer that does not know the roll at the start.

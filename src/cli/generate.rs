@@ -1,11 +1,10 @@
 //! `needle-bench generate`: completions and man pages, from the command line as it is declared.
 
+use super::output::say;
 use super::{Failure, command_line};
 use clap::Subcommand;
 use clap_complete::Shell;
-use std::io::{self, Write as _};
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 #[derive(Debug, Subcommand)]
 pub(super) enum What {
@@ -22,22 +21,19 @@ pub(super) enum What {
     },
 }
 
-pub(super) fn generate(what: &What) -> Result<ExitCode, Failure> {
+pub(super) fn generate(what: &What) -> Result<(), Failure> {
     let shell = match what {
         What::Bash => Shell::Bash,
         What::Zsh => Shell::Zsh,
         What::Fish => Shell::Fish,
         What::Man { dir } => {
-            let failed =
-                |error: io::Error| Failure::environment(format_args!("{}: {error}", dir.display()));
-            std::fs::create_dir_all(dir).map_err(failed)?;
-            clap_mangen::generate_to(command_line(), dir).map_err(failed)?;
-            return Ok(ExitCode::SUCCESS);
+            let written = std::fs::create_dir_all(dir)
+                .and_then(|()| clap_mangen::generate_to(command_line(), dir));
+            return written.map_err(|error| Failure::on_file(dir, error));
         }
     };
-    // Not to stdout: clap_complete panics where that is closed.
+    // Not to stdout: clap_complete panics if that is closed.
     let mut script = Vec::new();
     clap_complete::generate(shell, &mut command_line(), "needle-bench", &mut script);
-    std::io::stdout().write_all(&script)?;
-    Ok(ExitCode::SUCCESS)
+    say(String::from_utf8_lossy(&script).trim_end())
 }

@@ -32,7 +32,7 @@ use crate::transport::can::CanError;
 use clap::error::{ContextKind, ContextValue};
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use serde_json::{Value, json};
-use std::fmt::Display;
+use std::fmt::{self, Display, Formatter};
 use std::io::{self, ErrorKind};
 use std::path::Path;
 use std::process::ExitCode;
@@ -80,10 +80,11 @@ enum Command {
     Generate(generate::What),
 }
 
-/// Why a command failed.
+/// Why a command did not succeed.
 #[derive(Debug)]
 struct Failure {
-    message: String,
+    /// `None` where the command has printed it already.
+    message: Option<String>,
     /// The exit status of the command.
     status: u8,
 }
@@ -91,17 +92,37 @@ struct Failure {
 impl Failure {
     /// The configuration or the arguments are wrong.
     fn configuration(error: impl Display) -> Self {
-        Failure { message: error.to_string(), status: BAD_CONFIGURATION }
+        Failure { message: Some(error.to_string()), status: BAD_CONFIGURATION }
     }
 
     /// The environment lacks something.
     fn environment(error: impl Display) -> Self {
-        Failure { message: error.to_string(), status: ENVIRONMENT_FAILED }
+        Failure { message: Some(error.to_string()), status: ENVIRONMENT_FAILED }
     }
 
-    /// The file at `path` is wrong.
+    /// What is in the file at `path` is wrong.
     fn in_file(path: &Path, error: impl Display) -> Self {
         Failure::configuration(format_args!("{}: {error}", path.display()))
+    }
+
+    /// The system refuses the file at `path`.
+    fn on_file(path: &Path, error: impl Display) -> Self {
+        Failure::environment(format_args!("{}: {error}", path.display()))
+    }
+}
+
+/// The message; empty where it was printed already.
+impl Display for Failure {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        f.write_str(self.message.as_deref().unwrap_or_default())
+    }
+}
+
+/// The end of a command that has printed its result: a failure unless `status` is 0.
+fn ended(status: u8) -> Result<(), Failure> {
+    match status {
+        0 => Ok(()),
+        _ => Err(Failure { message: None, status }),
     }
 }
 
@@ -187,21 +208,26 @@ pub fn bench() -> ExitCode {
         Command::Run(_) => json!({ "outcome": null }),
         _ => json!({}),
     };
-    let result = match bench.command {
-        Command::Run(arguments) => run::run(&arguments),
-        Command::Plan(arguments) => plan::plan(&arguments),
-        Command::Check(arguments) => check::check(&arguments),
-        Command::Stage(arguments) => stage::stage(&arguments),
-        Command::Stop(arguments) => stop::stop(&arguments.configured, arguments.json),
-        Command::Replay(arguments) => replay::replay(&arguments),
-        Command::Review(arguments) => review::review(&arguments),
-        Command::Evaluate(arguments) => evaluate::evaluate(&arguments),
-        Command::Study(arguments) => study::study(&arguments),
-        Command::Tracker(look) => tracker::tracker(&look),
-        Command::Calibrate(calibration) => calibrate::calibrate(&calibration),
-        Command::Generate(what) => generate::generate(&what),
-    };
-    exit(result, is_json.then_some(no_result))
+    exit(bench.command.execute(), is_json.then_some(no_result))
+}
+
+impl Command {
+    fn execute(&self) -> Result<(), Failure> {
+        match self {
+            Command::Run(arguments) => run::run(arguments),
+            Command::Plan(arguments) => plan::plan(arguments),
+            Command::Check(arguments) => check::check(arguments),
+            Command::Stage(arguments) => stage::stage(arguments),
+            Command::Stop(arguments) => stop::stop(&arguments.configured, arguments.json),
+            Command::Replay(arguments) => replay::replay(arguments),
+            Command::Review(arguments) => review::review(arguments),
+            Command::Evaluate(arguments) => evaluate::evaluate(arguments),
+            Command::Study(arguments) => study::study(arguments),
+            Command::Tracker(look) => tracker::tracker(look),
+            Command::Calibrate(calibration) => calibrate::calibrate(calibration),
+            Command::Generate(what) => generate::generate(what),
+        }
+    }
 }
 
 /// Adds the nearest command to the error of a mistyped one: clap's own threshold misses swapped letters.
@@ -210,7 +236,7 @@ fn with_suggestion(mut error: clap::Error) -> clap::Error {
         return error;
     };
     let bench = Bench::command();
-    let command = std::env::args()
+    let command = std::env::args_os()
         .skip(1)
         .fold(&bench, |command, argument| command.find_subcommand(argument).unwrap_or(command));
     let edits_to = |name: &str| strsim::damerau_levenshtein(typed, name);
@@ -239,17 +265,17 @@ pub fn virtual_stage() -> ExitCode {
     exit(virtual_stage::serve(&arguments), None)
 }
 
-/// The exit status. A failure is reported on stderr, and in the object `json` on stdout.
-fn exit(result: Result<ExitCode, Failure>, json: Option<Value>) -> ExitCode {
-    let Failure { message, status } = match result {
-        Ok(code) => return code,
-        Err(failure) => failure,
-    };
-    tell(format_args!("error: {message}"));
-    if let Some(mut object) = json {
-        object["error"] = json!(message);
-        // If stdout is broken as well, nothing is left to report to.
-        let _ = say(object);
+/// The exit status. A failure that is not printed yet is reported on stderr, and in the object `json` on
+/// stdout.
+fn exit(result: Result<(), Failure>, json: Option<Value>) -> ExitCode {
+    let Err(Failure { message, status }) = result else { return ExitCode::SUCCESS };
+    if let Some(message) = message {
+        tell(format_args!("error: {message}"));
+        if let Some(mut object) = json {
+            object["error"] = json!(message);
+            // If stdout is broken as well, nothing is left to report to.
+            let _ = say(object);
+        }
     }
     ExitCode::from(status)
 }
@@ -269,6 +295,46 @@ fn listen_to_logs() {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn refusal(line: &str) -> String {
+        let words = ["needle-bench"].into_iter().chain(line.split_whitespace());
+        match Bench::try_parse_from(words) {
+            Ok(bench) => bench.command.execute().expect_err("it is refused").to_string(),
+            Err(error) => error.to_string(),
+        }
+    }
+
+    /// Nothing is measured, turned, replayed or planned for a file that cannot be written.
+    #[test]
+    fn a_file_that_exists_is_refused_before_anything_is_done() {
+        for line in [
+            "plan --out docs/target-plan.svg",
+            "study --out Cargo.toml",
+            "replay runs/none --out Cargo.toml",
+            "tracker rest --out Cargo.toml",
+            "calibrate registration none.csv --collect --out Cargo.toml",
+            "calibrate tip none.csv --run --out Cargo.toml",
+        ] {
+            let error = refusal(line);
+            assert!(error.contains("exists, and is not overwritten"), "{line}: {error}");
+        }
+    }
+
+    #[test]
+    fn a_plan_is_drawn_as_svg_alone() {
+        let error = refusal("plan bench-config/target.toml --out plan.pdf");
+        assert!(error.contains("the plan is drawn as SVG: a name that ends in .svg"), "{error}");
+    }
+
+    #[test]
+    fn a_stage_that_is_not_named_can_be_rehearsed_as_the_error_says() {
+        for line in ["calibrate tip none.csv --run", "stage status"] {
+            let error = refusal(line);
+            assert!(error.contains("on the emulated stage with --rehearse"), "{error}");
+        }
+        let rehearsed = Bench::try_parse_from(["needle-bench", "stage", "status", "--rehearse"]);
+        rehearsed.unwrap().command.execute().unwrap();
+    }
 
     /// What the help shows can be typed.
     #[test]

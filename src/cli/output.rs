@@ -2,11 +2,13 @@
 
 use super::Failure;
 use crate::text::{is_unprintable, wrapped};
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use serde::Serialize;
 use serde_json::Value;
 use std::fmt::Display;
 use std::fs::File;
 use std::io::{self, ErrorKind, Write};
+use std::os::fd::AsFd;
 use std::path::Path;
 
 /// Writes `text`, made [`plain`], and a line end to stdout. A closed pipe (`run --json | true`) is no
@@ -19,6 +21,14 @@ pub(super) fn say(text: impl Display) -> Result<(), Failure> {
         }
         _ => Ok(()),
     }
+}
+
+/// Whether `stream` is a pipe or a terminal whose other end is closed. A command that goes on until Ctrl-C then
+/// ends.
+pub(super) fn is_unread(stream: &impl AsFd) -> bool {
+    let mut fds = [PollFd::new(stream.as_fd(), PollFlags::empty())];
+    let is_known = poll(&mut fds, PollTimeout::ZERO).is_ok();
+    is_known && fds[0].revents().is_some_and(|events| events.contains(PollFlags::POLLERR))
 }
 
 /// Writes a result to stdout: the object if `json`, else the text.
@@ -51,13 +61,13 @@ pub(super) fn write_new(path: &Path, text: &str) -> Result<(), Failure> {
     let written = File::create_new(path).and_then(|mut file| file.write_all(text.as_bytes()));
     written.map_err(|error| match error.kind() {
         ErrorKind::AlreadyExists => exists(path),
-        _ => Failure::environment(format_args!("{}: cannot be written: {error}", path.display())),
+        _ => Failure::on_file(path, format_args!("cannot be written: {error}")),
     })
 }
 
 /// Refuses to write a file that exists, before there is anything to write.
-pub(super) fn refuse_existing(path: &Path) -> Result<(), Failure> {
-    if path.exists() { Err(exists(path)) } else { Ok(()) }
+pub(super) fn refuse_existing(path: Option<&Path>) -> Result<(), Failure> {
+    path.filter(|path| path.exists()).map_or(Ok(()), |path| Err(exists(path)))
 }
 
 fn exists(path: &Path) -> Failure {
@@ -98,6 +108,15 @@ pub(super) fn plain(text: impl Display, kept: &str) -> String {
 mod tests {
     use super::*;
     use serde_json::json;
+
+    #[test]
+    fn a_pipe_without_a_reader_is_unread() {
+        let (reader, writer) = nix::unistd::pipe().unwrap();
+        assert!(!is_unread(&writer));
+        drop(reader);
+        assert!(is_unread(&writer));
+        assert!(!is_unread(&File::open("/dev/null").unwrap()));
+    }
 
     #[test]
     fn nothing_that_a_terminal_acts_upon_is_printed() {

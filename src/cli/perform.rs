@@ -2,7 +2,7 @@
 
 use super::arguments::{About, RealTimeArguments};
 use super::console::Console;
-use super::ending::withdrawal;
+use super::ending::{record_error, withdrawal};
 use super::operator::Terminal;
 use super::output::tell;
 use super::plan::mask_reader;
@@ -10,7 +10,7 @@ use super::records::describe;
 use super::stage::Motion;
 use super::tracker::{described, open_tracker, replay};
 use super::{Failure, io_runtime};
-use crate::archive::{Manifest, sha256_hex};
+use crate::archive::{Manifest, RunOutcome, sha256_hex};
 use crate::config::{
     CanInterface, Config, ConfigError, GoalKind, Listen, OnFailure, TrackerSource,
 };
@@ -43,6 +43,12 @@ pub(super) struct Job<'a> {
     pub(super) plan: Plan,
     /// The motion of the stage; `None` for an insertion.
     pub(super) motion: Option<&'a Motion>,
+    pub(super) options: Options,
+}
+
+/// How a session is run, shown and described.
+#[derive(Clone, Default)]
+pub(super) struct Options {
     pub(super) about: About,
     pub(super) realtime: RealTimeArguments,
     /// Serves the run to viewers at this address.
@@ -64,28 +70,20 @@ pub(super) struct Performed {
     pub(super) wants_withdrawal: bool,
 }
 
-impl<'a> Job<'a> {
-    /// A run of `plan` with every option left out.
-    pub(super) fn new(config: &'a Config, plan: impl Into<Plan>) -> Self {
-        Job {
-            config,
-            plan: plan.into(),
-            motion: None,
-            about: About::default(),
-            realtime: RealTimeArguments::default(),
-            live: None,
-            quiet: false,
-            console: false,
-            paced: false,
-        }
+impl Options {
+    /// Those of the withdrawal after a run on the console. Viewers stay with the run.
+    pub(super) fn of_withdrawal(&self) -> Self {
+        Options { live: None, console: false, ..self.clone() }
     }
+}
 
+impl Job<'_> {
     /// Runs the session to its end. Everything that can be refused is refused before the run folder is
     /// made and before anything moves.
     pub(super) fn perform(self) -> Result<Performed, Failure> {
         let runtime = io_runtime()?;
         let interrupt = Interrupt::listen()?;
-        let performed = if self.console {
+        let performed = if self.options.console {
             let mut console = Console::open(self.config, interrupt.clone())?;
             let performed = self.attended(&mut console, &runtime, &interrupt);
             let left = performed.as_ref().map(|Performed { report, .. }| {
@@ -94,8 +92,8 @@ impl<'a> Job<'a> {
             let wants_withdrawal = console.finish(left.ok());
             performed.map(|performed| Performed { wants_withdrawal, ..performed })
         } else {
-            let has_progress = self.motion.is_none() && !self.quiet;
-            let mut terminal = Terminal::new(self.quiet, has_progress);
+            let quiet = self.options.quiet;
+            let mut terminal = Terminal::new(quiet, self.motion.is_none() && !quiet);
             let performed = self.attended(&mut terminal, &runtime, &interrupt);
             terminal.finish();
             performed
@@ -108,11 +106,12 @@ impl<'a> Job<'a> {
     /// Runs the session and completes its record.
     fn attended(
         &self,
-        operator: &mut dyn Operator,
+        operator: &mut (dyn Operator + Send),
         runtime: &Runtime,
         interrupt: &Interrupt,
     ) -> Result<Performed, Failure> {
-        let (mut report, done) = self.run(operator, runtime, interrupt)?;
+        let run = || self.run(operator, runtime, interrupt);
+        let (mut report, done) = self.options.realtime.around(run)?;
         complete_record(&mut report, describe(self.config.clone()), operator);
         Ok(Performed { report, done, wants_withdrawal: false })
     }
@@ -126,9 +125,10 @@ impl<'a> Job<'a> {
         let config = self.config;
         let stops_on_record_failure = config.record.on_failure == OnFailure::Stop;
         let begin = |now| self.plan.clone().begin(now).map_err(Failure::configuration);
-        self.live.map_or(Ok(()), is_free)?;
+        let Options { realtime, live, paced, .. } = self.options;
+        live.map_or(Ok(()), is_free)?;
         if config.is_emulated() {
-            self.realtime.refuse("a run with can.interface = \"memory\" is in virtual time")?;
+            realtime.refuse("a run with can.interface = \"memory\" is in virtual time")?;
             let stage = VirtualStage::new(config.virtual_stage()?, Time::ZERO);
             let (tool, target) = (config.tracker.tool.clone(), config.goal.tool.clone());
             let emulated = TipSource::Emulated { tool, target };
@@ -138,11 +138,11 @@ impl<'a> Job<'a> {
             let (recorder, _) = self.record(SystemTime::now(), Backpressure::Block)?;
             let sink = Sink::new(recorder, stops_on_record_failure, operator, interrupt);
             let mut session = begin(Time::ZERO)?;
-            let pace = self.paced.then(Pace::begin);
+            let pace = paced.then(Pace::begin);
             let report = run_virtual(&mut session, stage, tips, pace, sink);
             return Ok((report, session.done().to_vec()));
         }
-        self.realtime.try_out()?;
+        realtime.try_out()?;
         let mut bus = open_stage_bus(config)?;
         let clock = Clock::start();
         let mut tracker = self.open_tracker(runtime, clock)?;
@@ -174,8 +174,8 @@ impl<'a> Job<'a> {
             return Ok(None);
         }
         match open_tracker(self.config, runtime, clock) {
-            Err(Failure { message, .. }) if !self.needs_tracker() => {
-                tell(format_args!("warning: {message}; the record is without the tracker"));
+            Err(failure) if !self.needs_tracker() => {
+                tell(format_args!("warning: {failure}; the record is without the tracker"));
                 Ok(None)
             }
             opened => opened.map(Some),
@@ -201,7 +201,7 @@ impl<'a> Job<'a> {
         let config_toml = self.config.to_toml().map_err(Failure::environment)?;
         let mut recorder = Recorder::create(dir, manifest, config_toml, backpressure)
             .map_err(Failure::environment)?;
-        match self.serve(&mut recorder).and_then(|()| self.realtime.enter()) {
+        match self.serve(&mut recorder).and_then(|()| self.options.realtime.enter()) {
             Ok(realtime) => Ok((recorder, realtime)),
             Err(failure) => {
                 recorder.discard();
@@ -211,7 +211,7 @@ impl<'a> Job<'a> {
     }
 
     fn manifest(&self, started_utc: SystemTime) -> Result<Manifest, Failure> {
-        let Job { config, motion, about, .. } = self;
+        let Job { config, motion, options: Options { about, .. }, .. } = self;
         let calibration = config.calibration_toml().map_err(Failure::environment)?;
         let rehearsal = config.emulator.rehearse.then(|| config.can.interface.to_string());
         let parts = [motion.map(Motion::name), rehearsal.as_ref().map(|_| "rehearsal")];
@@ -238,7 +238,7 @@ impl<'a> Job<'a> {
 
     /// Serves the run to viewers, where there is an address for them, and says how to look.
     fn serve(&self, recorder: &mut Recorder) -> Result<(), Failure> {
-        let Some(address) = self.live else { return Ok(()) };
+        let Some(address) = self.options.live else { return Ok(()) };
         recorder.serve(address, scene(self.config)?).map_err(Failure::environment)?;
         tell(format_args!("live        rerun rerun+http://{address}/proxy"));
         Ok(())
@@ -312,8 +312,20 @@ fn is_free(address: SocketAddr) -> Result<(), Failure> {
     })
 }
 
+/// What every session's JSON says of its end.
+pub(super) fn end_json(report: &RunReport) -> Value {
+    json!({
+        "outcome": RunOutcome::from(&report.outcome),
+        "stop_reason": report.outcome.stop_reason(),
+        "duration_s": report.end.as_secs_f64(),
+        "run_dir": report.run_dir.display().to_string(),
+        "record_error": record_error(&report.record),
+        "emulated": report.emulated.as_ref().map(emulated_json),
+    })
+}
+
 /// What can be known only of an emulated run: its faults, and the true positions of its axes.
-pub(super) fn emulated_json(emulated: &EmulationReport) -> Value {
+fn emulated_json(emulated: &EmulationReport) -> Value {
     let moment = |moment: &Moment| {
         json!({
             "time_s": moment.time.as_secs_f64(),
@@ -334,4 +346,21 @@ pub(super) fn emulated_json(emulated: &EmulationReport) -> Value {
         "drives": emulated.drives.each_ref().map(drive),
         "end": moment(&emulated.end),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Its record names the operator, and an emulated needle takes as long to come out as a real one.
+    #[test]
+    fn a_withdrawal_after_a_run_has_what_the_run_was_given() {
+        let operator = Some("Ann".to_owned());
+        let about = About { operator: operator.clone(), ..About::default() };
+        let live = "127.0.0.1:9876".parse().ok();
+        let run = Options { about, live, console: true, paced: true, ..Options::default() };
+        let after = run.of_withdrawal();
+        assert_eq!(after.about.operator, operator);
+        assert_eq!((after.live, after.console, after.paced), (None, false, true));
+    }
 }

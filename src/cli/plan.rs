@@ -1,8 +1,8 @@
 //! `needle-bench plan`: the way to the target, without a stage.
 
 use super::arguments::Configured;
-use super::output::{give, write_new};
-use super::{Failure, STOPPED};
+use super::output::{give, refuse_existing, write_new};
+use super::{Failure, STOPPED, ended};
 use crate::config::PoseConfig;
 use crate::geometry::FixedAngles;
 use crate::plan::{
@@ -21,7 +21,6 @@ use std::fmt::Display;
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::time::Instant;
 
 /// Distance between two rows of `path`, mm.
@@ -34,12 +33,13 @@ pub(super) struct Arguments {
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
-    /// Write a picture of the plan, SVG.
-    #[arg(long, value_name = "FILE")]
+    /// Draw the plan into a new SVG file.
+    #[arg(long, value_name = "FILE.svg", value_parser = svg_file)]
     out: Option<PathBuf>,
 }
 
-pub(super) fn plan(arguments: &Arguments) -> Result<ExitCode, Failure> {
+pub(super) fn plan(arguments: &Arguments) -> Result<(), Failure> {
+    refuse_existing(arguments.out.as_deref())?;
     let (config, _) = arguments.configured.load_with_warnings()?;
     let (world, problem) = config.to_plan(&mask_reader(arguments.configured.path()))?;
     let begun = Instant::now();
@@ -60,10 +60,19 @@ pub(super) fn plan(arguments: &Arguments) -> Result<ExitCode, Failure> {
     }
     let text = || screen(include_str!("plan.txt"), &object, context! {});
     give(arguments.json, &object, text)?;
-    Ok(match answer.status {
-        Status::Plan => ExitCode::SUCCESS,
-        Status::None | Status::Budget => ExitCode::from(STOPPED),
+    ended(match answer.status {
+        Status::Plan => 0,
+        Status::None | Status::Budget => STOPPED,
     })
+}
+
+/// The name of a picture, for clap.
+fn svg_file(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension().is_some_and(|extension| extension == "svg") {
+        true => Ok(path),
+        false => Err("the plan is drawn as SVG: a name that ends in .svg".to_owned()),
+    }
 }
 
 /// Reads the masks that the configuration in `file` names. Their paths are relative to its folder.

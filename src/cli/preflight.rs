@@ -23,7 +23,6 @@ use socketcan::nl::{CanInterface as Interface, CanState};
 use std::io::{IsTerminal, Write as _};
 use std::os::fd::AsFd as _;
 use std::path::Path;
-use std::process::ExitCode;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 /// How long `run` listens to the tracker.
@@ -58,9 +57,9 @@ impl Preflight {
                         checks.extend(drive(config, axis, status));
                     }
                 }
-                Err(Failure { message, .. }) => {
+                Err(failure) => {
                     let drives = Check::new("drives", "no bus", "both answer");
-                    checks.push(drives.unless(false, Verdict::Fail, message));
+                    checks.push(drives.unless(false, Verdict::Fail, failure.to_string()));
                 }
             }
             let is_proof = |name: &str| name.starts_with("stage.") || name.starts_with("can.");
@@ -81,9 +80,9 @@ impl Preflight {
                 let check = Check::unlimited("tracker", "standard input: not listened to");
                 vec![check.unless(false, Verdict::Warn, next)]
             }
-            Err(Failure { message, .. }) => {
+            Err(failure) => {
                 let next = "see tracker.address and tracker.mode";
-                let check = Check::new("tracker", message, "a connection");
+                let check = Check::new("tracker", failure.to_string(), "a connection");
                 vec![check.unless(false, Verdict::Fail, next)]
             }
         });
@@ -114,15 +113,13 @@ impl Preflight {
     }
 }
 
-/// Shows the list before a run on hardware, and asks. The status to end with where nothing is to
-/// move; else the list, which is empty on the virtual stage.
-pub(super) fn before_run(
-    config: &Config,
-    yes: bool,
-    as_json: bool,
-) -> Result<Result<Vec<Check>, ExitCode>, Failure> {
+/// Shows the list before a run on hardware, and asks. Returns the list, which is empty on the virtual stage.
+///
+/// # Errors
+/// Nothing is to move, which is told already; or there is nobody to ask.
+pub(super) fn before_run(config: &Config, yes: bool, as_json: bool) -> Result<Vec<Check>, Failure> {
     if !config.stage.hardware || config.is_emulated() {
-        return Ok(Ok(Vec::new()));
+        return Ok(Vec::new());
     }
     if !yes && !std::io::stdin().is_terminal() {
         return Err(Failure::configuration(
@@ -138,14 +135,14 @@ pub(super) fn before_run(
     let reason = match worst(&preflight.checks) {
         _ if interrupt.is_raised() => "operator: interrupted".to_owned(),
         Verdict::Fail => format!("preflight: {failed} of {} checks failed", preflight.checks.len()),
-        _ if yes || is_confirmed(config, &interrupt) => return Ok(Ok(preflight.checks)),
+        _ if yes || is_confirmed(config, &interrupt) => return Ok(preflight.checks),
         _ => "not confirmed".to_owned(),
     };
     tell(format_args!("stopped: {reason}; nothing has moved"));
     if as_json {
         say(json!({ "outcome": null, "error": reason, "preflight": preflight.checks }))?;
     }
-    Ok(Err(ExitCode::from(if failed > 0 { ENVIRONMENT_FAILED } else { STOPPED })))
+    Err(Failure { message: None, status: if failed > 0 { ENVIRONMENT_FAILED } else { STOPPED } })
 }
 
 /// Shows the list of `rig` before its rehearsal `config`, which moves nothing and runs whatever the

@@ -87,7 +87,7 @@ pub(super) fn open(path: &Path) -> Result<(RunFolder, Config), Failure> {
 /// What the recording of a run of `config` needs beside the record.
 pub(super) fn describe(config: Config) -> Describe {
     Box::new(move |manifest| {
-        let plan = recorded_plan(manifest, &config).map_err(|failure| failure.message)?;
+        let plan = recorded_plan(manifest, &config).map_err(|failure| failure.to_string())?;
         Ok(RecordedRun { plan, scene: scene(&config)?, config_toml: config.to_toml()? })
     })
 }
@@ -299,7 +299,7 @@ mod tests {
             let insertions = Insertions { files, config: named.map(PathBuf::from), set: vec![] };
             match insertions.sorted() {
                 Ok((config, others)) => format!("{config:?} {others:?}"),
-                Err(failure) => failure.message,
+                Err(failure) => failure.to_string(),
             }
         };
         let both = r#"Some("rig.toml") ["a.csv", "runs/b"]"#;

@@ -1,8 +1,8 @@
 //! `needle-bench replay`: runs a recorded session again.
 
-use super::output::{give, write_new};
+use super::output::{give, refuse_existing, write_new};
 use super::records::{open, recorded_plan};
-use super::{Failure, STOPPED};
+use super::{Failure, STOPPED, ended};
 use crate::archive::file;
 use crate::config::{Config, Source};
 use crate::operation::Plan;
@@ -15,7 +15,6 @@ use clap::Args;
 use minijinja::context;
 use serde_json::json;
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::time::Instant;
 
 #[derive(Debug, Args)]
@@ -34,7 +33,8 @@ pub(super) struct Arguments {
     pub(super) json: bool,
 }
 
-pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
+pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
+    refuse_existing(arguments.out.as_deref())?;
     let (folder, config) = open(&arguments.run)?;
     let what_if = what_if(&folder, &arguments.set)?;
     let plan = recorded_plan(folder.manifest(), &config)?;
@@ -92,7 +92,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let more = context! { figures => shown };
     let text = || screen(include_str!("replay.txt"), &object, more);
     give(arguments.json, &object, text)?;
-    Ok(replayed.difference.map_or(ExitCode::SUCCESS, |_| ExitCode::from(STOPPED)))
+    ended(replayed.difference.map_or(0, |_| STOPPED))
 }
 
 /// The observer that `sets` describe; `None` without any.

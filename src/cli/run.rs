@@ -2,15 +2,12 @@
 
 use super::arguments::{About, Configured, RealTimeArguments, seed};
 use super::console::Console;
-use super::ending::{
-    after_insertion, ending, plan_status, plane_missed_by_mm, record_error, status, withdrawal,
-};
+use super::ending::{after_insertion, ending, plan_status, plane_missed_by_mm, status, withdrawal};
 use super::output::{give, tell, with};
-use super::perform::{Job, LIVE_ADDRESS, Performed, emulated_json};
+use super::perform::{Job, LIVE_ADDRESS, Options, Performed, end_json};
 use super::plan::{file_crc32, mask_reader};
 use super::preflight::{before_rehearsal, before_run};
-use super::{Failure, stage};
-use crate::archive::RunOutcome;
+use super::{Failure, ended, stage};
 use crate::config::Config;
 use crate::preflight::Check;
 use crate::runtime::{RunReport, gates_to_json};
@@ -21,7 +18,6 @@ use minijinja::{Value as Shown, context};
 use serde_json::{Value, json};
 use std::net::SocketAddr;
 use std::path::Path;
-use std::process::ExitCode;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -62,7 +58,7 @@ pub(super) struct Arguments {
     quiet: bool,
 }
 
-pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
+pub(super) fn run(arguments: &Arguments) -> Result<(), Failure> {
     if arguments.console {
         Console::keys()?;
     }
@@ -71,8 +67,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     if let Some(seed) = arguments.seed {
         if !config.is_emulated() {
             return Err(Failure::configuration(format_args!(
-                "--seed draws an emulated needle, but can.interface is \"{}\": its needle is where \
-                 it is",
+                "--seed draws the emulated needle, but can.interface is \"{}\"; rehearse it with \
+                 --rehearse, or leave --seed out",
                 config.can.interface
             )));
         }
@@ -88,55 +84,47 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let preflight = if arguments.rehearse {
         before_rehearsal(&config, &arguments.configured.load(None)?, arguments.quiet)
     } else {
-        match before_run(&config, arguments.yes, arguments.json)? {
-            Ok(checks) => checks,
-            Err(status) => return Ok(status),
-        }
+        before_run(&config, arguments.yes, arguments.json)?
     };
-    let job = Job {
+    let options = Options {
         about: arguments.about.clone(),
         realtime: arguments.realtime,
         live: arguments.live,
         quiet: arguments.quiet,
         console: arguments.console,
         paced: arguments.console,
-        ..Job::new(&config, session)
     };
+    let after = options.of_withdrawal();
+    let job = Job { config: &config, plan: session.into(), motion: None, options };
     let Performed { report, wants_withdrawal, .. } = job.perform()?;
     let object = to_json(&config, &report, &preflight);
     let more = more(&config, configured.whole_path(), &report);
     give(arguments.json, &object, || screen(include_str!("run.txt"), &object, more))?;
-    let mut ended = status(&config, &report);
+    let mut worst = status(&config, &report);
     if wants_withdrawal && let Ok(withdrawal) = withdrawal(&config, &report) {
         let config = withdrawal.allowed(config, &report);
         let words = format!("withdraw{}", withdrawal.by());
-        let (report, summary) = stage::perform(&config, &words, true)?;
+        let (report, summary) = stage::perform(&config, &words, after)?;
         tell(summary);
-        ended = ended.max(status(&config, &report));
+        worst = worst.max(status(&config, &report));
     }
-    Ok(ExitCode::from(ended))
+    ended(worst)
 }
 
 /// The figures and the result of the run.
 fn to_json(config: &Config, report: &RunReport, preflight: &[Check]) -> Value {
-    let RunReport { outcome, holds, gates, run_dir, record, end, timing, emulated, .. } = report;
+    let figures = with(json!(report.figures.report()), &end_json(report));
     let more = json!({
-        "outcome": RunOutcome::from(outcome),
-        "stop_reason": outcome.stop_reason(),
-        "duration_s": end.as_secs_f64(),
-        "timing": timing,
-        "holds": holds,
-        "tracker_samples": gates_to_json(gates),
+        "timing": report.timing,
+        "holds": report.holds,
+        "tracker_samples": gates_to_json(&report.gates),
         "plane_missed_by_mm": plane_missed_by_mm(report),
         "plan_status": plan_status(config, report),
         "rehearsal": config.emulator.rehearse,
-        "run_dir": run_dir.display().to_string(),
-        "record_dropped": record.as_ref().ok().map(|finished| finished.dropped),
-        "record_error": record_error(record),
-        "emulated": emulated.as_ref().map(emulated_json),
+        "record_dropped": report.record.as_ref().ok().map(|finished| finished.dropped),
         "preflight": preflight,
     });
-    with(json!(report.figures.report()), &more)
+    with(figures, &more)
 }
 
 /// What the screen shows besides the object.

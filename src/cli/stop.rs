@@ -4,7 +4,7 @@ use super::arguments::Configured;
 use super::output::{say, tell};
 use super::perform::open_bus;
 use super::records::last_run_on_a_bus;
-use super::{ENVIRONMENT_FAILED, Failure};
+use super::{ENVIRONMENT_FAILED, Failure, ended};
 use crate::canopen::Frame;
 use crate::config::{Source, StopConfig};
 use crate::runtime::{BusTrouble, Clock, talk_despite_errors};
@@ -12,7 +12,6 @@ use crate::stage::{Axis, Halt};
 use clap::Args;
 use serde_json::json;
 use std::fs;
-use std::process::ExitCode;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -32,10 +31,10 @@ pub(super) struct Arguments {
 
 /// Stops both axes. Errors of the configuration other than the bus and the nodes are reported after
 /// the stop.
-pub(super) fn stop(configured: &Configured, as_json: bool) -> Result<ExitCode, Failure> {
+pub(super) fn stop(configured: &Configured, as_json: bool) -> Result<(), Failure> {
     let settings = settings(configured)?;
-    let mut bus = open_bus(&settings.interface).map_err(|Failure { message, .. }| {
-        Failure::environment(format_args!("nothing was stopped: {message}; use the emergency stop"))
+    let mut bus = open_bus(&settings.interface).map_err(|failure| {
+        Failure::environment(format_args!("nothing was stopped: {failure}; use the emergency stop"))
     })?;
     let clock = Clock::start();
     let begun = clock.now();
@@ -45,10 +44,10 @@ pub(super) fn stop(configured: &Configured, as_json: bool) -> Result<ExitCode, F
     let status = report(&halt, &trouble, as_json);
     let checked =
         configured.load(None).and_then(|config| Ok(config.stage.to_stage(&config.can)?));
-    if let Err(Failure { message, .. }) = checked {
+    if let Err(failure) = checked {
         tell(format_args!(
             "warning: the stop was sent, but every other command would refuse this configuration:\n\
-             {message}"
+             {failure}"
         ));
     }
     status
@@ -77,7 +76,7 @@ fn settings(configured: &Configured) -> Result<StopConfig, Failure> {
 }
 
 /// Reports which stops were confirmed, which were not, and which frames were not sent.
-fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<ExitCode, Failure> {
+fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<(), Failure> {
     let mut object = json!({});
     let (mut errors, mut stands) = (Vec::new(), Vec::new());
     for axis in Axis::BOTH {
@@ -115,7 +114,7 @@ fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<ExitCode, 
         }
         say(object)?;
     }
-    Ok(if is_confirmed { ExitCode::SUCCESS } else { ExitCode::from(ENVIRONMENT_FAILED) })
+    ended(if is_confirmed { 0 } else { ENVIRONMENT_FAILED })
 }
 
 #[cfg(test)]

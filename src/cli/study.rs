@@ -16,7 +16,6 @@ use minijinja::context;
 use nalgebra::Vector3;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::time::Instant;
 
 /// At most this many failed trials are listed on the screen.
@@ -47,9 +46,9 @@ pub(super) struct Arguments {
     threads: Option<u16>,
 }
 
-pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
+pub(super) fn study(arguments: &Arguments) -> Result<(), Failure> {
     let config = arguments.configured.load(None)?;
-    arguments.out.as_deref().map_or(Ok(()), refuse_existing)?;
+    refuse_existing(arguments.out.as_deref())?;
     if !config.is_emulated() {
         return Err(Failure::configuration(format!(
             "can.interface is \"{}\": a study needs the emulated needle, can.interface = \"memory\"",
@@ -107,8 +106,7 @@ pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
         repeat => repeat(&arguments.configured, config.insertion.plane_out_of_reach),
     };
     let text = || screen(include_str!("study.txt"), &report, more);
-    give(arguments.json, &report, text)?;
-    Ok(ExitCode::SUCCESS)
+    give(arguments.json, &report, text)
 }
 
 /// The command that repeats a trial, but for its seed. A run refuses what a study counts.

@@ -13,7 +13,6 @@ use clap::Parser;
 use std::fs::File;
 use std::io::{LineWriter, Write};
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::time::{Duration, UNIX_EPOCH};
 
 /// The default configuration.
@@ -43,18 +42,16 @@ pub(super) struct Arguments {
     seconds: Option<f64>,
 }
 
-fn write_data_sheets(stage: &VirtualStageConfig, dir: &Path) -> Result<ExitCode, Failure> {
+fn write_data_sheets(stage: &VirtualStageConfig, dir: &Path) -> Result<(), Failure> {
     let drives = [("insertion.eds", &stage.insertion.0), ("rotation.eds", &stage.rotation.0)];
     for (name, drive) in drives {
         let path = dir.join(name);
-        std::fs::write(&path, drive.eds(name)).map_err(|error| {
-            Failure::environment(format!("cannot write {}: {error}", path.display()))
-        })?;
+        std::fs::write(&path, drive.eds(name)).map_err(|error| Failure::on_file(&path, error))?;
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
-pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
+pub(super) fn serve(arguments: &Arguments) -> Result<(), Failure> {
     let config = arguments.configured.load(Some(VCAN_TOML))?;
     let stage = config.virtual_stage()?;
     if let Some(dir) = &arguments.write_eds {
@@ -80,7 +77,7 @@ pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
     ));
     serve_stage(stage, bus.as_mut(), tips, until, &interrupt, log).map_err(Failure::environment)?;
     runtime.shutdown_background();
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// Writes every frame to a new file at `path`; without a path, none.
@@ -91,7 +88,7 @@ fn frame_log(
 ) -> Result<impl FnMut(Direction, &Frame) + use<>, Failure> {
     let file = path.map(|path| match File::create_new(path) {
         Ok(file) => Ok((LineWriter::new(file), path.display().to_string())),
-        Err(error) => Err(Failure::environment(format!("{}: {error}", path.display()))),
+        Err(error) => Err(Failure::on_file(path, error)),
     });
     let mut file = file.transpose()?;
     let origin = clock.origin_utc().duration_since(UNIX_EPOCH).unwrap_or_default();

@@ -241,6 +241,16 @@ fn bad_arguments_are_refused_by_name() {
     insta::assert_snapshot!(refusals(&scratch, commands));
 }
 
+/// An argument that is no text is an error of usage, whatever else is mistyped.
+#[cfg(unix)]
+#[test]
+fn an_argument_that_is_no_text_is_refused() {
+    use std::os::unix::ffi::OsStrExt;
+    let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+    command.arg("rnu").arg(std::ffi::OsStr::from_bytes(b"\xff.toml"));
+    assert_eq!(command.output().unwrap().status.code(), Some(2));
+}
+
 /// However long a list of what is allowed, or a reason, is.
 #[test]
 fn no_line_is_longer_than_a_reader_follows() {

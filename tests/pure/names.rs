@@ -89,6 +89,12 @@ fn a_script_that_nobody_reads_is_an_error_and_no_panic() {
     let full = fs::OpenOptions::new().write(true).open("/dev/full").expect("a full device");
     let status = command.args(["generate", "bash"]).stdout(full).status().expect("it starts");
     assert_eq!(status.code(), Some(3));
+    // As `needle-bench generate bash | true`: the reader has read all that it wanted.
+    let (reader, closed) = std::io::pipe().expect("a pipe");
+    drop(reader);
+    let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+    let status = command.args(["generate", "bash"]).stdout(closed).status().expect("it starts");
+    assert_eq!(status.code(), Some(0));
 }
 
 /// With what a help is for: something to copy.

@@ -9,7 +9,7 @@ pub(super) mod tracker;
 use self::recordings::{collect, turn};
 use super::Failure;
 use super::arguments::{Configured, number_in, text_of};
-use super::output::{say, tell, with, write_new};
+use super::output::{refuse_existing, say, tell, with, write_new};
 use super::records::{Insertion, Insertions};
 use crate::archive::sha256_hex;
 use crate::calibration::{FiducialPair, NeedleFit, PosedRow, RegistrationFit, TipFit, TurnSample};
@@ -23,7 +23,6 @@ use minijinja::{Value as Shown, context};
 use nalgebra::Rotation3;
 use serde_json::{Value, json};
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::time::SystemTime;
 
 /// The comment above the result of a needle's calibration.
@@ -128,7 +127,7 @@ pub(super) struct Output {
     pub(super) json: bool,
 }
 
-pub(super) fn calibrate(calibration: &Calibration) -> Result<ExitCode, Failure> {
+pub(super) fn calibrate(calibration: &Calibration) -> Result<(), Failure> {
     match calibration {
         Calibration::Needle { insertions, output } => needle(insertions, output),
         Calibration::Registration(arguments) => registration(arguments),
@@ -138,6 +137,11 @@ pub(super) fn calibrate(calibration: &Calibration) -> Result<ExitCode, Failure> 
 }
 
 impl Output {
+    /// Refuses a file that exists, before anything is measured.
+    pub(super) fn refuse_existing(&self) -> Result<(), Failure> {
+        refuse_existing(self.out.as_deref())
+    }
+
     /// Writes the result: the operator's `summary`, a template for the values of `json` and `more`;
     /// `overlay` as TOML below the comment `header` for the configuration; `json` for programs.
     fn give(
@@ -146,7 +150,7 @@ impl Output {
         header: &str,
         overlay: &Value,
         json: &Value,
-    ) -> Result<ExitCode, Failure> {
+    ) -> Result<(), Failure> {
         let toml = toml::to_string(overlay).map_err(Failure::environment)?;
         self.give_toml(summary, &format!("{header}{toml}"), json)
     }
@@ -157,26 +161,25 @@ impl Output {
         (summary, more): (&str, Shown),
         toml: &str,
         json: &Value,
-    ) -> Result<ExitCode, Failure> {
+    ) -> Result<(), Failure> {
         tell(screen(summary, json, more).map_err(Failure::environment)?);
         if let Some(path) = &self.out {
             write_new(path, toml)?;
         }
-        if self.json {
-            say(json)?;
-        } else if self.out.is_none() {
-            say(toml.trim_end())?;
+        match self.out {
+            _ if self.json => say(json),
+            None => say(toml.trim_end()),
+            Some(_) => Ok(()),
         }
-        Ok(ExitCode::SUCCESS)
     }
 }
 
 /// What a calibration says of itself: where it came from, computed now from `text`, the content of
-/// `file`, and what it `found`.
-fn fit_of(file: &str, text: &str, found: &Value) -> Value {
+/// `file` if it is one, and what it `found`.
+fn fit_of(file: &str, text: Option<&str>, found: &Value) -> Value {
     let source = json!({
         "file": file,
-        "sha256": sha256_hex(text.as_bytes()),
+        "sha256": text.map(|text| sha256_hex(text.as_bytes())),
         "version": env!("CARGO_PKG_VERSION"),
         "date_utc": utc_text(SystemTime::now()),
     });
@@ -194,7 +197,7 @@ fn angles(rotation: &Rotation3<f64>) -> Value {
 }
 
 /// Curvature, bevel zero, sensor tilt and torsion from insertions.
-fn needle(insertions: &Insertions, output: &Output) -> Result<ExitCode, Failure> {
+fn needle(insertions: &Insertions, output: &Output) -> Result<(), Failure> {
     let (config, insertions) = insertions.read(None)?;
     let posed_rows = insertions.iter().map(posed).collect::<Result<Vec<_>, _>>()?;
     let fit = NeedleFit::of(&posed_rows, &config.path_noise()).map_err(Failure::configuration)?;
@@ -217,7 +220,7 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<ExitCode, Failure>
             "curvature_per_mm": fit.bend.curvature_per_mm,
             "tip_ahead_mm": fit.bend.tip_ahead_mm,
             "torsion": written(&fit.torsion.torsion),
-            "fit": fit_of(&file, &text, &found),
+            "fit": fit_of(&file, Some(&text), &found),
         },
         "evaluation": {
             "axis": <[f64; 3]>::from(fit.axis),
@@ -262,9 +265,10 @@ fn written(torsion: &TorsionConfig) -> Value {
 }
 
 /// The tracker's pose on the bench from fiducials.
-fn registration(arguments: &RegistrationArguments) -> Result<ExitCode, Failure> {
+fn registration(arguments: &RegistrationArguments) -> Result<(), Failure> {
     let path = &arguments.file;
     let config = arguments.configured.load(None)?;
+    arguments.output.refuse_existing()?;
     if arguments.collect {
         collect(path, &arguments.configured)?;
     }
@@ -279,7 +283,7 @@ fn registration(arguments: &RegistrationArguments) -> Result<ExitCode, Failure> 
         "y_mm": y_mm,
         "z_mm": z_mm,
         "sd_mm": config.registration_sd_of_mm(&fit),
-        "fit": fit_of(&path.display().to_string(), &text, &found),
+        "fit": fit_of(&path.display().to_string(), Some(&text), &found),
     });
     let registration = with(angles(&fit.x_wt.rotation), &registration);
     let json = json!({
@@ -295,14 +299,13 @@ fn registration(arguments: &RegistrationArguments) -> Result<ExitCode, Failure> 
 }
 
 /// The tip's offset and tilt on the sensor, from the sensor's circle while the base turns.
-fn tip(arguments: &TipArguments) -> Result<ExitCode, Failure> {
+fn tip(arguments: &TipArguments) -> Result<(), Failure> {
     let path = &arguments.file;
+    arguments.output.refuse_existing()?;
     let mut rms_max_mm = RMS_MAX_MM;
     if arguments.run {
-        match turn(path, &arguments.configured, arguments.rehearse)? {
-            Ok(noise_sd_mm) => rms_max_mm = rms_max_mm.max(2.0 * noise_sd_mm),
-            Err(status) => return Ok(ExitCode::from(status)),
-        }
+        let noise_sd_mm = turn(path, &arguments.configured, arguments.rehearse)?;
+        rms_max_mm = rms_max_mm.max(2.0 * noise_sd_mm);
     }
     let rms_max_mm = arguments.rms_max_mm.unwrap_or(rms_max_mm);
     let text = text_of(path)?;
@@ -318,7 +321,7 @@ fn tip(arguments: &TipArguments) -> Result<ExitCode, Failure> {
     let tracker = json!({
         "tip_offset_mm": <[f64; 3]>::from(x_sb.translation),
         "tip_tilt": angles(&x_sb.rotation),
-        "tip_fit": fit_of(&path.display().to_string(), &text, &found),
+        "tip_fit": fit_of(&path.display().to_string(), Some(&text), &found),
     });
     let json = json!({
         "tracker": tracker,

@@ -3,13 +3,14 @@
 //! stage, whose records hold the sensor's circle.
 
 use crate::calibration::{FiducialPair, RegistrationFit};
-use crate::cli::Failure;
 use crate::cli::arguments::Configured;
 use crate::cli::ending::status;
 use crate::cli::output::{refuse_existing, tell, write_new};
+use crate::cli::perform::Options;
 use crate::cli::records::{ReplayedRun, position_at, replay_run};
 use crate::cli::stage::{load_stage, perform, sensor_off_axis};
 use crate::cli::tracker::{Listener, listen};
+use crate::cli::{Failure, ended};
 use crate::geometry::Pose;
 use crate::tracker::{Event, Gate, Registration};
 use crate::units::Time;
@@ -43,7 +44,7 @@ pub(super) fn collect(path: &Path, configured: &Configured) -> Result<(), Failur
         return Err(Failure::configuration(why));
     }
     write_new(path, HEADER)?;
-    let failed = |error| Failure::environment(format!("{}: {error}", path.display()));
+    let failed = |error| Failure::on_file(path, error);
     let mut file = OpenOptions::new().append(true).open(path).map_err(failed)?;
     let lines = lines();
     let mut text = HEADER.to_owned();
@@ -209,25 +210,17 @@ const TURNS: [&str; 2] = ["360deg", "-360deg"];
 const ROWS_APART_DEG: f64 = 0.5;
 
 /// Turns the base of the stage that `configured` names and writes the sensor's positions into the new
-/// file `path`; returns their configured noise, mm. After a turn that did not complete nothing is written,
-/// and its exit status is returned.
-pub(super) fn turn(
-    path: &Path,
-    configured: &Configured,
-    rehearse: bool,
-) -> Result<Result<f64, u8>, Failure> {
-    refuse_existing(path)?;
+/// file `path`; returns their configured noise, mm. After a turn that did not complete nothing is written.
+pub(super) fn turn(path: &Path, configured: &Configured, rehearse: bool) -> Result<f64, Failure> {
+    refuse_existing(Some(path))?;
     let configured = configured.clone().rehearsed(rehearse);
     let (config, _) = load_stage(configured, rehearse, sensor_off_axis)?;
     let (mut rows, mut has_orientation) = (Vec::new(), true);
     for by in TURNS {
         let line = format!("jog --axis rotation --by {by}");
-        let (report, summary) = perform(&config, &line, false)?;
+        let (report, summary) = perform(&config, &line, Options::default())?;
         tell(summary);
-        let status = status(&config, &report);
-        if status != 0 {
-            return Ok(Err(status));
-        }
+        ended(status(&config, &report))?;
         for row in rows_of(replay_run(&report.run_dir)?) {
             has_orientation &= row.len() == CELLS;
             rows.push(row);
@@ -240,7 +233,7 @@ pub(super) fn turn(
         text += &format!("{}\n", row.join(","));
     }
     write_new(path, &text)?;
-    Ok(Ok(config.tracker.to_track().noise_sd_mm))
+    Ok(config.tracker.to_track().noise_sd_mm)
 }
 
 /// The base's rotation, the sensor's position and, where the tracker gives it, its orientation. That the

@@ -11,9 +11,8 @@ use crate::tracker::{CsvMapping, Event, Gate, Sample, TimeColumns, csv, gate, nd
 use crate::units::Time;
 use clap::Args;
 use minijinja::context;
-use serde_json::{Value, json};
+use serde_json::json;
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 /// The columns that `tracker record` writes into a CSV file.
 pub(in crate::cli) const RECEIVED: &str = "receive_time_ns";
@@ -35,24 +34,40 @@ pub(in crate::cli) struct Arguments {
     output: Output,
 }
 
-pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
+pub(super) fn calibrate(arguments: &Arguments) -> Result<(), Failure> {
     let path = &arguments.file;
     let config = arguments.configured.load(None)?;
     let text = text_of(path)?;
-    let refused = |error: String| Failure::in_file(path, error);
-    let samples = recorded(&text, &config.tracker).map_err(refused)?;
-    let fit = TrackerFit::of(&samples).map_err(|error| refused(error.to_string()))?;
-    give(&fit, &path.display().to_string(), &text, &arguments.output)
+    let samples =
+        recorded(&text, &config.tracker).map_err(|error| Failure::in_file(path, error))?;
+    present(&samples, &path.display().to_string(), Some(&text), &arguments.output)
 }
 
-/// Prints what was found in `samples`, whose source is `name`.
+/// Prints what is found in the `samples` of `source`, whose content is `text` if it is a file.
 pub(in crate::cli) fn present(
     samples: &[RestSample],
-    name: &str,
+    source: &str,
+    text: Option<&str>,
     output: &Output,
-) -> Result<ExitCode, Failure> {
-    let fit = TrackerFit::of(samples).map_err(|error| Failure::in_file(name.as_ref(), error))?;
-    give(&fit, name, "", output)
+) -> Result<(), Failure> {
+    let fit = TrackerFit::of(samples).map_err(|error| Failure::in_file(source.as_ref(), error))?;
+    let found = serde_json::to_value(&fit).map_err(Failure::environment)?;
+    let all = &fit.together;
+    let json = json!({
+        "tracker": {
+            "noise": {
+                "white_sd_mm": all.white_sd_mm.value,
+                "correlated_sd_mm": all.correlated_sd_mm.value,
+                "correlation_time_s": all.correlation_time_s.value,
+            },
+            "gates": { "noise_sd_mm": all.sd_mm.value.max(SD_MIN_MM) },
+        },
+        "observer": { "invariant": { "position_sd_mm": all.sd_mm.value.max(SD_MIN_MM) } },
+        "fit": fit_of(source, text, &found),
+    });
+    let more = context! { source => escaped(source) };
+    let toml = screen(include_str!("noise.toml"), &json, more).map_err(Failure::environment)?;
+    output.give_toml((include_str!("tracker.txt"), context! {}), &format!("{toml}\n"), &json)
 }
 
 /// A sample as the calibration takes it.
@@ -105,28 +120,4 @@ fn mapping(text: &str, configured: &CsvMapping) -> CsvMapping {
         quaternion_wxyz: None,
         skip: configured.skip,
     }
-}
-
-fn give(fit: &TrackerFit, source: &str, text: &str, output: &Output) -> Result<ExitCode, Failure> {
-    let found = serde_json::to_value(fit).map_err(Failure::environment)?;
-    let mut fitted = fit_of(source, text, &found);
-    if text.is_empty() {
-        fitted["sha256"] = Value::Null;
-    }
-    let all = &fit.together;
-    let json = json!({
-        "tracker": {
-            "noise": {
-                "white_sd_mm": all.white_sd_mm.value,
-                "correlated_sd_mm": all.correlated_sd_mm.value,
-                "correlation_time_s": all.correlation_time_s.value,
-            },
-            "gates": { "noise_sd_mm": all.sd_mm.value.max(SD_MIN_MM) },
-        },
-        "observer": { "invariant": { "position_sd_mm": all.sd_mm.value.max(SD_MIN_MM) } },
-        "fit": fitted,
-    });
-    let more = context! { source => escaped(source) };
-    let toml = screen(include_str!("noise.toml"), &json, more).map_err(Failure::environment)?;
-    output.give_toml((include_str!("tracker.txt"), context! {}), &format!("{toml}\n"), &json)
 }

@@ -4,14 +4,14 @@ mod read;
 
 use super::output::{give, tell};
 use super::records::{RUNS, describe, newest_first, open};
-use super::{BAD_CONFIGURATION, Failure};
+use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure, ended};
 use crate::archive::{Verdict, VerdictKind, file};
 use crate::review::{
     Campaign, Comparison, Condition, Folder, GENERATOR, Run, html, to_json, to_text,
 };
 use crate::runtime::make_recording;
 use crate::telemetry::{
-    Repaired, RunFolder, is_being_written, lock, note_recording, repair, utc_text, write_manifest,
+    RunFolder, is_being_written, lock, note_recording, repair, utc_text, write_manifest,
 };
 use crate::text::escaped;
 use clap::Args;
@@ -20,7 +20,7 @@ use serde_json::json;
 use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
-use std::process::{Command, ExitCode, Stdio};
+use std::process::{Command, Stdio};
 use std::time::SystemTime;
 
 #[derive(Debug, Args)]
@@ -55,7 +55,7 @@ pub(super) struct Arguments {
     pub(super) json: bool,
 }
 
-pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
+pub(super) fn review(arguments: &Arguments) -> Result<(), Failure> {
     let mut paths = arguments.paths.clone();
     if paths.is_empty() {
         let newest = newest_first(Path::new(RUNS)).next();
@@ -78,13 +78,10 @@ pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
         }
     }
     match &paths[..] {
-        [path] if is_judged => {
-            match (arguments.verdict, &arguments.reason) {
-                (Some(verdict), Some(reason)) => judge(path, verdict, reason, arguments.json)?,
-                _ => close(path, arguments.json)?,
-            }
-            Ok(ExitCode::SUCCESS)
-        }
+        [path] if is_judged => match (arguments.verdict, &arguments.reason) {
+            (Some(verdict), Some(reason)) => judge(path, verdict, reason, arguments.json),
+            _ => close(path, arguments.json),
+        },
         _ if is_judged => Err(Failure::configuration(
             "--verdict and --repair are about one run: name one run folder",
         )),
@@ -93,21 +90,20 @@ pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
             let (a, b) = (read::run(a)?, read::run(b)?);
             let comparison = Comparison::of(&a, &b);
             give(arguments.json, &comparison.to_json(), || comparison.to_text())?;
-            Ok(status(&[&a, &b]))
+            status(&[&a, &b])
         }
         many => {
             let entries = many.iter().map(|path| read::entries(path));
             let entries = entries.collect::<io::Result<Vec<_>>>()?.concat();
             let campaign = Campaign::of(entries, arguments.by.as_deref());
             let campaign = campaign.map_err(Failure::configuration)?;
-            give(arguments.json, &campaign.to_json(), || campaign.to_text())?;
-            Ok(ExitCode::SUCCESS)
+            give(arguments.json, &campaign.to_json(), || campaign.to_text())
         }
     }
 }
 
 /// One run: its page, then its summary.
-fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
+fn one(path: &Path, arguments: &Arguments) -> Result<(), Failure> {
     let run = read::run(path)?;
     let page = match &arguments.html {
         _ if arguments.no_html => None,
@@ -131,22 +127,24 @@ fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
         // The summary was printed already; the error follows it.
         Some(Err(error)) => {
             tell(format_args!("error: {error}"));
-            Ok(ExitCode::from(super::ENVIRONMENT_FAILED))
+            ended(ENVIRONMENT_FAILED)
         }
-        _ if arguments.open => open_viewer(&path.join(file::RECORDING)).map(|()| status(&[&run])),
-        _ => Ok(status(&[&run])),
+        _ if arguments.open => open_viewer(path).and_then(|()| status(&[&run])),
+        _ => status(&[&run]),
     }
 }
 
-/// Starts the viewer with `recording`, and does not wait for it.
-fn open_viewer(recording: &Path) -> Result<(), Failure> {
+/// Starts the viewer with the recording of the run in `path`, and does not wait for it.
+fn open_viewer(path: &Path) -> Result<(), Failure> {
+    let recording = path.join(file::RECORDING);
     let shown = recording.display();
     if !recording.is_file() {
-        return Err(Failure::configuration(format!(
-            "{shown} is not there: make it by needle-bench review --repair"
+        return Err(Failure::configuration(format_args!(
+            "{shown} is not there; make it: needle-bench review {} --repair",
+            path.display()
         )));
     }
-    let started = Command::new("rerun").arg(recording).stdout(Stdio::null()).spawn();
+    let started = Command::new("rerun").arg(&recording).stdout(Stdio::null()).spawn();
     started.map(drop).map_err(|error| {
         Failure::environment(format!("rerun {shown}: {error}; install it: pip install rerun-sdk"))
     })
@@ -172,12 +170,9 @@ fn write_report(path: &Path, page: &str) -> io::Result<()> {
 }
 
 /// An edited record is bad input: it is not what the run recorded.
-fn status(runs: &[&Run]) -> ExitCode {
+fn status(runs: &[&Run]) -> Result<(), Failure> {
     let is_edited = |run: &&Run| matches!(run.folder.condition, Condition::Changed(_));
-    match runs.iter().any(is_edited) {
-        true => ExitCode::from(BAD_CONFIGURATION),
-        false => ExitCode::SUCCESS,
-    }
+    ended(if runs.iter().any(is_edited) { BAD_CONFIGURATION } else { 0 })
 }
 
 /// A parser of a verdict's name, for clap.
@@ -192,12 +187,9 @@ fn verdict() -> impl TypedValueParser<Value = VerdictKind> {
 fn close(path: &Path, json: bool) -> Result<(), Failure> {
     let is_closed = RunFolder::open(path)?.is_closed() && !is_being_written(path);
     let repaired = match is_closed && lacks_recording(path) {
-        true => {
-            note_recording(path, None)?;
-            None
-        }
-        false => Some(repair(path)?),
-    };
+        true => note_recording(path, None).map(|()| None),
+        false => repair(path).map(Some),
+    }?;
     let (_, config) = open(path)?;
     let fault = make_recording(path, describe(config), &mut |made| {
         tell(format_args!(
@@ -214,22 +206,18 @@ fn close(path: &Path, json: bool) -> Result<(), Failure> {
         }
         tell(text);
     }
-    let made = |repaired: Repaired| {
-        let cut = |(file, bytes): &(String, u64)| json!({ "file": file, "bytes": bytes });
-        let object = json!({
-            "run_dir": dir.to_string(),
-            "stop_reason": repaired.stop_reason,
-            "counts": repaired.counts,
-            "cut": repaired.cuts.iter().map(cut).collect::<Vec<_>>(),
-        });
-        (object, format!("{dir}: closed: {repaired}"))
-    };
-    let recorded = || {
+    let Some(repaired) = repaired else {
         let object = json!({ "run_dir": dir.to_string(), "recording_made": true });
-        (object, format!("{dir}: {} made", file::RECORDING))
+        return give(json, &object, || Ok(format!("{dir}: {} made", file::RECORDING)));
     };
-    let (object, text) = repaired.map_or_else(recorded, made);
-    give(json, &object, || Ok(text))
+    let cut = |(file, bytes): &(String, u64)| json!({ "file": file, "bytes": bytes });
+    let object = json!({
+        "run_dir": dir.to_string(),
+        "stop_reason": repaired.stop_reason,
+        "counts": repaired.counts,
+        "cut": repaired.cuts.iter().map(cut).collect::<Vec<_>>(),
+    });
+    give(json, &object, || Ok(format!("{dir}: closed: {repaired}")))
 }
 
 /// Whether the record in `path` has no `run.rrd`, or none that its manifest knows.

@@ -1,17 +1,16 @@
 //! `home`, `jog`, `withdraw` and `prove`: a run without a needle's steering, and its record.
 
 use super::{Arguments, Motion};
-use crate::archive::{RunOutcome, file, proof};
-use crate::cli::Failure;
-use crate::cli::ending::{after_operation, ending, record_error, status};
-use crate::cli::output::{say, show};
-use crate::cli::perform::{Job, Performed, emulated_json};
+use crate::archive::{file, proof};
+use crate::cli::ending::{after_operation, ending, status};
+use crate::cli::output::{say, show, with};
+use crate::cli::perform::{Job, Options, Performed, end_json};
+use crate::cli::{Failure, ended};
 use crate::config::Config;
 use crate::runtime::RunReport;
 use crate::session::Done;
 use serde_json::{Value, json};
 use std::path::Path;
-use std::process::ExitCode;
 
 /// Runs the `motion` of `arguments` and prints its result. `path` is the file of `config`, where no key was set
 /// over it.
@@ -20,15 +19,14 @@ pub(super) fn operate(
     path: Option<&Path>,
     motion: &Motion,
     arguments: &Arguments,
-) -> Result<ExitCode, Failure> {
-    let job = Job {
-        motion: Some(motion),
+) -> Result<(), Failure> {
+    let options = Options {
         about: motion.common().about.clone(),
         realtime: arguments.realtime,
         quiet: arguments.quiet,
-        ..Job::new(config, motion.plan(config)?)
+        ..Options::default()
     };
-    let Performed { report, done, .. } = job.perform()?;
+    let Performed { report, done, .. } = job(config, motion, options)?.perform()?;
     match arguments.json {
         true => say(to_json(motion.name(), &done, &report))?,
         false => {
@@ -36,21 +34,24 @@ pub(super) fn operate(
             proof_of(&report).map_or(Ok(()), show)?;
         }
     }
-    Ok(ExitCode::from(status(config, &report)))
+    ended(status(config, &report))
 }
 
 /// Runs the motion in `line`, written as on the command line of `stage`, and returns the report and the summary.
-/// An emulated stage that is `paced` takes as long as a rig.
 pub(in crate::cli) fn perform(
     config: &Config,
     line: &str,
-    paced: bool,
+    options: Options,
 ) -> Result<(RunReport, String), Failure> {
     let motion = Motion::of(line).map_err(Failure::configuration)?;
-    let job = Job { motion: Some(&motion), paced, ..Job::new(config, motion.plan(config)?) };
-    let Performed { report, done, .. } = job.perform()?;
+    let Performed { report, done, .. } = job(config, &motion, options)?.perform()?;
     let summary = summary(config, None, &motion, &done, &report);
     Ok((report, summary))
+}
+
+fn job<'a>(config: &'a Config, motion: &'a Motion, options: Options) -> Result<Job<'a>, Failure> {
+    let plan = motion.plan(config)?.into();
+    Ok(Job { config, plan, motion: Some(motion), options })
 }
 
 fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
@@ -62,17 +63,12 @@ fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
         object[format!("to_{unit}")] = json!(to);
         object
     };
-    json!({
+    let object = json!({
         "operation": name,
-        "outcome": RunOutcome::from(&report.outcome),
-        "stop_reason": report.outcome.stop_reason(),
         "axes": done.iter().map(axis).collect::<Vec<_>>(),
         "proof": proof_of(report),
-        "duration_s": report.end.as_secs_f64(),
-        "run_dir": report.run_dir.display().to_string(),
-        "record_error": record_error(&report.record),
-        "emulated": report.emulated.as_ref().map(emulated_json),
-    })
+    });
+    with(object, &end_json(report))
 }
 
 /// What the motion has proved, from its record.

@@ -1,15 +1,15 @@
 //! `status`: what the drives say of themselves.
 
-use crate::cli::output::{say, show, tell};
+use crate::cli::output::{is_unread, say, show, tell};
 use crate::cli::perform::open_bus;
-use crate::cli::{ENVIRONMENT_FAILED, Failure};
+use crate::cli::{ENVIRONMENT_FAILED, Failure, ended};
 use crate::config::Config;
 use crate::emulator::VirtualStage;
 use crate::runtime::{Clock, Interrupt, talk_live, talk_virtual};
 use crate::stage::{Axis, AxisStatus, Dialogue, Reset, StatusReader};
 use crate::units::Time;
 use serde_json::{Value, json};
-use std::process::ExitCode;
+use std::io::stdout;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -32,7 +32,7 @@ fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<(), Failure> {
 }
 
 /// Resets the faults of both drives, then says how they are.
-pub(super) fn reset(config: &Config, as_json: bool) -> Result<ExitCode, Failure> {
+pub(super) fn reset(config: &Config, as_json: bool) -> Result<(), Failure> {
     let stage = config.stage.to_stage(&config.can)?;
     let mut reset = Reset::new(&stage, Time::ZERO);
     talk(config, &mut reset)?;
@@ -44,15 +44,19 @@ pub(super) fn reset(config: &Config, as_json: bool) -> Result<ExitCode, Failure>
     }
 }
 
-/// The status each second, until Ctrl-C.
-pub(super) fn watch(config: &Config, as_json: bool) -> Result<ExitCode, Failure> {
+/// The status each second, until Ctrl-C or until nobody reads it.
+pub(super) fn watch(config: &Config, as_json: bool) -> Result<(), Failure> {
     let interrupt = Interrupt::listen()?;
     loop {
-        let status = status(config, as_json)?;
+        let read = status(config, as_json);
+        // A drive that does not answer now may answer the next time; without a bus none does.
+        if read.as_ref().is_err_and(|failure| failure.message.is_some()) || is_unread(&stdout()) {
+            return read;
+        }
         let next = Instant::now() + WATCH_PERIOD;
         while Instant::now() < next {
             if interrupt.is_raised() {
-                return Ok(status);
+                return read;
             }
             thread::sleep(LOOK_PERIOD);
         }
@@ -67,7 +71,7 @@ pub(in crate::cli) fn read_status(config: &Config) -> Result<StatusReader, Failu
     Ok(reader)
 }
 
-pub(super) fn status(config: &Config, as_json: bool) -> Result<ExitCode, Failure> {
+pub(super) fn status(config: &Config, as_json: bool) -> Result<(), Failure> {
     let reader = read_status(config)?;
     let (mut object, mut lines, mut errors) = (json!({}), Vec::new(), Vec::new());
     for axis in Axis::BOTH {
@@ -85,7 +89,7 @@ pub(super) fn status(config: &Config, as_json: bool) -> Result<ExitCode, Failure
     for error in &errors {
         tell(format_args!("error: {error}"));
     }
-    Ok(if errors.is_empty() { ExitCode::SUCCESS } else { ExitCode::from(ENVIRONMENT_FAILED) })
+    ended(if errors.is_empty() { 0 } else { ENVIRONMENT_FAILED })
 }
 
 /// A drive as it describes itself.

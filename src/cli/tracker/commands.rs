@@ -6,7 +6,7 @@ use crate::cli::Failure;
 use crate::cli::arguments::{Configured, number_in};
 use crate::cli::calibrate::Output;
 use crate::cli::calibrate::tracker::{POSITION, QUATERNION, RECEIVED, STAMP, present, rest_sample};
-use crate::cli::output::{refuse_existing, say, tell};
+use crate::cli::output::{is_unread, refuse_existing, say, tell};
 use crate::config::TrackerConfig;
 use crate::session::SampleRecord;
 use crate::text::{clipped, table};
@@ -21,7 +21,6 @@ use std::ffi::OsStr;
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::time::Duration;
 
 #[derive(Debug, Subcommand)]
@@ -36,7 +35,7 @@ pub(in crate::cli) enum Look {
     Rest(RestArguments),
 }
 
-pub(in crate::cli) fn tracker(look: &Look) -> Result<ExitCode, Failure> {
+pub(in crate::cli) fn tracker(look: &Look) -> Result<(), Failure> {
     match look {
         Look::List(arguments) => list(arguments),
         Look::Watch(arguments) => watch(arguments),
@@ -124,7 +123,7 @@ impl Tool {
     }
 }
 
-fn list(arguments: &ListArguments) -> Result<ExitCode, Failure> {
+fn list(arguments: &ListArguments) -> Result<(), Failure> {
     let mut listener = listen(&arguments.configured, true)?;
     let until = listener.now() + Duration::from_secs_f64(arguments.seconds);
     let mut tools: BTreeMap<String, Tool> = BTreeMap::new();
@@ -162,7 +161,7 @@ fn list(arguments: &ListArguments) -> Result<ExitCode, Failure> {
     if !tools.keys().any(is_configured) {
         tell(format_args!("warning: none of them is tracker.tool = \"{configured}\"; set it"));
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 const LINE_PERIOD: Duration = Duration::from_secs(1);
@@ -252,13 +251,13 @@ impl Watch {
     }
 }
 
-fn watch(arguments: &WatchArguments) -> Result<ExitCode, Failure> {
+fn watch(arguments: &WatchArguments) -> Result<(), Failure> {
     let mut listener = listen(&arguments.configured, false)?;
     let mut watch = Watch::new(&listener.config.tracker);
     let start = listener.now();
     let end = arguments.seconds.map_or(Time::NEVER, |s| start + Duration::from_secs_f64(s));
     let mut last_line = start;
-    while !listener.is_over() && listener.now() < end {
+    while !listener.is_over() && listener.now() < end && !is_unread(&io::stdout()) {
         let due = (last_line + LINE_PERIOD).min(end);
         while let Some(event) = listener.next(due) {
             watch.take(&event);
@@ -269,10 +268,7 @@ fn watch(arguments: &WatchArguments) -> Result<ExitCode, Failure> {
         }
         last_line = now;
     }
-    match watch.last {
-        Some(_) => Ok(ExitCode::SUCCESS),
-        None => Err(listener.nothing()),
-    }
+    watch.last.map(|_| ()).ok_or_else(|| listener.nothing())
 }
 
 /// What was written reaches the disk's cache this often.
@@ -325,11 +321,15 @@ impl Recording {
             None => tracker_line(&SampleRecord::received(sample.clone()))?,
             Some(columns) => {
                 let stamp = sample.source_unix_ns.unwrap_or(0);
-                let q = sample.orientation.unwrap_or_default();
-                let quaternion = [q.w, q.i, q.j, q.k];
                 let times = [sample.receive_time.as_nanos(), stamp].map(|ns| ns.to_string());
-                let pose = sample.position_mm.iter().chain(&quaternion).map(f64::to_string);
-                times.into_iter().chain(pose).take(columns).collect::<Vec<_>>().join(",")
+                let position = sample.position_mm.iter().map(f64::to_string);
+                // Empty where this sample has none: no orientation is made up.
+                let quaternion = match sample.orientation {
+                    Some(q) => [q.w, q.i, q.j, q.k].map(|part| part.to_string()),
+                    None => Default::default(),
+                };
+                let cells = times.into_iter().chain(position).chain(quaternion);
+                cells.take(columns).collect::<Vec<_>>().join(",")
             }
         };
         writeln!(self.out, "{line}")?;
@@ -341,10 +341,10 @@ impl Recording {
     }
 }
 
-fn record(arguments: &RecordArguments) -> Result<ExitCode, Failure> {
+fn record(arguments: &RecordArguments) -> Result<(), Failure> {
     let path = &arguments.file;
     let is_csv = path.extension().is_some_and(|ending| ending == "csv");
-    refuse_existing(path)?;
+    refuse_existing(Some(path))?;
     let mut listener = listen(&arguments.configured, false)?;
     let (mut recording, mut written, mut invalid) = (None, 0u64, 0u64);
     let failed = |error: io::Error, written: u64| {
@@ -384,7 +384,7 @@ fn record(arguments: &RecordArguments) -> Result<ExitCode, Failure> {
         (false, invalid) => format!(", {invalid} of them invalid"),
     };
     tell(format_args!("tracker: {written} samples of \"{tool}\" in {}{left_out}", path.display()));
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 #[derive(Debug, Args)]
@@ -398,7 +398,8 @@ pub(in crate::cli) struct RestArguments {
     output: Output,
 }
 
-fn rest(arguments: &RestArguments) -> Result<ExitCode, Failure> {
+fn rest(arguments: &RestArguments) -> Result<(), Failure> {
+    arguments.output.refuse_existing()?;
     let mut listener = listen(&arguments.configured, false)?;
     let source = described(&listener.config);
     tell(format_args!(
@@ -410,5 +411,32 @@ fn rest(arguments: &RestArguments) -> Result<ExitCode, Failure> {
         samples.push(rest_sample(sample));
         Ok(())
     })?;
-    present(&samples, &source, &arguments.output)
+    present(&samples, &source, None, &arguments.output)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A tracker may send an orientation with some positions only.
+    #[test]
+    fn an_orientation_that_was_not_sent_is_not_recorded() {
+        let path = std::env::temp_dir().join(format!("needle-record-{}.csv", std::process::id()));
+        let turned = Sample {
+            receive_time: Time::from_nanos(5),
+            source_unix_ns: None,
+            tool: String::new(),
+            position_mm: Vector3::new(1.0, 2.0, 3.0),
+            orientation: Some(Default::default()),
+            validity: Validity::Valid,
+        };
+        let mut recording = Recording::create(&path, true, &turned).unwrap();
+        recording.take(&turned).unwrap();
+        recording.take(&Sample { orientation: None, ..turned }).unwrap();
+        recording.out.flush().unwrap();
+        let text = std::fs::read_to_string(&path).unwrap();
+        std::fs::remove_file(&path).unwrap();
+        let rows: Vec<&str> = text.lines().skip(1).collect();
+        assert_eq!(rows, ["5,0,1,2,3,1,0,0,0", "5,0,1,2,3,,,,"]);
+    }
 }
