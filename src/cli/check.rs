@@ -1,8 +1,8 @@
 //! `needle-bench check`: what a run would start with. Nothing moves.
 
 use super::arguments::{Configured, number_in};
+use super::mask::mask_reader;
 use super::output::{say, show, tell};
-use super::plan::mask_reader;
 use super::preflight::Preflight;
 use super::stage::drive_json;
 use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure, ended};

@@ -10,6 +10,7 @@ mod console;
 mod ending;
 mod evaluate;
 mod generate;
+mod mask;
 mod operator;
 mod output;
 mod perform;

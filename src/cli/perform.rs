@@ -3,9 +3,9 @@
 use super::arguments::{About, RealTimeArguments};
 use super::console::Console;
 use super::ending::{record_error, withdrawal};
+use super::mask::mask_reader;
 use super::operator::Terminal;
 use super::output::tell;
-use super::plan::mask_reader;
 use super::records::describe;
 use super::stage::Motion;
 use super::tracker::{described, open_tracker, replay};

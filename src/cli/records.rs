@@ -2,9 +2,9 @@
 
 use super::Failure;
 use super::arguments::{Configured, text_of};
+use super::mask::mask_reader;
 use super::output::tell;
 use super::perform::scene;
-use super::plan::mask_reader;
 use super::stage;
 use crate::archive::{Manifest, file, proof};
 use crate::config::{CanInterface, Config, Source};

@@ -3,9 +3,9 @@
 use super::arguments::{About, Configured, RealTimeArguments, seed};
 use super::console::Console;
 use super::ending::{after_insertion, ending, plan_status, plane_missed_by_mm, status, withdrawal};
+use super::mask::{file_crc32, mask_reader};
 use super::output::{give, tell, with};
 use super::perform::{Job, LIVE_ADDRESS, Options, Performed, end_json};
-use super::plan::{file_crc32, mask_reader};
 use super::preflight::{before_rehearsal, before_run};
 use super::{Failure, ended, stage};
 use crate::config::Config;

@@ -2,8 +2,8 @@
 
 use super::Failure;
 use super::arguments::{Configured, seed};
+use super::mask::mask_reader;
 use super::output::{give, refuse_existing, shell_word, write_new};
-use super::plan::mask_reader;
 use crate::config::Config;
 use crate::geometry::coordinates;
 use crate::runtime::Study;

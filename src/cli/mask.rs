@@ -1,0 +1,179 @@
+//! Obstacles from masks: images in NIfTI-1 format, in the files that `[goal]` names.
+
+use crate::config::PoseConfig;
+use crate::plan::{Mask, Obstacle};
+use flate2::CrcReader;
+use flate2::read::MultiGzDecoder;
+use nalgebra::Vector3;
+use nifti::{NiftiError, NiftiHeader, NiftiObject, RandomAccessNiftiVolume, ReaderOptions};
+use std::fmt::Display;
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+
+/// Reads the masks that the configuration in `file` names. Their paths are relative to its folder.
+pub(super) fn mask_reader(
+    file: Option<&Path>,
+) -> impl Fn(&str, Option<u32>, &PoseConfig) -> Result<Obstacle, String> + Sync {
+    move |name, crc32, pose| {
+        let path = file.map_or_else(|| PathBuf::from(name), |file| file.with_file_name(name));
+        mask(&path, crc32, pose).map_err(|error| format!("{}: {error}", path.display()))
+    }
+}
+
+/// The image in `path`, as an obstacle.
+fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, String> {
+    check_regular(path).map_err(|error| error.to_string())?;
+    let header = NiftiHeader::from_file(path).map_err(|error| reason(&error))?;
+    // A record has one checksum for a mask, so the mask must be one file.
+    if &header.magic != b"n+1\0" {
+        return Err("its voxels are in another file (.img); write both as one .nii".to_owned());
+    }
+    let dim = header.dim().map_err(|error| reason(&error))?;
+    let size: [usize; 3] = match dim {
+        [x, y, z, rest @ ..] if rest.iter().all(|count| *count == 1) => {
+            [*x, *y, *z].map(usize::from)
+        }
+        _ => return Err(format!("the mask has {} dimensions, allowed: 3", dim.len())),
+    };
+    if !is_upright(&header) {
+        return Err("its header turns or mirrors the voxels; resample it along x, y, z".to_owned());
+    }
+    is_in_mm(&header)?;
+    let [_, x, y, z, ..] = header.pixdim.map(f64::from);
+    let spacing_mm = Vector3::new(x, y, z);
+    let voxels = Mask::check(size, &spacing_mm)?;
+    check_length(path, &header, voxels)?;
+    let image = ReaderOptions::new().read_file(path).map_err(|error| reason(&error))?;
+    let image = image.into_volume();
+    let mut at = vec![0; dim.len()];
+    let occupied = (0..voxels).map(|voxel| {
+        let [nx, ny, _] = size;
+        let indices = [voxel % nx, voxel / nx % ny, voxel / nx / ny];
+        at.iter_mut().zip(indices).for_each(|(at, index)| *at = index as u16);
+        // NaN is not 0: what is not known counts as part of the obstacle.
+        image.get_f64(&at).map(|value| value != 0.0).map_err(|error| reason(&error))
+    });
+    let occupied: Vec<bool> = occupied.collect::<Result<_, _>>()?;
+    let found = file_crc32(path).map_err(|error| error.to_string())?;
+    if let Some(crc32) = crc32.filter(|crc32| *crc32 != found) {
+        return Err(format!(
+            "the mask has another content: its CRC-32 is {found:#010x}, crc32 says {crc32:#010x}; find \
+             the file that was meant, or mend the key"
+        ));
+    }
+    if !occupied.contains(&true) {
+        return Err(
+            "all of its voxels are 0, so it is no obstacle: is it the right label?".to_owned()
+        );
+    }
+    Mask::new(size, spacing_mm, &occupied, &pose.to_pose()).map(Obstacle::Mask)
+}
+
+/// Refuses an image with bytes after its voxels: its header may belong to another image. A compressed image is
+/// refused if its bytes are damaged.
+fn check_length(path: &Path, header: &NiftiHeader, voxels: usize) -> Result<(), String> {
+    let unreadable = |error: io::Error| reason(&NiftiError::Io(error));
+    let file = File::open(path).map_err(unreadable)?;
+    let is_compressed = path.extension().is_some_and(|extension| extension == "gz");
+    let image: Box<dyn Read> =
+        if is_compressed { Box::new(MultiGzDecoder::new(file)) } else { Box::new(file) };
+    let bits = u64::try_from(header.bitpix).unwrap_or_default() * voxels as u64;
+    let expected = f64::from(header.vox_offset) as u64 + bits / 8;
+    // Not farther than is needed: a compressed file may be of any length.
+    let length = io::copy(&mut image.take(expected + 1), &mut io::sink()).map_err(unreadable)?;
+    match length > expected {
+        true => Err(format!(
+            "the mask goes on after the {voxels} voxels of its header: is it cut, or the header another's?"
+        )),
+        false => Ok(()),
+    }
+}
+
+/// Refuses a pipe or a device, because reading it may never end.
+fn check_regular(path: &Path) -> io::Result<()> {
+    match std::fs::metadata(path) {
+        Ok(found) if !found.is_file() => Err(io::Error::other("not a regular file")),
+        // Whoever opens it says what is wrong with it.
+        _ => Ok(()),
+    }
+}
+
+/// The CRC-32 of the file in `path`, read in pieces: a file that is no mask may be of any size.
+pub(super) fn file_crc32(path: &Path) -> io::Result<u32> {
+    check_regular(path)?;
+    let mut file = CrcReader::new(File::open(path)?);
+    io::copy(&mut file, &mut io::sink())?;
+    Ok(file.crc().sum())
+}
+
+/// Why an image cannot be read.
+fn reason(error: &NiftiError) -> String {
+    let error: &dyn Display = if let NiftiError::Io(error) = error { error } else { error };
+    format!("no NIfTI image can be read: {error}")
+}
+
+/// The largest part of a voxel's side that may point along another axis.
+const TURNED_MAX: f32 = 1e-3;
+
+/// Whether the header neither turns nor mirrors the voxels: the pose alone places them.
+fn is_upright(header: &NiftiHeader) -> bool {
+    let [qfac, sides @ ..] = header.pixdim;
+    if header.sform_code > 0 {
+        let rows = [header.srow_x, header.srow_y, header.srow_z];
+        (0..3).all(|i| {
+            (0..3).all(|j| match i == j {
+                true => rows[i][j] > 0.0,
+                false => rows[i][j].abs() <= TURNED_MAX * sides[j].abs(),
+            })
+        })
+    } else {
+        let turned = [header.quatern_b, header.quatern_c, header.quatern_d];
+        header.qform_code <= 0 || qfac >= 0.0 && turned.iter().all(|part| part.abs() <= TURNED_MAX)
+    }
+}
+
+/// Refuses an image whose voxels may be of another size than `pixdim` in mm: an obstacle must not be taken for
+/// smaller than it is.
+fn is_in_mm(header: &NiftiHeader) -> Result<(), String> {
+    // NIfTI-1, xyzt_units: the lowest three bits are the unit of space.
+    let unit = match header.xyzt_units & 7 {
+        0 | 2 => None,
+        1 => Some("metres".to_owned()),
+        3 => Some("micrometres".to_owned()),
+        code => Some(format!("units of code {code}")),
+    };
+    if let Some(unit) = unit {
+        return Err(format!("its header gives lengths in {unit}, allowed: mm (xyzt_units)"));
+    }
+    let [_, x, y, z, ..] = header.pixdim;
+    let rows = [header.srow_x[0], header.srow_y[1], header.srow_z[2]];
+    let differ = |(row, side): (&f32, &f32)| (row - side).abs() > TURNED_MAX * side.abs();
+    if header.sform_code > 0 && rows.iter().zip(&[x, y, z]).any(differ) {
+        let [a, b, c] = rows;
+        return Err(format!(
+            "its header gives voxels of two sizes, {x} x {y} x {z} mm (pixdim) and {a} x {b} x {c} mm \
+             (srow); resample it, or mend the header"
+        ));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_device_or_pipe_in_place_of_a_mask_is_refused() {
+        let pipe = std::env::temp_dir().join(format!("needle-mask-{}", std::process::id()));
+        nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRUSR).expect("a pipe");
+        for path in [Path::new("/dev/zero"), &pipe] {
+            assert_eq!(file_crc32(path).unwrap_err().to_string(), "not a regular file");
+            let read =
+                mask_reader(None)(path.to_str().expect("text"), None, &PoseConfig::default());
+            let error = read.expect_err("it is refused");
+            assert!(error.ends_with(": not a regular file"), "{error}");
+        }
+        std::fs::remove_file(&pipe).expect("the pipe");
+    }
+}

@@ -1,0 +1,115 @@
+//! `needle-bench plan`: the path to the target, without a stage.
+
+mod picture;
+
+use self::picture::picture;
+use super::arguments::Configured;
+use super::mask::mask_reader;
+use super::output::{give, refuse_existing, write_new};
+use super::{Failure, STOPPED, ended};
+use crate::geometry::FixedAngles;
+use crate::plan::{Answer, Arc, Problem, Status, Tip, World, plan as solve, plan_with_reserve};
+use crate::text::screen;
+use clap::Args;
+use minijinja::context;
+use nalgebra::{Matrix3, Rotation3, Vector3};
+use serde_json::{Value, json};
+use std::path::PathBuf;
+use std::time::Instant;
+
+/// Distance between two rows of `path`, mm.
+const ROW_MM: f64 = 0.5;
+
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    #[command(flatten)]
+    configured: Configured,
+    /// One JSON object on stdout.
+    #[arg(long)]
+    pub(super) json: bool,
+    /// Draw the plan into a new SVG file.
+    #[arg(long, value_name = "FILE.svg", value_parser = svg_file)]
+    out: Option<PathBuf>,
+}
+
+pub(super) fn plan(arguments: &Arguments) -> Result<(), Failure> {
+    refuse_existing(arguments.out.as_deref())?;
+    let (config, _) = arguments.configured.load_with_warnings()?;
+    let (world, problem) = config.to_plan(&mask_reader(arguments.configured.path()))?;
+    let begun = Instant::now();
+    let mut answer = solve(&world, &problem);
+    let seconds = begun.elapsed().as_secs_f64();
+    let roomy = plan_with_reserve(&world, &problem, config.goal.reserve_mm, &answer);
+    // A path that no run may take is no plan.
+    if let (Status::Plan, Err(refusal)) = (answer.status, &roomy) {
+        (answer.status, answer.reason) = (Status::None, Some(refusal.clone()));
+    }
+    let mut object = to_json(&world, &problem, &answer, seconds);
+    let reserve_mm = roomy.as_ref().ok().filter(|_| !world.obstacles.is_empty());
+    object["run_reserve_mm"] = json!(reserve_mm.map(|roomy| roomy.reserve_mm));
+    object["run_refusal"] = json!(roomy.err());
+    object["curvature_margin"] = json!(config.goal.curvature_margin());
+    if let Some(path) = &arguments.out {
+        write_new(path, &picture(&world, &problem, &answer)?)?;
+    }
+    let text = || screen(include_str!("plan.txt"), &object, context! {});
+    give(arguments.json, &object, text)?;
+    ended(match answer.status {
+        Status::Plan => 0,
+        Status::None | Status::Budget => STOPPED,
+    })
+}
+
+/// The name of a picture, for clap.
+fn svg_file(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension().is_some_and(|extension| extension == "svg") {
+        true => Ok(path),
+        false => Err("the plan is drawn as SVG: a name that ends in .svg".to_owned()),
+    }
+}
+
+fn to_json(world: &World, problem: &Problem, answer: &Answer, seconds: f64) -> Value {
+    let row = |point: &Vector3<f64>| json!([point.x, point.y, point.z]);
+    let path = answer.path.as_ref();
+    let clearance_mm = path.map(|path| path.distance_mm(world)).filter(|mm| mm.is_finite());
+    let error_mm = path.map(|path| (path.end().position_mm - problem.target_mm).norm());
+    let nearest = answer.nearest_mm.filter(|_| path.is_none());
+    let resolution = answer.resolution;
+    json!({
+        "status": answer.status.to_string(),
+        "reason": answer.reason,
+        "length_mm": path.map(|path| path.length_mm()),
+        "end_error_mm": error_mm,
+        "clearance_mm": clearance_mm,
+        "expansions": answer.expansions,
+        "seconds": seconds,
+        "start_mm": row(&problem.start.position_mm),
+        "target_mm": row(&problem.target_mm),
+        "nearest_mm": nearest.as_ref().map(row),
+        "nearest_distance_mm": nearest.map(|point| (point - problem.target_mm).norm()),
+        "resolution": {
+            "step_mm": resolution.step_mm,
+            "cell_mm": resolution.cell_mm,
+            "heading_deg": resolution.heading_rad.to_degrees(),
+        },
+        "path": path.map(|path| path.points_mm(ROW_MM).iter().map(row).collect::<Vec<_>>()),
+        "arcs": path.map(|path| {
+            let arc = |(tip, arc): (Tip, Arc)| json!({
+                "length_mm": arc.length_mm,
+                "curvature_per_mm": arc.curvature_per_mm,
+                "roll_deg": roll_rad(&tip, &arc.bend).to_degrees(),
+            });
+            path.pieces().map(arc).collect::<Vec<_>>()
+        }),
+    })
+}
+
+/// The roll with which the tip bends toward `bend`: an unturned tip bends toward its own -y.
+fn roll_rad(tip: &Tip, bend: &Vector3<f64>) -> f64 {
+    let y = -bend;
+    let axes = Matrix3::from_columns(&[y.cross(&tip.heading), y, tip.heading]);
+    let roll_rad = FixedAngles::from_rotation(&Rotation3::from_matrix_unchecked(axes)).roll;
+    // Rounding must not turn half a turn into its negative.
+    if roll_rad < -std::f64::consts::PI + 1e-9 { -roll_rad } else { roll_rad }
+}
