@@ -1,0 +1,118 @@
+//! What the keys ask for.
+
+use super::*;
+
+#[test]
+fn keys_are_commands_and_escape_sequences_are_none() {
+    let shared = Shared::new(setup(), Interrupt::default());
+    let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
+    lock(&shared.screen).progress.speed_mm_per_s = 1.0;
+    let mut keyboard = Keys::default();
+    let mut asked = |keys: &[u8]| {
+        keyboard.take(keys, &shared, &mut orders);
+        std::iter::from_fn(|| commands.pop().ok())
+            .map(|command| command.to_string())
+            .collect::<Vec<_>>()
+            .join(", ")
+    };
+    assert_eq!(asked(b"rs-"), "resume, step of 1 mm, speed 0.800 mm/s");
+    // Those that come together add up.
+    assert_eq!(asked(b"++"), "speed 1.200 mm/s, speed 1.400 mm/s");
+    // F3, page down, an arrow in two parts, F5 in three.
+    for sequence in [
+        &b"\x1bOR"[..],
+        b"\x1b[6~",
+        b"\x1b",
+        b"[A",
+        b"\x1b[",
+        b"15",
+        b"~",
+        b"xyz\n\t\0",
+        b"\x1b[99999999999999999999999999999999999999999999",
+    ] {
+        assert_eq!(asked(sequence), "");
+    }
+    // A key behind a sequence counts.
+    assert_eq!(asked(b"\x1b[Ar\x1b[6~r\x1bOSr\x1br"), "resume, resume, resume, resume");
+    assert!(!shared.interrupt.is_raised());
+    asked(b"\x03");
+    assert!(shared.interrupt.is_raised());
+}
+
+/// Text that was pasted by mistake lets nothing go on; what stops is obeyed wherever it comes from.
+#[test]
+fn a_paste_holds_and_stops_and_lets_nothing_go_on() {
+    let shared = Shared::new(setup(), Interrupt::default());
+    let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
+    let mut keyboard = Keys::default();
+    let mut asked = |keys: &[u8]| {
+        keyboard.take(keys, &shared, &mut orders);
+        let is_held = shared.hold.swap(false, Ordering::Relaxed);
+        (std::iter::from_fn(|| commands.pop().ok()).count(), is_held)
+    };
+    assert_eq!(asked(b"\x1b[200~rs+"), (0, false));
+    assert_eq!(asked(b"r\nr \x1b[20"), (0, true));
+    assert_eq!(asked(b"1~r"), (1, false), "the paste is over");
+    // A space after half of a sequence.
+    assert_eq!(asked(b"\x1b[ "), (0, true));
+    assert_eq!(asked(b"\x1bO "), (0, true));
+    shared.is_over.store(true, Ordering::Relaxed);
+    lock(&shared.screen).left = Some(Ok("to depth 0".to_owned()));
+    asked(b"\x1b[200~wy\x1b[201~");
+    assert!(!shared.wants_withdrawal.load(Ordering::Relaxed));
+}
+
+/// A key at the limit is a command like any other: the session refuses it with the limit, and the screen
+/// and the log say so.
+#[test]
+fn a_speed_at_its_limit_is_refused_on_the_screen() {
+    let shared = Shared::new(setup(), Interrupt::default());
+    let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
+    for (key, speed_mm_per_s, asked) in
+        [(b"+", 2.0, "speed 2.200 mm/s"), (b"-", 0.2, "speed 0.000 mm/s")]
+    {
+        *lock(&shared.screen) = inserted();
+        lock(&shared.screen).progress.speed_mm_per_s = speed_mm_per_s;
+        Keys::default().take(key, &shared, &mut orders);
+        assert_eq!(commands.pop().expect("a command").to_string(), asked);
+        let refused = format!("operator: {asked} refused: allowed: over 0 and up to 2 mm/s");
+        lock(&shared.screen).event(at(20.0), Lane::Session, Severity::Warning, &refused);
+        for size in [(80, 24), (120, 3)] {
+            let screen = shown(&lock(&shared.screen), size);
+            assert!(screen.contains(&refused), "{screen}");
+        }
+    }
+}
+
+/// The screen has no speed before the first news of the insertion.
+#[test]
+fn a_speed_asked_for_at_once_counts_from_the_highest() {
+    let shared = Shared::new(setup(), Interrupt::default());
+    let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
+    *lock(&shared.screen) = inserted();
+    lock(&shared.screen).progress.speed_mm_per_s = 0.0;
+    Keys::default().take(b"-", &shared, &mut orders);
+    assert_eq!(commands.pop().expect("a command").to_string(), "speed 1.800 mm/s");
+}
+
+/// A y alone, or after another key, withdraws nothing.
+#[test]
+fn the_needle_is_withdrawn_after_a_w_and_a_y() {
+    let pressed = |keys: &[u8], can_withdraw: bool| {
+        let shared = Shared::new(setup(), Interrupt::default());
+        let left = can_withdraw.then(|| "to depth 0".to_owned());
+        lock(&shared.screen).left = Some(left.ok_or_else(|| "it is out".to_owned()));
+        let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
+        shared.is_over.store(true, Ordering::Relaxed);
+        Keys::default().take(keys, &shared, &mut orders);
+        assert_eq!(commands.pop().ok(), None, "nothing is left to command");
+        [&shared.wants_withdrawal, &shared.is_leaving].map(|flag| flag.load(Ordering::Relaxed))
+    };
+    assert_eq!(pressed(b"wy", true), [true, true]);
+    assert_eq!(pressed(b"w nwy", true), [true, true]);
+    for keys in [&b"y"[..], b"w", b"wny", b"w\x1b[Ay y", b" rs+"] {
+        assert_eq!(pressed(keys, true)[0], keys == b"w\x1b[Ay y", "{keys:?}");
+    }
+    assert_eq!(pressed(b"q", true), [false, true]);
+    assert_eq!(pressed(b"wy", false), [false, false], "an emulated stage is gone");
+}

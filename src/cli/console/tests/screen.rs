@@ -1,0 +1,66 @@
+//! What the screen keeps of the records and events.
+
+use super::*;
+
+/// What the operator asks for while the needle is held, and what the tracker says, is not why it is held.
+#[test]
+fn the_reason_of_a_hold_stays_on_the_screen() {
+    let mut screen = inserted();
+    let why = "last tip 0.51 s old (limit 0.50)";
+    // As the session says it.
+    screen.event(at(19.0), Lane::Tracker, Severity::Warning, "1 sample refused");
+    screen.take(&Record::State { time: at(20.0), state: State::Holding });
+    screen.event(at(20.0), Lane::Tracker, Severity::Warning, why);
+    screen.event(at(21.0), Lane::Tracker, Severity::Warning, "3 samples refused");
+    let refused = "operator: resume refused: no fresh tip";
+    screen.event(at(22.0), Lane::Session, Severity::Warning, refused);
+    assert_eq!((screen.why.as_str(), screen.answer.as_str()), (why, refused));
+    screen.take(&Record::State { time: at(23.0), state: State::Inserting });
+    assert_eq!((screen.why.as_str(), screen.answer.as_str()), ("", ""));
+    let fault = "stage: rotation: drive in fault";
+    screen.event(at(24.0), Lane::Session, Severity::Fault, fault);
+    screen.event(at(24.1), Lane::Tracker, Severity::Warning, "connection lost");
+    screen.event(at(24.2), Lane::Session, Severity::Info, "operator: hold at 40.00 mm");
+    assert_eq!(screen.why, fault);
+}
+
+/// Of two drives in trouble the newest message is shown.
+#[test]
+fn the_newest_emergency_is_on_the_screen() {
+    let mut screen = inserted();
+    let mut tell = |s: f64, node: u8, code: u16| {
+        let emcy = Emcy { code: EmcyCode(code), register: 1, manufacturer: [0; 5] };
+        let frame = emcy.to_frame(NodeId::new(node).expect("a node"));
+        screen.take(&Record::Can { time: at(s), direction: Direction::Received, frame });
+        shown(&screen, SIZES[1])
+    };
+    assert!(tell(20.0, 2, 0x8611).contains("EMCY 0x8611"));
+    assert!(tell(21.0, 1, 0x3210).contains("EMCY 0x3210"));
+}
+
+/// Frames that the screen missed are no SYNCs that the bench skipped, and no text is a figure.
+#[test]
+fn figures_are_not_read_from_the_text_of_events() {
+    let mut screen = inserted();
+    let sync = Frame::new(0x80, &[]);
+    screen.take(&Record::Can { time: at(25.0), direction: Direction::Sent, frame: sync });
+    for text in [
+        "the bench was late: 12 SYNC periods skipped",
+        "insertion: emergency 0x3210 overvoltage",
+        "record: the disk is full",
+    ] {
+        screen.event(at(25.0), Lane::Tracker, Severity::Warning, text);
+    }
+    let panels = |screen: &Screen| shown(screen, (120, 40));
+    let before = panels(&screen);
+    for figure in [", skip 0 ", "EMCY none ", " MB ok "] {
+        assert!(before.contains(figure), "{before}");
+    }
+    screen.progress.syncs_skipped = 24;
+    assert!(panels(&screen).contains(", skip 24 "));
+    let shared = Shared::new(setup(), Interrupt::default());
+    let (mut sender, mut queue) = RingBuffer::new(1);
+    sender.push(Message::RecordTrouble("the disk is full".to_owned())).expect("a queue");
+    gather(&shared, &mut queue);
+    assert!(panels(&lock(&shared.screen)).contains(" MB the disk is full"));
+}
