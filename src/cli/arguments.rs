@@ -34,7 +34,7 @@ impl Configured {
         self.config.as_deref().or(self.named.as_deref())
     }
 
-    /// The file, if the configuration is what it says: what is set on the command line is in no file.
+    /// The file, if no key is set over it: it is then the whole configuration.
     pub(super) fn whole_path(&self) -> Option<&Path> {
         self.path().filter(|_| self.set.is_empty())
     }

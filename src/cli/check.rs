@@ -24,7 +24,7 @@ pub(super) struct Arguments {
           value_parser = number_in(0.1..=3600.0, "seconds"))]
     listen: f64,
     /// Print the whole configuration as it would be used.
-    #[arg(long, conflicts_with = "json")]
+    #[arg(long, conflicts_with_all = ["json", "connect"])]
     print: bool,
     /// Print every key with what it means, what it may be, and its default, as a TOML file.
     #[arg(long, conflicts_with_all = ["config", "named", "set", "connect", "print", "json", "schema"])]
@@ -34,7 +34,7 @@ pub(super) struct Arguments {
     schema: bool,
     /// One JSON object on stdout.
     #[arg(long)]
-    pub(super) json: bool,
+    json: bool,
 }
 
 pub(super) fn check(arguments: &Arguments) -> Result<(), Failure> {

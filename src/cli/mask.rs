@@ -94,7 +94,7 @@ fn check_length(path: &Path, header: &NiftiHeader, voxels: usize) -> Result<(), 
 fn check_regular(path: &Path) -> io::Result<()> {
     match std::fs::metadata(path) {
         Ok(found) if !found.is_file() => Err(io::Error::other("not a regular file")),
-        // Whoever opens it says what is wrong with it.
+        // A path that cannot be looked at fails when it is opened, with the reason.
         _ => Ok(()),
     }
 }

@@ -39,7 +39,7 @@ use std::path::Path;
 use std::process::ExitCode;
 use tokio::runtime::Runtime;
 
-/// Steers a flexible bevel-tip needle into a plane, and records the proof.
+/// Steers a flexible bevel-tip needle into a plane, and records the run.
 #[derive(Debug, Parser)]
 #[command(name = "needle-bench", version, arg_required_else_help = true)]
 struct Bench {

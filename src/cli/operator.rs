@@ -80,7 +80,7 @@ impl Terminal {
 
 impl Operator for Terminal {
     fn progress(&mut self, progress: Progress) {
-        // Whoever reads it has it for a moment only; the next one is as good.
+        // If the printing thread has the lock, this progress is skipped; the next one follows soon.
         if let Ok(mut latest) = self.latest.progress.try_lock() {
             *latest = progress;
         }
@@ -109,11 +109,9 @@ impl Operator for Terminal {
 
 fn progress_line(is_shown: bool) -> ProgressBar {
     let target = if is_shown { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
-    let bar = ProgressBar::with_draw_target(None, target);
-    if let Ok(style) = ProgressStyle::with_template("{wide_msg}") {
-        bar.set_style(style);
-    }
-    bar
+    let style = ProgressStyle::with_template("{wide_msg}");
+    let style = style.unwrap_or_else(|_| ProgressStyle::default_spinner());
+    ProgressBar::with_draw_target(None, target).with_style(style)
 }
 
 /// Prints until the run closes the queue.

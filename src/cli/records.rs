@@ -20,6 +20,7 @@ use crate::telemetry::RunFolder;
 use crate::tracker::{Registration, Sample};
 use crate::units::Time;
 use clap::Args;
+use std::io;
 use std::path::{Path, PathBuf};
 
 /// The default of `record.dir`.
@@ -30,16 +31,23 @@ pub(super) const RUNS: &str = "runs";
 const RECORDINGS_TOML: (&str, &str) =
     ("bench-config/recordings.toml", include_str!("../../bench-config/recordings.toml"));
 
-/// Rows of a run are this far apart at least, mm: a hold gives one.
+/// Minimum distance between two rows of a run, mm: a hold gives one row.
 const ROWS_APART_MM: f64 = 0.05;
 
 /// The runs in `dir`, the newest first.
 pub(super) fn newest_first(dir: &Path) -> impl Iterator<Item = RunFolder> + use<> {
-    let entries = dir.read_dir().into_iter().flatten();
-    let mut folders: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
     // A folder's name starts with its time.
-    folders.sort();
+    let folders = folders_in(dir).unwrap_or_default();
     folders.into_iter().rev().filter_map(|folder| RunFolder::open(&folder).ok())
+}
+
+/// The folders in `dir`, by name.
+pub(super) fn folders_in(dir: &Path) -> io::Result<Vec<PathBuf>> {
+    let paths = dir.read_dir()?.map(|entry| entry.map(|entry| entry.path()));
+    let mut folders = paths.collect::<io::Result<Vec<_>>>()?;
+    folders.retain(|path| path.is_dir());
+    folders.sort();
+    Ok(folders)
 }
 
 /// Names the newest run that was on a bus (not on the emulated stage in memory), in a line of its own: `before`,

@@ -9,7 +9,6 @@ use crate::operation::Plan;
 use crate::replay::{Recorded, replay as run_again};
 use crate::session::ObserverConfig;
 use crate::study::FigureReport;
-use crate::telemetry::RunFolder;
 use crate::text::screen;
 use clap::Args;
 use minijinja::context;
@@ -30,13 +29,13 @@ pub(super) struct Arguments {
     out: Option<PathBuf>,
     /// One JSON object on stdout.
     #[arg(long)]
-    pub(super) json: bool,
+    json: bool,
 }
 
 pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
     refuse_existing(arguments.out.as_deref())?;
     let (folder, config) = open(&arguments.run)?;
-    let what_if = what_if(&folder, &arguments.set)?;
+    let what_if = what_if(&folder.text(file::CONFIG)?, &arguments.set)?;
     let plan = recorded_plan(folder.manifest(), &config)?;
     let observer = match &plan {
         Plan::Insertion(session) => Some(session.observer.name()),
@@ -95,13 +94,12 @@ pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
     ended(replayed.difference.map_or(0, |_| STOPPED))
 }
 
-/// The observer that `sets` describe; `None` without any.
-fn what_if(folder: &RunFolder, sets: &[String]) -> Result<Option<ObserverConfig>, Failure> {
+/// The observer that `sets` over the configuration `text` describe; `None` without any.
+fn what_if(text: &str, sets: &[String]) -> Result<Option<ObserverConfig>, Failure> {
     if sets.is_empty() {
         return Ok(None);
     }
-    let text = folder.text(file::CONFIG)?;
-    let config = Config::from_sources(&[Source { name: file::CONFIG, text: &text }], sets)?;
+    let config = Config::from_sources(&[Source { name: file::CONFIG, text }], sets)?;
     for set in sets {
         let key = set.split('=').next().unwrap_or_default().trim();
         if key == "observer.shadows" {

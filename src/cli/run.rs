@@ -52,7 +52,7 @@ pub(super) struct Arguments {
     console: bool,
     /// One JSON object on stdout.
     #[arg(long)]
-    pub(super) json: bool,
+    json: bool,
     /// Show warnings and faults only.
     #[arg(long, short)]
     quiet: bool,

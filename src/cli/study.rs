@@ -33,7 +33,7 @@ pub(super) struct Arguments {
     seed: u64,
     /// One JSON object on stdout.
     #[arg(long)]
-    pub(super) json: bool,
+    json: bool,
     /// Write a CSV row for each trial.
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
@@ -60,16 +60,10 @@ pub(super) fn study(arguments: &Arguments) -> Result<(), Failure> {
     session.shadows.clear();
     session.insertion.plane_out_of_reach = PlaneOutOfReach::Insert;
     session.check().map_err(Failure::configuration)?;
-    let stage = |seed| {
-        config
-            .drawn(seed)
-            .and_then(|drawn| drawn.virtual_stage())
-            .map_err(|error| error.to_string())
-    };
+    let drawn = |seed| config.drawn(seed).map_err(|error| error.to_string());
+    let stage = |seed| drawn(seed)?.virtual_stage().map_err(|error| error.to_string());
     let read = mask_reader(arguments.configured.path());
-    let goal = |seed| {
-        config.drawn(seed).and_then(|drawn| drawn.to_goal(&read)).map_err(|error| error.to_string())
-    };
+    let goal = |seed| drawn(seed)?.to_goal(&read).map_err(|error| error.to_string());
     let (tool, prior) = (&config.tracker.tool, config.prior());
     let study = Study { session, tool, prior, stage: &stage, goal: &goal };
     let seeds: Vec<u64> =
@@ -128,13 +122,9 @@ struct Report<'a> {
 }
 
 fn progress_bar(trials: usize) -> ProgressBar {
-    let bar = ProgressBar::new(trials as u64);
-    if let Ok(style) =
-        ProgressStyle::with_template("{bar:40.cyan/blue} {pos} of {len} trials  {eta}")
-    {
-        bar.set_style(style);
-    }
-    bar
+    let style = ProgressStyle::with_template("{bar:40.cyan/blue} {pos} of {len} trials  {eta}");
+    let style = style.unwrap_or_else(|_| ProgressStyle::default_bar());
+    ProgressBar::new(trials as u64).with_style(style)
 }
 
 /// Writes a CSV row for each trial; a field that the trial has no number for is empty.

@@ -47,11 +47,11 @@ const NO_MOUNT: &str = "\
 # needle's axis cannot be taken off, and is left in the positions.
 ";
 
-/// Student's t at 95%, both sides, of 3 insertions and more: standard errors from so few are not sure themselves.
+/// Student's t at 95%, both sides, of 3 insertions and more: standard errors from so few are themselves uncertain.
 const STUDENT_95: [f64; 8] = [4.3, 3.2, 2.8, 2.6, 2.4, 2.4, 2.3, 2.3];
 const STUDENT_MANY: f64 = 2.2;
 
-/// A good tracker's positions are nearer to their circle, mm.
+/// Default limit of the RMS distance from the circle, mm.
 const RMS_MAX_MM: f64 = 0.5;
 
 #[derive(Debug, Subcommand)]
@@ -124,7 +124,7 @@ pub(super) struct Output {
     out: Option<PathBuf>,
     /// One JSON object on stdout.
     #[arg(long)]
-    pub(super) json: bool,
+    json: bool,
 }
 
 pub(super) fn calibrate(calibration: &Calibration) -> Result<(), Failure> {

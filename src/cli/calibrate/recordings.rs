@@ -24,12 +24,13 @@ use std::thread;
 use std::time::Duration;
 
 const HEADER: &str = "x_tracker_mm,y_tracker_mm,z_tracker_mm,x_bench_mm,y_bench_mm,z_bench_mm\n";
-/// A point is the mean of what comes in this time; fewer positions are none.
+/// A point is the mean of the positions of this time.
 const REST: Duration = Duration::from_secs(1);
+/// Fewer positions than this give no point.
 const POSITIONS_MIN: usize = 5;
-/// How long a point waits for the tool to rest.
+/// Timeout of a point while the tool does not rest.
 const WAIT_MAX: Duration = Duration::from_secs(10);
-/// A tool that rests scatters by no more than so many times the configured noise.
+/// Largest scatter of a tool at rest, in units of the configured noise.
 const STILL_SDS: f64 = 2.0;
 /// How often a line of the operator is looked for.
 const LOOK: Duration = Duration::from_millis(20);
@@ -202,11 +203,11 @@ fn residuals(text: &str) -> String {
 
 const COLUMNS: &str = "rotation_rad,x_mm,y_mm,z_mm";
 const ORIENTATION: &str = ",qw,qx,qy,qz";
-/// Of a row with an orientation.
+/// Cells of a row with an orientation.
 const CELLS: usize = 8;
 /// A whole turn, and back: no cable is left wound up, and what lags one way leads the other.
 const TURNS: [&str; 2] = ["360deg", "-360deg"];
-/// Rows of a turn are this far apart at least: a rest gives one.
+/// Minimum distance between two rows of a turn: a rest gives one row.
 const ROWS_APART_DEG: f64 = 0.5;
 
 /// Turns the base of the stage that `configured` names and writes the sensor's positions into the new

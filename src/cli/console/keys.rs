@@ -30,7 +30,7 @@ impl Keys {
         commands: &mut Producer<OperatorCommand>,
     ) {
         self.pending.extend(pressed);
-        // Of the keys + and − that came together.
+        // The speed after the keys + and − that came together.
         let mut speed_mm_per_s = None;
         while let Some(len) = first_len(&self.pending) {
             let first: Vec<u8> = self.pending.drain(..len).collect();

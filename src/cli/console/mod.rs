@@ -76,7 +76,6 @@ enum Message {
 struct Shared {
     screen: Mutex<Screen>,
     latest: Mutex<Progress>,
-    folder: Mutex<Option<PathBuf>>,
     /// The operator has asked for a hold, which overtakes every other command.
     hold: AtomicBool,
     dropped: AtomicU64,
@@ -95,7 +94,7 @@ impl Shared {
     }
 }
 
-/// Poisoned by a panic of another thread or not.
+/// Locks `mutex`, also after a panic of another thread that had it locked.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -284,7 +283,8 @@ impl Drawn {
         shared: &Shared,
     ) {
         if self.times.is_multiple_of(LOOK_EVERY) {
-            let bytes = lock(&shared.folder).clone().map_or(0, |dir| folder_bytes(&dir));
+            let folder = lock(&shared.screen).folder.clone();
+            let bytes = folder.map_or(0, |dir| folder_bytes(&dir));
             lock(&shared.screen).record_bytes = bytes;
         }
         // Something else may have written to the terminal. (Terminal::clear would ask it for its cursor.)
@@ -342,7 +342,7 @@ fn gather(shared: &Shared, queue: &mut Consumer<Message>) {
                 screen.event(time, lane, severity, &text);
             }
             Message::RecordTrouble(text) => screen.record_trouble = Some(text),
-            Message::Folder(folder) => *lock(&shared.folder) = Some(folder),
+            Message::Folder(folder) => screen.folder = Some(folder),
         }
     }
     if let Ok(latest) = shared.latest.try_lock() {

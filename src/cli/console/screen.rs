@@ -13,9 +13,10 @@ use crate::tracker::GateName;
 use crate::units::Time;
 use std::collections::{BTreeMap, VecDeque};
 use std::mem;
+use std::path::PathBuf;
 use std::time::Duration;
 
-/// Over which rates are counted.
+/// The time over which rates are counted.
 const SECOND: Duration = Duration::from_secs(1);
 /// Innovations over which the noise is judged.
 const INNOVATIONS: usize = 20;
@@ -90,6 +91,8 @@ pub(super) struct Screen {
     frames: VecDeque<(Time, u64)>,
     synced: Option<Time>,
     pub(super) sync_late_max: Duration,
+    /// Where the run is recorded.
+    pub(super) folder: Option<PathBuf>,
     pub(super) record_bytes: u64,
     pub(super) record_trouble: Option<String>,
     pub(super) events: VecDeque<(Severity, String)>,

@@ -26,7 +26,7 @@ pub(super) struct Arguments {
     configured: Configured,
     /// One JSON object on stdout.
     #[arg(long)]
-    pub(super) json: bool,
+    json: bool,
     /// Draw the plan into a new SVG file.
     #[arg(long, value_name = "FILE.svg", value_parser = svg_file)]
     out: Option<PathBuf>,

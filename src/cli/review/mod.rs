@@ -52,7 +52,7 @@ pub(super) struct Arguments {
     repair: bool,
     /// One JSON object on stdout.
     #[arg(long)]
-    pub(super) json: bool,
+    json: bool,
 }
 
 pub(super) fn review(arguments: &Arguments) -> Result<(), Failure> {

@@ -1,11 +1,12 @@
 //! Reads run folders for a review.
 
-use super::Failure;
 use crate::archive::{StepsTable, TrackerTimes, file};
+use crate::cli::Failure;
+use crate::cli::records::folders_in;
 use crate::review::{Condition, Folder, Line, Motion, Run, event, figures_of_steps, stamped};
 use crate::telemetry::{RunFolder, TelemetryError, is_being_written};
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// The whole run in `path`. [`Run::unreadable`] names the files that cannot be read.
 pub(super) fn run(path: &Path) -> Result<Run, Failure> {
@@ -34,8 +35,7 @@ pub(super) fn run(path: &Path) -> Result<Run, Failure> {
     Ok(Run { folder, steps, samples, motion, events, unreadable })
 }
 
-/// What `read` makes of the lines of the file `name`; those of which it makes nothing are
-/// `unreadable`.
+/// The lines of the file `name`, parsed by `read`; those that it cannot parse are `unreadable`.
 fn lines<T>(
     folder: &RunFolder,
     name: &str,
@@ -79,18 +79,6 @@ pub(super) fn is_folder_of_runs(path: &Path) -> bool {
     let is_run = |path: &Path| path.join(file::MANIFEST).exists();
     let folders = folders_in(path).unwrap_or_default();
     !is_run(path) && folders.iter().any(|folder| is_run(folder))
-}
-
-fn folders_in(path: &Path) -> io::Result<Vec<PathBuf>> {
-    let mut folders = Vec::new();
-    for entry in path.read_dir()? {
-        let path = entry?.path();
-        if path.is_dir() {
-            folders.push(path);
-        }
-    }
-    folders.sort();
-    Ok(folders)
 }
 
 /// The manifest and the configuration in `path`, and the condition of the folder.

@@ -3,7 +3,7 @@
 use crate::stage::{Axis, CountsRatio};
 use std::fmt;
 
-/// No axis of a stage goes further, in its unit: the bounds of its limits in the configuration.
+/// The longest travel of each axis, in its unit: as far as the configuration allows its limits to be.
 const FARTHEST: [(Axis, f64); 2] = [(Axis::Insertion, 1000.0), (Axis::Rotation, 360_000.0)];
 
 /// A distance along an axis in its unit, `2mm` or `10deg`; or a speed, the distance a second.
@@ -49,10 +49,10 @@ impl Distance {
         }
     }
 
-    /// The same, of an axis of which `ratio` counts go into a mm or a turn.
+    /// The same, for an axis with `ratio` counts per mm or per turn.
     ///
     /// # Errors
-    /// Besides, a distance that is no count.
+    /// Also a distance that rounds to 0 counts.
     pub(super) fn in_counts_of(self, axis: Axis, ratio: CountsRatio) -> Result<f64, String> {
         let distance = self.along(axis)?;
         let per_unit = if axis == Axis::Rotation { 360.0 } else { 1.0 };

@@ -37,7 +37,7 @@ pub(super) struct Arguments {
     rehearse: bool,
     /// One JSON object on stdout.
     #[arg(long, global = true)]
-    pub(super) json: bool,
+    json: bool,
     /// Show warnings and faults only.
     #[arg(long, short, global = true)]
     quiet: bool,
@@ -228,7 +228,7 @@ impl Motion {
         }
     }
 
-    /// What it is on the stage of `config`.
+    /// The operation that this asks of the stage of `config`.
     fn plan(&self, config: &Config) -> Result<OperationConfig, Failure> {
         let stage = config.stage.to_stage(&config.can)?;
         let operation = match self {
@@ -351,7 +351,7 @@ fn check_bus(interface: &CanInterface, emulated: bool) -> Result<(), Failure> {
     }
 }
 
-/// Degrees from the goal that count as there: the rotation has no needle to place.
+/// Distance from its goal at which a rotation has arrived.
 const ROTATION_ARRIVAL_DEG: f64 = 0.1;
 
 /// Turn of the base by which a sensor shows its handedness, made twice.
@@ -431,7 +431,7 @@ fn jog_move(config: &Config, axis: Axis, goal: Goal) -> Move {
     Move { axis, goal, speed, acceleration, arrival }
 }
 
-/// To depth 0, which an axis has only where it does not read 0 wherever it stands.
+/// The move that withdraws the needle: by a distance, or to depth 0, which only an axis with a configured zero has.
 fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Result<Move, Failure> {
     let insertion = &config.stage.insertion;
     let along = |by: Distance| by.in_counts_of(Axis::Insertion, stage.insertion.ratio);

@@ -271,7 +271,7 @@ fn watch(arguments: &WatchArguments) -> Result<(), Failure> {
     watch.last.map(|_| ()).ok_or_else(|| listener.nothing())
 }
 
-/// What was written reaches the disk's cache this often.
+/// Interval between two flushes of a recording.
 const FLUSH_PERIOD: Duration = Duration::from_secs(1);
 
 #[derive(Debug, Args)]
@@ -298,7 +298,7 @@ fn file(text: &str) -> Result<PathBuf, String> {
 /// A recording under way.
 struct Recording {
     out: BufWriter<File>,
-    /// Those of a CSV file: with or without an orientation. `None` of NDJSON.
+    /// The number of columns of a CSV file, with or without an orientation; `None` for NDJSON.
     columns: Option<usize>,
     flushed: Time,
 }

@@ -94,7 +94,7 @@ pub(super) fn described(config: &Config) -> String {
 /// How often a listener looks at Ctrl-C.
 const LOOK_PERIOD: Duration = Duration::from_millis(100);
 
-/// What a tracker is looked at with where no configuration is named: any stage, which is not touched.
+/// The configuration if none is named: the tracker alone is opened, the stage is not touched.
 const ANY_STAGE: (&str, &str) =
     ("no configuration", "can.interface = \"vcan0\"\ntracker.source = \"openigtlink\"\n");
 const NO_TRACKER: &str = "give --config my-rig.toml, or --set 'tracker.address=\"HOST:PORT\"'";
@@ -109,7 +109,7 @@ pub(super) struct Listener {
     /// Why there is no connection, or what was wrong with the last message.
     trouble: Option<String>,
     has_ended: bool,
-    // Ended after the link.
+    // Dropped last: the link uses it.
     runtime: Runtime,
 }
 
