@@ -184,6 +184,8 @@ struct Watch {
     counts: GateCounts,
     /// The last position, and when it was measured.
     last: Option<(Time, Vector3<f64>)>,
+    /// How often that position has come in a row.
+    times: u32,
     refusal: Option<Refusal>,
     /// Since the last line.
     positions: u64,
@@ -201,6 +203,7 @@ impl Watch {
             dates: tracker.to_clock(),
             counts: GateCounts::default(),
             last: None,
+            times: 0,
             refusal: None,
             positions: 0,
         }
@@ -215,10 +218,12 @@ impl Watch {
         let admitted = self.gate.admit(sample).and_then(|position_mm| {
             let time = self.dates.acquisition_time(sample)?;
             // A value that is sent again is no new measurement, whatever its stamp.
-            match self.last {
-                Some((_, last_mm)) if last_mm == position_mm => Err(Refusal::repeat(2)),
-                _ => Ok((time, position_mm)),
+            if self.last.is_some_and(|(_, last_mm)| last_mm == position_mm) {
+                self.times += 1;
+                return Err(Refusal::repeat(self.times));
             }
+            self.times = 1;
+            Ok((time, position_mm))
         });
         self.counts.count(admitted.as_ref().err());
         match admitted {
@@ -417,19 +422,37 @@ fn rest(arguments: &RestArguments) -> Result<(), Failure> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Config;
+
+    fn sample(tool: &str) -> Sample {
+        Sample {
+            receive_time: Time::from_nanos(5),
+            source_unix_ns: None,
+            tool: tool.to_owned(),
+            position_mm: Vector3::new(1.0, 2.0, 3.0),
+            orientation: Some(Default::default()),
+            validity: Validity::Valid,
+        }
+    }
+
+    #[test]
+    fn a_position_that_is_repeated_is_counted() {
+        let tracker = Config::from_sources(&[], &[]).unwrap().tracker;
+        let mut watch = Watch::new(&tracker);
+        watch.gate = tracker.to_unregistered_gate();
+        for _ in 0..3 {
+            watch.take(&Event::Sample(sample(&tracker.tool)));
+        }
+        assert_eq!((watch.positions, watch.counts.refused()), (1, 2));
+        let why = watch.refusal.expect("repeats are refused").why;
+        assert!(why.contains("to the bit, 3 in a row"), "{why}");
+    }
 
     /// A tracker may send an orientation with some positions only.
     #[test]
     fn an_orientation_that_was_not_sent_is_not_recorded() {
         let path = std::env::temp_dir().join(format!("needle-record-{}.csv", std::process::id()));
-        let turned = Sample {
-            receive_time: Time::from_nanos(5),
-            source_unix_ns: None,
-            tool: String::new(),
-            position_mm: Vector3::new(1.0, 2.0, 3.0),
-            orientation: Some(Default::default()),
-            validity: Validity::Valid,
-        };
+        let turned = sample("");
         let mut recording = Recording::create(&path, true, &turned).unwrap();
         recording.take(&turned).unwrap();
         recording.take(&Sample { orientation: None, ..turned }).unwrap();
