@@ -37,7 +37,7 @@ impl FixedAngles {
             * Rotation3::from_axis_angle(&Vector3::z_axis(), self.roll)
     }
 
-    /// The angles of `rotation`: yaw and roll in (−π, π], pitch in [−π/2, π/2]. Always finite.
+    /// The angles of `rotation`: yaw and roll in [−π, π], pitch in [−π/2, π/2]. Finite if `rotation` is.
     pub fn from_rotation(rotation: &Rotation3<f64>) -> Self {
         let r = rotation.matrix();
         let cos_pitch = math::hypot(r[(0, 0)], r[(0, 1)]);

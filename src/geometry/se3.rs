@@ -42,12 +42,12 @@ impl Pose {
         Pose { rotation: Rotation3::identity(), translation: Vector3::zeros() }
     }
 
-    /// The motion reached by following the constant body twist `xi` for one unit (Solà Eq. 172).
+    /// The motion reached by following the constant body twist `xi` for one unit.
     pub fn exp(xi: &Twist) -> Self {
         Pose { rotation: so3::exp(&xi.w), translation: so3::left_jacobian(&xi.w) * xi.v }
     }
 
-    /// The twist with `exp(log(g)) = g`, rotation part of length 0 to π (Solà Eq. 173).
+    /// The twist with `exp(log(g)) = g`, rotation part of length 0 to π.
     pub fn log(&self) -> Twist {
         let w = so3::log(&self.rotation);
         Twist { v: so3::left_jacobian_inverse(&w) * self.translation, w }
@@ -64,7 +64,7 @@ impl Pose {
         self.rotation * p + self.translation
     }
 
-    /// Ad_g with `g Exp(ξ) = Exp(Ad_g ξ) g`, in the order (v; w) (Solà Eq. 175).
+    /// Ad_g with `g Exp(ξ) = Exp(Ad_g ξ) g`, in the order (v; w).
     pub fn adjoint(&self) -> Matrix6<f64> {
         let r: &Matrix3<f64> = self.rotation.matrix();
         let mut ad = Matrix6::zeros();

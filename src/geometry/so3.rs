@@ -1,4 +1,5 @@
-//! Rotations: the exponential map of SO(3), its inverse and its left Jacobian.
+//! Rotations: the exponential map of SO(3), its inverse and its left Jacobian. Names and conventions are
+//! those of Solà et al., A micro Lie theory for state estimation in robotics (arXiv 1812.01537).
 
 use crate::math;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
@@ -7,7 +8,7 @@ use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 /// first omitted term is under 1e-16 there.
 const SERIES_ANGLE_RAD: f64 = 1e-2;
 
-/// The skew-symmetric matrix with `hat(w) u = w × u` (Solà Eq. 68).
+/// The skew-symmetric matrix with `hat(w) u = w × u`.
 pub fn hat(w: &Vector3<f64>) -> Matrix3<f64> {
     Matrix3::new(0.0, -w.z, w.y, w.z, 0.0, -w.x, -w.y, w.x, 0.0)
 }
@@ -28,14 +29,14 @@ fn coefficients(theta: f64) -> (f64, f64, f64) {
     }
 }
 
-/// The rotation by `|w|` about `w` (Rodrigues; Solà Eq. 69).
+/// The rotation by `|w|` about `w`: Rodrigues' formula, `I + a ŵ + b ŵ²` with the first two coefficients.
 pub fn exp(w: &Vector3<f64>) -> Rotation3<f64> {
     let (a, b, _) = coefficients(w.norm());
     let w_hat = hat(w);
     Rotation3::from_matrix_unchecked(Matrix3::identity() + w_hat * a + w_hat * w_hat * b)
 }
 
-/// The rotation vector of `rotation`, of length 0 to π (Solà Eq. 70).
+/// The rotation vector of `rotation`, of length 0 to π.
 ///
 /// Computed through the quaternion, which is accurate both near 0 and near π.
 pub fn log(rotation: &Rotation3<f64>) -> Vector3<f64> {
@@ -51,14 +52,15 @@ pub fn quaternion(rotation: &Rotation3<f64>) -> UnitQuaternion<f64> {
     UnitQuaternion::new_normalize(UnitQuaternion::from_rotation_matrix(rotation).into_inner())
 }
 
-/// The left Jacobian of SO(3) (Solà Eq. 145): the translation part of SE(3)'s exponential.
+/// The left Jacobian of SO(3), `Exp(w + d) ≈ Exp(J_l(w) d) Exp(w)`. It is also the translation part of SE(3)'s
+/// exponential.
 pub fn left_jacobian(w: &Vector3<f64>) -> Matrix3<f64> {
     let (_, b, c) = coefficients(w.norm());
     let w_hat = hat(w);
     Matrix3::identity() + w_hat * b + w_hat * w_hat * c
 }
 
-/// The inverse of [`left_jacobian`] (Solà Eq. 146), for |w| < 2π.
+/// The inverse of [`left_jacobian`], for |w| < 2π.
 pub fn left_jacobian_inverse(w: &Vector3<f64>) -> Matrix3<f64> {
     let theta = w.norm();
     let w_hat = hat(w);

@@ -12,38 +12,44 @@ const TOLERANCE: f64 = 1e-12;
 ///
 /// With s = ±1 the first arc bends the pitch by β′ = sκ to β_m = s|β_m| and the second bends it
 /// back to 0. Integrating x′ = sin β along both gives `cos β_m = (κ s x + cos β + 1) / 2` and the
-/// length `(s (β_m − β) + |β_m|) / κ`; the shorter of the two signs counts.
+/// length `(s (β_m − β) + |β_m|) / κ`; the shorter of the two signs counts. Where that cosine is
+/// negative (without pitch: beyond 2/κ), the arcs turn to 90° and back, and what is left of x, `−2 cos β_m / κ`,
+/// is a straight between them.
 ///
-/// `None` if no two arcs with |β_m| ≤ π/2 reach the plane: the tip is too far out (over 1/κ), or the
-/// needle is straight and not already in the plane.
+/// x is that of the point that moves along the shaft's axis. In the plane without pitch the tip is there too.
+///
+/// `None` if the needle is straight and not already in the plane, or |β| is over π/2.
 pub fn shortest_into_plane_mm(needle: &Needle, state: &Reduced) -> Option<f64> {
-    let Reduced { x_mm, pitch_rad, .. } = *state;
+    let Reduced { pitch_rad, .. } = *state;
+    let x_mm = state.x_mm - needle.tip_ahead_mm() * math::sin(pitch_rad);
     let curvature = needle.curvature_per_mm();
     if x_mm == 0.0 && pitch_rad == 0.0 {
         return Some(0.0);
     }
-    if curvature == 0.0 {
+    if curvature == 0.0 || pitch_rad.abs() > FRAC_PI_2 {
         return None;
     }
     [1.0, -1.0]
         .into_iter()
         .filter_map(|s| {
             let cos_turn = 0.5 * (curvature * s * x_mm + math::cos(pitch_rad) + 1.0);
-            if !(0.0..=1.0 + TOLERANCE).contains(&cos_turn) || pitch_rad.abs() > FRAC_PI_2 {
-                return None;
-            }
-            let turn_rad = math::acos(cos_turn.min(1.0));
+            let turn_rad = math::acos(cos_turn.clamp(0.0, 1.0));
+            let straight_rad = -2.0 * cos_turn.min(0.0);
             let first_rad = turn_rad - s * pitch_rad;
-            (first_rad >= -TOLERANCE).then(|| (first_rad.max(0.0) + turn_rad) / curvature)
+            let is_way = cos_turn <= 1.0 + TOLERANCE && first_rad >= -TOLERANCE;
+            is_way.then(|| (first_rad.max(0.0) + straight_rad + turn_rad) / curvature)
         })
         .min_by(f64::total_cmp)
 }
 
-/// An upper bound of how much nearer to the plane a needle comes over `length_mm`, mm, that heads for the
-/// plane at `toward_rad`: it bends toward it all the way, and `sin(β + κ s) ≤ sin β + κ s`.
+/// An upper bound of how much nearer to the plane a tip comes over `length_mm`, mm, that heads for the plane at
+/// `toward_rad`: the needle bends toward it all the way, and `sin(β + κ s) ≤ sin β + κ s`. A tip that is ahead of
+/// the point that moves along the shaft's axis comes nearer by its share of that turn, too.
 pub fn approach_max_mm(needle: &Needle, toward_rad: f64, length_mm: f64) -> f64 {
-    length_mm * math::sin(toward_rad.clamp(-FRAC_PI_2, FRAC_PI_2))
-        + 0.5 * needle.curvature_per_mm() * length_mm.powi(2)
+    let curvature = needle.curvature_per_mm();
+    length_mm * math::sin(toward_rad.min(FRAC_PI_2))
+        + 0.5 * curvature * length_mm.powi(2)
+        + needle.tip_ahead_mm().abs() * curvature * length_mm
 }
 
 #[cfg(test)]
@@ -99,10 +105,40 @@ mod tests {
     fn edges() {
         let needle = Needle::new(1.0 / 122.0).unwrap();
         assert_eq!(shortest_into_plane_mm(&needle, &Reduced::default()), Some(0.0));
-        let far = Reduced { x_mm: 500.0, ..Reduced::default() };
-        assert_eq!(shortest_into_plane_mm(&needle, &far), None);
+        let off = |x_mm: f64| Reduced { x_mm, ..Reduced::default() };
         let straight = Needle::new(0.0).unwrap();
-        let off = Reduced { x_mm: 1.0, ..Reduced::default() };
-        assert_eq!(shortest_into_plane_mm(&straight, &off), None);
+        assert_eq!(shortest_into_plane_mm(&straight, &off(1.0)), None);
+        let away = Reduced { pitch_rad: 1.6, ..off(1.0) };
+        assert_eq!(shortest_into_plane_mm(&needle, &away), None);
+        assert_eq!(shortest_into_plane_mm(&needle, &off(f64::NAN)), None);
+    }
+
+    /// Two quarters of a circle, and a straight across where these do not reach: from 244 mm on.
+    #[test]
+    fn a_tip_far_from_the_plane_goes_straight_between_the_arcs() {
+        let needle = Needle::new(1.0 / 122.0).unwrap();
+        for (x_mm, straight_mm) in [(244.0, 0.0), (-300.0, 56.0), (500.0, 256.0)] {
+            let state = Reduced { x_mm, ..Reduced::default() };
+            let length_mm = shortest_into_plane_mm(&needle, &state).unwrap();
+            let expected_mm = 122.0 * std::f64::consts::PI + straight_mm;
+            assert!((length_mm - expected_mm).abs() < 1e-5, "{x_mm}: {length_mm}");
+        }
+    }
+
+    /// The point that moves along the axis is 6.5 mm behind the tip.
+    #[test]
+    fn a_tip_ahead_swings_with_the_heading() {
+        let rear = Needle::new(1.0 / 122.0).unwrap();
+        let needle = rear.with_tip_ahead(6.5).unwrap();
+        let start = Reduced { x_mm: 20.0, pitch_rad: -0.1, roll_rad: -FRAC_PI_2 };
+        let at_rear = Reduced { x_mm: 20.0 + 6.5 * 0.1f64.sin(), ..start };
+        assert_eq!(
+            shortest_into_plane_mm(&needle, &start),
+            shortest_into_plane_mm(&rear, &at_rear)
+        );
+        let bent = needle.step(&start.join(&Fibre::default()), Increment::new(40.0, 0.0).unwrap());
+        let nearer_mm = start.x_mm - bent.translation.x;
+        let most_mm = approach_max_mm(&needle, 0.1, 40.0);
+        assert!((nearer_mm..nearer_mm + 0.5).contains(&most_mm), "{nearer_mm} of {most_mm}");
     }
 }

@@ -39,7 +39,8 @@ pub(super) fn covariance(
 ) -> Matrix6<f64> {
     let mut p = Matrix6::zeros();
     (0..3).for_each(|i| p[(i, i)] = position_sd_mm.powi(2));
-    // At roll 0, yaw turns about the tip's x axis and pitch about its y axis.
+    // As at pitch 0: yaw and pitch turn about the x and y axes of a tip without roll. At another pitch a turn by
+    // yaw is smaller about x, and a part of it is roll; both are left out.
     let (sin, cos) = math::sin_cos(angles.roll);
     let (yaw, pitch) = (sd.yaw.powi(2), sd.pitch.powi(2));
     p[(3, 3)] = cos * cos * yaw + sin * sin * pitch;

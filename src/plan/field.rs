@@ -77,7 +77,7 @@ impl Grid {
 
 /// Where the tip may be: the obstacles with the clearance around them, in the workspace.
 #[derive(Debug, Clone)]
-pub struct Field<'a> {
+pub(super) struct Field<'a> {
     pub(super) world: Cow<'a, World>,
     pub(super) clearance_mm: f64,
     pub(super) grid: Grid,
@@ -89,8 +89,8 @@ pub struct Field<'a> {
 }
 
 impl<'a> Field<'a> {
-    /// The field around the obstacles of `world`; `in_plane`: in x = 0 only.
-    pub fn new(world: Cow<'a, World>, clearance_mm: f64, in_plane: bool) -> Self {
+    /// The field around the obstacles of `world`. One that is `in_plane` judges points of the plane x = 0 only.
+    pub(super) fn new(world: Cow<'a, World>, clearance_mm: f64, in_plane: bool) -> Self {
         let grid = Grid::new(&world, in_plane);
         let distances_mm = vec![f32::NAN; grid.nodes()];
         Field { world, clearance_mm, grid, in_plane, distances_mm, visited: Visited::default() }
@@ -148,7 +148,7 @@ impl<'a> Field<'a> {
         loop {
             let at = tip.after(&arc.with_length(along_mm)).position_mm;
             let slack_mm = self.slack_mm(&at);
-            if slack_mm < 0.0 || slack_mm.is_nan() {
+            if slack_mm < 0.0 {
                 return arc.with_length(clear_mm);
             }
             clear_mm = along_mm;
@@ -171,7 +171,7 @@ impl<'a> Field<'a> {
         while along_mm < arc.length_mm - end_slack_mm {
             let at = tip.after(&arc.with_length(along_mm)).position_mm;
             let slack_mm = self.slack_mm(&at);
-            if slack_mm < 0.0 || slack_mm.is_nan() {
+            if slack_mm < 0.0 {
                 return false;
             }
             along_mm += slack_mm.max(TEST_STEP_MM);

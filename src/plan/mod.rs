@@ -17,7 +17,6 @@ mod route;
 mod search;
 
 pub use arc::{Arc, Tip};
-pub use field::Field;
 pub use lattice::Resolution;
 pub use mask::Mask;
 pub use obstacle::{Obstacle, Workspace, World};
@@ -25,5 +24,4 @@ pub use path::Path;
 pub use reach::{Reach, reach_around};
 pub use replanner::{Estimate, Hold, Replanner, Steer, Step};
 pub use reserve::{RoomyPath, plan_with_reserve};
-pub use route::Route;
-pub use search::{Answer, Problem, Status, plan, plan_along};
+pub use search::{Answer, Problem, Status, plan};

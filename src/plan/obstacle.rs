@@ -40,7 +40,8 @@ impl Obstacle {
             Obstacle::Sphere { centre_mm, radius_mm } => (point_mm - centre_mm).norm() - radius_mm,
             Obstacle::Cylinder { from_mm, to_mm, radius_mm } => {
                 let length_mm = (to_mm - from_mm).norm();
-                let axis = (to_mm - from_mm) / length_mm;
+                // Without a length it has no axis: then it is taken for a ball.
+                let axis = (to_mm - from_mm).try_normalize(0.0).unwrap_or_default();
                 let to_point = point_mm - from_mm;
                 let along_mm = to_point.dot(&axis);
                 let off_axis_mm = (to_point - axis * along_mm).norm();
@@ -83,8 +84,12 @@ pub struct Workspace {
 
 impl Workspace {
     /// How far `point_mm` is inside, mm: at most the distance to the boundary. Negative outside, where the
-    /// distance to the workspace may be larger.
+    /// distance to the workspace may be larger; a point that is no number is outside.
     pub fn depth_mm(&self, point_mm: &Vector3<f64>) -> f64 {
+        // Least and greatest ignore NaN.
+        if point_mm.iter().any(|mm| mm.is_nan()) {
+            return f64::NEG_INFINITY;
+        }
         let depth_mm = (point_mm - self.min_mm).inf(&(self.max_mm - point_mm)).min();
         let of_start_mm = |start_mm: Vector3<f64>| START_ROOM_MM - (point_mm - start_mm).norm();
         self.start_mm.map_or(depth_mm, |start_mm| depth_mm.max(of_start_mm(start_mm)))
@@ -191,6 +196,9 @@ mod tests {
         assert_eq!(cylinder.distance_mm(&at(0.0, 0.0, 13.0)), 3.0, "flat ends");
         assert_eq!(cylinder.distance_mm(&at(5.0, 0.0, 14.0)), 5.0, "the rim");
         assert_eq!(cylinder.distance_mm(&at(0.0, 1.5, 5.0)), -0.5);
+        let [from_mm, to_mm] = [at(1e-200, 0.0, 0.0), at(0.0, 0.0, 0.0)];
+        let flat = Obstacle::Cylinder { from_mm, to_mm, radius_mm: 2.0 };
+        assert_eq!(flat.distance_mm(&at(0.0, 5.0, 0.0)), 3.0, "too short for an axis");
         let box_ = Obstacle::Box { min_mm: at(-1.0, -2.0, -3.0), max_mm: at(1.0, 2.0, 3.0) };
         assert_eq!(box_.distance_mm(&at(4.0, 6.0, 0.0)), 5.0);
         assert_eq!(box_.distance_mm(&at(0.0, 0.0, 1.0)), -1.0);
@@ -200,6 +208,7 @@ mod tests {
         assert_eq!(world.distance_mm(&at(5.0, 5.0, 5.0)), f64::INFINITY);
         assert_eq!(world.slack_mm(&at(5.0, 9.0, 5.0), 2.0), 1.0, "no clearance to the walls");
         assert_eq!(world.slack_mm(&at(5.0, 11.0, 5.0), 2.0), -1.0);
+        assert_eq!(world.slack_mm(&at(5.0, f64::NAN, 5.0), 2.0), f64::NEG_INFINITY);
     }
 
     /// A start on a wall has room beyond it; the wall has none elsewhere.

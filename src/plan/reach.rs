@@ -1,10 +1,11 @@
 //! What the tip can still reach, for the operator to see.
 
 use super::arc::Tip;
+use super::field::Field;
 use super::obstacle::World;
-use super::path::Path;
 use super::search::Problem;
 use nalgebra::Vector3;
+use std::borrow::Cow;
 
 /// How far around the target points are judged, mm.
 const AROUND_MM: f64 = 30.0;
@@ -14,9 +15,9 @@ const SPACING_MM: [f64; 2] = [1.0, 3.0];
 /// Whether one arc of the needle leads from the tip to a point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reach {
-    /// It does, and keeps the clearance.
+    /// It does, keeps the clearance, and stays in the workspace.
     Clear,
-    /// It comes nearer to an obstacle than the clearance.
+    /// It comes nearer to an obstacle than the clearance, or leaves the workspace.
     Obstructed,
     /// The needle does not bend enough, or the point is behind it.
     OutOfReach,
@@ -36,16 +37,17 @@ pub fn reach_around(world: &World, problem: &Problem, tip: &Tip) -> Vec<(Vector3
     let points = around
         .filter(|(i, j)| i * i + j * j <= count * count)
         .map(|(i, j)| target_mm + (first * f64::from(i) + second * f64::from(j)) * spacing_mm);
-    points.map(|point_mm| (point_mm, reach(world, problem, tip, &point_mm))).collect()
-}
-
-fn reach(world: &World, problem: &Problem, tip: &Tip, point_mm: &Vector3<f64>) -> Reach {
-    let arc = tip.arc_to(point_mm).filter(|arc| arc.curvature_per_mm <= problem.curvature_per_mm);
-    let Some(arc) = arc else { return Reach::OutOfReach };
-    let path = Path { start: *tip, arcs: vec![arc] };
-    let is_clear = path.distance_mm(world) >= problem.clearance_mm
-        && world.workspace.depth_mm(point_mm) >= 0.0;
-    if is_clear { Reach::Clear } else { Reach::Obstructed }
+    // In space: the estimated tip may be off the plane.
+    let mut field = Field::new(Cow::Borrowed(world), problem.clearance_mm, false);
+    let mut reach = |point_mm: &Vector3<f64>| {
+        let arc = tip.arc_to(point_mm);
+        match arc.filter(|arc| arc.curvature_per_mm <= problem.curvature_per_mm) {
+            None => Reach::OutOfReach,
+            Some(arc) if field.is_clear(tip, &arc) => Reach::Clear,
+            Some(_) => Reach::Obstructed,
+        }
+    };
+    points.map(|point_mm| (point_mm, reach(&point_mm))).collect()
 }
 
 #[cfg(test)]
@@ -70,5 +72,20 @@ mod tests {
             assert_eq!([at(0.0), at(-12.0)], [Reach::Clear; 2], "{in_plane}");
             assert_eq!([at(15.0), at(27.0)], [Reach::Obstructed, Reach::OutOfReach], "{in_plane}");
         }
+    }
+
+    /// The arc swings 6.8 mm aside, and the wall is 5 mm beside its ends.
+    #[test]
+    fn an_arc_that_leaves_the_workspace_on_its_way_is_obstructed() {
+        let problem = problem([0.0, 70.0, 90.0], true);
+        let reach = |y_mm: f64| {
+            let position_mm = Vector3::new(0.0, y_mm, 0.0);
+            let tip = Tip { position_mm, heading: Vector3::new(0.0, 0.3f64.sin(), 0.3f64.cos()) };
+            let problem = Problem { target_mm: Vector3::new(0.0, y_mm, 90.0), ..problem.clone() };
+            let points = reach_around(&world(vec![]), &problem, &tip);
+            let is_target = |(at, _): &&(Vector3<f64>, Reach)| *at == problem.target_mm;
+            points.iter().find(is_target).expect("the target").1
+        };
+        assert_eq!([reach(70.0), reach(60.0)], [Reach::Obstructed, Reach::Clear]);
     }
 }

@@ -147,15 +147,16 @@ impl Replanner {
         self.path.as_ref()
     }
 
-    /// Whether a path leads from `start` to the target, by the curvature of the problem: the one that is
-    /// known, or one that a search finds.
+    /// Whether a path that is not too long leads from `start` to the target, by the curvature of the problem:
+    /// the one that is known, or one that a search finds.
     ///
     /// # Errors
     /// Why none is found, in words.
     pub fn check_start(&mut self, start: Tip) -> Result<(), String> {
         self.problem.start = start;
         let last = self.path.as_ref().map(|path| rest_of(path, 0.0, start));
-        if self.known(last.as_ref()).is_some() {
+        let length_max_mm = self.problem.length_max_mm;
+        if self.known(last.as_ref()).is_some_and(|path| path.length_mm() <= length_max_mm) {
             return Ok(());
         }
         let answer = plan_thoroughly(&mut self.field, &self.problem, &self.route);
@@ -189,21 +190,12 @@ impl Replanner {
         if ahead_mm <= ARRIVED_MM && error_mm <= self.problem.tolerance_mm.max(step_mm) {
             return Step::Arrived { error_mm };
         }
-        self.problem.length_max_mm -= inserted_mm;
-        let (clearance_mm, doubt_mm) = (self.problem.clearance_mm, SDS * position_sd_mm);
-        let is_allowed = |at: Vector3<f64>, doubt_mm: f64| {
-            self.field.world.slack_mm(&at, clearance_mm - doubt_mm) >= 0.0
-        };
-        let Tip { position_mm, heading } = estimate.tip;
-        if !is_allowed(position_mm, doubt_mm) || !is_allowed(tip.position_mm, doubt_mm) {
-            return Step::Hold(Hold::TipNotAllowed);
-        }
-        // The needle may go straight ahead: while it turns, and off the plane, in which the path is. It goes no
-        // farther than a target ahead.
+        let left_mm = self.problem.length_max_mm - inserted_mm;
+        self.problem.length_max_mm = left_mm.max(0.0);
+        // It goes no farther than a target ahead.
         let next_mm = if ahead_mm > 0.0 { step_mm.min(ahead_mm) } else { step_mm };
-        let next_mm = position_mm + heading * next_mm;
-        if !is_allowed(next_mm, AHEAD_SDS * position_sd_mm) {
-            return Step::Hold(Hold::AheadNotAllowed);
+        if let Some(hold) = self.not_allowed(estimate, &tip, next_mm) {
+            return Step::Hold(hold);
         }
         self.problem.start = tip;
         let last = self.path.take().map(|path| rest_of(&path, inserted_mm, tip));
@@ -234,6 +226,22 @@ impl Replanner {
         };
         self.path = Some(path);
         Step::Steer(steer)
+    }
+
+    /// Why the tip must not go on: the estimate, or the `tip` in the plane, is where it must not be; or the next
+    /// `next_mm` straight ahead lead there. The needle may go straight ahead: while it turns, and off the plane,
+    /// in which the path is.
+    fn not_allowed(&self, estimate: &Estimate, tip: &Tip, next_mm: f64) -> Option<Hold> {
+        let Tip { position_mm, heading } = estimate.tip;
+        let is_allowed = |at: &Vector3<f64>, sds: f64| {
+            let clearance_mm = self.problem.clearance_mm - sds * estimate.position_sd_mm;
+            self.field.world.slack_mm(at, clearance_mm) >= 0.0
+        };
+        if !is_allowed(&position_mm, SDS) || !is_allowed(&tip.position_mm, SDS) {
+            return Some(Hold::TipNotAllowed);
+        }
+        let next_mm = position_mm + heading * next_mm;
+        (!is_allowed(&next_mm, AHEAD_SDS)).then_some(Hold::AheadNotAllowed)
     }
 
     /// True if a way to the target is left after `turn_mm` straight ahead: so far the needle goes while the

@@ -15,7 +15,7 @@ const TICK_MM: f64 = 1e-3;
 
 /// Lengths of the shortest ways to the target, on a grid of nodes over the workspace.
 #[derive(Debug, Clone)]
-pub struct Route {
+pub(super) struct Route {
     grid: Grid,
     /// Of each node; infinite where there is no way.
     lengths_mm: Vec<f32>,
@@ -28,7 +28,7 @@ impl Route {
     ///
     /// A node is blocked only if no point near it is free. So where this finds no way, there is none,
     /// and but for the longer ways over nodes its lengths are lower bounds.
-    pub fn new(field: &mut Field<'_>, target_mm: &Vector3<f64>) -> Self {
+    pub(super) fn new(field: &mut Field<'_>, target_mm: &Vector3<f64>) -> Self {
         let grid = field.grid.clone();
         let (reach, longer) = if field.in_plane { PLANE } else { SPACE };
         let steps = steps(reach, grid.counts);
@@ -63,12 +63,12 @@ impl Route {
     }
 
     /// How far `target_mm` is from the target of this route, mm: ways to it may be shorter by this much.
-    pub fn moved_mm(&self, target_mm: &Vector3<f64>) -> f64 {
+    pub(super) fn moved_mm(&self, target_mm: &Vector3<f64>) -> f64 {
         (target_mm - self.target_mm).norm()
     }
 
     /// The length of the shortest way from `point_mm`, in the workspace; infinite if there is none.
-    pub fn length_mm(&self, point_mm: &Vector3<f64>) -> f64 {
+    pub(super) fn length_mm(&self, point_mm: &Vector3<f64>) -> f64 {
         let by_way_of = |at: [usize; 3]| {
             let away_mm = (self.grid.place_mm(at) - point_mm).norm();
             f64::from(self.lengths_mm[self.grid.node(at)]) + away_mm

@@ -115,7 +115,7 @@ pub(super) fn plan_thoroughly(field: &mut Field<'_>, problem: &Problem, route: &
 }
 
 /// The best-first search alone. In space it may miss a path between its cells, of which it visits each once.
-pub fn plan_along(field: &mut Field<'_>, problem: &Problem, route: &Route) -> Answer {
+pub(super) fn plan_along(field: &mut Field<'_>, problem: &Problem, route: &Route) -> Answer {
     let levels = if problem.in_plane { 1 } else { LEVELS.len() };
     let mut level = 0;
     let mut expansions = 0;

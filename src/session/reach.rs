@@ -98,8 +98,9 @@ mod tests {
         assert_eq!(
             reach(&[], 500.0).unwrap_err(),
             "the plane is out of reach: the tip is 500.0 mm off it, heading 0 ± 24 deg; the way into it \
-             does not exist, insertion.depth_mm is 250"
+             takes 597 mm at least, insertion.depth_mm is 250"
         );
+        assert_eq!(reach(&["insertion.depth_mm=600", "stage.insertion.max_mm=600"], 500.0), Ok(()));
         assert_eq!(
             reach(&["insertion.depth_mm=150"], -100.0).unwrap_err(),
             "the plane is out of reach: the tip is -100.0 mm off it, heading 0 ± 24 deg; the way into \

@@ -194,6 +194,9 @@ fn a_plan_needs_a_target() {
     insta::assert_snapshot!(refusals(&scratch, &[&["plan", "--set", "goal.kind=plane"]]));
 }
 
+/// Where a header has its units (`xyzt_units`).
+const UNITS: usize = 123;
+
 /// An image of `size` voxels of `spacing_mm` with the `values`, in the single-file form of NIfTI-1.
 fn nifti(size: [u16; 3], spacing_mm: [f32; 3], values: &[u8]) -> Vec<u8> {
     let mut bytes = vec![0; 352];
@@ -207,6 +210,8 @@ fn nifti(size: [u16; 3], spacing_mm: [f32; 3], values: &[u8]) -> Vec<u8> {
     let sides = [1.0, spacing_mm[0], spacing_mm[1], spacing_mm[2]];
     sides.iter().enumerate().for_each(|(i, side)| put(76 + 4 * i, &side.to_le_bytes()));
     put(108, &352f32.to_le_bytes());
+    // mm.
+    put(UNITS, &[2]);
     put(344, b"n+1\0");
     bytes.extend(values);
     bytes
@@ -273,7 +278,9 @@ fn what_is_no_mask_is_refused() {
     let mut turned = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
     turned[254..256].copy_from_slice(&1i16.to_le_bytes());
     let mut metres = nifti([2, 2, 2], [0.001; 3], &[1; 8]);
-    metres[123] = 1;
+    metres[UNITS] = 1;
+    let mut no_unit = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
+    no_unit[UNITS] = 0;
     let mut two_sizes = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
     two_sizes[254..256].copy_from_slice(&1i16.to_le_bytes());
     for at in [280, 300, 320] {
@@ -291,6 +298,7 @@ fn what_is_no_mask_is_refused() {
         nifti([20, 10, 10], [1.0; 3], &[1; 100]),
         turned,
         metres,
+        no_unit,
         two_sizes,
         nifti([20, 10, 10], [1.0; 3], &[1; 2500]),
         nifti([2, 2, 2], [0.001; 3], &[1; 8]),

@@ -36,7 +36,35 @@ impl mixture::Hypothesis for Hypothesis {
     }
 
     fn is_alike(&self, other: &Self) -> bool {
-        alike(self, other)
+        let (p, q) = (&self.covariance, &other.covariance);
+        let least = |state: usize| p.at(state, state).min(q.at(state, state));
+        let near =
+            |state: usize, apart: f64| apart * apart <= ALIKE_SD * ALIKE_SD * least(state) + 1e-18;
+        let as_sure = |state: usize| {
+            let most = p.at(state, state).max(q.at(state, state));
+            most <= ALIKE_VARIANCE * least(state) + 1e-12
+        };
+        // A cheap test first: hypotheses far apart in roll have different bevel directions.
+        let bevels =
+            self.x_pb.rotation.matrix().column(0).dot(&other.x_pb.rotation.matrix().column(0));
+        let parameters = || {
+            [
+                (CURVATURE, self.curvature_per_mm - other.curvature_per_mm),
+                (LAG, self.lag_rad - other.lag_rad),
+                (LOWER, self.band.lower_rad - other.band.lower_rad),
+                (UPPER, self.band.upper_rad - other.band.upper_rad),
+                (GROWTH, self.band.growth_rad_per_mm - other.band.growth_rad_per_mm),
+            ]
+        };
+        let poses = || {
+            let apart = (self.x_pb.inverse() * other.x_pb).log().to_vector();
+            apart.iter().enumerate().all(|(state, &apart)| near(state, apart))
+        };
+        p.extent() == q.extent()
+            && 1.0 - bevels <= ALIKE_SD * ALIKE_SD * (least(4) + least(ROLL)) + 1e-12
+            && [CURVATURE, LOWER, UPPER, GROWTH].into_iter().all(as_sure)
+            && parameters().into_iter().all(|(state, apart)| near(state, apart))
+            && poses()
     }
 }
 
@@ -70,35 +98,4 @@ pub(super) fn estimate(bank: &[Hypothesis]) -> Option<Estimate> {
         },
     };
     Some(Estimate::of_belief(x_pb, belief))
-}
-
-fn alike(a: &Hypothesis, b: &Hypothesis) -> bool {
-    let (p, q) = (&a.covariance, &b.covariance);
-    let least = |state: usize| p.at(state, state).min(q.at(state, state));
-    let near =
-        |state: usize, apart: f64| apart * apart <= ALIKE_SD * ALIKE_SD * least(state) + 1e-18;
-    let as_sure = |state: usize| {
-        let most = p.at(state, state).max(q.at(state, state));
-        most <= ALIKE_VARIANCE * least(state) + 1e-12
-    };
-    // A cheap test first: hypotheses far apart in roll have different bevel directions.
-    let bevels = a.x_pb.rotation.matrix().column(0).dot(&b.x_pb.rotation.matrix().column(0));
-    let parameters = || {
-        [
-            (CURVATURE, a.curvature_per_mm - b.curvature_per_mm),
-            (LAG, a.lag_rad - b.lag_rad),
-            (LOWER, a.band.lower_rad - b.band.lower_rad),
-            (UPPER, a.band.upper_rad - b.band.upper_rad),
-            (GROWTH, a.band.growth_rad_per_mm - b.band.growth_rad_per_mm),
-        ]
-    };
-    let poses = || {
-        let apart = (a.x_pb.inverse() * b.x_pb).log().to_vector();
-        apart.iter().enumerate().all(|(state, &apart)| near(state, apart))
-    };
-    p.extent() == q.extent()
-        && 1.0 - bevels <= ALIKE_SD * ALIKE_SD * (least(4) + least(ROLL)) + 1e-12
-        && [CURVATURE, LOWER, UPPER, GROWTH].into_iter().all(as_sure)
-        && parameters().into_iter().all(|(state, apart)| near(state, apart))
-        && poses()
 }

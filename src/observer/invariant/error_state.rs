@@ -135,8 +135,8 @@ impl Covariance {
     }
 
     /// Moves the covariance to the pose corrected by `delta`, to second order in δ. The remaining
-    /// error η becomes `J_r(δ) η`, since `Exp(−δ) Exp(δ + η) ≈ Exp(J_r(δ) η)` (Solà Eq. 69), with
-    /// `J_r(δ) ≈ I − ad_δ/2 + ad_δ²/6`.
+    /// error η becomes `J_r(δ) η` with the right Jacobian of SE(3),
+    /// `Exp(−δ) Exp(δ + η) ≈ Exp(J_r(δ) η)` and `J_r(δ) ≈ I − ad_δ/2 + ad_δ²/6`.
     pub(super) fn shift(&mut self, delta: &Twist) {
         let states = self.extent.states();
         // Each pass replaces P by J Pᵀ; two passes give J P Jᵀ.

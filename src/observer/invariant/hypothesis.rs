@@ -82,8 +82,8 @@ pub(super) struct Hypothesis {
     pub(super) log_weight: f64,
 }
 
-/// `J_r(ξ) τ`: how the end of a step moves, seen from the end, when its twist changes by `tau`
-/// (Solà Eq. 41), by the series `Σ (−ad_ξ)ᵏ τ / (k + 1)!`.
+/// `J_r(ξ) τ`, the right Jacobian of SE(3) times a twist: how the end of a step moves, seen from the end, when
+/// its twist changes by `tau`. By the series `Σ (−ad_ξ)ᵏ τ / (k + 1)!`.
 fn right_jacobian_times(xi: &Twist, tau: [f64; 6]) -> [f64; 6] {
     let (mut term, mut sum) = (tau, tau);
     for k in 2..16 {

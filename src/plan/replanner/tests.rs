@@ -265,6 +265,52 @@ fn a_step_ahead_that_is_nearer_than_the_clearance_is_not_made() {
     }
 }
 
+/// 120 mm are left to insert, or 118: less than the way to the target by more than the tolerance.
+#[test]
+fn a_start_from_which_the_path_is_too_long_is_refused() {
+    let problem = problem([0.0, 0.0, 120.0], true);
+    let check = |length_max_mm: f64| {
+        let problem = Problem { length_max_mm, ..problem.clone() };
+        let path = plan(&world(vec![]), &self::problem([0.0, 0.0, 120.0], true)).path;
+        Replanner::new(world(vec![]), problem.clone(), 0.0, path).check_start(problem.start)
+    };
+    assert_eq!(check(120.0), Ok(()));
+    assert_eq!(check(119.5), Ok(()), "within the tolerance");
+    let why = check(118.0).unwrap_err();
+    assert!(why.contains("takes 120 mm at least, allowed are 118"), "{why}");
+}
+
+/// The insertion may end a little deeper than it was to: then there is no way left, and none backwards.
+#[test]
+fn beyond_the_longest_path_nothing_leads_back() {
+    let problem = Problem { length_max_mm: 1.0, ..problem([0.0, 60.0, 50.0], true) };
+    let mut planner = Replanner::new(world(vec![]), problem.clone(), 0.0, None);
+    for inserted_mm in [0.0, 1.5] {
+        let estimate = Estimate {
+            tip: problem.start,
+            curvature_per_mm: problem.curvature_per_mm,
+            position_sd_mm: 0.05,
+            heading_sd_rad: 0.001,
+        };
+        let step = planner.step(&estimate, inserted_mm, STEP_MM);
+        let backwards = |path: &Path| path.arcs.iter().any(|arc| arc.length_mm < 0.0);
+        assert!(!planner.path().is_some_and(backwards), "{step:?}, {:?}", planner.path());
+    }
+}
+
+#[test]
+fn a_tip_that_is_no_number_is_held() {
+    let problem = problem([0.0, 0.0, 120.0], false);
+    let mut planner = Replanner::new(world(vec![]), problem.clone(), 0.0, None);
+    let estimate = Estimate {
+        tip: Tip { position_mm: Vector3::new(0.0, f64::NAN, 10.0), ..problem.start },
+        curvature_per_mm: problem.curvature_per_mm,
+        position_sd_mm: 0.05,
+        heading_sd_rad: 0.001,
+    };
+    assert_eq!(planner.step(&estimate, 1.0, STEP_MM), Step::Hold(Hold::TipNotAllowed));
+}
+
 /// No step goes beyond the target, to what is behind it.
 #[test]
 fn a_target_right_before_an_obstacle_is_met() {
