@@ -16,6 +16,7 @@
 use super::{Invariant, InvariantConfig, Observer};
 use crate::geometry::FixedAngles;
 use crate::needle::{Increment, Needle, TipPosition, Torsion};
+use derive_more::Display;
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI};
 use thiserror::Error;
 
@@ -34,43 +35,48 @@ pub const ROLL_KNOWN_RAD: f64 = FRAC_PI_2;
 /// The first positions show the heading at the start. It is not judged any more after this depth.
 const HEADING_SHOWN_MM: f64 = 30.0;
 
-/// How the positions contradict the configuration.
+/// The positions fit an alternative much better than the configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
-pub enum StreamContradiction {
-    /// They fit a mirrored needle.
-    #[error(
-        "the positions fit a mirrored needle e^{log_odds:.0} times better after {depth_mm:.1} mm (limit \
-         e^{LOG_ODDS_MAX:.0}): is a tracker axis mirrored, \
-         stage.rotation.sign wrong, or the stream another's?"
-    )]
-    Mirrored {
-        /// Logarithm of the likelihood ratio.
-        log_odds: f64,
-        /// Insertion since the first position, mm.
-        depth_mm: f64,
-    },
-    /// They fit a needle that started in another direction than configured.
-    #[error(
-        "the positions fit another heading at the start e^{log_odds:.0} times better after {depth_mm:.1} \
-         mm (limit e^{LOG_ODDS_MAX:.0}): is the registration tilted, or observer.start or start_sd wrong?"
-    )]
-    Tilted {
-        /// Logarithm of the likelihood ratio.
-        log_odds: f64,
-        /// Insertion since the first position, mm.
-        depth_mm: f64,
-    },
-    /// They fit a needle that started at another roll than configured.
-    #[error(
-        "the positions fit another roll at the start e^{log_odds:.0} times better after {depth_mm:.1} mm \
-         (limit e^{LOG_ODDS_MAX:.0}): is the registration turned, or observer.start.roll_deg wrong?"
-    )]
-    Turned {
-        /// Logarithm of the likelihood ratio.
-        log_odds: f64,
-        /// Insertion since the first position, mm.
-        depth_mm: f64,
-    },
+#[error(
+    "the positions fit {alternative} e^{log_odds:.0} times better after {depth_mm:.1} mm (limit \
+     e^{LOG_ODDS_MAX:.0}): {}",
+    .alternative.question()
+)]
+pub struct StreamContradiction {
+    /// What they fit.
+    alternative: Alternative,
+    /// Logarithm of the likelihood ratio.
+    log_odds: f64,
+    /// Insertion since the first position, mm.
+    depth_mm: f64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
+enum Alternative {
+    /// The base turns the other way.
+    #[display("a mirrored needle")]
+    Mirrored,
+    /// The heading at the start is not known.
+    #[display("another heading at the start")]
+    Tilted,
+    /// The roll at the start is not known.
+    #[display("another roll at the start")]
+    Turned,
+}
+
+impl Alternative {
+    /// What the operator is to check.
+    fn question(self) -> &'static str {
+        match self {
+            Alternative::Mirrored => {
+                "is a tracker axis mirrored, stage.rotation.sign wrong, or the stream another's?"
+            }
+            Alternative::Tilted => {
+                "is the registration tilted, or observer.start or start_sd wrong?"
+            }
+            Alternative::Turned => "is the registration turned, or observer.start.roll_deg wrong?",
+        }
+    }
 }
 
 /// Compares the configured model with its alternatives until the odds decide.
@@ -83,16 +89,6 @@ pub struct HandednessWatch {
     /// Insertion at the last correction, mm.
     corrected_mm: f64,
     contradiction: Option<StreamContradiction>,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Alternative {
-    /// The base turns the other way.
-    Mirrored,
-    /// The heading at the start is not known.
-    Tilted,
-    /// The roll at the start is not known.
-    Turned,
 }
 
 impl HandednessWatch {
@@ -160,10 +156,11 @@ impl HandednessWatch {
             // innovations of the alternative itself show by how much.
             let log_odds = (model.log_evidence() - configured) / model.innovation_excess();
             if log_odds > LOG_ODDS_MAX {
-                contradiction.get_or_insert(match alternative {
-                    Alternative::Mirrored => StreamContradiction::Mirrored { log_odds, depth_mm },
-                    Alternative::Tilted => StreamContradiction::Tilted { log_odds, depth_mm },
-                    Alternative::Turned => StreamContradiction::Turned { log_odds, depth_mm },
+                let alternative = *alternative;
+                contradiction.get_or_insert(StreamContradiction {
+                    alternative,
+                    log_odds,
+                    depth_mm,
                 });
             }
             let is_shown = *alternative == Alternative::Tilted && depth_mm > HEADING_SHOWN_MM;

@@ -58,13 +58,13 @@ pub(super) fn sharpest_arc(tip: &Tip, problem: &Problem, length_max_mm: f64) -> 
 pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path {
     let level = LEVELS.len() - 1;
     let visited = std::mem::take(&mut field.visited);
-    let Problem { curvature_per_mm, in_plane, length_max_mm, target_mm, .. } = *problem;
+    let Problem { curvature_per_mm, in_plane, length_max_mm, .. } = *problem;
     let workspace = &field.world.workspace;
     let mut lattice = Lattice::new(workspace, curvature_per_mm, in_plane, level, visited);
     let step_mm = lattice.resolution.step_mm;
     let place = lattice.start(problem.start);
     let mut nodes = vec![Node { place, before: None, length_mm: 0.0, from: None }];
-    let distance_mm = |tip: &Tip| (tip.position_mm - target_mm).norm();
+    let distance_mm = |tip: &Tip| problem.to_target_mm(&tip.position_mm);
     // In nm, so that the order is the same everywhere.
     let rank = |tip: &Tip| {
         let mm = miss_mm(tip, problem) + DISTANCE_SHARE * distance_mm(tip);
@@ -113,43 +113,48 @@ pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path 
     improved(field, problem, Path { start: problem.start, arcs }.joined())
 }
 
-/// A path that ends no farther from the target than `path`: it leaves that somewhere by one arc, and goes on
-/// by the sharpest toward the target.
+/// The path with changes that bring its end nearer to the target, the best one first each time.
 fn improved(field: &mut Field<'_>, problem: &Problem, mut path: Path) -> Path {
-    let Problem { target_mm, curvature_per_mm, in_plane, length_max_mm, .. } = *problem;
-    let distance_mm = |tip: &Tip| (tip.position_mm - target_mm).norm();
     for _ in 0..ROUNDS_MAX {
-        let mut best = (distance_mm(&path.end()) - GAIN_MIN_MM, None);
-        for point in 0..=(path.length_mm() / LEAVE_MM) as u32 {
-            let along_mm = LEAVE_MM * f64::from(point);
-            let (tip, _) = path.at(along_mm);
-            for (bend, share) in bends(&tip, in_plane) {
-                let arc = Arc {
-                    bend,
-                    curvature_per_mm: share * curvature_per_mm,
-                    length_mm: ARC_MAX_MM.min(length_max_mm - along_mm),
-                };
-                let clear_mm = field.clear_part(&tip, arc).length_mm;
-                let parts = (clear_mm / LEAVE_MM).ceil();
-                for part in 1..=parts as u32 {
-                    let arc = arc.with_length(clear_mm * f64::from(part) / parts);
-                    let to = tip.after(&arc);
-                    if miss_mm(&to, problem) > best.0 {
-                        continue;
-                    }
-                    let left_mm = length_max_mm - along_mm - arc.length_mm;
-                    let sharpest = field.clear_part(&to, sharpest_arc(&to, problem, left_mm));
-                    let end_mm = distance_mm(&to.after(&sharpest));
-                    if end_mm < best.0 {
-                        best = (end_mm, Some((along_mm, [arc, sharpest])));
-                    }
-                }
-            }
-        }
-        let Some((along_mm, ways)) = best.1 else { break };
+        let Some((along_mm, ways)) = best_change(field, problem, &path) else { break };
         path = Path { arcs: [path.first(along_mm), ways.to_vec()].concat(), ..path }.joined();
     }
     path
+}
+
+/// Where to leave `path` by one arc, and go on by the sharpest toward the target, to end nearest to it; `None`
+/// if that gains too little.
+fn best_change(field: &mut Field<'_>, problem: &Problem, path: &Path) -> Option<(f64, [Arc; 2])> {
+    let Problem { curvature_per_mm, in_plane, length_max_mm, .. } = *problem;
+    let mut best_mm = problem.to_target_mm(&path.end().position_mm) - GAIN_MIN_MM;
+    let mut best = None;
+    for point in 0..=(path.length_mm() / LEAVE_MM) as u32 {
+        let along_mm = LEAVE_MM * f64::from(point);
+        let (tip, _) = path.at(along_mm);
+        for (bend, share) in bends(&tip, in_plane) {
+            let arc = Arc {
+                bend,
+                curvature_per_mm: share * curvature_per_mm,
+                length_mm: ARC_MAX_MM.min(length_max_mm - along_mm),
+            };
+            let clear_mm = field.clear_part(&tip, arc).length_mm;
+            let parts = (clear_mm / LEAVE_MM).ceil();
+            for part in 1..=parts as u32 {
+                let arc = arc.with_length(clear_mm * f64::from(part) / parts);
+                let to = tip.after(&arc);
+                if miss_mm(&to, problem) > best_mm {
+                    continue;
+                }
+                let left_mm = length_max_mm - along_mm - arc.length_mm;
+                let sharpest = field.clear_part(&to, sharpest_arc(&to, problem, left_mm));
+                let end_mm = problem.to_target_mm(&to.after(&sharpest).position_mm);
+                if end_mm < best_mm {
+                    (best_mm, best) = (end_mm, Some((along_mm, [arc, sharpest])));
+                }
+            }
+        }
+    }
+    best
 }
 
 /// Directions to bend to, each with a share of the curvature.

@@ -184,9 +184,8 @@ impl Replanner {
         if self.problem.in_plane {
             tip = in_plane(&tip);
         }
-        let target_mm = self.problem.target_mm;
-        let error_mm = (target_mm - estimate.tip.position_mm).norm();
-        let ahead_mm = (target_mm - tip.position_mm).dot(&tip.heading);
+        let error_mm = self.problem.to_target_mm(&estimate.tip.position_mm);
+        let ahead_mm = (self.problem.target_mm - tip.position_mm).dot(&tip.heading);
         if ahead_mm <= ARRIVED_MM && error_mm <= self.problem.tolerance_mm.max(step_mm) {
             return Step::Arrived { error_mm };
         }
@@ -222,7 +221,7 @@ impl Replanner {
             bend: first.bend,
             curvature_per_mm: mean_curvature_per_mm(&path, &first, step_mm),
             left_mm: path.length_mm(),
-            error_mm: (path.end().position_mm - target_mm).norm(),
+            error_mm: self.miss_mm(&path),
         };
         self.path = Some(path);
         Step::Steer(steer)
@@ -269,7 +268,7 @@ impl Replanner {
     }
 
     fn miss_mm(&self, path: &Path) -> f64 {
-        (path.end().position_mm - self.problem.target_mm).norm()
+        self.problem.to_target_mm(&path.end().position_mm)
     }
 
     /// A path for what is known of the tip. The searches share one budget; each may spend half of what is

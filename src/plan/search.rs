@@ -41,6 +41,13 @@ pub struct Problem {
     pub expansions_max: u32,
 }
 
+impl Problem {
+    /// Distance of a point from the target, mm.
+    pub(super) fn to_target_mm(&self, from_mm: &Vector3<f64>) -> f64 {
+        (from_mm - self.target_mm).norm()
+    }
+}
+
 /// What a search found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
 pub enum Status {
@@ -102,11 +109,10 @@ pub(super) fn plan_thoroughly(field: &mut Field<'_>, problem: &Problem, route: &
     if let (Status::None, Some(nearest_mm)) = (answer.status, answer.nearest_mm) {
         let path = path_to_nearest(field, problem);
         let end_mm = path.end().position_mm;
-        let miss_mm = |at: Vector3<f64>| (at - problem.target_mm).norm();
-        if miss_mm(end_mm) < miss_mm(nearest_mm) {
+        if problem.to_target_mm(&end_mm) < problem.to_target_mm(&nearest_mm) {
             answer.nearest_mm = Some(end_mm);
         }
-        if miss_mm(end_mm) <= problem.tolerance_mm {
+        if problem.to_target_mm(&end_mm) <= problem.tolerance_mm {
             let (status, path) = (Status::Plan, Some(path));
             answer = Answer { status, path, reason: None, ..answer };
         }
@@ -273,7 +279,7 @@ impl Search<'_, '_> {
         by: u8,
         parent: u32,
     ) -> usize {
-        let distance_mm = (place.tip.position_mm - self.problem.target_mm).norm();
+        let distance_mm = self.problem.to_target_mm(&place.tip.position_mm);
         if distance_mm < self.nearest.0 {
             self.nearest = (distance_mm, place.tip.position_mm);
         }
@@ -343,7 +349,7 @@ impl Search<'_, '_> {
         let Node { place: Place { tip, .. }, length_mm, changes, may_be_free, .. } =
             self.nodes[node as usize];
         let length_mm = f64::from(length_mm);
-        let distance_mm = (target_mm - tip.position_mm).norm();
+        let distance_mm = self.problem.to_target_mm(&tip.position_mm);
         let ends_near = distance_mm <= *tolerance_mm + self.lattice.resolution.step_mm;
         let near = if ends_near { self.nearest_on_arcs(node) } else { None };
         // The grid of the route is too coarse to judge a target that is near.
@@ -366,7 +372,6 @@ impl Search<'_, '_> {
 
     /// The point within tolerance on the arcs from `node` that costs least: distance left, and the way.
     fn nearest_on_arcs(&self, node: u32) -> Option<(f64, [Arc; 2])> {
-        let Problem { target_mm, tolerance_mm, .. } = self.problem;
         let (tip, before) = (self.nodes[node as usize].place.tip, self.before(node));
         let arcs = (0..self.lattice.arcs()).map(|by| self.lattice.arc(&tip, before, by));
         let parts = arcs.flat_map(|arc| {
@@ -374,10 +379,10 @@ impl Search<'_, '_> {
                 arc.with_length(arc.length_mm * f64::from(part) / f64::from(PARTS))
             })
         });
-        let ends =
-            parts.map(|arc| ((tip.after(&arc).position_mm - target_mm).norm(), [arc, NO_ARC]));
+        let ends = parts
+            .map(|arc| (self.problem.to_target_mm(&tip.after(&arc).position_mm), [arc, NO_ARC]));
         let cost_mm = |(left_mm, [arc, _]): &(f64, [Arc; 2])| left_mm + arc.length_mm;
-        ends.filter(|(left_mm, _)| left_mm <= tolerance_mm)
+        ends.filter(|(left_mm, _)| *left_mm <= self.problem.tolerance_mm)
             .min_by(|a, b| cost_mm(a).total_cmp(&cost_mm(b)))
     }
 

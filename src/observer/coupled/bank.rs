@@ -34,8 +34,9 @@ const FIBRE: [usize; 3] = [1, 2, 3];
 ///
 /// Copies start around the circle. Their weights are the likelihoods of all three coordinates of
 /// the innovations, and fade like everything else. Unlikely copies are dropped, and those that
-/// agree are merged. The stated
-/// covariance is the one that the gains follow from. It counts old positions for less than they
+/// agree are merged.
+///
+/// The stated covariance is the one that the gains follow from. It counts old positions for less than they
 /// contribute, so it is larger than the error's: NEES is about 2.3 (`docs/steering.md`).
 #[derive(Debug, Clone)]
 pub(super) struct CoupledBank {
