@@ -283,7 +283,8 @@ fn a_start_from_which_the_path_is_too_long_is_refused() {
 /// The insertion may end a little deeper than it was to: then there is no way left, and none backwards.
 #[test]
 fn beyond_the_longest_path_nothing_leads_back() {
-    let problem = Problem { length_max_mm: 1.0, ..problem([0.0, 60.0, 50.0], true) };
+    let mut problem = Problem { length_max_mm: 1.0, ..problem([0.0, 60.0, 60.0], true) };
+    problem.start.position_mm.z = 10.0;
     let mut planner = Replanner::new(world(vec![]), problem.clone(), 0.0, None);
     for inserted_mm in [0.0, 1.5] {
         let estimate = Estimate {
