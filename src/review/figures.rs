@@ -122,7 +122,9 @@ fn figures(folder: &Folder, report: &FigureReport, limits: &Limits) -> Vec<Figur
         limit: limits.get(key).copied().filter(|_| is_insertion || key != DEPTH),
     };
     let mut all: Vec<Figure> = FIGURES.iter().map(of_report).collect();
-    let known = if folder.is_emulated() { "true" } else { "estimated" };
+    // The manifest of a record left open may not name the bus.
+    let has_truth = folder.is_emulated() || report.final_error.is_some();
+    let known = if has_truth { "true" } else { "estimated" };
     for figure in all.iter_mut().filter(|figure| figure.key == OFF_PLANE) {
         figure.label = format!("off plane ({known}), RMS over {}", last_third(folder, report));
     }
