@@ -138,12 +138,8 @@ fn is_upright(header: &NiftiHeader) -> bool {
 fn is_in_mm(header: &NiftiHeader) -> Result<(), String> {
     // NIfTI-1, xyzt_units: the lowest three bits are the unit of space.
     let unit = match header.xyzt_units & 7 {
-        2 => None,
-        0 => {
-            return Err("its header gives no unit of length; if it is mm, say so: xyzt_units = 2 (nibabel: \
-                 header.set_xyzt_units('mm'))"
-                .to_owned());
-        }
+        // Without a unit it is mm, as for other programs.
+        0 | 2 => None,
         1 => Some("metres".to_owned()),
         3 => Some("micrometres".to_owned()),
         code => Some(format!("units of code {code}")),

@@ -57,6 +57,9 @@ const CALIBRATION_FILES: [CalibrationFile; 3] = [
     },
 ];
 
+/// Keys of calibration files that may be changed without a change of what was measured.
+const NOT_MEASURED: [&str; 2] = ["tracker.registration.sd_mm", "evaluation"];
+
 /// The preset that the topmost of `layers` names, as layer number `layer`.
 pub(super) fn preset(layers: &[Entries], layer: usize) -> Result<Entries, ConfigError> {
     let named = last(layers, "emulator.tracker").map(|entry| &entry.value);
@@ -87,16 +90,16 @@ pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Unusab
 pub(super) fn remove_outdated_fits(tree: &mut Tree) {
     for file in &CALIBRATION_FILES {
         let Some(layer) = tree.get(file.fit).map(|fit| fit.layer) else { continue };
-        if tree.iter().any(|(key, entry)| entry.layer > layer && file.is_about(key)) {
+        if tree.iter().any(|(key, entry)| entry.layer > layer && file.measures(key)) {
             tree.retain(|key, _| !is_of(key, &[file.fit]));
         }
     }
 }
 
 impl CalibrationFile {
-    /// True for the keys that the file holds, and for those that say the same.
-    fn is_about(&self, key: &str) -> bool {
-        is_of(key, self.holds) || is_of(key, self.instead_of)
+    /// True for the measured values that the file holds, and for those that say the same.
+    fn measures(&self, key: &str) -> bool {
+        (is_of(key, self.holds) || is_of(key, self.instead_of)) && !is_of(key, &NOT_MEASURED)
     }
 
     fn lay(&self, layers: &mut [Entries], read: ReadFile<'_>) -> Result<(), ConfigError> {
@@ -109,8 +112,12 @@ impl CalibrationFile {
         if others.any(|other| other.layer > naming.layer && !other.is_beside(&naming)) {
             return Ok(());
         }
-        let beside = layers.iter().flatten().filter(|(_, entry)| entry.is_beside(&naming));
-        if let Some(key) = beside.map(|(key, _)| key).find(|key| self.is_about(key)) {
+        // Of what the file only holds, the later `--set` counts.
+        let is_twice = |(key, entry): &&(String, Entry)| {
+            is_of(key, self.instead_of) && entry.is_beside(&naming)
+                || is_of(key, self.holds) && entry.layer == naming.layer
+        };
+        if let Some((key, _)) = layers.iter().flatten().find(is_twice) {
             let message = format!("{} is given along with {key}: give one of the two", self.key);
             return Err(refusal(message));
         }

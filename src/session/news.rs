@@ -26,7 +26,7 @@ pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
              and its display for why"
         ),
         StageEvent::Flood(frames) => {
-            format!("a flood on the bus: {frames} unexpected frames within 100 ms")
+            format!("a flood on the bus: {frames} frames beside the cycle within 100 ms")
         }
         StageEvent::Ignored { why, count, frame } => {
             format!("{why}, {count} so far, the newest {frame}")

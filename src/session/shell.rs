@@ -57,6 +57,8 @@ pub(crate) struct Shell {
     /// The follow-up reasons reported since the stop began.
     then: Vec<String>,
     left_unknown: Option<&'static str>,
+    /// A drive had power when the stop began, whoever gave it.
+    stopped_with_power: bool,
     outputs: VecDeque<Output>,
 }
 
@@ -72,6 +74,7 @@ impl Shell {
             states: BTreeMap::new(),
             then: Vec::new(),
             left_unknown: None,
+            stopped_with_power: false,
             outputs: VecDeque::new(),
         }
     }
@@ -243,6 +246,7 @@ impl Shell {
     }
 
     fn begin_stopping(&mut self, outcome: Outcome) {
+        self.stopped_with_power |= self.had_power();
         self.phase = Phase::Stopping { outcome, since: self.now };
         self.state(State::Stopping);
     }
@@ -288,7 +292,8 @@ impl Shell {
     /// The bench gave the drives power, or something else did.
     fn had_power(&self) -> bool {
         let reports = self.stage.drive_reports();
-        matches!(self.power, Power::ComingOn | Power::On(_))
+        self.stopped_with_power
+            || matches!(self.power, Power::ComingOn | Power::On(_))
             || Axis::BOTH.into_iter().any(|axis| reports[axis].says_power())
     }
 

@@ -376,7 +376,7 @@ impl StageConfig {
             return Err(no_homing(axis));
         }
         let values = [
-            (Some(config.following_error_window()), "a following error", ""),
+            (Some(config.following_error_window()), FOLLOWING_ERROR, ""),
             (config.quick_stop_deceleration, "a quick-stop deceleration", "/s²"),
             (homing.and_then(|homing| homing.speed_switch), "a homing speed", "/s"),
             (homing.and_then(|homing| homing.speed_zero), "a homing speed", "/s"),
@@ -386,11 +386,26 @@ impl StageConfig {
         for (value, what, per) in values {
             if let Some(value) = value.filter(|value| unsigned_counts(scale, *value).is_none()) {
                 let (value, unit) = axis.in_unit(value);
+                let hint = match config.following_error_max {
+                    None if what == FOLLOWING_ERROR => {
+                        format!(
+                            "; it is that of 30 ms at the highest speed: set following_error_{unit}"
+                        )
+                    }
+                    _ => String::new(),
+                };
                 return Err(format!(
-                    "{axis}: {what} of {value} {unit}{per}: it must be over zero and fit 32 bits in \
-                     counts"
+                    "{axis}: {what} of {value} {unit}{per}: less than half a count, or more than 32 bits \
+                     hold{hint}"
                 ));
             }
+        }
+        let offset = homing.and_then(|homing| homing.offset);
+        if let Some(offset) = offset.filter(|offset| scale.relative_counts(*offset).is_none()) {
+            let offset = axis.shown(offset);
+            return Err(format!(
+                "{axis}: a home offset of {offset}: more than 32 bits hold in counts"
+            ));
         }
         // It brakes first, and the last SYNC counts when the next is due.
         let needed = self.standstill_window(axis) + 2 * self.bus.sync_period();
@@ -405,6 +420,9 @@ impl StageConfig {
         Ok(())
     }
 }
+
+/// What a following-error window is called in an error.
+const FOLLOWING_ERROR: &str = "a following error";
 
 /// An axis is to be homed, and no homing is configured.
 pub(super) fn no_homing(axis: Axis) -> String {
@@ -450,7 +468,7 @@ mod tests {
         // 30 ms at its highest speed are less than half a count.
         assert!(
             text(|c| c.insertion.limits.speed_max = 0.01)
-                .starts_with("insertion: a following error of 0.0003 mm: ")
+                .starts_with("insertion: a following error of 0.0003 mm: less than half a count")
         );
         assert!(
             text(|c| c.insertion.quick_stop_deceleration = Some(1e9))

@@ -181,6 +181,10 @@ impl Stage {
                 None => format!(
                     "{axis}: enabled, but no heartbeat within {timeout_ms} ms, is can.heartbeat_ms longer?"
                 ),
+                Some(NmtState::Operational) => format!(
+                    "both drives were enabled only as {timeout_ms} ms ended; raise \
+                     stage.enable_timeout_s"
+                ),
                 Some(state) => format!(
                     "{axis}: enabled, but NMT state {state} instead of operational after {timeout_ms} ms, \
                      is there another master?"

@@ -3,9 +3,9 @@
 //! # Contract
 //! Hand a [`Stage`] every frame received ([`Stage::handle_frame`]) and the time at its
 //! [`Stage::deadline`] ([`Stage::handle_timeout`]). After each, drain [`Stage::poll`] to `None`, and send
-//! the frames in order and at once. Hand in all frames that were received before the time is: a bench that
-//! was held up would otherwise take unread frames for missing ones. The stage touches no clock and no
-//! socket.
+//! the frames in order and at once. Before you hand in the time, hand in every frame that was received
+//! before it: a bench that was held up would otherwise take unread frames for missing ones. The stage
+//! touches no clock and no socket.
 //!
 //! The stage listens first, for as long as a heartbeat may be late. If another master commands these
 //! drives, the stage ends without sending anything; if one begins to do so later, it stops with a fault.

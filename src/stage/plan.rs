@@ -343,7 +343,7 @@ impl Script {
     }
 }
 
-/// A value, in mm or rad, that `object` cannot hold in counts.
+/// A value, in mm or rad, that `object` cannot hold in counts; the configuration is checked for such.
 fn unfit(object: ObjectAddress, value: f64) -> String {
-    format!("{object}: {value} is 0 in counts, or does not fit 32 bits")
+    format!("{object} cannot hold {value} in counts")
 }

@@ -20,7 +20,7 @@ pub struct TrialResult {
     pub outcome: Outcome,
     /// The figures of the insertion, by the true tip.
     pub figures: FigureReport,
-    /// The shortest path into the plane, mm: two arcs.
+    /// The shortest path into the plane, mm: two arcs, from far out with a straight between them.
     pub shortest_settling_mm: Option<f64>,
     /// The information bound of the estimate's errors, as RMS over the last third; `None` without noise.
     pub bound_rms: Option<TipError>,

@@ -82,7 +82,7 @@ pub struct StudySummary {
     pub off_plane_rms_mm: OffPlane,
     /// Depth after which the tip stays within 1 mm of the plane.
     pub settling_mm: Settling,
-    /// The least depth in which two arcs reach the plane: no needle can be faster.
+    /// The length of the shortest way into the plane: no needle can be faster.
     pub shortest_settling_mm: Median,
     /// The estimate's RMS errors over the last third, medians over the trials.
     pub estimate_rms: Option<TipError>,

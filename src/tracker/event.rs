@@ -100,7 +100,11 @@ impl Census {
                 self.refused = Some((before + 1, error.clone()));
             }
             Event::SawTool { tool, message_type } if self.unread.len() < NAMES_MAX => {
-                self.unread.insert(tool.clone(), message_type.clone());
+                let known = self.unread.entry(tool.clone()).or_insert_with(|| message_type.clone());
+                // A tool may be the device of a status as well.
+                if has_positions(message_type) {
+                    known.clone_from(message_type);
+                }
             }
             Event::Disconnected { .. } => *self = Census::default(),
             Event::SawTool { .. } | Event::Unreachable { .. } => {}
@@ -267,6 +271,13 @@ mod tests {
             census.explain_missing("Needle"),
             "tracker: localhost:18944 sent 0 messages, none of \"Needle\"; saw \"PlusServer\" (STATUS), \
              \"Tracker\" (TDATA without tools); is the tool in view?"
+        );
+        for message_type in ["TRANSFORM", "STATUS"].map(str::to_owned) {
+            census.note(&Event::SawTool { tool: "PlusServer".to_owned(), message_type });
+        }
+        assert!(
+            census.explain_missing("Needle").ends_with("; set tracker.tool"),
+            "a tool after all"
         );
     }
 

@@ -5,7 +5,7 @@ use super::ndjson::LineDecoder;
 use super::openigtlink::{Body, Message, StreamDecoder};
 use super::sample::Sample;
 use crate::units::Time;
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::{BTreeMap, VecDeque};
 
 /// The protocol of a tracker's connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -23,8 +23,8 @@ pub enum Protocol {
 pub struct Reader {
     decoder: Decoder,
     received: Time,
-    /// Names seen on this connection.
-    names: BTreeSet<String>,
+    /// Names seen on this connection, and whether with positions.
+    names: BTreeMap<String, bool>,
     events: VecDeque<Event>,
     messages: u64,
 }
@@ -47,7 +47,7 @@ impl Reader {
                 Protocol::Ndjson => Decoder::Ndjson(LineDecoder::default()),
             },
             received: Time::ZERO,
-            names: BTreeSet::new(),
+            names: BTreeMap::new(),
             events: VecDeque::new(),
             messages: 0,
         }
@@ -132,10 +132,15 @@ impl Reader {
         self.events.push_back(Event::Sample(sample));
     }
 
-    /// Reports a name that is new on this connection.
+    /// Reports a name that is new on this connection, or comes with positions for the first time.
     fn note_name(&mut self, name: &str, message_type: &str) {
-        if self.names.len() < Self::NAMES_MAX && !self.names.contains(name) {
-            self.names.insert(name.to_owned());
+        let with_positions = has_positions(message_type);
+        let is_news = match self.names.get(name) {
+            Some(had_positions) => with_positions && !had_positions,
+            None => self.names.len() < Self::NAMES_MAX,
+        };
+        if is_news {
+            self.names.insert(name.to_owned(), with_positions);
             let (tool, message_type) = (name.to_owned(), message_type.to_owned());
             self.events.push_back(Event::SawTool { tool, message_type });
         }
@@ -233,6 +238,25 @@ mod tests {
         let empty = encode(&Message::new("Tracker", None, Body::TrackingData(Vec::new())));
         let events = read(Protocol::OpenIgtLink, [&empty[..]]);
         assert_eq!(summary(&events), ["saw Tracker (TDATA without tools)"]);
+    }
+
+    /// A device may send its status first, and its positions later.
+    #[test]
+    fn a_name_is_reported_again_when_it_comes_with_positions() {
+        let status =
+            Status { code: 1, subcode: 0, error_name: String::new(), message: String::new() };
+        let pose = Body::Transform([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 4.0, 5.0, 6.0]);
+        let bytes = [Body::Status(status), pose.clone(), pose]
+            .map(|body| encode(&Message::new("Stylus", None, body)))
+            .concat();
+        let saw: Vec<_> = read(Protocol::OpenIgtLink, [&bytes[..]])
+            .into_iter()
+            .filter_map(|event| match event {
+                Event::SawTool { message_type, .. } => Some(message_type),
+                _ => None,
+            })
+            .collect();
+        assert_eq!(saw, ["STATUS", "TRANSFORM"]);
     }
 
     #[test]

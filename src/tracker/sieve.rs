@@ -1,6 +1,6 @@
 //! Keeps other tools, and floods of notices, away from the session.
 
-use super::event::Event;
+use super::event::{Event, has_positions};
 use super::gate::is_tool;
 use super::reader::Reader;
 use crate::units::Time;
@@ -42,7 +42,7 @@ impl Sieve {
     pub fn pass(&mut self, now: Time, event: Event) -> Option<Event> {
         match event {
             Event::Connected { .. } => self.names.clear(),
-            Event::SawTool { ref tool, .. } => {
+            Event::SawTool { ref tool, ref message_type } if has_positions(message_type) => {
                 self.names.insert(tool.clone());
             }
             Event::Sample(sample) if !self.is_own(&sample.tool) => {

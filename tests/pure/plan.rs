@@ -279,8 +279,6 @@ fn what_is_no_mask_is_refused() {
     turned[254..256].copy_from_slice(&1i16.to_le_bytes());
     let mut metres = nifti([2, 2, 2], [0.001; 3], &[1; 8]);
     metres[UNITS] = 1;
-    let mut no_unit = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
-    no_unit[UNITS] = 0;
     let mut two_sizes = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
     two_sizes[254..256].copy_from_slice(&1i16.to_le_bytes());
     for at in [280, 300, 320] {
@@ -298,7 +296,6 @@ fn what_is_no_mask_is_refused() {
         nifti([20, 10, 10], [1.0; 3], &[1; 100]),
         turned,
         metres,
-        no_unit,
         two_sizes,
         nifti([20, 10, 10], [1.0; 3], &[1; 2500]),
         nifti([2, 2, 2], [0.001; 3], &[1; 8]),

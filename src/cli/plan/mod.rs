@@ -63,7 +63,7 @@ pub(super) fn plan(arguments: &Arguments) -> Result<(), Failure> {
 /// The name of a picture, for clap.
 fn svg_file(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
-    match path.extension().is_some_and(|extension| extension == "svg") {
+    match path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("svg")) {
         true => Ok(path),
         false => Err("the plan is drawn as SVG: a name that ends in .svg".to_owned()),
     }

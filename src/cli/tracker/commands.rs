@@ -273,6 +273,9 @@ fn watch(arguments: &WatchArguments) -> Result<(), Failure> {
         }
         last_line = now;
     }
+    if is_unread(&io::stdout()) {
+        return Ok(());
+    }
     watch.last.map(|_| ()).ok_or_else(|| listener.nothing())
 }
 

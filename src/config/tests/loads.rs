@@ -371,6 +371,8 @@ fn a_value_beside_the_calibration_file_that_holds_it_is_refused() {
     // Given in a source over the one that names the file, it is laid over what the file holds.
     let over = said(&format!("needle.{needle}"), &["needle.tip_ahead_mm=3"]);
     assert!(over.starts_with("bench.toml:1: needle.needle_file: cannot be read"), "{over}");
+    let over = said("", &["needle.needle_file=needle.toml", "needle.tip_ahead_mm=3"]);
+    assert!(over.starts_with("--set needle.needle_file: cannot be read"), "{over}");
 }
 
 /// A registration, a tip or a needle that is changed by hand is not the one that was measured.
@@ -392,6 +394,7 @@ fn a_calibration_does_not_vouch_for_a_value_that_is_given_over_it() {
         [given.fit.is_some(), config.tracker.tip_fit.is_some()]
     };
     assert_eq!(has_fit("insertion.depth_mm=80"), [true, true]);
+    assert_eq!(has_fit("tracker.registration.sd_mm=0.5"), [true, true]);
     assert_eq!(has_fit("tracker.registration.x_mm=2.0"), [false, true]);
     assert_eq!(has_fit("tracker.tip_tilt.roll_deg=3.0"), [true, false]);
     assert_eq!(has_fit("tracker.tip_offset_mm=[0.0, 0.0, 7.0]"), [true, false]);

@@ -287,6 +287,8 @@ impl Insert {
         let heard = tip.min(target).unwrap_or(self.begun).max(self.begun);
         let since = match power {
             Power::Off | Power::ComingOn => heard,
+            // Decided; power comes on at the next SYNC.
+            Power::Awaited(_) if self.tip_believed => heard,
             Power::Awaited(since) | Power::On(since) => since.min(heard),
         };
         let due = since + self.config.tracker.timeout;

@@ -123,6 +123,37 @@ fn a_start_in_doubt_is_decided_before_the_tip_times_out() {
     assert!(reason.starts_with("insertion: the plane is out of reach"), "{reason}");
 }
 
+/// The same, where the mean is within reach, although the first position is not.
+#[test]
+fn a_start_in_doubt_that_is_good_begins_although_the_tip_times_out() {
+    let seen_at = |x_mm: f64, then_mm: f64, phase_ms: u64| {
+        // 0.5 s are no whole number of SYNCs.
+        let sets = ["tracker.timeout_s=0.3", "insertion.depth_mm=150", "can.sync_ms=12"];
+        let mut bench = Bench::new(&sets);
+        bench.tip_mm.x = x_mm;
+        bench.run_until(CONFIGURED);
+        bench.next_sample = bench.now + Duration::from_millis(phase_ms);
+        bench.run_for(Duration::from_millis(phase_ms + 130));
+        bench.tip_mm.x = then_mm;
+        while bench.session.outcome().is_none() {
+            if bench.events.iter().any(|text| text.contains("enabling both axes")) {
+                return Ok(bench.now);
+            }
+            bench.step();
+        }
+        Err(bench.reason())
+    };
+    // The nearest millimetre from which the plane is out of reach.
+    let refused_mm = (40..100)
+        .map(f64::from)
+        .find(|x_mm| seen_at(*x_mm, *x_mm, 150).is_err())
+        .expect("a plane out of reach");
+    for phase_ms in [150, 153, 157] {
+        let begun = seen_at(refused_mm, refused_mm - 2.0, phase_ms);
+        assert!(begun.is_ok(), "{phase_ms} ms: {begun:?}");
+    }
+}
+
 /// The bench has given it no power, but must not claim that it has none.
 #[test]
 fn a_drive_that_keeps_power_from_elsewhere_is_told_at_the_end() {
@@ -143,4 +174,22 @@ fn a_drive_that_keeps_power_from_elsewhere_is_told_at_the_end() {
     let unknown = left.unknown.unwrap_or("nothing");
     assert!(left.had_power && unknown.contains("press the emergency stop"), "{unknown}");
     assert!(bench.events.iter().any(|text| text == unknown), "{:?}", bench.events);
+}
+
+#[test]
+fn power_from_elsewhere_that_the_stop_took_off_is_told_at_the_end() {
+    let mut bench = Bench::new(&[]);
+    bench.run_until(CONFIGURED);
+    for controlword in [0x06, 0x07, 0x0F] {
+        let write = Frame::new(0x601, &[0x2B, 0x40, 0x60, 0, controlword, 0, 0, 0]);
+        bench.stage.handle_frame(bench.now, &write);
+    }
+    let reason = bench.reason();
+    assert!(
+        reason.starts_with("stage: insertion: the drive has power before the bench gave it any"),
+        "{reason}"
+    );
+    let left = bench.session.left();
+    assert!(left.had_power, "{left:?}");
+    assert_eq!(left.unknown, None);
 }
