@@ -79,7 +79,7 @@ impl SocketCan {
         };
         match set_up() {
             Ok(None) => Ok(bus),
-            Ok(Some(error)) | Err(error) => Err(failed(&bus.interface, "set the socket up")(error)),
+            Ok(Some(error)) | Err(error) => Err(failed(&bus.interface, "set the socket up", error)),
         }
     }
 
@@ -91,7 +91,7 @@ impl SocketCan {
     /// [`CanError::Io`] if the kernel gives no echoes.
     pub fn confirm_sending(&mut self, syncs_max: usize) -> Result<(), CanError> {
         let asked = self.socket.set_recv_own_msgs(true);
-        asked.map_err(failed(&self.interface, "ask for echoes"))?;
+        asked.map_err(|error| failed(&self.interface, "ask for echoes", error))?;
         self.unconfirmed = Some(Unconfirmed::new(syncs_max));
         Ok(())
     }
@@ -113,7 +113,9 @@ impl SocketCan {
             .chain(numbers)
             .map(|number| CanFilter::new(number, NODE_BITS | CAN_EFF_FLAG))
             .collect();
-        self.socket.set_filters(&filters).map_err(failed(&self.interface, "set filters"))?;
+        self.socket
+            .set_filters(&filters)
+            .map_err(|error| failed(&self.interface, "set filters", error))?;
         // A flood that passes the filters would never let this end.
         for _ in 0..DRAIN_MAX {
             if self.receive(Duration::ZERO)?.is_none() {
@@ -170,7 +172,7 @@ impl CanBus for SocketCan {
             }
             Err(error) => {
                 self.give_up_unconfirmed();
-                Err(failed(&self.interface, "send")(error))
+                Err(failed(&self.interface, "send", error))
             }
         }
     }
@@ -181,7 +183,8 @@ impl CanBus for SocketCan {
             let left = timeout.saturating_sub(start.elapsed());
             match self.socket.read_frame_with_timestamps() {
                 Ok((frame, stamps)) => {
-                    let event = event(&frame).map_err(failed(&self.interface, "receive"))?;
+                    let event =
+                        event(&frame).map_err(|error| failed(&self.interface, "receive", error))?;
                     if self.is_echo(&event) {
                         continue;
                     }
@@ -190,11 +193,11 @@ impl CanBus for SocketCan {
                 }
                 Err(error) if !nothing_there(&error) => {
                     self.give_up_unconfirmed();
-                    return Err(failed(&self.interface, "receive")(error));
+                    return Err(failed(&self.interface, "receive", error));
                 }
                 Err(_) if left.is_zero() => return Ok(None),
                 Err(_) => readable(self.socket.as_fd(), left)
-                    .map_err(failed(&self.interface, "receive"))?,
+                    .map_err(|error| failed(&self.interface, "receive", error))?,
             }
         }
     }
@@ -205,7 +208,7 @@ impl CanBus for SocketCan {
 
     fn report(&mut self, error: &BusError) -> Result<(), CanError> {
         let sent = self.socket.write_frame(&CanFrame::Error(error.0));
-        sent.map_err(failed(&self.interface, "put an error frame on the bus"))
+        sent.map_err(|error| failed(&self.interface, "put an error frame on the bus", error))
     }
 
     fn name(&self) -> &str {
@@ -214,7 +217,7 @@ impl CanBus for SocketCan {
 
     fn dropped(&self) -> Result<u64, CanError> {
         let mut info = [0; MEMINFO_BYTES];
-        let failed = failed(&self.interface, "count drops");
+        let failed = |error| failed(&self.interface, "count drops", error);
         match self.socket.get_socket_option_bytes(SOL_SOCKET, SO_MEMINFO, &mut info) {
             Ok(MEMINFO_BYTES) => {
                 let [.., a, b, c, d] = info;
@@ -226,11 +229,11 @@ impl CanBus for SocketCan {
     }
 }
 
-/// Makes an error of the operating system a [`CanError`]. An interface that vanished is ENODEV once, and ENXIO
-/// at each later frame.
-fn failed(interface: &str, action: &'static str) -> impl FnOnce(io::Error) -> CanError {
+/// An error of the operating system as a [`CanError`]. An interface that vanished is ENODEV once, and ENXIO at
+/// each later frame.
+fn failed(interface: &str, action: &'static str, reason: io::Error) -> CanError {
     let interface = interface.to_owned();
-    move |reason| match errno(&reason) {
+    match errno(&reason) {
         Some(Errno::ENETDOWN) => CanError::Down(interface),
         Some(Errno::ENODEV | Errno::ENXIO) => CanError::Gone(interface),
         _ => CanError::Io { interface, action, reason },
@@ -321,10 +324,10 @@ mod tests {
     #[test]
     fn an_interface_that_vanished_is_gone_at_every_frame() {
         for errno in [Errno::ENODEV, Errno::ENXIO] {
-            let error = failed("can0", "send")(errno.into());
+            let error = failed("can0", "send", errno.into());
             assert_eq!(error.to_string(), "interface can0 is gone, was the adapter unplugged?");
         }
-        let other = failed("can0", "send")(Errno::EPERM.into()).to_string();
+        let other = failed("can0", "send", Errno::EPERM.into()).to_string();
         assert!(other.starts_with("can0: cannot send: Operation not permitted"), "{other}");
     }
 
