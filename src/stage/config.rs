@@ -466,10 +466,10 @@ mod tests {
                 .starts_with("rotation: a following error of 0 deg: ")
         );
         // 30 ms at its highest speed are less than half a count.
-        assert!(
-            text(|c| c.insertion.limits.speed_max = 0.01)
-                .starts_with("insertion: a following error of 0.0003 mm: less than half a count")
-        );
+        assert!(text(|c| c.insertion.limits.speed_max = 0.01).ends_with(
+            "a following error of 0.0003 mm: less than half a count, or more than 32 bits hold; \
+                     it is that of 30 ms at the highest speed: set following_error_mm"
+        ));
         assert!(
             text(|c| c.insertion.quick_stop_deceleration = Some(1e9))
                 .starts_with("insertion: a quick-stop deceleration of 1000000000 mm/s²: ")

@@ -118,6 +118,7 @@ mod tests {
         for _ in 0..5 {
             assert_eq!(pass(sample("Stylus")), None);
         }
+        assert_eq!(pass(saw("Probe", "STATUS")), Some(saw("Probe", "STATUS")), "it may be no tool");
         assert_eq!(pass(sample("Probe")), Some(saw("Probe", "NDJSON")), "of a recording");
         assert_eq!(pass(sample("Probe")), None);
         assert_eq!(pass(sample("Needle")), Some(sample("Needle")));

@@ -486,6 +486,25 @@ fn a_node_that_does_not_say_that_it_is_operational_is_named() {
     }
 }
 
+/// The last heartbeat comes after the answers to the last SYNC in time.
+#[test]
+fn drives_that_are_enabled_too_late_are_told_from_those_that_are_not() {
+    let mut config = config();
+    config.bus.heartbeat_timeout_ms = 60_000;
+    let mut bench = Bench::new(config);
+    bench.rotation.heartbeat_off = true;
+    bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+    let late = bench.now + Duration::from_millis(2_999);
+    while bench.stage.deadline() < late {
+        bench.step();
+    }
+    bench.receive(heartbeat_frame(bench.rotation.node, NmtState::Operational));
+    assert_eq!(
+        bench.until_fault(),
+        "both drives were enabled only as 3000 ms ended; raise stage.enable_timeout_s"
+    );
+}
+
 /// Comes to the identity, restarts, and so on.
 fn reboot(bench: &mut Bench, times: u32) {
     for _ in 0..times {

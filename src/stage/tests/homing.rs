@@ -198,3 +198,13 @@ fn homing_by(method: i8) -> HomingConfig {
         homed_bit: HomingConfig::ATTAINED_BIT,
     }
 }
+
+#[test]
+fn a_home_offset_that_no_drive_holds_is_refused_before_the_bring_up() {
+    let mut config = config();
+    config.insertion.homing = Some(HomingConfig { offset: Some(1e8), ..homing_by(37) });
+    assert_eq!(
+        config.validate().expect_err("refused"),
+        "insertion: a home offset of 100000000 mm: more than 32 bits hold in counts"
+    );
+}
