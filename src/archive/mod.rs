@@ -1,7 +1,7 @@
 //! The formats of a run folder, written and read: pure text and types.
 //!
-//! `telemetry` fills a folder and opens one; replay and review read it through the types here. A
-//! file's writer and its reader stand side by side, so that a change of one is not made without the other.
+//! `telemetry` fills a folder and opens one; replay and review read it through the types here.
+//! Each format has one source file here, which writes and reads it.
 
 mod candump;
 mod events;

@@ -19,10 +19,10 @@ struct CalibrationFile {
     made_by: &'static str,
     /// The keys that such a file holds, and no others.
     holds: &'static [&'static str],
-    /// Keys that take the file's place where they are given in a source over the one that names it. In one
-    /// source neither they nor what the file holds may be given beside `key`.
+    /// Keys that replace the file if a source above the one that names it gives them. Within one source,
+    /// neither they nor what the file holds may stand beside `key`.
     instead_of: &'static [&'static str],
-    /// Where the values came from: the one of the keys in `holds` that the preflight judges.
+    /// The key in `holds` that says how the values were measured. The preflight judges it.
     fit: &'static str,
 }
 
@@ -86,7 +86,7 @@ pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Unusab
     unusable
 }
 
-/// Removes the origin of each calibration over which a value of it is given: it does not vouch for that.
+/// Removes the `fit` of each calibration of which a source above changes a measured value.
 pub(super) fn remove_outdated_fits(tree: &mut Tree) {
     for file in &CALIBRATION_FILES {
         let Some(layer) = tree.get(file.fit).map(|fit| fit.layer) else { continue };

@@ -219,7 +219,7 @@ impl Flattener<'_> {
         let value = match spanned.get_ref() {
             DeValue::String(text) => Value::from(&**text),
             DeValue::Integer(integer) => {
-                // An integer of more than 64 bits is out of range for every key.
+                // No key takes an integer of more than 64 bits.
                 let parsed = i64::from_str_radix(integer.as_str(), integer.radix());
                 Value::from(parsed.unwrap_or(i64::MAX))
             }

@@ -135,7 +135,7 @@ fn the_stream_is_counted() {
     assert!((fit.rate_hz.value - 40.0).abs() < 0.6, "by receipt");
 }
 
-/// If the stamps dated the positions, those of ten seconds would come before the one ahead.
+/// By the stamps, the positions of the ten seconds after the one that is ahead would be older than it.
 #[test]
 fn one_stamp_ahead_costs_no_position() {
     let mut samples = rest(NEAR, 7, 1200, still);
@@ -145,7 +145,7 @@ fn one_stamp_ahead_costs_no_position() {
     assert!((fit.duration_s - 30.0).abs() < 0.1, "{fit:?}");
 }
 
-/// Four positions at a time, without stamps: most have the time of the one before.
+/// Positions are received four at a time, without stamps, so most have the same time as the one before.
 #[test]
 fn positions_that_are_received_in_bursts_are_no_dropouts() {
     let mut samples = rest(NEAR, 7, 1200, still);

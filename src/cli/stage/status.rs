@@ -44,7 +44,7 @@ pub(super) fn reset(config: &Config, as_json: bool) -> Result<(), Failure> {
     }
 }
 
-/// The status each second, until Ctrl-C or until nobody reads it.
+/// Prints the status each second, until Ctrl-C or until the pipe it goes to is closed.
 pub(super) fn watch(config: &Config, as_json: bool) -> Result<(), Failure> {
     let interrupt = Interrupt::listen()?;
     loop {

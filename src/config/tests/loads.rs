@@ -368,14 +368,14 @@ fn a_value_beside_the_calibration_file_that_holds_it_is_refused() {
         "--set tracker.registration_file is given along with tracker.registration.sd_mm: give one of \
          the two"
     );
-    // Given in a source over the one that names the file, it is laid over what the file holds.
+    // A source above the one that names the file may change what the file holds.
     let over = said(&format!("needle.{needle}"), &["needle.tip_ahead_mm=3"]);
     assert!(over.starts_with("bench.toml:1: needle.needle_file: cannot be read"), "{over}");
     let over = said("", &["needle.needle_file=needle.toml", "needle.tip_ahead_mm=3"]);
     assert!(over.starts_with("--set needle.needle_file: cannot be read"), "{over}");
 }
 
-/// A registration, a tip or a needle that is changed by hand is not the one that was measured.
+/// A registration or a tip that is changed by hand is no longer the measured one.
 #[test]
 fn a_calibration_does_not_vouch_for_a_value_that_is_given_over_it() {
     let origin =

@@ -7,6 +7,7 @@ use proptest::prelude::*;
 use super::*;
 
 mod axes;
+mod contradictions;
 mod faults;
 mod loads;
 mod refusals;

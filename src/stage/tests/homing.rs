@@ -205,6 +205,6 @@ fn a_home_offset_that_no_drive_holds_is_refused_before_the_bring_up() {
     config.insertion.homing = Some(HomingConfig { offset: Some(1e8), ..homing_by(37) });
     assert_eq!(
         config.validate().expect_err("refused"),
-        "insertion: a home offset of 100000000 mm: more than 32 bits hold in counts"
+        "insertion: a home offset of 100000000.000 mm: more than 32 bits hold in counts"
     );
 }

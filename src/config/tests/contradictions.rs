@@ -1,0 +1,231 @@
+//! Keys that are each right and do not go together.
+
+use super::*;
+
+#[test]
+fn both_alternatives() {
+    assert_eq!(
+        refusal("[needle]\nradius_mm = 100\ncurvature_per_mm = 0.01"),
+        "bench.toml:3: needle.curvature_per_mm is given along with needle.radius_mm: give one of \
+         the two"
+    );
+    assert_eq!(
+        refusal("emulator.noise = { uniform_mm = 1, sd_mm = 1 }"),
+        "bench.toml:1: emulator.noise.sd_mm is given along with emulator.noise.uniform_mm: give \
+         one of the two"
+    );
+    // The command line is one source.
+    for (one, other) in [
+        ("needle.radius_mm=100", "needle.curvature_per_mm=0.01"),
+        ("emulator.noise.sd_mm=1", "emulator.noise.uniform_mm=1"),
+        ("tracker.registration.x_mm=1", "tracker.registration.fiducials=[]"),
+        ("tracker.tip_file=tip.toml", "tracker.tip_offset_mm=[0,0,1]"),
+    ] {
+        for sets in [[one, other], [other, one]] {
+            let said = set_refusal(&sets);
+            assert!(said.contains("given along with"), "{sets:?}: {said}");
+        }
+    }
+    // The same key again takes the place of what was given before.
+    let radius = loaded("", &["needle.radius_mm=100", "needle.radius_mm=120"]);
+    assert_eq!(radius.number("needle.radius_mm"), 120.0);
+}
+
+#[test]
+fn keys_that_do_not_go_together() {
+    assert_eq!(
+        refusal("\ninsertion.depth_mm = 400"),
+        "bench.toml:2: insertion.depth_mm is 400, allowed: up to stage.insertion.max_mm, which is \
+         310"
+    );
+    assert_eq!(
+        set_refusal(&[
+            "insertion.speed_mm_per_s=20",
+            "stage.rotation.speed_max_deg_per_s=2e3",
+            "tracker.hold_after_mm=10",
+        ]),
+        "--set insertion.speed_mm_per_s is 20, allowed: up to \
+         stage.insertion.speed_max_mm_per_s, which is 10"
+    );
+    assert_eq!(
+        refusal("stage.rotation.speed_max_deg_per_s = 30"),
+        "bench.toml:1: control.nested_saturation.rotation_max_deg_per_mm is 60: at 2 mm/s \
+         that is 120 deg/s, over stage.rotation.speed_max_deg_per_s = 30; turn by 15.0000 deg/mm or \
+         insert at 0.5000 mm/s"
+    );
+    assert_eq!(
+        refusal("emulator.torsion = { half_width_deg = 10, offset_deg = -23 }"),
+        "bench.toml:1: emulator.torsion: torsion offset is -23.000 deg, allowed is up to the half-width at \
+         the start, 10.000 deg, in magnitude: the tip would start outside its own band"
+    );
+    assert_eq!(
+        refusal("needle.torsion.creep_mm_per_mm = 0.01"),
+        "bench.toml:1: needle.torsion: torsion creep grows by 0.01 mm per mm from 0 mm: give its length at \
+         the start"
+    );
+    assert_eq!(
+        refusal("stage.rotation.node = 1"),
+        "bench.toml:1: stage.rotation.node is 1, the same as stage.insertion.node: each node \
+         needs its own number"
+    );
+    assert_eq!(
+        refusal("can.bench_node = 2"),
+        "bench.toml:1: stage.rotation.node is 2, the same as can.bench_node: each node needs its \
+         own number"
+    );
+    assert_eq!(
+        refusal("can.heartbeat_ms = 150"),
+        "bench.toml:1: can.heartbeat_timeout_ms is 100, allowed: at least twice can.heartbeat_ms, \
+         which is 150"
+    );
+    assert_eq!(
+        refusal("can.interface = \"vcan0\""),
+        "bench.toml:1: tracker.source is \"emulated\", allowed only with can.interface = \
+         \"memory\", which is \"vcan0\": it sees the emulated needle alone. Set tracker.source = \
+         \"openigtlink\""
+    );
+    assert_eq!(
+        set_refusal(&["can.interface=vcan0"]),
+        "--set can.interface: tracker.source is \"emulated\", allowed only with can.interface = \
+         \"memory\", which is \"vcan0\": it sees the emulated needle alone. Set tracker.source = \
+         \"openigtlink\""
+    );
+    let on_a_wire = [
+        "can.interface=can0",
+        "tracker.source=openigtlink",
+        "stage.insertion.abort_connection_option=0",
+    ];
+    assert_eq!(
+        set_refusal(&on_a_wire),
+        "--set can.interface is \"can0\", which may have real drives on it, but stage.hardware is \
+         false: start from bench-config/rig-epos4.toml, or name \"vcan0\" or \"udp\" for emulated \
+         drives"
+    );
+    assert!(load("", &["can.interface=vxcan0", on_a_wire[1]]).is_ok());
+    let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
+    assert_eq!(
+        load(&rig, &["can.interface=udp"]).expect_err("refused").to_string(),
+        "--set can.interface is \"udp\", a bus made for tests, but stage.hardware is true: name the \
+         interface of the real stage, such as \"can0\""
+    );
+    assert_eq!(
+        load(&rig, &["can.interface=memory"]).expect_err("refused").to_string(),
+        "--set can.interface is \"memory\", a bus made for tests, but stage.hardware is true: name \
+         the interface of the real stage, such as \"can0\"\n\
+         --set can.interface: tracker.source is \"openigtlink\", but can.interface = \"memory\" is \
+         the emulated stage, which only its own tracker sees: name \"vcan0\" with vcan-stage on it"
+    );
+    assert!(
+        refusal("tracker.source = \"ndjson\"").ends_with("on it, or a recording as tracker.file")
+    );
+    assert_eq!(
+        set_refusal(&["tracker.hold_after_mm=0.1"]),
+        "--set tracker.hold_after_mm is 0.1, allowed: over the 0.140 mm to standstill from \
+         2 mm/s with tracker.hold_braking_mm_per_s2 = 40 and tracker.latency_ms = 0: insert slower \
+         or brake harder"
+    );
+    assert_eq!(
+        refusal("tracker.workspace = { min_mm = [0, 0, 0], max_mm = [1, 0, 1] }"),
+        "bench.toml:1: tracker.workspace.min_mm is [0.0, 0.0, 0.0], allowed: each under that of \
+         tracker.workspace.max_mm, which is [1.0, 0.0, 1.0]"
+    );
+}
+
+#[test]
+fn sources_of_tip_positions_that_do_not_go_together() {
+    assert_eq!(
+        refusal("tracker.source = \"csv\""),
+        "bench.toml:1: tracker.source is \"csv\", and there is no tracker.file to read"
+    );
+    assert_eq!(
+        refusal("tracker.file = \"tip.csv\""),
+        "bench.toml:1: tracker.file is \"tip.csv\", allowed with tracker.source = \"ndjson\" or \
+         \"csv\", which is \"emulated\""
+    );
+    let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
+    assert_eq!(
+        load(&rig, &["tracker.source=csv", "tracker.file=tip.csv"])
+            .expect_err("refused")
+            .to_string(),
+        "--set tracker.file is \"tip.csv\", but stage.hardware is true: a recording does not see the \
+         needle that would move"
+    );
+    assert_eq!(
+        refusal("tracker.address = \"-\""),
+        "bench.toml:1: tracker.address is \"-\", allowed with tracker.source = \"ndjson\", which is \
+         \"emulated\""
+    );
+    assert_eq!(
+        refusal("tracker.request = \"tdata\""),
+        "bench.toml:1: tracker.request is given, allowed with tracker.source = \"openigtlink\", \
+         which is \"emulated\""
+    );
+    assert_eq!(
+        refusal("tracker.csv.time = {}"),
+        "bench.toml:1: tracker.csv.time names no column, expected the name of one as s, ms, us or ns"
+    );
+    assert_eq!(
+        refusal("tracker.csv.position = [\"x\", \"y\"]"),
+        "bench.toml:1: tracker.csv.position is [\"x\", \"y\"], expected 3 strings, each the name of a \
+         column"
+    );
+    assert_eq!(
+        refusal("tracker.csv.position = [\"x\", \"y\", \" \"]"),
+        "bench.toml:1: tracker.csv.position[2] is \" \", allowed: the name of a column"
+    );
+}
+
+#[test]
+fn correlated_noise_without_a_time_or_a_size() {
+    assert_eq!(
+        set_refusal(&["emulator.noise={sd_mm=0.1,correlated_sd_mm=0.4}"]),
+        "--set emulator.noise.correlated_sd_mm is given without \
+         emulator.noise.correlation_time_s: give both"
+    );
+    assert_eq!(
+        set_refusal(&["emulator.noise={correlation_time_s=0.4}"]),
+        "--set emulator.noise.correlation_time_s is given without \
+         emulator.noise.correlated_sd_mm: give both"
+    );
+    assert_eq!(
+        set_refusal(&["emulator.noise={correlated_sd_mm=1,correlation_time_s=-1}"]),
+        "--set emulator.noise.correlation_time_s is -1, allowed: over 0 to 3600 s"
+    );
+}
+
+#[test]
+fn noise_that_lasts_longer_than_the_run() {
+    let noise = |time: &str| {
+        format!("tracker.noise={{white_sd_mm=0.1,correlated_sd_mm=0.1,correlation_time_s={time}}}")
+    };
+    assert_eq!(
+        set_refusal(&[&noise("126")]),
+        "--set tracker.noise.correlation_time_s is 126, allowed: up to the 125.000 s of the insertion; \
+         noise that lasts longer is an error of the registration, tracker.registration.sd_mm"
+    );
+    // What is advised is allowed: 125.0006 s are not rounded up.
+    let longer = set_refusal(&["insertion.depth_mm=250.0012", &noise("125.001")]);
+    assert!(longer.contains("allowed: up to the 125.000 s"), "{longer}");
+    assert_eq!(
+        set_refusal(&[&noise("-0.1")]),
+        "--set tracker.noise.correlation_time_s is -0.1, allowed: 0 to 3600 s"
+    );
+    assert_eq!(
+        set_refusal(&["tracker.noise={white_sd_mm=0.1}"]),
+        "--set tracker.noise.correlated_sd_mm is missing and has no default here, expected a number in \
+         mm\n--set tracker.noise.correlation_time_s is missing and has no default here, expected a \
+         number in s"
+    );
+}
+
+/// Only a path to a target goes around them.
+#[test]
+fn obstacles_on_the_way_into_the_plane() {
+    assert_eq!(
+        refusal(
+            "[[goal.obstacle]]\nshape = \"sphere\"\ncentre_mm = [0.0, 0.0, 60.0]\nradius_mm = 10.0"
+        ),
+        "bench.toml:1: goal.obstacle has no effect, since goal.kind is \"plane\": set goal.kind = \
+         \"target\""
+    );
+}
