@@ -18,6 +18,7 @@ use crate::telemetry::free_mb;
 use nix::errno::Errno;
 use nix::net::if_::if_nametoindex;
 use nix::poll::{PollFd, PollFlags, poll};
+use nix::sys::termios::{FlushArg, tcflush};
 use serde_json::json;
 use socketcan::nl::{CanInterface as Interface, CanState};
 use std::io::{IsTerminal, Write as _};
@@ -116,7 +117,7 @@ impl Preflight {
 /// Shows the list before a run on hardware, and asks. Returns the list, which is empty on the virtual stage.
 ///
 /// # Errors
-/// Nothing is to move, which is told already; or there is nobody to ask.
+/// The run is refused: by a row, by the operator, or because there is nobody to ask.
 pub(super) fn before_run(config: &Config, yes: bool, as_json: bool) -> Result<Vec<Check>, Failure> {
     if !config.stage.hardware || config.is_emulated() {
         return Ok(Vec::new());
@@ -160,9 +161,13 @@ pub(super) fn before_rehearsal(config: &Config, rig: &Config, quiet: bool) -> Ve
 /// Asks, until a line is given or a signal comes.
 fn is_confirmed(config: &Config, interrupt: &Interrupt) -> bool {
     let insertion = &config.insertion;
+    let stdin = std::io::stdin();
+    // What was typed before the question is no answer to it.
+    if tcflush(&stdin, FlushArg::TCIFLUSH).is_err() {
+        return false;
+    }
     eprint!("insert {} mm at {} mm/s? [y/N] ", insertion.depth_mm, insertion.speed_mm_per_s);
     let _ = std::io::stderr().flush();
-    let stdin = std::io::stdin();
     let is_given = || {
         let mut line = [PollFd::new(stdin.as_fd(), PollFlags::POLLIN)];
         !matches!(poll(&mut line, ASK_EVERY_MS), Ok(0) | Err(Errno::EINTR))

@@ -206,18 +206,24 @@ impl Rig {
         OnTerminal::start(&self.command(words), &keyboard, [24, 80]).expect("a terminal")
     }
 
-    /// A run on hardware, which asks first: the operator answers Ctrl-C, and then yes.
+    /// A run on hardware, which asks first: the operator answers Ctrl-C, and then yes. A yes before the
+    /// question does not count.
     fn confirmed(&self, words: &[&str]) -> Ended {
+        let asked = |run: &mut OnTerminal| {
+            // The last row of the list; the question after it is no whole line.
+            run.program.wait_for("  configuration ");
+            thread::sleep(Duration::from_millis(500));
+        };
         let mut unsure = self.on_terminal(words);
-        // The last row of the list; the question after it is no whole line.
-        unsure.program.wait_for("  configuration ");
-        thread::sleep(Duration::from_millis(500));
+        unsure.press("y\n");
+        asked(&mut unsure);
         unsure.press("\x03");
         let refused = unsure.program.end();
         refused.assert_status(1);
         assert!(refused.stdout.contains("nothing has moved"), "{}", refused.stdout);
         assert!(self.insertions().is_empty(), "no record of a run that did not begin");
         let mut sure = self.on_terminal(words);
+        asked(&mut sure);
         sure.press("y\n");
         sure.program.end()
     }
