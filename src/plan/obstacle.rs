@@ -127,6 +127,16 @@ impl World {
     pub fn slack_mm(&self, point_mm: &Vector3<f64>, clearance_mm: f64) -> f64 {
         (self.distance_mm(point_mm) - clearance_mm).min(self.workspace.depth_mm(point_mm))
     }
+
+    /// The same without masks. Another point has at most its distance from `point_mm` more; where masks count,
+    /// it may have more, because the distance to a mask jumps between voxels.
+    pub(super) fn slack_at_most_mm(&self, point_mm: &Vector3<f64>, clearance_mm: f64) -> f64 {
+        let is_exact = |obstacle: &&Obstacle| !matches!(obstacle, Obstacle::Mask(_));
+        let exact = self.obstacles.iter().filter(is_exact);
+        let distances = exact.map(|obstacle| obstacle.distance_mm(point_mm));
+        let distance_mm = distances.fold(f64::INFINITY, f64::min);
+        (distance_mm - clearance_mm).min(self.workspace.depth_mm(point_mm))
+    }
 }
 
 #[cfg(test)]

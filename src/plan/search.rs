@@ -96,12 +96,12 @@ pub fn plan(world: &World, problem: &Problem) -> Answer {
 
 /// The same with the `route` to the target known.
 pub(super) fn plan_thoroughly(field: &mut Field<'_>, problem: &Problem, route: &Route) -> Answer {
-    // No path leaves the workspace.
-    let outside_mm = -field.world.workspace.depth_mm(&problem.target_mm);
-    let is_outside = outside_mm > problem.tolerance_mm;
-    let expansions_max = if is_outside { 0 } else { problem.expansions_max };
+    // No path leaves the workspace, or comes nearer to an obstacle than the clearance.
+    let slack_mm = field.world.slack_at_most_mm(&problem.target_mm, problem.clearance_mm);
+    let is_closed = slack_mm < -problem.tolerance_mm;
+    let expansions_max = if is_closed { 0 } else { problem.expansions_max };
     let mut answer = plan_along(field, &Problem { expansions_max, ..problem.clone() }, route);
-    if is_outside {
+    if is_closed {
         answer.status = Status::None;
     }
     // The search does not follow ways on which the target is out of reach, and they may come nearer. One

@@ -87,6 +87,21 @@ fn what_the_plane_does_not_allow_space_may() {
     path(&world, &problem, &answer);
 }
 
+/// Deeper in an obstacle, or farther outside, than the tolerance, the target needs no search. Less deep, a path
+/// ends short of it.
+#[test]
+fn a_target_out_of_bounds_needs_no_search() {
+    let world = world(vec![sphere([0.0, 0.0, 100.0], 10.0)]);
+    for in_plane in [true, false] {
+        for (z_mm, is_searched) in [(91.5, false), (89.0, true), (152.0, false)] {
+            let problem = Problem { clearance_mm: 1.5, ..problem([0.0, 0.0, z_mm], in_plane) };
+            let answer = plan(&world, &problem);
+            assert_eq!(answer.expansions > 0, is_searched, "{z_mm}, {in_plane}");
+            assert_eq!(answer.status == Status::None, !is_searched, "{z_mm}, {in_plane}");
+        }
+    }
+}
+
 #[test]
 fn why_there_is_none() {
     let mut reasons = String::new();
