@@ -57,8 +57,12 @@ impl Script {
                          node-id and bitrate right?"
                     ));
                 }
-                // It may have been left in NMT Stopped, where no node answers.
-                Err(SdoError::Timeout(_)) => self.sdo.leave_operational(),
+                // It may have been left in NMT Stopped, where no node answers. The next request must not be
+                // sent before it has left that state.
+                Err(SdoError::Timeout(_)) => {
+                    self.sdo.leave_operational();
+                    self.sdo.pause(POLL_PERIOD).await;
+                }
                 Err(SdoError::TooLong | SdoError::UnexpectedCommand(_))
                     if self.sdo.now() < give_up => {}
                 answer => break answer,

@@ -329,10 +329,15 @@ fn a_drive_left_in_nmt_stopped_is_brought_up() {
     let mut bench = Bench::new(config());
     bench.insertion.nmt = NmtState::Stopped;
     bench.run_until(|event| *event == StageEvent::Ready);
-    let first_word = bench.sent.iter().find(|(_, frame)| frame.to_string() == "000#8001");
-    let first_answer =
-        bench.sent.iter().find(|(_, frame)| frame.to_string().starts_with("601#401810"));
-    assert!(first_word.map(|(time, _)| time) < first_answer.map(|(time, _)| time));
+    let first = |start: &str| {
+        let is_it = |(_, frame): &(Time, Frame)| frame.to_string().starts_with(start);
+        bench.sent.iter().position(is_it).expect("sent")
+    };
+    let (leave, identify) = (first("000#8001"), first("601#401810"));
+    assert!(leave < identify);
+    // The node has left Stopped when it is asked again: that request is answered.
+    let asked_after = bench.sent[identify].0.since(bench.sent[leave].0);
+    assert_eq!(asked_after, Duration::from_millis(10));
 }
 
 /// Comes to the identity, restarts, and so on.
