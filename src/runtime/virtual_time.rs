@@ -168,7 +168,7 @@ impl<W: Witness> World for VirtualRun<'_, W> {
         }
         self.stage.handle_frame(self.now, frame);
         match self.stage.bus_fault() {
-            Some(FaultKind::BusStuck) => self.unconfirmed.sent(*frame),
+            Some(FaultKind::BusStuck) => self.unconfirmed.sent(*frame, 0),
             _ => self.unconfirmed.give_up(),
         }
         self.emulated.update(&self.stage, self.now);

@@ -49,8 +49,6 @@ pub struct SocketCan {
     received_at: Option<SystemTime>,
     /// Set when sending is confirmed.
     unconfirmed: Option<Unconfirmed>,
-    /// The count of dropped frames when echoes were last missing.
-    dropped_before: u64,
 }
 
 impl SocketCan {
@@ -62,13 +60,7 @@ impl SocketCan {
     pub fn open(interface: &str) -> Result<Self, CanError> {
         let socket = CanSocket::open(interface).map_err(|error| cannot_open(interface, error))?;
         let interface = interface.to_owned();
-        let bus = SocketCan {
-            interface,
-            socket,
-            received_at: None,
-            unconfirmed: None,
-            dropped_before: 0,
-        };
+        let bus = SocketCan { interface, socket, received_at: None, unconfirmed: None };
         let set_up = || {
             bus.socket.set_error_filter_accept_all()?;
             bus.socket.set_timestamping(STAMPS)?;
@@ -144,14 +136,16 @@ impl SocketCan {
 
 impl CanBus for SocketCan {
     fn send(&mut self, frame: &Frame) -> Result<(), CanError> {
-        if let Some((frames, syncs)) = self.unconfirmed.as_ref().and_then(Unconfirmed::too_many) {
-            // A full socket drops echoes as it drops other frames.
-            let dropped = self.dropped()?;
-            if dropped == std::mem::replace(&mut self.dropped_before, dropped) {
+        // Where they cannot be counted, none are known to be dropped.
+        let dropped = self.dropped().unwrap_or_default();
+        if let Some(waiting) = &mut self.unconfirmed
+            && let Some((frames, syncs)) = waiting.too_many()
+        {
+            if !waiting.may_be_dropped(dropped) {
                 let interface = self.interface.clone();
                 return Err(CanError::NotConfirmed { interface, frames, syncs });
             }
-            self.give_up_unconfirmed();
+            waiting.give_up();
         }
         let sent = match to_socketcan(frame) {
             Some(frame) => self.socket.write_frame(&frame),
@@ -159,7 +153,7 @@ impl CanBus for SocketCan {
         };
         match sent {
             Ok(()) => {
-                self.unconfirmed.iter_mut().for_each(|waiting| waiting.sent(*frame));
+                self.unconfirmed.iter_mut().for_each(|waiting| waiting.sent(*frame, dropped));
                 Ok(())
             }
             // ENOBUFS: the interface's queue is full. EAGAIN: the socket's queue is full.

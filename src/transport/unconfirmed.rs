@@ -16,6 +16,8 @@ pub struct Unconfirmed {
     /// Maximum number of SYNCs that wait.
     syncs_max: usize,
     frames: VecDeque<Frame>,
+    /// The socket's count of dropped frames when the oldest SYNC that waits was sent.
+    dropped_before: u64,
     /// Frames that were given up; their echoes may still come.
     given_up: VecDeque<Frame>,
     /// Frames whose echo is missing although a later frame's has come: since the last SYNC was sent, and
@@ -30,6 +32,7 @@ impl Unconfirmed {
         Unconfirmed {
             syncs_max: syncs_max.max(1),
             frames: VecDeque::new(),
+            dropped_before: 0,
             given_up: VecDeque::new(),
             passed: Default::default(),
         }
@@ -37,17 +40,31 @@ impl Unconfirmed {
 
     /// How many frames wait, and of how many SYNCs, if no more may be sent.
     pub fn too_many(&self) -> Option<(usize, usize)> {
-        let syncs = self.frames.iter().filter(|frame| is_sync(frame)).count();
+        let syncs = self.syncs();
         (syncs >= self.syncs_max).then_some((self.frames.len(), syncs))
     }
 
-    /// Adds a frame that the kernel took.
-    pub fn sent(&mut self, frame: Frame) {
+    /// True if the socket, which has `dropped` so many frames, may have dropped the echoes that are missing:
+    /// a full one drops echoes as it drops other frames.
+    pub fn may_be_dropped(&self, dropped: u64) -> bool {
+        dropped != self.dropped_before
+    }
+
+    /// Adds a frame that the kernel took, when the socket had `dropped` so many.
+    pub fn sent(&mut self, frame: Frame, dropped: u64) {
         if is_sync(&frame) {
+            // Frames dropped long before explain no echo that is missing now.
+            if self.syncs() == 0 {
+                self.dropped_before = dropped;
+            }
             let [newest, before] = &mut self.passed;
             *before = std::mem::take(newest);
         }
         self.frames.push_back(frame);
+    }
+
+    fn syncs(&self) -> usize {
+        self.frames.iter().filter(|frame| is_sync(frame)).count()
     }
 
     /// True if a received frame is the echo of one of these. The bus has carried every frame before it, too.
@@ -98,8 +115,8 @@ mod tests {
         let mut unconfirmed = Unconfirmed::new(2);
         for cycle in 0..2 {
             assert_eq!(unconfirmed.too_many(), None);
-            unconfirmed.sent(set_point(cycle));
-            unconfirmed.sent(sync());
+            unconfirmed.sent(set_point(cycle), 0);
+            unconfirmed.sent(sync(), 0);
         }
         assert_eq!(unconfirmed.too_many(), Some((4, 2)));
         assert!(unconfirmed.take_echo(&set_point(0)));
@@ -108,10 +125,27 @@ mod tests {
         assert_eq!(unconfirmed.too_many(), None, "it goes on as soon as one cycle is out");
     }
 
+    /// Frames that were dropped before the cable came out must not hide that it is out.
+    #[test]
+    fn only_frames_dropped_since_the_oldest_sync_that_waits_excuse_missing_echoes() {
+        let mut unconfirmed = Unconfirmed::new(2);
+        unconfirmed.sent(sync(), 0);
+        assert!(unconfirmed.take_echo(&sync()));
+        unconfirmed.sent(sync(), 5);
+        unconfirmed.sent(sync(), 5);
+        assert!(unconfirmed.too_many().is_some());
+        assert!(!unconfirmed.may_be_dropped(5), "dropped before");
+        assert!(unconfirmed.may_be_dropped(6));
+        unconfirmed.give_up();
+        unconfirmed.sent(sync(), 6);
+        unconfirmed.sent(sync(), 7);
+        assert!(unconfirmed.may_be_dropped(7), "between the two");
+    }
+
     #[test]
     fn a_frame_is_an_echo_once() {
         let mut unconfirmed = Unconfirmed::new(2);
-        unconfirmed.sent(sync());
+        unconfirmed.sent(sync(), 0);
         assert!(!unconfirmed.take_echo(&set_point(1)), "never sent");
         assert!(unconfirmed.take_echo(&sync()));
         assert!(!unconfirmed.take_echo(&sync()), "another master's");
@@ -121,12 +155,12 @@ mod tests {
     #[test]
     fn the_echo_of_a_frame_that_was_given_up_is_recognized() {
         let mut unconfirmed = Unconfirmed::new(2);
-        (0..100).for_each(|number| unconfirmed.sent(set_point(number)));
-        unconfirmed.sent(sync());
-        unconfirmed.sent(sync());
+        (0..100).for_each(|number| unconfirmed.sent(set_point(number), 0));
+        unconfirmed.sent(sync(), 0);
+        unconfirmed.sent(sync(), 0);
         unconfirmed.give_up();
         assert_eq!(unconfirmed.too_many(), None);
-        unconfirmed.sent(set_point(200));
+        unconfirmed.sent(set_point(200), 0);
         assert!(unconfirmed.take_echo(&set_point(99)));
         assert!(!unconfirmed.take_echo(&set_point(1)), "long ago");
         assert!(unconfirmed.take_echo(&set_point(200)));
@@ -136,8 +170,8 @@ mod tests {
     #[test]
     fn echoes_may_pass_one_another() {
         let mut unconfirmed = Unconfirmed::new(2);
-        (0..3).for_each(|number| unconfirmed.sent(set_point(number)));
-        unconfirmed.sent(sync());
+        (0..3).for_each(|number| unconfirmed.sent(set_point(number), 0));
+        unconfirmed.sent(sync(), 0);
         assert!(unconfirmed.take_echo(&sync()));
         assert_eq!(unconfirmed.too_many(), None);
         for number in [1, 0] {
@@ -151,11 +185,11 @@ mod tests {
     fn a_lost_echo_hides_another_masters_frame_for_two_cycles_at_most() {
         for (cycles, is_echo) in [(1, true), (2, false)] {
             let mut unconfirmed = Unconfirmed::new(2);
-            unconfirmed.sent(set_point(7));
-            unconfirmed.sent(set_point(8));
+            unconfirmed.sent(set_point(7), 0);
+            unconfirmed.sent(set_point(8), 0);
             assert!(unconfirmed.take_echo(&set_point(8)), "that of 7 is lost");
             for _ in 0..cycles {
-                unconfirmed.sent(sync());
+                unconfirmed.sent(sync(), 0);
                 assert!(unconfirmed.take_echo(&sync()));
             }
             assert_eq!(unconfirmed.take_echo(&set_point(7)), is_echo, "{cycles}");
