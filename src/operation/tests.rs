@@ -324,6 +324,17 @@ fn a_bench_that_falls_silent_is_missed_by_both_drives() {
     assert_eq!(bench.travel(), (0.0, 0.0));
 }
 
+/// A drive may have missed an earlier bench, and have said so twice before it was brought up.
+#[test]
+fn a_drive_that_repeats_an_earlier_message_is_heard_to_miss_the_bench() {
+    let mut bench = Bench::new(&config(&[]), Operation::Prove);
+    let missed = Frame::new(0x82, &[0x30, 0x81, 0x11, 127, 0, 0, 0, 0]);
+    for _ in 0..2 {
+        bench.operation.handle(bench.now, Input::Frame(missed));
+    }
+    assert_eq!(bench.run(), Outcome::Completed);
+}
+
 /// By 6007 = 0 its emergency message is all that it does.
 #[test]
 fn a_drive_that_misses_the_bench_and_goes_on_is_named() {

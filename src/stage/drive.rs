@@ -316,6 +316,11 @@ impl Drive {
         count.is_power_of_two()
     }
 
+    /// Makes the next emergency message the first, although it may repeat an earlier one.
+    pub(super) fn expect_news(&mut self) {
+        self.emcy.1 = 0;
+    }
+
     /// Fixes zero, scale and target: from here on the drive follows its target.
     ///
     /// # Errors

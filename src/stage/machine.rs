@@ -292,6 +292,9 @@ impl Stage {
     /// [`quick_stop`](Self::quick_stop) stops the axes.
     pub fn fall_silent(&mut self) {
         self.faulted = true;
+        for axis in Axis::BOTH {
+            self.drives[axis].expect_news();
+        }
         self.heartbeat =
             HeartbeatProducer::new(self.config.bus.bench_node, Duration::ZERO, Time::NEVER);
     }
