@@ -172,8 +172,12 @@ impl Insert {
 
     /// Tells the observers what was measured until `time`. An error is the reason to stop for.
     fn correct(&mut self, time: Time) -> Result<(), String> {
-        for measurement in self.untold.drain(..) {
-            self.estimation.take(&measurement, &self.history)?;
+        let untold = std::mem::take(&mut self.untold);
+        for same_time in untold.chunk_by(|a, b| a.acquisition_time == b.acquisition_time) {
+            // Positions that are received at once are dated the same. The last is the newest.
+            if let Some(newest) = same_time.last() {
+                self.estimation.take(newest, &self.history)?;
+            }
         }
         self.estimation.carry_to(time - self.config.tracker.hold.after, &self.history)
     }

@@ -3,7 +3,7 @@
 use crate::canopen::Frame;
 use crate::config::Config;
 use crate::emulator::{StageOutput, VirtualStage};
-use crate::session::{Input, Machine, Output, Record, Session};
+use crate::session::{Input, Machine, Output, Record, Session, StepRecord};
 use crate::tracker::{Event, Sample, Validity};
 use crate::units::Time;
 use nalgebra::Vector3;
@@ -18,9 +18,12 @@ struct Bench {
     tip_mm: Vector3<f64>,
     next_sample: Time,
     samples: u32,
+    /// Each position is received together with one from before, which is so far behind, mm.
+    behind_mm: Option<f64>,
     /// RPDO1 and SDO requests do not reach the insertion drive.
     is_deaf: bool,
     events: Vec<String>,
+    steps: Vec<StepRecord>,
 }
 
 impl Bench {
@@ -36,8 +39,10 @@ impl Bench {
             tip_mm: Vector3::zeros(),
             next_sample: Time::NEVER,
             samples: 0,
+            behind_mm: None,
             is_deaf: false,
             events: Vec::new(),
+            steps: Vec::new(),
         }
     }
 
@@ -52,6 +57,7 @@ impl Bench {
                         }
                     }
                     Output::Record(Record::Event { text, .. }) => self.events.push(text),
+                    Output::Record(Record::Step(step)) => self.steps.push(*step),
                     Output::Record(_) => {}
                 }
             }
@@ -70,22 +76,29 @@ impl Bench {
         let due = self.session.deadline().min(self.stage.deadline());
         self.now = self.now.max(due.min(self.next_sample));
         self.stage.handle_timeout(self.now);
-        let input = if self.now < self.next_sample {
-            Input::Tick
+        if self.now < self.next_sample {
+            self.session.handle(self.now, Input::Tick);
         } else {
             self.next_sample = self.now + Duration::from_millis(25);
-            self.samples += 1;
-            Input::Tracker(Event::Sample(Sample {
-                tool: self.tool.clone(),
-                receive_time: self.now,
-                source_unix_ns: None,
-                position_mm: self.tip_mm + Vector3::z() * 1e-3 * f64::from(self.samples % 7),
-                orientation: None,
-                validity: Validity::Valid,
-            }))
-        };
-        self.session.handle(self.now, input);
+            for behind_mm in self.behind_mm.into_iter().chain([0.0]) {
+                let sample = self.sample(behind_mm);
+                self.session.handle(self.now, Input::Tracker(Event::Sample(sample)));
+            }
+        }
         self.settle();
+    }
+
+    fn sample(&mut self, behind_mm: f64) -> Sample {
+        self.samples += 1;
+        let ahead_mm = 1e-3 * f64::from(self.samples % 7) - behind_mm;
+        Sample {
+            tool: self.tool.clone(),
+            receive_time: self.now,
+            source_unix_ns: None,
+            position_mm: self.tip_mm + Vector3::z() * ahead_mm,
+            orientation: None,
+            validity: Validity::Valid,
+        }
     }
 
     fn run_until(&mut self, event: &str) {
@@ -151,6 +164,21 @@ fn a_start_in_doubt_that_is_good_begins_although_the_tip_times_out() {
     for phase_ms in [150, 153, 157] {
         let begun = seen_at(refused_mm, refused_mm - 2.0, phase_ms);
         assert!(begun.is_ok(), "{phase_ms} ms: {begun:?}");
+    }
+}
+
+/// The stamp of receipt is right for the last of them, and too late for the others.
+#[test]
+fn of_positions_that_are_received_at_once_the_last_corrects() {
+    let mut bench = Bench::new(&["insertion.depth_mm=10", "insertion.plane_out_of_reach=insert"]);
+    bench.next_sample = Time::ZERO;
+    bench.behind_mm = Some(0.5);
+    while bench.steps.len() < 3 {
+        bench.step();
+    }
+    for step in &bench.steps {
+        let tip_mm = step.tip_meas_mm.expect("a position");
+        assert!(tip_mm.z >= 0.0, "{tip_mm}, 0.5 mm behind");
     }
 }
 
