@@ -19,8 +19,11 @@ const CURVATURE_SLACK: f64 = 0.05;
 impl Replanner {
     /// A path that is found without a search.
     pub(super) fn known(&mut self, last: Option<&Path>) -> Option<Path> {
-        let mended = |this: &mut Self| this.mended(last?);
-        let known = self.direct().or_else(|| mended(self)).or_else(|| self.nearly_direct());
+        let direct = self.direct();
+        // Where one arc is too long, several may be short enough.
+        let short = direct.clone().filter(|path| path.length_mm() <= self.problem.length_max_mm);
+        let known = short.or_else(|| self.mended(last?)).or(direct);
+        let known = known.or_else(|| self.nearly_direct());
         known.or_else(|| self.continued(last?)).or_else(|| self.rejoined())
     }
 

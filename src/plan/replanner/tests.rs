@@ -280,6 +280,32 @@ fn a_start_from_which_the_path_is_too_long_is_refused() {
     assert!(why.contains("takes 120 mm at least, allowed are 118"), "{why}");
 }
 
+/// One arc to the target is 128.7 mm long, and a sharper one with a straight after it 127 mm.
+#[test]
+fn one_arc_that_is_too_long_does_not_replace_a_path_that_is_not() {
+    let world = world(vec![]);
+    let problem = Problem { length_max_mm: 127.5, ..problem([0.0, 40.0, 120.0], true) };
+    let path = plan(&world, &problem).path;
+    assert!(path.is_some(), "it is short enough");
+    let mut planner = Replanner::new(world, problem.clone(), 0.0, path);
+    let mut needle = Simulated::new(RADIUS_MM);
+    for step in 0..100 {
+        let estimate = Estimate {
+            tip: needle.tip,
+            curvature_per_mm: problem.curvature_per_mm,
+            position_sd_mm: 0.05,
+            heading_sd_rad: 0.001,
+        };
+        let inserted_mm = if step == 0 { 0.0 } else { STEP_MM };
+        let Step::Steer(steer) = planner.step(&estimate, inserted_mm, STEP_MM) else {
+            panic!("no path at {step} mm");
+        };
+        let end_mm = f64::from(step) * STEP_MM + steer.left_mm;
+        assert!(end_mm <= problem.length_max_mm, "{end_mm} mm");
+        needle.step(&steer, RADIUS_MM);
+    }
+}
+
 /// The insertion may end a little deeper than it was to: then there is no way left, and none backwards.
 #[test]
 fn beyond_the_longest_path_nothing_leads_back() {
