@@ -123,6 +123,22 @@ fn study(config: &Config, reader: &mut Reader) {
             "{depth} or {obstacles} is given, without effect since {kind} is \"plane\": set it to \"target\""
         )
     });
+    let [moves, tool] = ["study.target_move_mm", "goal.tool"];
+    let is_still = study.target_move_mm.is_some() && config.goal.tool.is_none();
+    reader.check(&[moves, tool], is_still, || {
+        format!("{moves} has no effect without {tool}: name the tool that is the target")
+    });
+    let least_mm = match study.target_depth_mm {
+        Some([low, _]) => low,
+        None => config.goal.position_mm.map_or(f64::INFINITY, |target_mm| target_mm.norm()),
+    };
+    let [_, move_mm] = study.target_move_mm.unwrap_or_default();
+    reader.check(&[moves, depth, "goal.position_mm"], move_mm > least_mm, || {
+        format!(
+            "{moves} reaches {move_mm}, allowed: up to the least distance of the target from the start, \
+             {least_mm} mm; it would move faster than the needle"
+        )
+    });
     let or_emulated = |drawn: Option<[f64; 2]>, key: &str| {
         drawn.unwrap_or_else(|| [config.number(&format!("emulator.torsion.{key}")); 2])
     };

@@ -4,7 +4,7 @@ use super::pose::{POSITION, TIP_PITCH};
 use super::{Config, ConfigError, GoalKind, WorkspaceConfig};
 use crate::emulator::counted;
 use crate::geometry::TURN;
-use crate::keys::{Field, Key, over, section, within};
+use crate::keys::{Field, Key, Words, find, over, section, within};
 use crate::math;
 use crate::needle::{HALF_WIDTH, HALF_WIDTH_PER_MM, OFFSET};
 use crate::study::Prior;
@@ -88,8 +88,10 @@ impl Config {
     /// torsion drawn from `[study]`, and the seed of the noise.
     ///
     /// # Errors
-    /// [`ConfigError`] if `[study]` leaves no room for an obstacle.
+    /// [`ConfigError`] if `[study]` leaves no room for an obstacle, or may draw a value that its key does not
+    /// allow.
     pub fn drawn(&self, seed: u64) -> Result<Config, ConfigError> {
+        self.check_relative()?;
         let mut written = self.written.clone();
         let emulator = &mut written["emulator"];
         // Each range has its own number, so a range that is declared after the others changes none of them.
@@ -125,6 +127,39 @@ impl Config {
             }
         }
         Ok(Config::of(written))
+    }
+
+    /// Checks that no relative error takes a value out of the range of its key: the record of such a run could
+    /// not be read. This is not checked as the configuration is read, since a drawn one has both the error and
+    /// what it was drawn to.
+    fn check_relative(&self) -> Result<(), ConfigError> {
+        let (study, emulator) = (&self.study, &self.emulator);
+        let creep = [emulator.torsion.creep_mm, emulator.torsion.creep_mm_per_mm];
+        let curvature_per_mm = emulator.arc.curvature_per_mm();
+        for (error, range, key, emulated) in [
+            (
+                "curvature_error",
+                study.curvature_error,
+                "emulator.curvature_per_mm",
+                curvature_per_mm,
+            ),
+            ("creep_error", study.creep_error, "emulator.torsion.creep_mm", creep[0]),
+            ("creep_error", study.creep_error, "emulator.torsion.creep_mm_per_mm", creep[1]),
+        ] {
+            let (Some([low, high]), Some(key_of)) = (range, find(Config::KEYS, key)) else {
+                continue;
+            };
+            let allowed = key_of.kind.range(&key_of.rule);
+            for drawn in [low, high].map(|error| emulated * (1.0 + error)) {
+                if allowed.is_some_and(|allowed| !allowed.contains(drawn)) {
+                    return Err(ConfigError::of(format!(
+                        "study.{error} = [{low}, {high}] may draw {key} = {drawn}, allowed: {}",
+                        Words::of_key(&key_of).allowed
+                    )));
+                }
+            }
+        }
+        Ok(())
     }
 
     /// Draws how the target of the trial with this seed moves, mm per mm.

@@ -218,6 +218,23 @@ fn noise_that_lasts_longer_than_the_run() {
     );
 }
 
+#[test]
+fn a_target_that_does_not_move_or_moves_faster_than_the_needle() {
+    let moves = "study.target_move_mm=[1, 30]";
+    assert_eq!(
+        set_refusal(&[moves]),
+        "--set study.target_move_mm has no effect without goal.tool: name the tool that is the target"
+    );
+    let target = ["goal.kind=target", "goal.tool=Target", "goal.position_mm=[0, 0, 90]", moves];
+    assert!(load("", &target).is_ok());
+    let near = [&["study.target_depth_mm=[20, 90]"], &target[..]].concat();
+    assert_eq!(
+        set_refusal(&near),
+        "--set study.target_move_mm reaches 30, allowed: up to the least distance of the target from the \
+         start, 20 mm; it would move faster than the needle"
+    );
+}
+
 /// Only a path to a target goes around them.
 #[test]
 fn obstacles_on_the_way_into_the_plane() {

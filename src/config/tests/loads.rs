@@ -286,6 +286,33 @@ fn trials_are_drawn_by_their_seed() {
     assert_ne!(wide.drawn(1).unwrap().emulator, wide.drawn(2).unwrap().emulator);
 }
 
+/// The record of a trial can be read, whatever is drawn; ranges whose ends a key does not allow are refused.
+#[test]
+fn what_a_trial_draws_is_allowed_by_its_key() {
+    let curved = ["emulator.radius_mm=20", "study.curvature_error=[-0.5, 1.0]"];
+    let creep = ["emulator.torsion.creep_mm=50", "study.creep_error=[0.0, 1.0]"];
+    for sets in [curved, creep] {
+        let config = loaded("", &sets);
+        for seed in 0..50 {
+            let drawn = config.drawn(seed).unwrap();
+            assert_eq!(loaded(&drawn.to_toml().unwrap(), &[]), drawn);
+        }
+    }
+    for (sets, said) in [
+        (
+            [curved[0], "study.curvature_error=[-0.5, 1.5]"],
+            "study.curvature_error = [-0.5, 1.5] may draw emulator.curvature_per_mm = 0.125, allowed: \
+             0.00001 to 0.1 per mm",
+        ),
+        (
+            [creep[0], "study.creep_error=[0, 1.5]"],
+            "study.creep_error = [0, 1.5] may draw emulator.torsion.creep_mm = 125, allowed: 0 to 100 mm",
+        ),
+    ] {
+        assert_eq!(loaded("", &sets).drawn(1).expect_err("refused").to_string(), said);
+    }
+}
+
 /// Each constant of a creeping shaft is drawn by itself.
 #[test]
 fn the_two_constants_of_creep_are_drawn_apart() {
