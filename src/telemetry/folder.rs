@@ -2,8 +2,11 @@
 
 use super::TelemetryError;
 use crate::archive::{Manifest, compact, file};
+use nix::errno::Errno;
+use nix::fcntl::{FcntlArg, fcntl};
+use nix::libc::{F_UNLCK, F_WRLCK, SEEK_SET, flock};
 use nix::sys::statvfs::statvfs;
-use std::fs::{self, File, OpenOptions, TryLockError};
+use std::fs::{self, File, OpenOptions};
 use std::io::ErrorKind::{AlreadyExists, InvalidInput, Unsupported};
 use std::io::{self, Write as _};
 use std::os::unix::fs::MetadataExt;
@@ -92,6 +95,11 @@ pub(super) fn is_at(file: &File, path: &Path) -> io::Result<()> {
     Err(io::Error::other("another file has taken its place"))
 }
 
+/// A write lock on a whole file. It belongs to the file as it was opened (F_OFD_SETLK), and unlike that of
+/// `File::try_lock` it can be looked for without being taken.
+const WRITE_LOCK: flock =
+    flock { l_type: F_WRLCK as i16, l_whence: SEEK_SET as i16, l_start: 0, l_len: 0, l_pid: 0 };
+
 /// Marks the run folder `dir` as being written while the returned file is open, by a lock on its
 /// configuration. `None` if another process holds the lock. On a file system without locks nothing is
 /// marked.
@@ -102,16 +110,19 @@ pub fn lock(dir: &Path) -> Result<Option<File>, TelemetryError> {
     let path = dir.join(file::CONFIG);
     let opened = OpenOptions::new().read(true).write(true).open(&path);
     let config = opened.map_err(TelemetryError::file(&path))?;
-    Ok(match config.try_lock() {
-        Err(TryLockError::WouldBlock) => None,
-        Ok(()) | Err(TryLockError::Error(_)) => Some(config),
+    Ok(match fcntl(&config, FcntlArg::F_OFD_SETLK(&WRITE_LOCK)) {
+        Err(Errno::EAGAIN | Errno::EACCES) => None,
+        _ => Some(config),
     })
 }
 
-/// True if another process holds the lock of the run folder `dir`.
+/// True if another process holds the lock of the run folder `dir`. Nothing is locked to find that out: a run
+/// that begins would not get its lock.
 pub fn is_being_written(dir: &Path) -> bool {
-    let config = File::open(dir.join(file::CONFIG));
-    config.is_ok_and(|config| matches!(config.try_lock_shared(), Err(TryLockError::WouldBlock)))
+    let Ok(config) = File::open(dir.join(file::CONFIG)) else { return false };
+    let mut found = WRITE_LOCK;
+    let looked = fcntl(&config, FcntlArg::F_OFD_GETLK(&mut found));
+    looked.is_ok() && i32::from(found.l_type) != F_UNLCK
 }
 
 /// With less than this, some seconds of a run, a disk counts as full.
@@ -172,6 +183,9 @@ fn free_bytes(path: &Path) -> io::Result<Option<u64>> {
 mod tests {
     use super::*;
     use crate::telemetry::tests::Scratch;
+    use std::sync::atomic::AtomicBool;
+    use std::sync::atomic::Ordering::Relaxed;
+    use std::thread;
 
     #[test]
     fn a_folder_is_never_given_twice() {
@@ -207,6 +221,28 @@ mod tests {
         assert!(held.is_some() && lock(&scratch.0).unwrap().is_none());
         drop(held);
         assert!(lock(&scratch.0).unwrap().is_some());
+    }
+
+    /// A run gets its lock however often others look whether there is one.
+    #[test]
+    fn looking_for_a_lock_takes_none() {
+        let scratch = Scratch::new("look");
+        fs::write(scratch.0.join(file::CONFIG), "").unwrap();
+        let is_over = AtomicBool::new(false);
+        thread::scope(|scope| {
+            scope.spawn(|| {
+                while !is_over.load(Relaxed) {
+                    is_being_written(&scratch.0);
+                }
+            });
+            let refused = (0..20_000).filter(|_| lock(&scratch.0).unwrap().is_none()).count();
+            is_over.store(true, Relaxed);
+            assert_eq!(refused, 0);
+        });
+        let held = lock(&scratch.0).unwrap();
+        assert!(is_being_written(&scratch.0));
+        drop(held);
+        assert!(!is_being_written(&scratch.0));
     }
 
     #[test]
