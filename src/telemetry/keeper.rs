@@ -113,6 +113,7 @@ fn is_in_place((path, file): &Kept) -> Result<(), TelemetryError> {
 
 impl Sink for Folder {
     type Item = Box<Manifest>;
+    const ITEMS: &'static str = "manifests";
     /// Each check syncs one of the five text files, so a loss of power costs 1.25 s.
     const TICK: Duration = Duration::from_millis(250);
 
@@ -196,6 +197,21 @@ mod tests {
             assert!(refused.to_string().ends_with(replaced), "{refused}");
         }
         assert_eq!(fs::read_to_string(dir.join(file::MANIFEST)).unwrap(), "another's");
+    }
+
+    #[test]
+    fn a_manifest_that_is_dropped_is_called_one() {
+        let scratch = Scratch::new("keeper-dropped");
+        let (mut keeper, _) = keep(scratch.0.clone(), Vec::new()).unwrap();
+        while keeper.dropped == 0 {
+            keeper.give(Box::default());
+        }
+        let news = std::iter::from_fn(|| keeper.news(Instant::now()));
+        let said: Vec<String> = news.map(|news| format!("{news:?}")).collect();
+        assert!(
+            said.concat().contains("run folder: 1 manifests lost, its queue is full"),
+            "{said:?}"
+        );
     }
 
     #[test]

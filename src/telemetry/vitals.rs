@@ -93,22 +93,24 @@ enum Health {
 #[derive(Debug)]
 pub(super) struct Watch {
     writer: &'static str,
+    /// The items that it takes.
+    items: &'static str,
     silence: Silence,
     /// The health that was reported.
     health: Health,
-    /// Lost records that were reported, and when.
+    /// Lost items that were reported, and when.
     dropped: u64,
     drops_told: Option<Instant>,
 }
 
 impl Watch {
-    /// Watches `writer` from `now` on.
-    pub(super) fn new(writer: &'static str, now: Instant) -> Self {
+    /// Watches `writer`, which takes `items`, from `now` on.
+    pub(super) fn new(writer: &'static str, items: &'static str, now: Instant) -> Self {
         let (silence, health) = (Silence::new(0, now), Health::Alive);
-        Watch { writer, silence, health, dropped: 0, drops_told: None }
+        Watch { writer, items, silence, health, dropped: 0, drops_told: None }
     }
 
-    /// The next change by `now`, with `dropped` records lost to its queue so far. Call it until it returns
+    /// The next change by `now`, with `dropped` items lost to its queue so far. Call it until it returns
     /// `None`.
     pub(super) fn look(
         &mut self,
@@ -153,13 +155,13 @@ impl Watch {
         }
         let more = dropped - mem::replace(&mut self.dropped, dropped);
         let is_first = self.drops_told.replace(now).is_none();
-        let writer = self.writer;
+        let (writer, items) = (self.writer, self.items);
         if is_first && self.health < Health::GivenUp {
             return Some(RecordNews::Failed(TelemetryError::Recording(format!(
-                "{writer}: {dropped} records lost, its queue is full; is the disk too slow for this run?"
+                "{writer}: {dropped} {items} lost, its queue is full; is the disk too slow for this run?"
             ))));
         }
-        let text = format!("{writer}: {more} records more are lost, {dropped} in all");
+        let text = format!("{writer}: {more} {items} more are lost, {dropped} in all");
         Some(RecordNews::Warning(text))
     }
 }
@@ -181,7 +183,7 @@ mod tests {
             let now = Instant::now();
             Watched {
                 vitals: Vitals::default(),
-                watch: Watch::new("text files", now),
+                watch: Watch::new("text files", "records", now),
                 now,
                 every_ms,
             }

@@ -30,6 +30,8 @@ const WARN_AFTER: Duration = Duration::from_secs(3);
 pub(super) trait Sink: 'static {
     /// The items that it takes.
     type Item: Send + 'static;
+    /// Those items in messages.
+    const ITEMS: &'static str = "records";
     /// Interval of [`Sink::tick`].
     const TICK: Duration;
     /// Takes one item.
@@ -105,7 +107,7 @@ impl<T: Send + 'static> Worker<T> {
         let (opened_tx, opened) = channel();
         let (done_tx, done) = channel();
         let vitals = Arc::new(Vitals::default());
-        let watch = Watch::new(writer, Instant::now());
+        let watch = Watch::new(writer, S::ITEMS, Instant::now());
         let of_thread = Arc::clone(&vitals);
         let run = move || {
             let sink = open();
