@@ -161,17 +161,20 @@ fn when(line: &Line) -> (bool, &str, &str) {
 /// if one was judged invalid.
 fn exclude_copies(lines: &mut [Line]) {
     let is_invalid = |line: &Line| matches!(line.excluded, Some((Exclusion::Invalid, _)));
-    // All runs without a frame have the same seal.
-    let seal = |run: &Folder| {
-        let seal = run.manifest.files.get(file::CAN)?;
-        (seal.bytes > 0).then(|| seal.sha256.clone())
-    };
     // A copy may be older than the verdict, so the runs judged invalid come first.
     let (first, rest): (Vec<&mut Line>, Vec<&mut Line>) =
         lines.iter_mut().partition(|line| is_invalid(line));
-    exclude_equal(first.into_iter().chain(rest), seal, |first| {
-        (Exclusion::Copy, format!("the record in {first}"))
-    });
+    exclude_equal(
+        first.into_iter().chain(rest),
+        |run| seal(run, file::CAN),
+        |first| (Exclusion::Copy, format!("the record in {first}")),
+    );
+}
+
+/// The seal of the file `name`; none of an empty one, since those of all runs are equal.
+fn seal(run: &Folder, name: &str) -> Option<String> {
+    let seal = run.manifest.files.get(name).filter(|seal| seal.bytes > 0)?;
+    Some(seal.sha256.clone())
 }
 
 /// Emulated runs with the same steps, or without a step with the same tip positions, are one insertion,
@@ -182,9 +185,9 @@ fn exclude_repeats(lines: &mut [Line], by: Option<&str>) {
     let insertion = |run: &Folder| {
         let has_steps = run.manifest.counts.is_some_and(|counts| counts.steps > 0);
         let file = if has_steps { file::STEPS } else { file::TRACKER };
-        let seal = run.manifest.files.get(file).filter(|_| run.is_emulated())?;
+        let seal = seal(run, file).filter(|_| run.is_emulated())?;
         let value = by.and_then(|key| run.keys().ok()?.remove(key));
-        Some((seal.sha256.clone(), value))
+        Some((seal, value))
     };
     exclude_equal(counted, insertion, |first| {
         (Exclusion::Repeat, format!("as {first}: same seed, same tip positions"))
@@ -387,7 +390,8 @@ mod tests {
         assert!(text.contains("reached     1 of 3, 33 % "), "{text}");
     }
 
-    /// Two runs without a step are two where their tip positions are.
+    /// Two runs without a step are two where their tip positions are; without a position nothing says that
+    /// they are one.
     #[test]
     fn runs_without_a_step_are_told_apart_by_their_tip_positions() {
         let waiting = |n, positions: &'static [u8]| {
@@ -398,6 +402,8 @@ mod tests {
             })
         };
         let entries = vec![waiting(0, b"seed 1"), waiting(1, b"seed 2"), waiting(2, b"seed 1")];
+        assert_eq!(Campaign::of(entries, None).unwrap().counted(), 2);
+        let entries = vec![waiting(0, b""), waiting(1, b"")];
         assert_eq!(Campaign::of(entries, None).unwrap().counted(), 2);
     }
 
