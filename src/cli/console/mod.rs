@@ -17,7 +17,7 @@ use super::ending::folder_bytes;
 use super::output::plain;
 use crate::config::Config;
 use crate::runtime::{Interrupt, Operator};
-use crate::session::{Lane, OperatorCommand, Progress, Record, Severity};
+use crate::session::{Input, Lane, OperatorCommand, Progress, Record, Severity};
 use crate::units::Time;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use ratatui::Terminal;
@@ -199,6 +199,7 @@ impl Operator for Console {
                 | Record::Stage(_)
                 | Record::Step(_)
                 | Record::State { .. }
+                | Record::Input { input: Input::Operator(_), .. }
         );
         if is_shown {
             self.send(Message::Record(record.clone()));

@@ -6,7 +6,7 @@ use crate::canopen::{Frame, NodeId, cob};
 use crate::config::Config;
 use crate::geometry::coordinates;
 use crate::session::{
-    Approach, Direction, Lane, Progress, Record, SampleRecord, Severity, State, StepRecord,
+    Approach, Direction, Input, Lane, Progress, Record, SampleRecord, Severity, State, StepRecord,
 };
 use crate::stage::Axis;
 use crate::tracker::GateName;
@@ -76,8 +76,10 @@ pub(super) struct Screen {
     /// The answer to the operator's last command, unless it is the reason of the state.
     pub(super) answer: String,
     is_held: bool,
-    /// The tracker has held the insertion, and its reason comes next.
-    is_reason_due: bool,
+    /// The insertion is held, and the next event of this lane says why.
+    reason_due: Option<Lane>,
+    /// The operator has asked for something, and the next event of the session answers it.
+    is_answer_due: bool,
     /// x, y, z in mm and yaw, pitch, roll in rad, with their standard deviations.
     pub(super) pose: Option<([f64; 6], Option<[f64; 6]>)>,
     /// How far it is to the target; empty without one.
@@ -131,6 +133,7 @@ impl Screen {
                 }
             }
             Record::State { state, .. } => self.take_state(*state),
+            Record::Input { input: Input::Operator(_), .. } => self.is_answer_due = true,
             _ => {}
         }
     }
@@ -149,7 +152,12 @@ impl Screen {
             _ => {}
         }
         if state.lane() == Lane::Session {
-            self.is_reason_due = state == State::Holding;
+            self.reason_due = match state {
+                State::Holding => Some(Lane::Tracker),
+                // An insertion that begins held was asked for that before.
+                State::HeldByOperator if self.is_answer_due => Some(Lane::Session),
+                _ => None,
+            };
             self.is_held = state.is_held();
         }
     }
@@ -215,20 +223,21 @@ impl Screen {
             self.faults += 1;
             self.alarm();
         }
-        // The first fault explains the end, and the first warning of the tracker its hold: nothing that is
-        // said meanwhile does.
-        let is_hold = text.starts_with("operator: hold ") && severity == Severity::Info;
+        // The first fault explains the end, and the first warning of the tracker or the answer to the operator
+        // a hold: nothing that is said meanwhile does.
+        let is_answer = lane == Lane::Session && mem::take(&mut self.is_answer_due);
         let is_of_tracker = lane == Lane::Tracker && severity == Severity::Warning;
+        let is_reason = self.reason_due == Some(lane) && (is_answer || is_of_tracker);
+        if is_reason {
+            self.reason_due = None;
+        }
         let explains = match severity {
             Severity::Fault => self.faults == 1,
-            _ => {
-                let is_why = is_of_tracker && (!self.is_held || mem::take(&mut self.is_reason_due));
-                self.faults == 0 && (is_hold || is_why)
-            }
+            _ => self.faults == 0 && (is_reason || is_of_tracker && !self.is_held),
         };
         if explains {
             self.why = text.to_owned();
-        } else if text.starts_with("operator: ") {
+        } else if is_answer {
             self.answer = text.to_owned();
         }
     }

@@ -98,10 +98,17 @@ fn inserted() -> Screen {
     screen
 }
 
+/// The operator asks for something.
+fn ask(screen: &mut Screen, s: f64, command: OperatorCommand) {
+    screen.take(&Record::Input { time: at(s), input: Input::Operator(command) });
+}
+
 fn held() -> Screen {
     let mut screen = inserted();
     screen.progress.state = State::HeldByOperator;
     screen.progress.to_go_s = None;
+    ask(&mut screen, 20.0, OperatorCommand::Hold);
+    screen.take(&Record::State { time: at(20.0), state: State::HeldByOperator });
     screen.event(at(20.0), Lane::Session, Severity::Info, "operator: hold at 39.98 mm");
     screen
 }

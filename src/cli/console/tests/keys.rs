@@ -74,7 +74,9 @@ fn a_speed_at_its_limit_is_refused_on_the_screen() {
         *lock(&shared.screen) = inserted();
         lock(&shared.screen).progress.speed_mm_per_s = speed_mm_per_s;
         Keys::default().take(key, &shared, &mut orders);
-        assert_eq!(commands.pop().expect("a command").to_string(), asked);
+        let command = commands.pop().expect("a command");
+        assert_eq!(command.to_string(), asked);
+        ask(&mut lock(&shared.screen), 20.0, command);
         let refused = format!("operator: {asked} refused: allowed: over 0 and up to 2 mm/s");
         lock(&shared.screen).event(at(20.0), Lane::Session, Severity::Warning, &refused);
         for size in [(80, 24), (120, 3)] {

@@ -13,6 +13,7 @@ fn the_reason_of_a_hold_stays_on_the_screen() {
     screen.event(at(20.0), Lane::Tracker, Severity::Warning, why);
     screen.event(at(21.0), Lane::Tracker, Severity::Warning, "3 samples refused");
     let refused = "operator: resume refused: no fresh tip";
+    ask(&mut screen, 22.0, OperatorCommand::Resume);
     screen.event(at(22.0), Lane::Session, Severity::Warning, refused);
     assert_eq!((screen.why.as_str(), screen.answer.as_str()), (why, refused));
     screen.take(&Record::State { time: at(23.0), state: State::Inserting });
@@ -20,8 +21,35 @@ fn the_reason_of_a_hold_stays_on_the_screen() {
     let fault = "stage: rotation: drive in fault";
     screen.event(at(24.0), Lane::Session, Severity::Fault, fault);
     screen.event(at(24.1), Lane::Tracker, Severity::Warning, "connection lost");
+    ask(&mut screen, 24.2, OperatorCommand::Hold);
     screen.event(at(24.2), Lane::Session, Severity::Info, "operator: hold at 40.00 mm");
     assert_eq!(screen.why, fault);
+}
+
+/// A hold by the operator is explained by the answer to it, however that is worded, and by no later one.
+#[test]
+fn the_operators_hold_is_told_by_what_was_asked_for() {
+    let mut screen = inserted();
+    let info = |screen: &mut Screen, text| {
+        screen.event(at(20.0), Lane::Session, Severity::Info, text);
+        (screen.why.clone(), screen.answer.clone())
+    };
+    ask(&mut screen, 20.0, OperatorCommand::Hold);
+    screen.take(&Record::State { time: at(20.0), state: State::HeldByOperator });
+    let (why, answer) = info(&mut screen, "stands at 40 mm");
+    assert_eq!((why.as_str(), answer.as_str()), ("stands at 40 mm", ""));
+    ask(&mut screen, 21.0, OperatorCommand::Hold);
+    let (why, answer) = info(&mut screen, "operator: hold is not needed");
+    assert_eq!(
+        (why.as_str(), answer.as_str()),
+        ("stands at 40 mm", "operator: hold is not needed")
+    );
+    // An insertion that begins held.
+    let mut screen = Screen::new(setup());
+    ask(&mut screen, 20.0, OperatorCommand::Hold);
+    info(&mut screen, "operator: hold: the insertion will begin held");
+    screen.take(&Record::State { time: at(20.0), state: State::HeldByOperator });
+    assert_eq!(info(&mut screen, "operator: speed 1.000 mm/s").0, "");
 }
 
 /// Of two drives in trouble the newest message is shown.
