@@ -39,14 +39,45 @@ pub(super) fn covariance(
 ) -> Matrix6<f64> {
     let mut p = Matrix6::zeros();
     (0..3).for_each(|i| p[(i, i)] = position_sd_mm.powi(2));
-    // As at pitch 0: yaw and pitch turn about the x and y axes of a tip without roll. At another pitch a turn by
-    // yaw is smaller about x, and a part of it is roll; both are left out.
+    // Yaw turns about the x axis of a tip without pitch and roll, pitch about the y axis of one without roll. At
+    // another pitch a part of yaw is roll.
     let (sin, cos) = math::sin_cos(angles.roll);
-    let (yaw, pitch) = (sd.yaw.powi(2), sd.pitch.powi(2));
+    let (sin_pitch, cos_pitch) = math::sin_cos(angles.pitch);
+    let [across, along] = [sd.yaw * cos_pitch, sd.yaw * sin_pitch];
+    let (yaw, pitch) = (across.powi(2), sd.pitch.powi(2));
     p[(3, 3)] = cos * cos * yaw + sin * sin * pitch;
     p[(4, 4)] = sin * sin * yaw + cos * cos * pitch;
     p[(3, 4)] = sin * cos * (pitch - yaw);
-    p[(4, 3)] = p[(3, 4)];
-    p[(5, 5)] = sd.roll * sd.roll;
+    p[(3, 5)] = cos * across * along;
+    p[(4, 5)] = -sin * across * along;
+    p[(5, 5)] = sd.roll * sd.roll + along * along;
+    p.fill_lower_triangle_with_upper_triangle();
     p
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Pose;
+    use nalgebra::Matrix3;
+
+    /// Against the turns of the tip by a small change of each angle.
+    #[test]
+    fn the_angles_at_the_start_are_as_uncertain_at_every_pitch() {
+        let sd = FixedAngles { yaw: 0.1, pitch: 0.2, roll: 0.3 };
+        for (pitch, roll) in [(0.0, 0.0), (0.6, 0.0), (-1.2, 2.0), (0.4, -0.7)] {
+            let start = FixedAngles { yaw: 0.5, pitch, roll };
+            let pose =
+                |angles: FixedAngles| Pose { rotation: angles.to_rotation(), ..Pose::identity() };
+            let turn = |changed| (pose(start).inverse() * pose(changed)).log().w / 1e-6;
+            let turns = Matrix3::from_columns(&[
+                turn(FixedAngles { yaw: start.yaw + 1e-6, ..start }) * sd.yaw,
+                turn(FixedAngles { pitch: pitch + 1e-6, ..start }) * sd.pitch,
+                turn(FixedAngles { roll: roll + 1e-6, ..start }) * sd.roll,
+            ]);
+            let covariance = covariance(&start, &sd, 1.0);
+            let off = covariance.fixed_view::<3, 3>(3, 3) - turns * turns.transpose();
+            assert!(off.norm() < 1e-6, "{start:?}: {off}");
+        }
+    }
 }
