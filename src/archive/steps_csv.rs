@@ -27,9 +27,9 @@ impl<'a> StepRow<'a> {
     pub fn new(step: &'a StepRecord, truth: Option<&Truth>) -> Self {
         StepRow {
             step,
-            approach: step.approach.as_ref(),
-            estimate: step.estimate.map(|e| coordinates(&e.x_pb)),
-            sd: step.estimate.and_then(|e| e.sd),
+            approach: step.decision.approach.as_ref(),
+            estimate: step.decision.estimate.map(|e| coordinates(&e.x_pb)),
+            sd: step.decision.estimate.and_then(|e| e.sd),
             truth: truth.map(|t| coordinates(t.x_pb())),
             target_true: truth.and_then(|t| t.target_mm().copied()),
         }
@@ -50,7 +50,7 @@ pub const STEP_COLUMNS: [StepColumn; 36] = [
     ("time_s", |c| Some(c.step.time.as_nanos() as f64 / 1e9)),
     ("insertion_mm", |c| Some(c.step.insertion_meas_mm)),
     ("rotation_rad", |c| Some(c.step.rotation_meas_rad)),
-    ("rotation_cmd_rad_per_mm", |c| c.step.rotation_cmd_rad_per_mm),
+    ("rotation_cmd_rad_per_mm", |c| c.step.decision.rotation_cmd_rad_per_mm),
     ("x_meas_mm", |c| c.step.tip_meas_mm.map(|p| p.x)),
     ("y_meas_mm", |c| c.step.tip_meas_mm.map(|p| p.y)),
     ("z_meas_mm", |c| c.step.tip_meas_mm.map(|p| p.z)),
@@ -152,6 +152,7 @@ pub fn is_of_truth(column: &str) -> bool {
 mod tests {
     use super::*;
     use crate::observer::Estimate;
+    use crate::session::Decision;
     use nalgebra::Rotation3;
 
     fn step() -> StepRecord {
@@ -184,21 +185,24 @@ mod tests {
         let angles = FixedAngles { yaw: 0.0, pitch: 0.5, roll: 0.0 };
         let pose = |x: f64, rotation| Pose { rotation, translation: Vector3::new(x, -2.0, 1e-9) };
         let full = StepRecord {
-            rotation_cmd_rad_per_mm: Some(0.1 + 0.2),
             tip_positions: 1,
             tip_meas_mm: Some(Vector3::new(1.5, f64::NAN, f64::NEG_INFINITY)),
-            estimate: Some(Estimate {
-                x_pb: pose(1.25, Rotation3::identity()),
-                sd: Some([0.5, 0.5, 0.5, 0.125, 0.125, 3.0]),
-                belief: None,
-            }),
-            approach: Some(Approach {
-                target_mm: Vector3::new(0.0, 8.0, 90.5),
-                distance_mm: 3.5,
-                clearance_mm: 2.0,
-                error_mm: 0.25,
-                path: None,
-            }),
+            decision: Decision {
+                rotation_cmd_rad_per_mm: Some(0.1 + 0.2),
+                estimate: Some(Estimate {
+                    x_pb: pose(1.25, Rotation3::identity()),
+                    sd: Some([0.5, 0.5, 0.5, 0.125, 0.125, 3.0]),
+                    belief: None,
+                }),
+                approach: Some(Approach {
+                    target_mm: Vector3::new(0.0, 8.0, 90.5),
+                    distance_mm: 3.5,
+                    clearance_mm: 2.0,
+                    error_mm: 0.25,
+                    path: None,
+                }),
+                ..Decision::default()
+            },
             ..step()
         };
         let target_mm = Some(Vector3::new(0.0, 8.5, 90.5));

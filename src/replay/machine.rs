@@ -211,12 +211,12 @@ impl Replay<'_> {
 
     /// The truth at `step`, as recorded.
     fn step(&mut self, mut step: StepRecord) -> Result<Option<Truth>, String> {
-        let asked = if self.asks { step.shadows.pop() } else { None };
+        let asked = if self.asks { step.decision.shadows.pop() } else { None };
         let recorded = self.comparison.step(&step)?.unwrap_or_default();
         let truth = self.comparison.columns.truth(&recorded);
         self.figures.take(&step, truth.as_ref());
         if let Some((_, estimate)) = asked {
-            step.estimate = estimate;
+            step.decision.estimate = estimate;
             self.what_if.take(&step, truth.as_ref());
         }
         let row = StepRow::new(&step, None).to_string();

@@ -207,7 +207,7 @@ mod tests {
         let mut largest = [0.0f64; 2];
         for ((step, truth), (short_step, short_truth)) in whole.iter().zip(&short) {
             assert_eq!(step.tip_meas_mm.is_some(), short_step.tip_meas_mm.is_some());
-            let estimate = |step: &StepRecord| step.estimate.as_ref().unwrap().x_pb.translation;
+            let estimate = |step: &StepRecord| step.decision.estimate.unwrap().x_pb.translation;
             let apart = [
                 truth.x_pb().translation - short_truth.x_pb().translation,
                 estimate(step) - estimate(short_step),

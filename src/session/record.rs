@@ -1,10 +1,9 @@
 //! What a session reports for its record. It never reads it back.
 
-use super::goal::Approach;
 use super::machine::Input;
 use super::state::State;
+use super::steering::Decision;
 use crate::canopen::{Frame, NodeId};
-use crate::observer::Estimate;
 use crate::stage::{Axis, Feedback, Identity};
 use crate::tracker::{Refusal, Sample};
 use crate::units::Time;
@@ -89,10 +88,6 @@ pub struct StepRecord {
     pub insertion_meas_mm: f64,
     /// Measured base rotation, rad.
     pub rotation_meas_rad: f64,
-    /// Rotation rate commanded for the next millimetre, rad/mm; `None` where none was commanded.
-    pub rotation_cmd_rad_per_mm: Option<f64>,
-    /// The controller asked for more than its limits let through.
-    pub command_saturated: bool,
     /// Tracked positions that corrected the observers since the step before.
     pub tip_positions: u32,
     /// The newest of them, or the mean of a standstill, plane frame, mm.
@@ -103,12 +98,8 @@ pub struct StepRecord {
     pub tip_meas_age_s: Option<f64>,
     /// Measured minus predicted position at that depth, plane frame, mm.
     pub innovation_mm: Option<Vector3<f64>>,
-    /// The estimate that steers, carried forward to this depth.
-    pub estimate: Option<Estimate>,
-    /// Estimates of the observers that only run alongside, by name.
-    pub shadows: Vec<(String, Option<Estimate>)>,
-    /// What is known of the target.
-    pub approach: Option<Approach>,
+    /// The estimates at this depth, and the command.
+    pub decision: Decision,
 }
 
 /// One record of a session.

@@ -31,7 +31,7 @@ pub struct Steering {
 const UNSEEN_INFLATION: f64 = 2.0;
 
 /// The result of a step.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Decision {
     /// The estimate that steers; `None` while its observer has none.
     pub estimate: Option<Estimate>,

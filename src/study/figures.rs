@@ -45,7 +45,7 @@ impl TipError {
 
     /// The error of a step's estimate; `None` without an estimate.
     pub fn of(step: &StepRecord, truth: &Truth) -> Option<Self> {
-        let estimate = coordinates(&step.estimate.as_ref()?.x_pb);
+        let estimate = coordinates(&step.decision.estimate.as_ref()?.x_pb);
         Some(TipError::between(estimate, coordinates(truth.x_pb())))
     }
 
@@ -191,16 +191,16 @@ impl FigureReport {
 impl RunFigures {
     /// Adds one step.
     pub fn take(&mut self, step: &StepRecord, truth: Option<&Truth>) {
-        let x_est_mm = step.estimate.as_ref().map(|estimate| estimate.x_pb.translation.x);
+        let x_est_mm = step.decision.estimate.as_ref().map(|estimate| estimate.x_pb.translation.x);
         self.estimated.extend(x_est_mm.map(|x_mm| (step.insertion_meas_mm, x_mm)));
         let x_mm = truth.map(|truth| truth.x_pb().translation.x).or(x_est_mm);
         let error = truth.and_then(|truth| TipError::of(step, truth));
         self.take_scored(step.insertion_meas_mm, x_mm, error);
-        self.saturated += usize::from(step.command_saturated);
+        self.saturated += usize::from(step.decision.command_saturated);
         if let Some(age_s) = step.tip_meas_age_s {
             raise(&mut self.so_far.tip_age_s_max, age_s);
         }
-        if let Some(approach) = &step.approach {
+        if let Some(approach) = &step.decision.approach {
             let true_mm = |truth: &Truth| {
                 let target_mm = truth.target_mm().unwrap_or(&approach.target_mm);
                 (truth.x_pb().translation - target_mm).norm()
@@ -287,6 +287,7 @@ mod tests {
     use super::*;
     use crate::geometry::Pose;
     use crate::observer::Estimate;
+    use crate::session::Decision;
     use crate::stage::SetPoint;
     use crate::tracker::{GateName, Refusal, Sample, Validity};
     use nalgebra::Vector3;
@@ -295,7 +296,7 @@ mod tests {
         let x_pb = Pose { translation: Vector3::new(x, 0.0, depth), ..Pose::identity() };
         StepRecord {
             insertion_meas_mm: depth,
-            estimate: Some(Estimate::of_pose(x_pb)),
+            decision: Decision { estimate: Some(Estimate::of_pose(x_pb)), ..Decision::default() },
             ..StepRecord::default()
         }
     }

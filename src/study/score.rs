@@ -125,7 +125,7 @@ impl TrialScore {
             bound.iter_mut().skip(3).for_each(|angle| *angle = angle.to_degrees());
             self.bounds.push((depth_mm, TipError::from(bound)));
         }
-        let estimate = step.estimate.as_ref();
+        let estimate = step.decision.estimate.as_ref();
         let nees = estimate.and_then(|estimate| nees(estimate, truth.x_pb()));
         self.nees.extend(nees.map(|nees| (depth_mm, nees)));
         if step.tip_meas_mm.is_some() {

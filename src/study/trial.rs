@@ -169,18 +169,11 @@ impl<'a> EmulatedNeedle<'a> {
 
 /// The record of a step as a session makes it; a study has no times.
 fn record(step: usize, insertion_mm: f64, base: &BasePath, decision: Decision) -> StepRecord {
-    let Decision {
-        estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, approach, ..
-    } = decision;
     StepRecord {
         step: u32::try_from(step).unwrap_or(u32::MAX),
         insertion_meas_mm: insertion_mm,
         rotation_meas_rad: base.rotation_at(insertion_mm),
-        rotation_cmd_rad_per_mm,
-        command_saturated,
-        estimate,
-        shadows,
-        approach,
+        decision,
         ..StepRecord::default()
     }
 }

@@ -202,13 +202,13 @@ impl Screen {
             self.innovations.push_back(innovation_mm.norm_squared() / 3.0);
             keep_last(&mut self.innovations, INNOVATIONS);
         }
-        self.target = step.approach.as_ref().map_or(String::new(), |approach| {
+        self.target = step.decision.approach.as_ref().map_or(String::new(), |approach| {
             let Approach { distance_mm, error_mm, path, .. } = approach;
             let path =
                 path.as_ref().map_or("-".to_owned(), |path| format!("{:.1}", path.length_mm()));
             format!("  target {distance_mm:.1} mm, {error_mm:.2} off, path {path}")
         });
-        if let Some(estimate) = &step.estimate {
+        if let Some(estimate) = &step.decision.estimate {
             let pose = coordinates(&estimate.x_pb);
             self.pose = Some((pose, estimate.sd));
             self.path.push([step.insertion_meas_mm, pose[0], pose[1], pose[2]]);

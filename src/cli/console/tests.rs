@@ -15,7 +15,7 @@ use crate::canopen::{Frame, NodeId};
 use crate::geometry::{FixedAngles, Pose};
 use crate::observer::Estimate;
 use crate::session::news;
-use crate::session::{Approach, Direction, SampleRecord, State, StepRecord};
+use crate::session::{Approach, Decision, Direction, SampleRecord, State, StepRecord};
 use crate::stage::{Axis, Feedback, SetPoint, StageEvent};
 use crate::tracker::{GateName, Refusal, Sample, Validity};
 use nalgebra::Vector3;
@@ -76,7 +76,10 @@ fn inserted() -> Screen {
                 time,
                 insertion_meas_mm: mm,
                 innovation_mm: Some(Vector3::new(0.8, -0.8, 0.8)),
-                estimate: Some(Estimate { x_pb, sd, belief: None }),
+                decision: Decision {
+                    estimate: Some(Estimate { x_pb, sd, belief: None }),
+                    ..Decision::default()
+                },
                 ..StepRecord::default()
             })));
         }

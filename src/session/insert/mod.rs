@@ -225,15 +225,10 @@ impl Insert {
         target_mm.into_iter().for_each(|target_mm| self.estimation.steering.set_target(target_mm));
         let corrections = self.estimation.corrections.take();
         let newest = corrections.map(|corrections| corrections.newest);
-        let Decision {
-            estimate,
-            shadows,
-            rotation_cmd_rad_per_mm,
-            command_saturated,
-            approach,
-            refused,
-        } = self.estimation.decide(time, history, due.is_last)?;
-        let path = approach.as_ref().and_then(|approach| approach.path.as_ref());
+        let decision = self.estimation.decide(time, history, due.is_last)?;
+        let Decision { estimate, rotation_cmd_rad_per_mm, command_saturated, .. } = decision;
+        let refused = decision.refused.clone();
+        let path = decision.approach.as_ref().and_then(|approach| approach.path.as_ref());
         let end_mm = path.map(|path| at.insertion_mm + path.length_mm());
         let observer = match &estimate {
             None => State::NoEstimate,
@@ -251,16 +246,12 @@ impl Insert {
             time,
             insertion_meas_mm: at.insertion_mm,
             rotation_meas_rad: at.rotation_rad,
-            rotation_cmd_rad_per_mm,
-            command_saturated,
             tip_positions: corrections.map_or(0, |corrections| corrections.positions),
             tip_meas_mm: newest.map(|m| m.tip_meas.mm()),
             tip_meas_insertion_mm: newest.map(|m| insertion.depth_mm(m.stage_insertion_meas_mm)),
             tip_meas_age_s: newest.map(|m| time.seconds_after(m.acquisition_time)),
             innovation_mm: corrections.and_then(|corrections| corrections.innovation_mm),
-            estimate,
-            shadows,
-            approach,
+            decision,
         })));
         if let Some(reason) = refused {
             return Err(reason);

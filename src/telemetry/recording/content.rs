@@ -175,7 +175,7 @@ impl Content {
 
     /// Moves the plane and the view to a needle that starts outside of them.
     fn move_view_to_needle(&mut self, step: &StepRecord) -> Logged {
-        let estimated_mm = step.estimate.as_ref().map(|estimate| estimate.x_pb.translation);
+        let estimated_mm = step.decision.estimate.map(|estimate| estimate.x_pb.translation);
         let Some(start_mm) = step.tip_meas_mm.or(estimated_mm) else { return Ok(()) };
         let Some(scene) = self.scene_until_start.take() else { return Ok(()) };
         let Some(reach) = Reach::of(&scene).moved_to(&start_mm) else { return Ok(()) };

@@ -75,11 +75,11 @@ impl Space {
         step: &StepRecord,
         truth: Option<&Truth>,
     ) -> Logged {
-        if let Some(estimate) = &step.estimate {
+        if let Some(estimate) = &step.decision.estimate {
             self.estimate.log(stream, &estimate.x_pb)?;
             log_ellipsoid(stream, estimate)?;
         }
-        if let Some(approach) = &step.approach {
+        if let Some(approach) = &step.decision.approach {
             if let Some(path) = &approach.path {
                 let points: Vec<_> = path.points_mm(PLANNED_STEP_MM).iter().map(point).collect();
                 let strip = LineStrips3D::new([points]).with_colors([COMMANDED]);
@@ -110,7 +110,7 @@ impl Space {
         step: &StepRecord,
         target_mm: &Vector3<f64>,
     ) -> Logged {
-        let x_pb = step.estimate.map(|estimate| estimate.x_pb).filter(Pose::is_finite);
+        let x_pb = step.decision.estimate.map(|estimate| estimate.x_pb).filter(Pose::is_finite);
         let Some(((world, problem), x_pb)) = self.goal.as_ref().zip(x_pb) else { return Ok(()) };
         let Pose { rotation, translation } = x_pb;
         let tip = PlanTip { position_mm: translation, heading: rotation * Vector3::z() };

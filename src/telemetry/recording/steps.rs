@@ -6,7 +6,7 @@ use crate::emulator::Truth;
 use crate::geometry::coordinates;
 use crate::observer::Estimate;
 use crate::plan::Path;
-use crate::session::StepRecord;
+use crate::session::{Decision, StepRecord};
 use crate::telemetry::Scene;
 use crate::units::wrap_angle;
 use rerun::RecordingStream;
@@ -58,11 +58,11 @@ impl Steps {
             let error = in_degrees(error(estimate, truth));
             (0..6).filter(move |_| has_truth).map(move |n| (column(n, "error"), error[n]))
         };
-        let estimate = step.estimate.as_ref().map_or(UNKNOWN, coordinates_of);
+        let estimate = step.decision.estimate.as_ref().map_or(UNKNOWN, coordinates_of);
         let (mut shown, mut truth_shown) = (estimate, truth);
         self.unwrap_roll(&mut shown);
         self.unwrap_roll(&mut truth_shown);
-        for (name, shadow) in &step.shadows {
+        for (name, shadow) in &step.decision.shadows {
             let estimate = shadow.as_ref().map_or(UNKNOWN, coordinates_of);
             let mut shown = estimate;
             shown[ROLL] = near(shown[ROLL], self.roll_shown_rad);
@@ -84,7 +84,7 @@ impl Steps {
             };
             (name.replace("_rad", "_deg"), shown)
         });
-        let sd = in_degrees(step.estimate.and_then(|e| e.sd).unwrap_or(UNKNOWN));
+        let sd = in_degrees(step.decision.estimate.and_then(|e| e.sd).unwrap_or(UNKNOWN));
         let shown = in_degrees(shown);
         let bounds = REDUCED.into_iter().flat_map(|n| {
             let half = 2.0 * sd[n];
@@ -113,7 +113,8 @@ impl Steps {
 /// The predicted error at the target less and plus twice its standard deviation, mm: that of the position,
 /// and that of the heading over the rest of the path. What is corrected on the way is not in it.
 fn target_band(step: &StepRecord) -> Vec<(String, f64)> {
-    let known = step.approach.as_ref().zip(step.estimate.and_then(|estimate| estimate.sd));
+    let Decision { approach, estimate, .. } = &step.decision;
+    let known = approach.as_ref().zip(estimate.and_then(|estimate| estimate.sd));
     let Some((approach, [x, y, z, yaw, pitch, _])) = known else { return Vec::new() };
     let left_mm = approach.path.as_ref().map_or(0.0, Path::length_mm);
     let sd_mm = x.max(y).max(z).hypot(yaw.max(pitch) * left_mm);

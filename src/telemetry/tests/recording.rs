@@ -67,7 +67,7 @@ pub(super) fn readable_paths(path: &Path) -> Vec<String> {
 fn steps(entries: &[Entry]) -> impl Iterator<Item = (&StepRecord, [f64; 6], [f64; 6])> {
     entries.iter().filter_map(|entry| match (&entry.record, &entry.truth) {
         (Record::Step(step), Some(truth)) => {
-            let estimate = step.estimate.map_or([f64::NAN; 6], |e| coordinates(&e.x_pb));
+            let estimate = step.decision.estimate.map_or([f64::NAN; 6], |e| coordinates(&e.x_pb));
             Some((step.as_ref(), estimate, coordinates(truth.x_pb())))
         }
         _ => None,
@@ -118,7 +118,7 @@ fn the_recording_holds_what_was_recorded() {
     assert_same(read.column("/steps", "x_true_mm"), &x_true);
     let upper: Series = steps(&entries)
         .map(|(step, estimate, _)| {
-            let sd = step.estimate.and_then(|e| e.sd).map_or(f64::NAN, |sd| sd[0]);
+            let sd = step.decision.estimate.and_then(|e| e.sd).map_or(f64::NAN, |sd| sd[0]);
             (i64::from(step.step), estimate[0] + 2.0 * sd)
         })
         .collect();

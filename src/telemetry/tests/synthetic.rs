@@ -5,7 +5,9 @@ use crate::emulator::Truth;
 use crate::geometry::{FixedAngles, Pose, Twist};
 use crate::needle::{Increment, Needle};
 use crate::observer::Estimate;
-use crate::session::{Direction, Lane, Record, SampleRecord, Severity, State, StepRecord};
+use crate::session::{
+    Decision, Direction, Lane, Record, SampleRecord, Severity, State, StepRecord,
+};
 use crate::stage::{Feedback, SetPoint};
 use crate::telemetry::Entry;
 use crate::tracker::{Sample, Validity};
@@ -58,10 +60,10 @@ pub(super) fn spoil(entry: &mut Entry, value: f64) {
         }
         Record::Step(step) => {
             step.insertion_meas_mm = value;
-            step.rotation_cmd_rad_per_mm = Some(value);
+            step.decision.rotation_cmd_rad_per_mm = Some(value);
             step.tip_meas_mm = Some(Vector3::repeat(value));
             step.innovation_mm = Some(Vector3::repeat(value));
-            if let Some(estimate) = &mut step.estimate {
+            if let Some(estimate) = &mut step.decision.estimate {
                 estimate.x_pb.translation.y = value;
                 estimate.sd = Some([value; 6]);
             }
@@ -205,16 +207,18 @@ impl Run {
             time,
             insertion_meas_mm: f64::from(step),
             rotation_meas_rad: self.rotation_rad,
-            rotation_cmd_rad_per_mm: Some(rate),
-            command_saturated: step < 20,
             tip_positions: 1,
             tip_meas_mm: Some(tip_meas_mm),
             tip_meas_insertion_mm: Some(f64::from(step)),
             tip_meas_age_s: Some(0.02),
             innovation_mm: Some(tip_meas_mm - x_pb.translation),
-            estimate: (step > 2).then_some(Estimate { x_pb, sd: Some(sd), belief: None }),
-            shadows: vec![("finite-difference".to_owned(), Some(Estimate::of_pose(x_pb)))],
-            approach: None,
+            decision: Decision {
+                estimate: (step > 2).then_some(Estimate { x_pb, sd: Some(sd), belief: None }),
+                shadows: vec![("finite-difference".to_owned(), Some(Estimate::of_pose(x_pb)))],
+                rotation_cmd_rad_per_mm: Some(rate),
+                command_saturated: step < 20,
+                ..Decision::default()
+            },
         };
         let truth = Some(Truth::new(self.tip));
         self.entries.push(Entry { record: Record::Step(Box::new(step)), truth });

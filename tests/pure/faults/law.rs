@@ -6,7 +6,7 @@ use needle_bench::canopen::Frame;
 
 /// Sum of all rotation commanded, in turns.
 fn turns(bench: &Bench) -> f64 {
-    let commanded = bench.steps().filter_map(|step| step.rotation_cmd_rad_per_mm);
+    let commanded = bench.steps().filter_map(|step| step.decision.rotation_cmd_rad_per_mm);
     commanded.map(f64::abs).sum::<f64>() / std::f64::consts::TAU
 }
 

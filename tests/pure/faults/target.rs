@@ -146,7 +146,7 @@ fn a_target_that_moves_is_met() {
     let mut bench = bench(&["emulator.target_drift_mm_per_mm=[0.0, 0.05, 0.0]"]);
     bench.run_to_end();
     assert!(bench.completed(), "{}", bench.reason());
-    let end = bench.steps().last().expect("steps").approach.clone().expect("a target");
+    let end = bench.steps().last().expect("steps").decision.approach.clone().expect("a target");
     assert!((end.target_mm.y - 7.0).abs() < 0.7, "{}", end.target_mm);
     assert!(end.distance_mm < 0.7, "{}", end.distance_mm);
     let truth = bench.stage.truth(bench.now);

@@ -62,7 +62,7 @@ fn every_other_position_infinite_costs_nothing_but_those() {
     assert_eq!(refused.len(), bench.received.1 / 2);
     assert!(refused.iter().all(|reason| reason.starts_with("finite: ")));
     let finite = |step: &StepRecord| {
-        step.estimate.is_none_or(|estimate| estimate.x_pb.is_finite())
+        step.decision.estimate.is_none_or(|estimate| estimate.x_pb.is_finite())
             && step.tip_meas_mm.is_none_or(|tip| tip.iter().all(|x| x.is_finite()))
     };
     assert!(bench.steps().all(finite));

@@ -105,7 +105,7 @@ fn the_way_to_a_target_is_shown() {
     let approach =
         Approach { target_mm, distance_mm: 61.2, clearance_mm: 5.0, error_mm: 0.12, path: None };
     screen.take(&Record::Step(Box::new(StepRecord {
-        approach: Some(approach),
+        decision: Decision { approach: Some(approach), ..Decision::default() },
         ..StepRecord::default()
     })));
     let shown = shown(&screen, SIZES[0]);
