@@ -7,7 +7,7 @@ use super::reader::{REGISTRATION, Reader};
 use super::registration::GivenRegistration;
 use super::study::StudyConfig;
 use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
-use super::{CanInterface, Config, GoalKind};
+use super::{CanInterface, Config};
 use crate::emulator::fault::Fault;
 use crate::keys::{Key, expanded};
 use crate::needle::TorsionConfig;
@@ -116,13 +116,6 @@ fn study(config: &Config, reader: &mut Reader) {
         });
     }
     let study = &config.study;
-    let is_drawn = study.target_depth_mm.is_some() || study.obstacles.unwrap_or_default() > 0;
-    let [depth, obstacles, kind] = ["study.target_depth_mm", "study.obstacles", "goal.kind"];
-    reader.check(&[depth, obstacles, kind], is_drawn && config.goal.kind == GoalKind::Plane, || {
-        format!(
-            "{depth} or {obstacles} is given, without effect since {kind} is \"plane\": set it to \"target\""
-        )
-    });
     let [moves, tool] = ["study.target_move_mm", "goal.tool"];
     let is_still = study.target_move_mm.is_some() && config.goal.tool.is_none();
     reader.check(&[moves, tool], is_still, || {
@@ -133,7 +126,7 @@ fn study(config: &Config, reader: &mut Reader) {
         None => config.goal.position_mm.map_or(f64::INFINITY, |target_mm| target_mm.norm()),
     };
     let [_, move_mm] = study.target_move_mm.unwrap_or_default();
-    reader.check(&[moves, depth, "goal.position_mm"], move_mm > least_mm, || {
+    reader.check(&[moves, "study.target_depth_mm", "goal.position_mm"], move_mm > least_mm, || {
         format!(
             "{moves} reaches {move_mm}, allowed: up to the least distance of the target from the start, \
              {least_mm} mm; it would move faster than the needle"

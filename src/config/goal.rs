@@ -306,6 +306,8 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
         (position, goal.position_mm.is_some()),
         (tool, goal.tool.is_some()),
         (obstacle, !goal.obstacle.is_empty()),
+        ("study.target_depth_mm", config.study.target_depth_mm.is_some()),
+        ("study.obstacles", config.study.obstacles.is_some_and(|obstacles| obstacles > 0)),
     ];
     for (key, is_given) in given {
         reader.check(&[key, kind], !is_target && is_given, || {

@@ -245,4 +245,8 @@ fn obstacles_on_the_way_into_the_plane() {
         "bench.toml:1: goal.obstacle has no effect, since goal.kind is \"plane\": set goal.kind = \
          \"target\""
     );
+    for drawn in ["study.target_depth_mm=[20, 90]", "study.obstacles=1"] {
+        let said = set_refusal(&[drawn]);
+        assert!(said.contains(" has no effect, since goal.kind is \"plane\""), "{said}");
+    }
 }
