@@ -1,7 +1,7 @@
 //! Arguments that several commands share, and the configuration that they name.
 
 use super::Failure;
-use super::output::tell;
+use super::output::print_stderr;
 use crate::config::{Config, SEED_MAX, Source};
 use crate::runtime::{RealTime, enter_real_time};
 use clap::Args;
@@ -54,7 +54,7 @@ impl Configured {
     pub(super) fn load_with_warnings(&self) -> Result<(Config, Vec<String>), Failure> {
         let (config, warnings) = self.read(None)?;
         for warning in &warnings {
-            tell(format_args!("warning: {warning}"));
+            print_stderr(format_args!("warning: {warning}"));
         }
         Ok((config, warnings))
     }

@@ -2,7 +2,7 @@
 
 use super::arguments::{Configured, number_in};
 use super::mask::mask_reader;
-use super::output::{say, show, tell};
+use super::output::{print_stderr, print_stdout, print_wrapped};
 use super::preflight::Preflight;
 use super::stage::drive_json;
 use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure, ended};
@@ -43,12 +43,12 @@ pub(super) fn check(arguments: &Arguments) -> Result<(), Failure> {
             true => format!("{:#}", Config::json_schema()),
             false => Config::reference(),
         };
-        return say(text.trim_end());
+        return print_stdout(text.trim_end());
     }
     let (config, warnings) = arguments.configured.load_with_warnings()?;
     check_goal(&config, arguments)?;
     if arguments.print {
-        return say(config.to_toml().map_err(Failure::environment)?.trim_end());
+        return print_stdout(config.to_toml().map_err(Failure::environment)?.trim_end());
     }
     let mut report = json!({
         "configuration": "ok",
@@ -58,14 +58,14 @@ pub(super) fn check(arguments: &Arguments) -> Result<(), Failure> {
     });
     if !arguments.connect {
         return match arguments.json {
-            true => say(report),
-            false => say(format_args!("configuration: ok\nname: {}", config.name)),
+            true => print_stdout(report),
+            false => print_stdout(format_args!("configuration: ok\nname: {}", config.name)),
         };
     }
     let preflight = Preflight::inspect(&config, &config, Duration::from_secs_f64(arguments.listen));
     let troubles = preflight.troubles();
     if !troubles.is_empty() {
-        tell(format_args!("error: {}", troubles.join("\n       ")));
+        print_stderr(format_args!("error: {}", troubles.join("\n       ")));
         report["error"] = json!(troubles.join("; "));
     }
     if arguments.json {
@@ -81,9 +81,9 @@ pub(super) fn check(arguments: &Arguments) -> Result<(), Failure> {
         };
         report["troubles"] = json!(troubles);
         report["checks"] = json!(preflight.checks);
-        say(report)?;
+        print_stdout(report)?;
     } else {
-        show(to_text(&preflight.checks))?;
+        print_wrapped(to_text(&preflight.checks))?;
     }
     ended(match (troubles.len(), config.tracker.registration.is_none()) {
         (0, _) => 0,

@@ -1,7 +1,7 @@
 //! `needle-bench evaluate`: runs the observers over recorded insertions and scores them.
 
 use super::Failure;
-use super::output::{give, tell, with};
+use super::output::{merged, print_result, print_stderr};
 use super::records::{Insertion, Insertions};
 use crate::session::ObserverConfig;
 use crate::study::{Evaluation, Recording, Score, evaluate as score};
@@ -33,7 +33,7 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<(), Failure> {
     };
     for Insertion { path, recording, .. } in &insertions {
         if recording.lacks_roll() {
-            tell(format_args!(
+            print_stderr(format_args!(
                 "warning: {}: its orientations do not turn with the base: no roll is scored",
                 path.display()
             ));
@@ -45,18 +45,18 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<(), Failure> {
         for Insertion { path, recording, .. } in &insertions {
             let score = one(&observer, |observer| scored_by(observer, recording));
             let score = score.map_err(|error| Failure::in_file(path, error))?;
-            files.push(with(json!({ "file": path.display().to_string() }), &json!(score)));
+            files.push(merged(json!({ "file": path.display().to_string() }), &json!(score)));
             scores.push(score);
         }
         let figures = json!(Evaluation::of(scores.iter()));
         let scored = json!({ "observer": observer.name(), "files": files });
-        observers.push(with(scored, &figures));
+        observers.push(merged(scored, &figures));
     }
     // The figures of the first observer are at the top, those of all observers under `observers`.
     let first = observers.first().cloned().unwrap_or_default();
-    let object = with(first, &json!({ "observers": observers }));
+    let object = merged(first, &json!({ "observers": observers }));
     let text = || screen(include_str!("evaluate.txt"), &object, context! {});
-    give(arguments.json, &object, text)
+    print_result(arguments.json, &object, text)
 }
 
 /// The score of `observer`, and of the same observer that does not know the roll at the start.

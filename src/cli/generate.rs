@@ -1,6 +1,6 @@
 //! `needle-bench generate`: completions and man pages, from the command line as it is declared.
 
-use super::output::say;
+use super::output::print_stdout;
 use super::{Failure, command_line};
 use clap::Subcommand;
 use clap_complete::Shell;
@@ -35,5 +35,5 @@ pub(super) fn generate(what: &What) -> Result<(), Failure> {
     // Not to stdout: clap_complete panics if that is closed.
     let mut script = Vec::new();
     clap_complete::generate(shell, &mut command_line(), "needle-bench", &mut script);
-    say(String::from_utf8_lossy(&script).trim_end())
+    print_stdout(String::from_utf8_lossy(&script).trim_end())
 }

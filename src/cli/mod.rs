@@ -26,7 +26,7 @@ mod study;
 mod tracker;
 mod virtual_stage;
 
-use self::output::{say, tell};
+use self::output::{print_stderr, print_stdout};
 use crate::config::ConfigError;
 use crate::telemetry::TelemetryError;
 use crate::transport::can::CanError;
@@ -200,7 +200,7 @@ pub fn bench() -> ExitCode {
     let bench = bench.unwrap_or_else(|error| {
         let error = with_suggestion(error);
         if error.use_stderr() && is_json {
-            let _ = say(json!({ "error": error.to_string().trim_end() }));
+            let _ = print_stdout(json!({ "error": error.to_string().trim_end() }));
         }
         error.exit()
     });
@@ -271,11 +271,11 @@ pub fn virtual_stage() -> ExitCode {
 fn exit(result: Result<(), Failure>, json: Option<Value>) -> ExitCode {
     let Err(Failure { message, status }) = result else { return ExitCode::SUCCESS };
     if let Some(message) = message {
-        tell(format_args!("error: {message}"));
+        print_stderr(format_args!("error: {message}"));
         if let Some(mut object) = json {
             object["error"] = json!(message);
             // If stdout is broken as well, nothing is left to report to.
-            let _ = say(object);
+            let _ = print_stdout(object);
         }
     }
     ExitCode::from(status)

@@ -1,7 +1,7 @@
 //! What the operator sees during a run without the console: one line of progress and the events, on stderr.
 
 use super::console::minutes;
-use super::output::{plain, tell};
+use super::output::{plain, print_stderr};
 use crate::runtime::Operator;
 use crate::session::{Lane, Progress, Severity, State};
 use crate::text::wrapped;
@@ -121,7 +121,7 @@ fn print(queue: &mut Consumer<String>, latest: &Latest, bar: &ProgressBar) {
         let is_closed = queue.is_abandoned();
         while let Ok(line) = queue.pop() {
             match bar.is_hidden() {
-                true => tell(line),
+                true => print_stderr(line),
                 false => bar.println(wrapped(&line)),
             }
         }
@@ -137,7 +137,7 @@ fn print(queue: &mut Consumer<String>, latest: &Latest, bar: &ProgressBar) {
     bar.finish_and_clear();
     let dropped = latest.dropped.load(Ordering::Relaxed);
     if dropped > 0 {
-        tell(format_args!("{dropped} messages were not shown: stderr did not keep up"));
+        print_stderr(format_args!("{dropped} messages were not shown: stderr did not keep up"));
     }
 }
 

@@ -12,8 +12,8 @@ use std::os::fd::AsFd;
 use std::path::Path;
 
 /// Writes `text`, made [`plain`], and a line end to stdout. A closed pipe (`run --json | true`) is no
-/// failure: its reader has read all that it wanted.
-pub(super) fn say(text: impl Display) -> Result<(), Failure> {
+/// failure: the reader has read all that it wanted.
+pub(super) fn print_stdout(text: impl Display) -> Result<(), Failure> {
     let mut stdout = io::stdout().lock();
     match writeln!(stdout, "{}", plain(text, "\n\t")).and_then(|()| stdout.flush()) {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {
@@ -23,28 +23,28 @@ pub(super) fn say(text: impl Display) -> Result<(), Failure> {
     }
 }
 
-/// Whether `stream` is a pipe or a terminal whose other end is closed. A command that goes on until Ctrl-C then
-/// ends.
-pub(super) fn is_unread(stream: &impl AsFd) -> bool {
+/// Whether `stream` is a pipe or a terminal whose other end is closed. A command that runs until Ctrl-C
+/// then ends.
+pub(super) fn has_no_reader(stream: &impl AsFd) -> bool {
     let mut fds = [PollFd::new(stream.as_fd(), PollFlags::empty())];
-    let is_known = poll(&mut fds, PollTimeout::ZERO).is_ok();
-    is_known && fds[0].revents().is_some_and(|events| events.contains(PollFlags::POLLERR))
+    let is_polled = poll(&mut fds, PollTimeout::ZERO).is_ok();
+    is_polled && fds[0].revents().is_some_and(|events| events.contains(PollFlags::POLLERR))
 }
 
 /// Writes a result to stdout: the object if `json`, else the text.
-pub(super) fn give(
+pub(super) fn print_result(
     json: bool,
     object: &impl Serialize,
     text: impl FnOnce() -> Result<String, minijinja::Error>,
 ) -> Result<(), Failure> {
     match json {
-        true => say(serde_json::to_value(object).map_err(Failure::environment)?),
-        false => show(text().map_err(Failure::environment)?),
+        true => print_stdout(serde_json::to_value(object).map_err(Failure::environment)?),
+        false => print_wrapped(text().map_err(Failure::environment)?),
     }
 }
 
 /// `object` with the fields of `more`.
-pub(super) fn with(mut object: Value, more: &Value) -> Value {
+pub(super) fn merged(mut object: Value, more: &Value) -> Value {
     for (key, value) in more.as_object().into_iter().flatten() {
         object[key] = value.clone();
     }
@@ -52,25 +52,25 @@ pub(super) fn with(mut object: Value, more: &Value) -> Value {
 }
 
 /// Writes text for an operator to stdout, its long lines broken.
-pub(super) fn show(text: impl Display) -> Result<(), Failure> {
-    say(wrapped(&text.to_string()))
+pub(super) fn print_wrapped(text: impl Display) -> Result<(), Failure> {
+    print_stdout(wrapped(&text.to_string()))
 }
 
 /// Writes a new file. A file that exists is not overwritten.
 pub(super) fn write_new(path: &Path, text: &str) -> Result<(), Failure> {
     let written = File::create_new(path).and_then(|mut file| file.write_all(text.as_bytes()));
     written.map_err(|error| match error.kind() {
-        ErrorKind::AlreadyExists => exists(path),
+        ErrorKind::AlreadyExists => already_exists(path),
         _ => Failure::on_file(path, format_args!("cannot be written: {error}")),
     })
 }
 
 /// Refuses to write a file that exists, before there is anything to write.
 pub(super) fn refuse_existing(path: Option<&Path>) -> Result<(), Failure> {
-    path.filter(|path| path.exists()).map_or(Ok(()), |path| Err(exists(path)))
+    path.filter(|path| path.exists()).map_or(Ok(()), |path| Err(already_exists(path)))
 }
 
-fn exists(path: &Path) -> Failure {
+fn already_exists(path: &Path) -> Failure {
     Failure::in_file(path, "exists, and is not overwritten; name another file, or remove it")
 }
 
@@ -84,7 +84,7 @@ pub(super) fn shell_word(word: &str) -> String {
 }
 
 /// Writes `text`, made [`plain`], its long lines broken, and a line end to stderr; errors are ignored.
-pub(super) fn tell(text: impl Display) {
+pub(super) fn print_stderr(text: impl Display) {
     let _ = writeln!(io::stderr().lock(), "{}", wrapped(&plain(text, "\n\t")));
 }
 
@@ -112,10 +112,10 @@ mod tests {
     #[test]
     fn a_pipe_without_a_reader_is_unread() {
         let (reader, writer) = nix::unistd::pipe().unwrap();
-        assert!(!is_unread(&writer));
+        assert!(!has_no_reader(&writer));
         drop(reader);
-        assert!(is_unread(&writer));
-        assert!(!is_unread(&File::open("/dev/null").unwrap()));
+        assert!(has_no_reader(&writer));
+        assert!(!has_no_reader(&File::open("/dev/null").unwrap()));
     }
 
     #[test]

@@ -5,7 +5,7 @@ use super::console::Console;
 use super::ending::{record_error, withdrawal};
 use super::mask::mask_reader;
 use super::operator::Terminal;
-use super::output::tell;
+use super::output::print_stderr;
 use super::records::describe;
 use super::stage::Motion;
 use super::tracker::{described, open_tracker, replay};
@@ -175,7 +175,7 @@ impl Job<'_> {
         }
         match open_tracker(self.config, runtime, clock) {
             Err(failure) if !self.needs_tracker() => {
-                tell(format_args!("warning: {failure}; the record is without the tracker"));
+                print_stderr(format_args!("warning: {failure}; the record is without the tracker"));
                 Ok(None)
             }
             opened => opened.map(Some),
@@ -240,7 +240,7 @@ impl Job<'_> {
     fn serve(&self, recorder: &mut Recorder) -> Result<(), Failure> {
         let Some(address) = self.options.live else { return Ok(()) };
         recorder.serve(address, scene(self.config)?).map_err(Failure::environment)?;
-        tell(format_args!("live        rerun rerun+http://{address}/proxy"));
+        print_stderr(format_args!("live        rerun rerun+http://{address}/proxy"));
         Ok(())
     }
 }

@@ -1,7 +1,7 @@
 //! Finds what the preflight judges: looks at the bus, the drives, the tracker, earlier runs, the disk.
 //! Nothing is written and nothing moves.
 
-use super::output::{say, tell};
+use super::output::{print_stderr, print_stdout};
 use super::records::earlier_run;
 use super::stage::read_status;
 use super::tracker::Listener;
@@ -131,7 +131,7 @@ pub(super) fn before_run(config: &Config, yes: bool, as_json: bool) -> Result<Ve
     // From here on Ctrl-C is an answer, to the list as to the question.
     let interrupt = Interrupt::listen()?;
     let preflight = Preflight::inspect(config, config, LISTEN);
-    tell(to_text(&preflight.checks));
+    print_stderr(to_text(&preflight.checks));
     let failed = preflight.troubles().len();
     let reason = match worst(&preflight.checks) {
         _ if interrupt.is_raised() => "operator: interrupted".to_owned(),
@@ -139,9 +139,9 @@ pub(super) fn before_run(config: &Config, yes: bool, as_json: bool) -> Result<Ve
         _ if yes || is_confirmed(config, &interrupt) => return Ok(preflight.checks),
         _ => "not confirmed".to_owned(),
     };
-    tell(format_args!("stopped: {reason}; nothing has moved"));
+    print_stderr(format_args!("stopped: {reason}; nothing has moved"));
     if as_json {
-        say(json!({ "outcome": null, "error": reason, "preflight": preflight.checks }))?;
+        print_stdout(json!({ "outcome": null, "error": reason, "preflight": preflight.checks }))?;
     }
     Err(Failure { message: None, status: if failed > 0 { ENVIRONMENT_FAILED } else { STOPPED } })
 }
@@ -153,7 +153,7 @@ pub(super) fn before_rehearsal(config: &Config, rig: &Config, quiet: bool) -> Ve
     let is_shown = |check: &&Check| !quiet || check.verdict != Verdict::Pass;
     let shown: Vec<Check> = checks.iter().filter(is_shown).cloned().collect();
     if !shown.is_empty() {
-        tell(to_text(&shown));
+        print_stderr(to_text(&shown));
     }
     checks
 }

@@ -3,7 +3,7 @@
 use super::Failure;
 use super::arguments::{Configured, text_of};
 use super::mask::mask_reader;
-use super::output::tell;
+use super::output::print_stderr;
 use super::perform::scene;
 use super::stage;
 use crate::archive::{Manifest, file, proof};
@@ -191,14 +191,14 @@ impl Insertions {
             all.push(Insertion { path: path.to_owned(), text, recording });
         }
         if let (None, Some(run)) = (configuration, files.iter().find(|path| path.is_dir())) {
-            tell(format_args!(
+            print_stderr(format_args!(
                 "warning: judged with the needle, noises and mount of bench-config/recordings.toml; those of the \
                  run itself: --config {}",
                 run.join(file::CONFIG).display()
             ));
         }
         if config.tracker.tip_offset_mm != [0.0; 3] && !files.iter().all(|path| path.is_dir()) {
-            tell(
+            print_stderr(
                 "warning: positions in a CSV file are taken as the tip's: tracker.tip_offset_mm is not added",
             );
         }

@@ -1,6 +1,6 @@
 //! `needle-bench replay`: runs a recorded session again.
 
-use super::output::{give, refuse_existing, write_new};
+use super::output::{print_result, refuse_existing, write_new};
 use super::records::{open, recorded_plan};
 use super::{Failure, STOPPED, ended};
 use crate::archive::file;
@@ -90,7 +90,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
     }
     let more = context! { figures => shown };
     let text = || screen(include_str!("replay.txt"), &object, more);
-    give(arguments.json, &object, text)?;
+    print_result(arguments.json, &object, text)?;
     ended(replayed.difference.map_or(0, |_| STOPPED))
 }
 

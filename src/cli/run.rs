@@ -4,7 +4,7 @@ use super::arguments::{About, Configured, RealTimeArguments, seed};
 use super::console::Console;
 use super::ending::{after_insertion, ending, plan_status, plane_missed_by_mm, status, withdrawal};
 use super::mask::{file_crc32, mask_reader};
-use super::output::{give, tell, with};
+use super::output::{merged, print_result, print_stderr};
 use super::perform::{Job, LIVE_ADDRESS, Options, Performed, end_json};
 use super::preflight::{before_rehearsal, before_run};
 use super::{Failure, ended, stage};
@@ -99,13 +99,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), Failure> {
     let Performed { report, wants_withdrawal, .. } = job.perform()?;
     let object = to_json(&config, &report, &preflight);
     let more = more(&config, configured.whole_path(), &report);
-    give(arguments.json, &object, || screen(include_str!("run.txt"), &object, more))?;
+    print_result(arguments.json, &object, || screen(include_str!("run.txt"), &object, more))?;
     let mut worst = status(&config, &report);
     if wants_withdrawal && let Ok(withdrawal) = withdrawal(&config, &report) {
         let config = withdrawal.allowed(config, &report);
         let words = format!("withdraw{}", withdrawal.by());
         let (report, summary) = stage::perform(&config, &words, after)?;
-        tell(summary);
+        print_stderr(summary);
         worst = worst.max(status(&config, &report));
     }
     ended(worst)
@@ -113,7 +113,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), Failure> {
 
 /// The figures and the result of the run.
 fn to_json(config: &Config, report: &RunReport, preflight: &[Check]) -> Value {
-    let figures = with(json!(report.figures.report()), &end_json(report));
+    let figures = merged(json!(report.figures.report()), &end_json(report));
     let more = json!({
         "timing": report.timing,
         "holds": report.holds,
@@ -124,7 +124,7 @@ fn to_json(config: &Config, report: &RunReport, preflight: &[Check]) -> Value {
         "record_dropped": report.record.as_ref().ok().map(|finished| finished.dropped),
         "preflight": preflight,
     });
-    with(figures, &more)
+    merged(figures, &more)
 }
 
 /// What the screen shows besides the object.

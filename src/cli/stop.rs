@@ -1,7 +1,7 @@
 //! `needle-bench stop`: quick stop of both drives, whichever program moves them.
 
 use super::arguments::Configured;
-use super::output::{say, tell};
+use super::output::{print_stderr, print_stdout};
 use super::perform::open_bus;
 use super::records::last_run_on_a_bus;
 use super::{ENVIRONMENT_FAILED, Failure, ended};
@@ -45,7 +45,7 @@ pub(super) fn stop(configured: &Configured, as_json: bool) -> Result<(), Failure
     let checked =
         configured.load(None).and_then(|config| Ok(config.stage.to_stage(&config.can)?));
     if let Err(failure) = checked {
-        tell(format_args!(
+        print_stderr(format_args!(
             "warning: the stop was sent, but every other command would refuse this configuration:\n\
              {failure}"
         ));
@@ -92,27 +92,27 @@ fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<(), Failur
         let unsent: Vec<String> = trouble.unsent.iter().map(Frame::to_string).collect();
         errors.push(format!("not sent: {}: {first}", unsent.join(", ")));
     } else if trouble.first.is_some() {
-        tell(format_args!(
+        print_stderr(format_args!(
             "warning: every frame was sent in the end, after {} refusals: {first}",
             trouble.refused
         ));
     }
     for error in &errors {
-        tell(format_args!("error: {error}"));
+        print_stderr(format_args!("error: {error}"));
     }
     let is_confirmed = errors.is_empty();
     if !is_confirmed {
-        tell("an axis whose stop was not confirmed may still move: use the emergency stop");
+        print_stderr("an axis whose stop was not confirmed may still move: use the emergency stop");
     }
     // Stdout comes last: if it blocks, everything on stderr was written already.
     for line in stands {
-        say(line)?;
+        print_stdout(line)?;
     }
     if as_json {
         if !is_confirmed {
             object["error"] = json!(errors.join("; "));
         }
-        say(object)?;
+        print_stdout(object)?;
     }
     ended(if is_confirmed { 0 } else { ENVIRONMENT_FAILED })
 }

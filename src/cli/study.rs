@@ -3,7 +3,7 @@
 use super::Failure;
 use super::arguments::{Configured, seed};
 use super::mask::mask_reader;
-use super::output::{give, refuse_existing, shell_word, write_new};
+use super::output::{print_result, refuse_existing, shell_word, write_new};
 use crate::config::Config;
 use crate::geometry::coordinates;
 use crate::runtime::Study;
@@ -100,7 +100,7 @@ pub(super) fn study(arguments: &Arguments) -> Result<(), Failure> {
         repeat => repeat(&arguments.configured, config.insertion.plane_out_of_reach),
     };
     let text = || screen(include_str!("study.txt"), &report, more);
-    give(arguments.json, &report, text)
+    print_result(arguments.json, &report, text)
 }
 
 /// The command that repeats a trial, but for its seed. A run refuses what a study counts.

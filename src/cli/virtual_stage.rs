@@ -1,7 +1,7 @@
 //! `vcan-stage`: the virtual stage on a CAN interface, with its tracker on TCP.
 
 use super::arguments::{Configured, number_in};
-use super::output::tell;
+use super::output::print_stderr;
 use super::perform::open_bus;
 use super::{Failure, io_runtime};
 use crate::archive::{CandumpLine, interface_name, unix_us};
@@ -68,7 +68,7 @@ pub(super) fn serve(arguments: &Arguments) -> Result<(), Failure> {
         .map_err(Failure::environment)?;
     let until = arguments.seconds.map(|s| clock.now() + Duration::from_secs_f64(s));
     let stage = VirtualStage::new(stage, clock.now());
-    tell(format_args!(
+    print_stderr(format_args!(
         "vcan-stage: nodes {} and {} on {}, \"{tool}\" at {}",
         config.stage.insertion.node,
         config.stage.rotation.node,

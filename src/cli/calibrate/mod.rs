@@ -9,7 +9,7 @@ pub(super) mod tracker;
 use self::recordings::{collect, turn};
 use super::Failure;
 use super::arguments::{Configured, number_in, text_of};
-use super::output::{refuse_existing, say, tell, with, write_new};
+use super::output::{merged, print_stderr, print_stdout, refuse_existing, write_new};
 use super::records::{Insertion, Insertions};
 use crate::archive::sha256_hex;
 use crate::calibration::{FiducialPair, NeedleFit, PosedRow, RegistrationFit, TipFit, TurnSample};
@@ -144,7 +144,7 @@ impl Output {
 
     /// Writes the result: the operator's `summary`, a template for the values of `json` and `more`;
     /// `overlay` as TOML below the comment `header` for the configuration; `json` for programs.
-    fn give(
+    fn write(
         &self,
         summary: (&str, Shown),
         header: &str,
@@ -152,23 +152,23 @@ impl Output {
         json: &Value,
     ) -> Result<(), Failure> {
         let toml = toml::to_string(overlay).map_err(Failure::environment)?;
-        self.give_toml(summary, &format!("{header}{toml}"), json)
+        self.write_toml(summary, &format!("{header}{toml}"), json)
     }
 
     /// The same, with the `toml` at hand.
-    fn give_toml(
+    fn write_toml(
         &self,
         (summary, more): (&str, Shown),
         toml: &str,
         json: &Value,
     ) -> Result<(), Failure> {
-        tell(screen(summary, json, more).map_err(Failure::environment)?);
+        print_stderr(screen(summary, json, more).map_err(Failure::environment)?);
         if let Some(path) = &self.out {
             write_new(path, toml)?;
         }
         match self.out {
-            _ if self.json => say(json),
-            None => say(toml.trim_end()),
+            _ if self.json => print_stdout(json),
+            None => print_stdout(toml.trim_end()),
             Some(_) => Ok(()),
         }
     }
@@ -183,7 +183,7 @@ fn fit_of(file: &str, text: Option<&str>, found: &Value) -> Value {
         "version": env!("CARGO_PKG_VERSION"),
         "date_utc": utc_text(SystemTime::now()),
     });
-    with(source, found)
+    merged(source, found)
 }
 
 /// An orientation as a configuration has it.
@@ -228,7 +228,12 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<(), Failure> {
         },
     });
     let times = STUDENT_95.get(fit.insertions - 3).unwrap_or(&STUDENT_MANY);
-    output.give((include_str!("needle.txt"), context! { times }), NEEDLE_HEADER, &overlay, &overlay)
+    output.write(
+        (include_str!("needle.txt"), context! { times }),
+        NEEDLE_HEADER,
+        &overlay,
+        &overlay,
+    )
 }
 
 /// The rows of an insertion; every row must have an orientation.
@@ -285,7 +290,7 @@ fn registration(arguments: &RegistrationArguments) -> Result<(), Failure> {
         "sd_mm": config.registration_sd_of_mm(&fit),
         "fit": fit_of(&path.display().to_string(), Some(&text), &found),
     });
-    let registration = with(angles(&fit.x_wt.rotation), &registration);
+    let registration = merged(angles(&fit.x_wt.rotation), &registration);
     let json = json!({
         "registration": registration,
         "worst_point": fit.worst_point,
@@ -295,7 +300,7 @@ fn registration(arguments: &RegistrationArguments) -> Result<(), Failure> {
     let overlay = json!({ "tracker": { "registration": registration } });
     let more = context! { rms_max_mm => arguments.rms_max_mm, remarks => fit.remarks() };
     let summary = (include_str!("registration.txt"), more);
-    arguments.output.give(summary, REGISTRATION_HEADER, &overlay, &json)
+    arguments.output.write(summary, REGISTRATION_HEADER, &overlay, &json)
 }
 
 /// The tip's offset and tilt on the sensor, from the sensor's circle while the base turns.
@@ -338,5 +343,5 @@ fn tip(arguments: &TipArguments) -> Result<(), Failure> {
         tilt_deg => fit.mount.map(|mount| mount.axis.z.clamp(-1.0, 1.0).acos().to_degrees()),
     };
     let overlay = json!({ "tracker": tracker });
-    arguments.output.give((include_str!("tip.txt"), more), &header, &overlay, &json)
+    arguments.output.write((include_str!("tip.txt"), more), &header, &overlay, &json)
 }

@@ -5,7 +5,7 @@
 use crate::calibration::{FiducialPair, RegistrationFit};
 use crate::cli::arguments::Configured;
 use crate::cli::ending::status;
-use crate::cli::output::{refuse_existing, tell, write_new};
+use crate::cli::output::{print_stderr, refuse_existing, write_new};
 use crate::cli::perform::Options;
 use crate::cli::records::{ReplayedRun, position_at, replay_run};
 use crate::cli::stage::{load_stage, perform, sensor_off_axis};
@@ -51,7 +51,7 @@ pub(super) fn collect(path: &Path, configured: &Configured) -> Result<(), Failur
     let mut text = HEADER.to_owned();
     let mut number = 1_usize;
     loop {
-        tell(format_args!(
+        print_stderr(format_args!(
             "point {number}: touch it, hold still, and type its place on the bench as x y z in mm; an \
              empty line ends, `undo` takes the last point back"
         ));
@@ -67,18 +67,21 @@ pub(super) fn collect(path: &Path, configured: &Configured) -> Result<(), Failur
             continue;
         }
         let Some(bench_mm) = place(&line) else {
-            tell(format_args!("not three numbers: {line}"));
+            print_stderr(format_args!("not three numbers: {line}"));
             continue;
         };
         match at_rest(&mut listener) {
-            Err(why) => tell(format_args!("not taken: {why}")),
+            Err(why) => print_stderr(format_args!("not taken: {why}")),
             Ok(tracker_mm) => {
                 let [x, y, z]: [f64; 3] = tracker_mm.into();
                 let [u, v, w] = bench_mm;
                 let row = format!("{x},{y},{z},{u},{v},{w}\n");
                 file.write_all(row.as_bytes()).and_then(|()| file.flush()).map_err(failed)?;
                 text.push_str(&row);
-                tell(format_args!("taken: {x:.2}, {y:.2}, {z:.2} mm; {}", residuals(&text)));
+                print_stderr(format_args!(
+                    "taken: {x:.2}, {y:.2}, {z:.2} mm; {}",
+                    residuals(&text)
+                ));
                 number += 1;
             }
         }
@@ -149,7 +152,7 @@ fn at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
             return Ok(mean_mm);
         }
         if moved_mm.replace(sd_mm).is_none() {
-            tell("the tool moves: hold it still");
+            print_stderr("the tool moves: hold it still");
         }
     }
     Err(match moved_mm {
@@ -220,7 +223,7 @@ pub(super) fn turn(path: &Path, configured: &Configured, rehearse: bool) -> Resu
     for by in TURNS {
         let line = format!("jog --axis rotation --by {by}");
         let (report, summary) = perform(&config, &line, Options::default())?;
-        tell(summary);
+        print_stderr(summary);
         ended(status(&config, &report))?;
         for row in rows_of(replay_run(&report.run_dir)?) {
             has_orientation &= row.len() == CELLS;

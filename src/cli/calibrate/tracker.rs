@@ -67,7 +67,7 @@ pub(in crate::cli) fn present(
     });
     let more = context! { source => escaped(source) };
     let toml = screen(include_str!("noise.toml"), &json, more).map_err(Failure::environment)?;
-    output.give_toml((include_str!("tracker.txt"), context! {}), &format!("{toml}\n"), &json)
+    output.write_toml((include_str!("tracker.txt"), context! {}), &format!("{toml}\n"), &json)
 }
 
 /// A sample as the calibration takes it.

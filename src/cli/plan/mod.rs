@@ -5,7 +5,7 @@ mod picture;
 use self::picture::picture;
 use super::arguments::Configured;
 use super::mask::mask_reader;
-use super::output::{give, refuse_existing, write_new};
+use super::output::{print_result, refuse_existing, write_new};
 use super::{Failure, STOPPED, ended};
 use crate::geometry::FixedAngles;
 use crate::plan::{Answer, Arc, Problem, Status, Tip, World, plan as solve, plan_with_reserve};
@@ -53,7 +53,7 @@ pub(super) fn plan(arguments: &Arguments) -> Result<(), Failure> {
         write_new(path, &picture(&world, &problem, &answer)?)?;
     }
     let text = || screen(include_str!("plan.txt"), &object, context! {});
-    give(arguments.json, &object, text)?;
+    print_result(arguments.json, &object, text)?;
     ended(match answer.status {
         Status::Plan => 0,
         Status::None | Status::Budget => STOPPED,

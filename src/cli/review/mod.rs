@@ -2,7 +2,7 @@
 
 mod read;
 
-use super::output::{give, tell};
+use super::output::{print_result, print_stderr};
 use super::records::{RUNS, describe, newest_first, open};
 use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure, ended};
 use crate::archive::{Verdict, VerdictKind, file};
@@ -89,7 +89,7 @@ pub(super) fn review(arguments: &Arguments) -> Result<(), Failure> {
         [a, b] => {
             let (a, b) = (read::run(a)?, read::run(b)?);
             let comparison = Comparison::of(&a, &b);
-            give(arguments.json, &comparison.to_json(), || comparison.to_text())?;
+            print_result(arguments.json, &comparison.to_json(), || comparison.to_text())?;
             status(&[&a, &b])
         }
         many => {
@@ -97,7 +97,7 @@ pub(super) fn review(arguments: &Arguments) -> Result<(), Failure> {
             let entries = entries.collect::<io::Result<Vec<_>>>()?.concat();
             let campaign = Campaign::of(entries, arguments.by.as_deref());
             let campaign = campaign.map_err(Failure::configuration)?;
-            give(arguments.json, &campaign.to_json(), || campaign.to_text())
+            print_result(arguments.json, &campaign.to_json(), || campaign.to_text())
         }
     }
 }
@@ -122,11 +122,11 @@ fn one(path: &Path, arguments: &Arguments) -> Result<(), Failure> {
     let report = written.as_ref().and_then(|written| written.as_deref().ok());
     let mut object = to_json(&run);
     object["report"] = json!(report);
-    give(arguments.json, &object, || to_text(&run, report))?;
+    print_result(arguments.json, &object, || to_text(&run, report))?;
     match written {
         // The summary was printed already; the error follows it.
         Some(Err(error)) => {
-            tell(format_args!("error: {error}"));
+            print_stderr(format_args!("error: {error}"));
             ended(ENVIRONMENT_FAILED)
         }
         _ if arguments.open => open_viewer(path).and_then(|()| status(&[&run])),
@@ -192,7 +192,7 @@ fn close(path: &Path, json: bool) -> Result<(), Failure> {
     }?;
     let (_, config) = open(path)?;
     let fault = make_recording(path, describe(config), &mut |made| {
-        tell(format_args!(
+        print_stderr(format_args!(
             "making {}: {:.0} s of the run done",
             file::RECORDING,
             made.as_secs_f64()
@@ -204,11 +204,11 @@ fn close(path: &Path, json: bool) -> Result<(), Failure> {
         if lacks_recording(path) {
             return Err(Failure::environment(text));
         }
-        tell(text);
+        print_stderr(text);
     }
     let Some(repaired) = repaired else {
         let object = json!({ "run_dir": dir.to_string(), "recording_made": true });
-        return give(json, &object, || Ok(format!("{dir}: {} made", file::RECORDING)));
+        return print_result(json, &object, || Ok(format!("{dir}: {} made", file::RECORDING)));
     };
     let cut = |(file, bytes): &(String, u64)| json!({ "file": file, "bytes": bytes });
     let object = json!({
@@ -217,7 +217,7 @@ fn close(path: &Path, json: bool) -> Result<(), Failure> {
         "counts": repaired.counts,
         "cut": repaired.cuts.iter().map(cut).collect::<Vec<_>>(),
     });
-    give(json, &object, || Ok(format!("{dir}: closed: {repaired}")))
+    print_result(json, &object, || Ok(format!("{dir}: closed: {repaired}")))
 }
 
 /// Whether the record in `path` has no `run.rrd`, or none that its manifest knows.
@@ -254,5 +254,5 @@ fn judge(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<
     manifest.verdicts.push(Verdict { verdict, reason: reason.to_owned(), given_utc });
     write_manifest(path, &manifest).map_err(Failure::environment)?;
     let object = json!({ "run_dir": dir, "verdicts": manifest.verdicts });
-    give(json, &object, || Ok(format!("{dir}: {verdict}, {}", escaped(reason))))
+    print_result(json, &object, || Ok(format!("{dir}: {verdict}, {}", escaped(reason))))
 }

@@ -10,7 +10,7 @@ pub(super) use self::status::{drive_json, read_status};
 use self::distance::Distance;
 use super::Failure;
 use super::arguments::{About, Configured, RealTimeArguments};
-use super::output::tell;
+use super::output::print_stderr;
 use super::records::last_run_on_a_bus;
 use super::stop::stop;
 use crate::archive::Manifest;
@@ -327,7 +327,7 @@ pub(super) fn load_stage(
     let mut config = configured.load(None)?;
     check_bus(config.bus(), emulated)?;
     if let Some(key) = key(&config) {
-        tell(format_args!("emulated    {key}"));
+        print_stderr(format_args!("emulated    {key}"));
         configured.set.push(key);
         config = configured.load(None)?;
     }

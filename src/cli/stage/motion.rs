@@ -3,7 +3,7 @@
 use super::{Arguments, Motion};
 use crate::archive::{file, proof};
 use crate::cli::ending::{after_operation, ending, status};
-use crate::cli::output::{say, show, with};
+use crate::cli::output::{merged, print_stdout, print_wrapped};
 use crate::cli::perform::{Job, Options, Performed, end_json};
 use crate::cli::{Failure, ended};
 use crate::config::Config;
@@ -28,10 +28,10 @@ pub(super) fn operate(
     };
     let Performed { report, done, .. } = job(config, motion, options)?.perform()?;
     match arguments.json {
-        true => say(to_json(motion.name(), &done, &report))?,
+        true => print_stdout(to_json(motion.name(), &done, &report))?,
         false => {
-            show(summary(config, path, motion, &done, &report))?;
-            proof_of(&report).map_or(Ok(()), show)?;
+            print_wrapped(summary(config, path, motion, &done, &report))?;
+            proof_of(&report).map_or(Ok(()), print_wrapped)?;
         }
     }
     ended(status(config, &report))
@@ -68,7 +68,7 @@ fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
         "axes": done.iter().map(axis).collect::<Vec<_>>(),
         "proof": proof_of(report),
     });
-    with(object, &end_json(report))
+    merged(object, &end_json(report))
 }
 
 /// What the motion has proved, from its record.

@@ -1,6 +1,6 @@
 //! `status`: what the drives say of themselves.
 
-use crate::cli::output::{is_unread, say, show, tell};
+use crate::cli::output::{has_no_reader, print_stderr, print_stdout, print_wrapped};
 use crate::cli::perform::open_bus;
 use crate::cli::{ENVIRONMENT_FAILED, Failure, ended};
 use crate::config::Config;
@@ -50,7 +50,8 @@ pub(super) fn watch(config: &Config, as_json: bool) -> Result<(), Failure> {
     loop {
         let read = status(config, as_json);
         // A drive that does not answer now may answer the next time; without a bus none does.
-        if read.as_ref().is_err_and(|failure| failure.message.is_some()) || is_unread(&stdout()) {
+        if read.as_ref().is_err_and(|failure| failure.message.is_some()) || has_no_reader(&stdout())
+        {
             return read;
         }
         let next = Instant::now() + WATCH_PERIOD;
@@ -83,11 +84,11 @@ pub(super) fn status(config: &Config, as_json: bool) -> Result<(), Failure> {
         object["error"] = json!(errors.join("; "));
     }
     match as_json {
-        true => say(object)?,
-        false => lines.iter().try_for_each(show)?,
+        true => print_stdout(object)?,
+        false => lines.iter().try_for_each(print_wrapped)?,
     }
     for error in &errors {
-        tell(format_args!("error: {error}"));
+        print_stderr(format_args!("error: {error}"));
     }
     ended(if errors.is_empty() { 0 } else { ENVIRONMENT_FAILED })
 }

@@ -6,7 +6,7 @@ use crate::cli::Failure;
 use crate::cli::arguments::{Configured, number_in};
 use crate::cli::calibrate::Output;
 use crate::cli::calibrate::tracker::{POSITION, QUATERNION, RECEIVED, STAMP, present, rest_sample};
-use crate::cli::output::{is_unread, refuse_existing, say, tell};
+use crate::cli::output::{has_no_reader, print_stderr, print_stdout, refuse_existing};
 use crate::config::TrackerConfig;
 use crate::session::SampleRecord;
 use crate::text::{clipped, table};
@@ -151,15 +151,17 @@ fn list(arguments: &ListArguments) -> Result<(), Failure> {
     if arguments.json {
         let tools: Vec<Value> =
             tools.iter().map(|(name, tool)| tool.json(name, is_configured(name))).collect();
-        say(json!({ "seconds": arguments.seconds, "tools": tools }))?;
+        print_stdout(json!({ "seconds": arguments.seconds, "tools": tools }))?;
     } else {
         let head = ["tool", "type", "samples", "rate", "status"].map(str::to_owned).to_vec();
         let rows = tools.iter().map(|(name, tool)| tool.row(name, is_configured(name)));
         let rows: Vec<Vec<String>> = std::iter::once(head).chain(rows).collect();
-        say(table(&rows).join("\n"))?;
+        print_stdout(table(&rows).join("\n"))?;
     }
     if !tools.keys().any(is_configured) {
-        tell(format_args!("warning: none of them is tracker.tool = \"{configured}\"; set it"));
+        print_stderr(format_args!(
+            "warning: none of them is tracker.tool = \"{configured}\"; set it"
+        ));
     }
     Ok(())
 }
@@ -262,18 +264,18 @@ fn watch(arguments: &WatchArguments) -> Result<(), Failure> {
     let start = listener.now();
     let end = arguments.seconds.map_or(Time::NEVER, |s| start + Duration::from_secs_f64(s));
     let mut last_line = start;
-    while !listener.is_over() && listener.now() < end && !is_unread(&io::stdout()) {
+    while !listener.is_over() && listener.now() < end && !has_no_reader(&io::stdout()) {
         let due = (last_line + LINE_PERIOD).min(end);
         while let Some(event) = listener.next(due) {
             watch.take(&event);
         }
         let now = listener.now();
         if now >= due || watch.positions > 0 {
-            say(watch.line(now, now.seconds_after(last_line).max(1e-3), &mut listener))?;
+            print_stdout(watch.line(now, now.seconds_after(last_line).max(1e-3), &mut listener))?;
         }
         last_line = now;
     }
-    if is_unread(&io::stdout()) {
+    if has_no_reader(&io::stdout()) {
         return Ok(());
     }
     watch.last.map(|_| ()).ok_or_else(|| listener.nothing())
@@ -391,7 +393,10 @@ fn record(arguments: &RecordArguments) -> Result<(), Failure> {
         (true, invalid) => format!("; {invalid} invalid ones are not in it"),
         (false, invalid) => format!(", {invalid} of them invalid"),
     };
-    tell(format_args!("tracker: {written} samples of \"{tool}\" in {}{left_out}", path.display()));
+    print_stderr(format_args!(
+        "tracker: {written} samples of \"{tool}\" in {}{left_out}",
+        path.display()
+    ));
     Ok(())
 }
 
@@ -410,7 +415,7 @@ fn rest(arguments: &RestArguments) -> Result<(), Failure> {
     arguments.output.refuse_existing()?;
     let mut listener = listen(&arguments.configured, false)?;
     let source = described(&listener.config);
-    tell(format_args!(
+    print_stderr(format_args!(
         "tracker: hold \"{}\" still for {} s",
         listener.config.tracker.tool, arguments.seconds
     ));

@@ -5,7 +5,7 @@ mod commands;
 pub(super) use self::commands::{Look, tracker};
 
 use super::arguments::{Configured, text_of};
-use super::output::tell;
+use super::output::print_stderr;
 use super::{Failure, io_runtime};
 use crate::config::{Config, TrackerConfig, TrackerMode, TrackerSource};
 use crate::runtime::{Clock, Interrupt};
@@ -217,7 +217,9 @@ impl Listener {
         }
         match self.link.dropped() {
             0 => {}
-            lost => tell(format_args!("warning: {lost} samples were lost, they came too fast")),
+            lost => {
+                print_stderr(format_args!("warning: {lost} samples were lost, they came too fast"))
+            }
         }
         Ok(())
     }
