@@ -73,7 +73,7 @@ impl Configured {
 
 /// The text of a file that the arguments name.
 pub(super) fn text_of(path: &Path) -> Result<String, Failure> {
-    text(path).map_err(|error| Failure::in_file(path, error))
+    text(path).map_err(|error| Failure::bad_input(path, error))
 }
 
 /// The text of the file `path`, or why it cannot be read.

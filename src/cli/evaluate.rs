@@ -44,7 +44,7 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<(), Failure> {
         let (mut scores, mut files) = (Vec::new(), Vec::new());
         for Insertion { path, recording, .. } in &insertions {
             let score = one(&observer, |observer| scored_by(observer, recording));
-            let score = score.map_err(|error| Failure::in_file(path, error))?;
+            let score = score.map_err(|error| Failure::bad_input(path, error))?;
             files.push(merged(json!({ "file": path.display().to_string() }), &json!(score)));
             scores.push(score);
         }

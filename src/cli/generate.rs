@@ -29,7 +29,7 @@ pub(super) fn generate(what: &What) -> Result<(), Failure> {
         What::Man { dir } => {
             let written = std::fs::create_dir_all(dir)
                 .and_then(|()| clap_mangen::generate_to(command_line(), dir));
-            return written.map_err(|error| Failure::on_file(dir, error));
+            return written.map_err(|error| Failure::io(dir, error));
         }
     };
     // Not to stdout: clap_complete panics if that is closed.

@@ -101,13 +101,13 @@ impl Failure {
         Failure { message: Some(error.to_string()), status: ENVIRONMENT_FAILED }
     }
 
-    /// What is in the file at `path` is wrong.
-    fn in_file(path: &Path, error: impl Display) -> Self {
+    /// The content of the file or folder `path` is wrong.
+    fn bad_input(path: &Path, error: impl Display) -> Self {
         Failure::configuration(format_args!("{}: {error}", path.display()))
     }
 
-    /// The system refuses the file at `path`.
-    fn on_file(path: &Path, error: impl Display) -> Self {
+    /// The system cannot read or write the file `path`.
+    fn io(path: &Path, error: impl Display) -> Self {
         Failure::environment(format_args!("{}: {error}", path.display()))
     }
 }

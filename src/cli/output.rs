@@ -61,7 +61,7 @@ pub(super) fn write_new(path: &Path, text: &str) -> Result<(), Failure> {
     let written = File::create_new(path).and_then(|mut file| file.write_all(text.as_bytes()));
     written.map_err(|error| match error.kind() {
         ErrorKind::AlreadyExists => already_exists(path),
-        _ => Failure::on_file(path, format_args!("cannot be written: {error}")),
+        _ => Failure::io(path, format_args!("cannot be written: {error}")),
     })
 }
 
@@ -71,7 +71,7 @@ pub(super) fn refuse_existing(path: Option<&Path>) -> Result<(), Failure> {
 }
 
 fn already_exists(path: &Path) -> Failure {
-    Failure::in_file(path, "exists, and is not overwritten; name another file, or remove it")
+    Failure::bad_input(path, "exists, and is not overwritten; name another file, or remove it")
 }
 
 /// `word` as a shell takes it.

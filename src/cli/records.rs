@@ -129,9 +129,9 @@ pub(super) fn replay_run(path: &Path) -> Result<ReplayedRun, Failure> {
         Record::Sample(sample) => samples.push(sample),
         _ => {}
     });
-    match replayed.map_err(|error| Failure::in_file(path, error))?.difference {
+    match replayed.map_err(|error| Failure::bad_input(path, error))?.difference {
         Some(difference) => {
-            Err(Failure::in_file(path, format_args!("does not replay: {difference}")))
+            Err(Failure::bad_input(path, format_args!("does not replay: {difference}")))
         }
         None => Ok(ReplayedRun { folder, config, stage, samples }),
     }
@@ -186,7 +186,7 @@ impl Insertions {
                 let first = first.path.display();
                 let error =
                     format!("the same recording as {first}: it would count twice, give each once");
-                return Err(Failure::in_file(path, error));
+                return Err(Failure::bad_input(path, error));
             }
             all.push(Insertion { path: path.to_owned(), text, recording });
         }
@@ -229,7 +229,7 @@ impl Insertions {
 fn insertion(path: &Path) -> Result<(String, Recording), Failure> {
     if !path.is_dir() {
         let text = text_of(path)?;
-        let recording = Recording::parse(&text).map_err(|error| Failure::in_file(path, error))?;
+        let recording = Recording::parse(&text).map_err(|error| Failure::bad_input(path, error))?;
         return Ok((text, recording));
     }
     let ReplayedRun { folder, config, stage, samples } = replay_run(path)?;
@@ -241,7 +241,7 @@ fn insertion(path: &Path) -> Result<(String, Recording), Failure> {
     match rows.is_empty() {
         true => {
             let why = "no position was accepted while the needle was inserted";
-            Err(Failure::in_file(path, why))
+            Err(Failure::bad_input(path, why))
         }
         false => Ok((folder.text(file::TRACKER)?, Recording { rows })),
     }

@@ -44,7 +44,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
     let recorded = Recorded { manifest: folder.manifest(), plan, open: &|name| folder.lines(name) };
     let begun = Instant::now();
     let replayed =
-        run_again(&recorded, what_if).map_err(|error| Failure::in_file(&arguments.run, error))?;
+        run_again(&recorded, what_if).map_err(|error| Failure::bad_input(&arguments.run, error))?;
     let speed = replayed.duration_s() / begun.elapsed().as_secs_f64();
     if let Some(path) = &arguments.out {
         write_new(path, &replayed.steps_csv())?;

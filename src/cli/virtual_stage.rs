@@ -46,7 +46,7 @@ fn write_data_sheets(stage: &VirtualStageConfig, dir: &Path) -> Result<(), Failu
     let drives = [("insertion.eds", &stage.insertion.0), ("rotation.eds", &stage.rotation.0)];
     for (name, drive) in drives {
         let path = dir.join(name);
-        std::fs::write(&path, drive.eds(name)).map_err(|error| Failure::on_file(&path, error))?;
+        std::fs::write(&path, drive.eds(name)).map_err(|error| Failure::io(&path, error))?;
     }
     Ok(())
 }
@@ -88,7 +88,7 @@ fn frame_log(
 ) -> Result<impl FnMut(Direction, &Frame) + use<>, Failure> {
     let file = path.map(|path| match File::create_new(path) {
         Ok(file) => Ok((LineWriter::new(file), path.display().to_string())),
-        Err(error) => Err(Failure::on_file(path, error)),
+        Err(error) => Err(Failure::io(path, error)),
     });
     let mut file = file.transpose()?;
     let origin = clock.origin_utc().duration_since(UNIX_EPOCH).unwrap_or_default();

@@ -241,7 +241,7 @@ fn posed(Insertion { path, recording, .. }: &Insertion) -> Result<Vec<PosedRow>,
     if recording.lacks_roll() {
         let why = "its orientations do not turn with the base; a needle is calibrated from those of a sensor \
                    of six degrees of freedom";
-        return Err(Failure::in_file(path, why));
+        return Err(Failure::bad_input(path, why));
     }
     let posed = recording.rows.iter().map(|row| {
         Some(PosedRow {
@@ -254,7 +254,7 @@ fn posed(Insertion { path, recording, .. }: &Insertion) -> Result<Vec<PosedRow>,
     });
     posed.collect::<Option<_>>().ok_or_else(|| {
         let lacks = "no columns qw,qx,qy,qz; a needle is calibrated from recorded orientations";
-        Failure::in_file(path, lacks)
+        Failure::bad_input(path, lacks)
     })
 }
 
@@ -278,9 +278,9 @@ fn registration(arguments: &RegistrationArguments) -> Result<(), Failure> {
         collect(path, &arguments.configured)?;
     }
     let text = text_of(path)?;
-    let pairs = FiducialPair::parse(&text).map_err(|error| Failure::in_file(path, error))?;
+    let pairs = FiducialPair::parse(&text).map_err(|error| Failure::bad_input(path, error))?;
     let fit = RegistrationFit::of(&pairs, arguments.rms_max_mm)
-        .map_err(|error| Failure::in_file(path, error))?;
+        .map_err(|error| Failure::bad_input(path, error))?;
     let found = json!({ "points": fit.points, "rms_mm": fit.rms_mm, "spread_mm": fit.spread_mm });
     let [x_mm, y_mm, z_mm]: [f64; 3] = fit.x_wt.translation.into();
     let registration = json!({
@@ -314,12 +314,12 @@ fn tip(arguments: &TipArguments) -> Result<(), Failure> {
     }
     let rms_max_mm = arguments.rms_max_mm.unwrap_or(rms_max_mm);
     let text = text_of(path)?;
-    let samples = TurnSample::parse(&text).map_err(|error| Failure::in_file(path, error))?;
-    let fit = TipFit::of(&samples, rms_max_mm).map_err(|error| Failure::in_file(path, error))?;
+    let samples = TurnSample::parse(&text).map_err(|error| Failure::bad_input(path, error))?;
+    let fit = TipFit::of(&samples, rms_max_mm).map_err(|error| Failure::bad_input(path, error))?;
     let oriented = samples.iter().all(|sample| sample.orientation_meas.is_some());
     if arguments.along_mm != 0.0 && !oriented {
         let why = "--along-mm needs the sensor's orientation: record qw,qx,qy,qz, or leave it out";
-        return Err(Failure::in_file(path, why));
+        return Err(Failure::bad_input(path, why));
     }
     let x_sb = fit.x_sb(arguments.along_mm);
     let found = json!({ "points": fit.points, "radius_mm": fit.radius_mm, "rms_mm": fit.rms_mm });

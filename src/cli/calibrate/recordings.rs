@@ -45,7 +45,7 @@ pub(super) fn collect(path: &Path, configured: &Configured) -> Result<(), Failur
         return Err(Failure::configuration(why));
     }
     write_new(path, HEADER)?;
-    let failed = |error| Failure::on_file(path, error);
+    let failed = |error| Failure::io(path, error);
     let mut file = OpenOptions::new().append(true).open(path).map_err(failed)?;
     let lines = lines();
     let mut text = HEADER.to_owned();

@@ -39,7 +39,7 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<(), Failure> {
     let config = arguments.configured.load(None)?;
     let text = text_of(path)?;
     let samples =
-        recorded(&text, &config.tracker).map_err(|error| Failure::in_file(path, error))?;
+        recorded(&text, &config.tracker).map_err(|error| Failure::bad_input(path, error))?;
     present(&samples, &path.display().to_string(), Some(&text), &arguments.output)
 }
 
@@ -50,7 +50,8 @@ pub(in crate::cli) fn present(
     text: Option<&str>,
     output: &Output,
 ) -> Result<(), Failure> {
-    let fit = TrackerFit::of(samples).map_err(|error| Failure::in_file(source.as_ref(), error))?;
+    let fit =
+        TrackerFit::of(samples).map_err(|error| Failure::bad_input(source.as_ref(), error))?;
     let found = serde_json::to_value(&fit).map_err(Failure::environment)?;
     let all = &fit.together;
     let json = json!({
