@@ -1,5 +1,5 @@
-//! Finds what the preflight judges: looks at the bus, the drives, the tracker, earlier runs, the disk.
-//! Nothing is written and nothing moves.
+//! Inspects what the preflight judges: the bus, the drives, the tracker, earlier runs and the disk. Nothing is
+//! written and nothing moves.
 
 use super::output::{print_stderr, print_stdout};
 use super::records::earlier_run;
@@ -10,7 +10,7 @@ use crate::archive::{Manifest, RunOutcome};
 use crate::config::{CanInterface, Config, TrackerSource};
 use crate::preflight::{
     BusFacts, Check, Listening, TrackerReport, Verdict, bus, calibrations, changes, disk, drive,
-    plane, proof, start_roll, to_text, tracker, worst,
+    plane, proof, start_roll, to_text, tracker,
 };
 use crate::runtime::Interrupt;
 use crate::stage::{Axis, AxisStatus};
@@ -28,26 +28,26 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 /// How long `run` listens to the tracker.
 const LISTEN: Duration = Duration::from_secs(2);
-/// How often its question looks for a signal.
-const ASK_EVERY_MS: u8 = 50;
+/// Interval at which the question of `run` checks for a signal.
+const SIGNAL_POLL_MS: u8 = 50;
 
-/// The list, and what was found for it.
+/// The checks, and what was found for them.
 pub(super) struct Preflight {
     pub(super) checks: Vec<Check>,
-    /// Of each drive on a bus.
+    /// The status of each drive that answered; empty for an emulated stage.
     pub(super) drives: Vec<(Axis, AxisStatus)>,
-    /// Of a tracker that can be listened to.
+    /// The report on the tracker, if it can be listened to without a run.
     pub(super) tracker: Option<TrackerReport>,
 }
 
 impl Preflight {
-    /// Inspects everything that `config` names, and listens to its tracker for the time `listen`. `config` may be the
-    /// rehearsal of `rig`: bus, drives and tracker are the emulated ones, calibrations and earlier runs
-    /// those of the rig.
+    /// Inspects everything that `config` names, and listens to its tracker for the time `listen`. `config` may be
+    /// the rehearsal of `rig`: then bus, drives and tracker are the emulated ones, but calibrations and earlier
+    /// runs are those of the rig.
     pub(super) fn inspect(config: &Config, rig: &Config, listen: Duration) -> Self {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let now_unix_us = i64::try_from(now.as_micros()).unwrap_or(i64::MAX);
-        let mut checks = bus(config, facts(config));
+        let mut checks = bus(config, bus_facts(config));
         let mut drives = Vec::new();
         if !rig.is_emulated() {
             match read_status(config) {
@@ -58,20 +58,21 @@ impl Preflight {
                         checks.extend(drive(config, axis, status));
                     }
                 }
-                Err(failure) => {
-                    let drives = Check::new("drives", "no bus", "both answer");
-                    checks.push(drives.unless(false, Verdict::Fail, failure.to_string()));
-                }
+                Err(failure) => checks.push(
+                    Check::new("drives", "no bus", "both answer")
+                        .with(Verdict::Fail, failure.to_string()),
+                ),
             }
-            let is_proof = |name: &str| name.starts_with("stage.") || name.starts_with("can.");
-            let is_prove = |run: &Manifest| {
+            let is_completed_proof = |run: &Manifest| {
                 let is_completed = run.outcome == Some(RunOutcome::Completed);
                 is_completed && run.operation.as_deref() == Some("prove")
             };
-            checks.push(proof(rig, earlier_run(rig, is_prove, is_proof).as_ref(), now_unix_us));
+            let concerns_proof = |key: &str| key.starts_with("stage.") || key.starts_with("can.");
+            let last_proof = earlier_run(rig, is_completed_proof, concerns_proof);
+            checks.push(proof(rig, last_proof.as_ref(), now_unix_us));
         }
-        let heard = listen_to_tracker(config, listen);
-        checks.extend(match &heard {
+        let listened = listen_to_tracker(config, listen);
+        checks.extend(match &listened {
             Ok(Some(report)) => tracker(config, report),
             Ok(None) if config.tip_source() == TrackerSource::Emulated => {
                 vec![Check::unlimited("tracker", "emulated: not listened to")]
@@ -79,15 +80,15 @@ impl Preflight {
             Ok(None) => {
                 let next = "watch it on its own: needle-bench tracker watch";
                 let check = Check::unlimited("tracker", "standard input: not listened to");
-                vec![check.unless(false, Verdict::Warn, next)]
+                vec![check.with(Verdict::Warn, next)]
             }
             Err(failure) => {
                 let next = "see tracker.address and tracker.mode";
                 let check = Check::new("tracker", failure.to_string(), "a connection");
-                vec![check.unless(false, Verdict::Fail, next)]
+                vec![check.with(Verdict::Fail, next)]
             }
         });
-        let report = heard.ok().flatten();
+        let report = listened.ok().flatten();
         checks.extend(calibrations(rig, now_unix_us));
         checks.extend(start_roll(rig));
         checks.extend(report.as_ref().and_then(|report| plane(config, report)));
@@ -95,17 +96,18 @@ impl Preflight {
         let free_mb = free_mb(dir).map_err(|error| format!("{}: {error}", dir.display()));
         checks.push(disk(config, free_mb));
         if !rig.is_emulated() {
-            let counts = |key: &str| !key.starts_with("emulator.") && !key.starts_with("record.");
-            let last = earlier_run(rig, |run| run.operation.is_none(), counts);
-            checks.push(changes(last.as_ref(), now_unix_us));
+            let is_insertion = |run: &Manifest| run.operation.is_none();
+            let concerns_rig =
+                |key: &str| !key.starts_with("emulator.") && !key.starts_with("record.");
+            let last_insertion = earlier_run(rig, is_insertion, concerns_rig);
+            checks.push(changes(last_insertion.as_ref(), now_unix_us));
         }
         Preflight { checks, drives, tracker: report }
     }
 
-    /// What the checks that failed found, a line each.
+    /// What the failed checks found and what to do next, a line each.
     pub(super) fn troubles(&self) -> Vec<String> {
-        let failed = self.checks.iter().filter(|check| check.verdict == Verdict::Fail);
-        failed
+        failed(&self.checks)
             .map(|Check { name, found, next_step, .. }| {
                 let next = next_step.as_deref().unwrap_or_default();
                 format!("{name}: {found}; {next}")
@@ -114,10 +116,15 @@ impl Preflight {
     }
 }
 
-/// Shows the list before a run on hardware, and asks. Returns the list, which is empty on the virtual stage.
+fn failed(checks: &[Check]) -> impl Iterator<Item = &Check> {
+    checks.iter().filter(|check| check.verdict == Verdict::Fail)
+}
+
+/// Shows the checks before a run on hardware, and asks the operator. Returns the checks; there are none on the
+/// virtual stage.
 ///
 /// # Errors
-/// The run is refused: by a row, by the operator, or because there is nobody to ask.
+/// The run is refused: by a failed check, by the operator, or because there is no terminal to ask at.
 pub(super) fn before_run(config: &Config, yes: bool, as_json: bool) -> Result<Vec<Check>, Failure> {
     if !config.stage.hardware || config.is_emulated() {
         return Ok(Vec::new());
@@ -128,26 +135,46 @@ pub(super) fn before_run(config: &Config, yes: bool, as_json: bool) -> Result<Ve
              --connect`, then give --yes",
         ));
     }
-    // From here on Ctrl-C is an answer, to the list as to the question.
+    // From here on Ctrl-C means no, during the checks as at the question; it does not kill the program.
     let interrupt = Interrupt::listen()?;
     let preflight = Preflight::inspect(config, config, LISTEN);
     print_stderr(to_text(&preflight.checks));
-    let failed = preflight.troubles().len();
-    let reason = match worst(&preflight.checks) {
-        _ if interrupt.is_raised() => "operator: interrupted".to_owned(),
-        Verdict::Fail => format!("preflight: {failed} of {} checks failed", preflight.checks.len()),
-        _ if yes || is_confirmed(config, &interrupt) => return Ok(preflight.checks),
-        _ => "not confirmed".to_owned(),
+    let is_confirmed = || yes || ask(config, &interrupt);
+    let refusal = refusal(&preflight.checks, || interrupt.is_raised(), is_confirmed);
+    let Some((reason, status)) = refusal else {
+        return Ok(preflight.checks);
     };
     print_stderr(format_args!("stopped: {reason}; nothing has moved"));
     if as_json {
         print_stdout(json!({ "outcome": null, "error": reason, "preflight": preflight.checks }))?;
     }
-    Err(Failure { message: None, status: if failed > 0 { ENVIRONMENT_FAILED } else { STOPPED } })
+    Err(Failure { message: None, status })
 }
 
-/// Shows the list of `rig` before its rehearsal `config`, which moves nothing and runs whatever the
-/// list says. A `quiet` rehearsal shows only what did not pass.
+/// Why the run does not start, and the exit status for it; `None` if it starts. Calls `ask` only if no check
+/// failed.
+fn refusal(
+    checks: &[Check],
+    is_interrupted: impl Fn() -> bool,
+    ask: impl FnOnce() -> bool,
+) -> Option<(String, u8)> {
+    let interrupted = || Some(("operator: interrupted".to_owned(), STOPPED));
+    if is_interrupted() {
+        return interrupted();
+    }
+    let failed = failed(checks).count();
+    if failed > 0 {
+        let reason = format!("preflight: {failed} of {} checks failed", checks.len());
+        return Some((reason, ENVIRONMENT_FAILED));
+    }
+    if ask() {
+        return None;
+    }
+    if is_interrupted() { interrupted() } else { Some(("not confirmed".to_owned(), STOPPED)) }
+}
+
+/// Shows the checks of `rig` before its rehearsal `config`. A rehearsal moves nothing, so it runs even if
+/// checks fail. A `quiet` rehearsal shows only the checks that did not pass.
 pub(super) fn before_rehearsal(config: &Config, rig: &Config, quiet: bool) -> Vec<Check> {
     let checks = Preflight::inspect(config, rig, LISTEN).checks;
     let is_shown = |check: &&Check| !quiet || check.verdict != Verdict::Pass;
@@ -158,8 +185,8 @@ pub(super) fn before_rehearsal(config: &Config, rig: &Config, quiet: bool) -> Ve
     checks
 }
 
-/// Asks, until a line is given or a signal comes.
-fn is_confirmed(config: &Config, interrupt: &Interrupt) -> bool {
+/// Asks the operator whether to insert. Waits for a line or a signal; true only for a yes.
+fn ask(config: &Config, interrupt: &Interrupt) -> bool {
     let insertion = &config.insertion;
     let stdin = std::io::stdin();
     // What was typed before the question is no answer to it.
@@ -168,11 +195,11 @@ fn is_confirmed(config: &Config, interrupt: &Interrupt) -> bool {
     }
     eprint!("insert {} mm at {} mm/s? [y/N] ", insertion.depth_mm, insertion.speed_mm_per_s);
     let _ = std::io::stderr().flush();
-    let is_given = || {
+    let is_answered = || {
         let mut line = [PollFd::new(stdin.as_fd(), PollFlags::POLLIN)];
-        !matches!(poll(&mut line, ASK_EVERY_MS), Ok(0) | Err(Errno::EINTR))
+        !matches!(poll(&mut line, SIGNAL_POLL_MS), Ok(0) | Err(Errno::EINTR))
     };
-    while !is_given() {
+    while !is_answered() {
         if interrupt.is_raised() {
             return false;
         }
@@ -182,8 +209,8 @@ fn is_confirmed(config: &Config, interrupt: &Interrupt) -> bool {
     read.is_ok() && matches!(answer.trim(), "y" | "Y" | "yes")
 }
 
-/// What the kernel says of the CAN interface; `None` where there is none of this name.
-fn facts(config: &Config) -> Result<Option<BusFacts>, String> {
+/// What the kernel reports about the CAN interface; `None` if there is no interface of this name.
+fn bus_facts(config: &Config) -> Result<Option<BusFacts>, String> {
     let CanInterface::Socket(name) = config.bus() else { return Ok(Some(BusFacts::default())) };
     if if_nametoindex(name.as_str()) == Err(Errno::ENODEV) {
         return Ok(None);
@@ -209,7 +236,7 @@ fn facts(config: &Config) -> Result<Option<BusFacts>, String> {
     }))
 }
 
-/// What came from the tracker; `None` where it cannot be listened to without a run.
+/// Listens to the tracker; `None` if it cannot be listened to without a run.
 fn listen_to_tracker(config: &Config, listen: Duration) -> Result<Option<TrackerReport>, Failure> {
     if config.tip_source() == TrackerSource::Emulated || config.tracker.is_standard_input() {
         return Ok(None);
@@ -225,4 +252,23 @@ fn listen_to_tracker(config: &Config, listen: Duration) -> Result<Option<Tracker
     }
     let now = listener.now();
     Ok(Some(listening.report(since, now, || listener.missing())))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Ctrl-C during the checks may be the reason why some of them failed.
+    #[test]
+    fn an_interrupted_preflight_is_a_stop_whatever_its_checks_found() {
+        let failed = [Check::new("disk", "9 MB", "100 MB").with(Verdict::Fail, "make room")];
+        let status_of = |checks: &[Check], is_interrupted: bool, answer: bool| {
+            refusal(checks, || is_interrupted, || answer).map(|(_, status)| status)
+        };
+        assert_eq!(status_of(&failed, true, true), Some(STOPPED));
+        assert_eq!(status_of(&failed, false, true), Some(ENVIRONMENT_FAILED));
+        assert_eq!(status_of(&[], true, true), Some(STOPPED));
+        assert_eq!(status_of(&[], false, false), Some(STOPPED));
+        assert_eq!(status_of(&[], false, true), None);
+    }
 }

@@ -1,7 +1,7 @@
 //! The checks before a run, while nothing has power, as one list.
 //!
-//! The caller looks at the bus, the drives, the tracker, earlier runs and the disk; this folder judges. After a
-//! [`Verdict::Fail`] nothing moves.
+//! The caller inspects the bus, the drives, the tracker, earlier runs and the disk; this folder judges what it
+//! found. After a [`Verdict::Fail`] nothing moves.
 
 mod calibration;
 mod equipment;
@@ -14,7 +14,7 @@ pub use listening::{Listening, TrackerReport};
 use derive_more::Display;
 use serde::Serialize;
 
-/// The longest name of a check.
+/// Length of the longest name of a check.
 const NAME_WIDTH: usize = 23;
 
 /// The result of a check.
@@ -61,21 +61,21 @@ impl Check {
         Check::new(name, found, "no limit")
     }
 
-    /// This check if it `passes`, else with that verdict and the next step.
+    /// This check if it `passes`, else [`with`](Self::with) that verdict and the next step.
     pub fn unless(self, passes: bool, verdict: Verdict, next_step: impl Into<String>) -> Self {
-        match passes || self.verdict > verdict {
+        if passes { self } else { self.with(verdict, next_step) }
+    }
+
+    /// This check with that verdict and the next step; unchanged if its verdict is worse already.
+    pub fn with(self, verdict: Verdict, next_step: impl Into<String>) -> Self {
+        match self.verdict > verdict {
             true => self,
             false => Check { verdict, next_step: Some(next_step.into()), ..self },
         }
     }
 }
 
-/// The worst of `checks`.
-pub fn worst(checks: &[Check]) -> Verdict {
-    checks.iter().map(|check| check.verdict).max().unwrap_or(Verdict::Pass)
-}
-
-/// The list for a screen: a line for each check, and what to do under those that did not pass.
+/// The list for a screen: a line for each check; below a check that did not pass, its next step.
 pub fn to_text(checks: &[Check]) -> String {
     let lines = checks.iter().map(|Check { name, verdict, found, limit, next_step }| {
         let next_step =
