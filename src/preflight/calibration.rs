@@ -8,7 +8,7 @@ use crate::config::{Config, RegistrationConfig};
 use crate::observer::ROLL_KNOWN_RAD;
 
 const DAY_US: f64 = 86_400e6;
-/// Two clocks may differ by an hour; a date further ahead is not believed.
+/// A date may be ahead of this machine's clock by an hour; a later one is wrong.
 const AHEAD_MAX_DAYS: f64 = 1.0 / 24.0;
 
 /// A run before this one.
@@ -16,19 +16,19 @@ const AHEAD_MAX_DAYS: f64 = 1.0 / 24.0;
 pub struct Earlier {
     /// When it began, RFC 3339.
     pub started_utc: String,
-    /// What it has proved.
+    /// What it proved about the drives, if it was a `stage prove`.
     pub proof: Option<String>,
-    /// The keys in which its configuration differs from this one.
+    /// The keys in which its configuration differs from the present one.
     pub changed: Vec<String>,
 }
 
-/// Days from `date_utc` to `now_unix_us`; `None` where it is no date.
+/// Days from `date_utc` to `now_unix_us`; `None` if `date_utc` is not a date.
 fn age_days(date_utc: &str, now_unix_us: i64) -> Option<f64> {
     Some((now_unix_us - unix_us_of(date_utc)?) as f64 / DAY_US)
 }
 
-/// True if the date is one, not ahead of the clock, and no older than `days_max`.
-fn is_young(days: Option<f64>, days_max: f64) -> bool {
+/// True for a known age that is not ahead of the clock and at most `days_max`.
+fn is_recent(days: Option<f64>, days_max: f64) -> bool {
     days.is_some_and(|days| (-AHEAD_MAX_DAYS..=days_max).contains(&days))
 }
 
@@ -46,16 +46,16 @@ fn ago(days: Option<f64>) -> String {
 pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
     let (tracker, is_emulated) = (&config.tracker, !config.stage.hardware);
     let days_max = config.calibration.max_age_days;
-    let aged =
+    let dated =
         |name: &str, found: String, limit: &str, fit: Option<&Provenance>, next: &str| {
             let days = fit.map(|fit| age_days(&fit.date_utc, now_unix_us));
             let age = days.map_or_else(|| "typed in, no date".to_owned(), ago);
             let found = if found.is_empty() { age } else { format!("{found}, {age}") };
-            let is_young = days.is_none_or(|days| is_young(days, days_max));
-            let unknown = format!("nothing shows when and how it was measured: {next}");
+            let is_recent = days.is_none_or(|days| is_recent(days, days_max));
+            let undated = format!("nothing shows when and how it was measured: {next}");
             Check::new(name, found, limit)
-                .unless(fit.is_some() || is_emulated, Warn, unknown)
-                .unless(is_young, Warn, format!("measure it again: {next}"))
+                .unless(fit.is_some() || is_emulated, Warn, undated)
+                .unless(is_recent, Warn, format!("measure it again: {next}"))
         };
     let register = "needle-bench calibrate registration";
     let collect = format!("{register} --collect");
@@ -64,7 +64,7 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
     let registration = match &tracker.registration {
         None => {
             let next = format!("{register}, then name its file in tracker.registration_file");
-            Check::new("registration", "missing", limit).unless(false, Fail, next)
+            Check::new("registration", "missing", limit).with(Fail, next)
         }
         Some(RegistrationConfig::Given(given)) => {
             let fit = given.fit.as_ref();
@@ -72,22 +72,22 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
             let provenance = fit.map(|fit| &fit.provenance);
             let is_close = fit.is_none_or(|fit| fit.rms_mm <= rms_max_mm);
             let next = format!("over {rms_max_mm} mm RMS: {register}");
-            aged("registration", found, &limit, provenance, &collect).unless(is_close, Fail, next)
+            dated("registration", found, &limit, provenance, &collect).unless(is_close, Fail, next)
         }
         Some(RegistrationConfig::Fiducials(fiducials)) => match fiducials.fit() {
             Ok(fit) => {
                 let found = format!("{} points, {:.2} mm RMS", fit.points, fit.rms_mm);
-                aged("registration", found, &limit, None, &collect)
+                dated("registration", found, &limit, None, &collect)
             }
             Err(error) => {
                 let check = Check::new("registration", error.to_string(), limit);
-                check.unless(false, Fail, collect)
+                check.with(Fail, collect)
             }
         },
     };
     let days_limit = format!("up to {days_max:.0} days");
     let fit = tracker.tip_fit.as_ref();
-    // The default stands for a sensor in the tip itself.
+    // The default is that of a sensor in the tip itself.
     let is_placeholder = fit.is_none() && tracker.tip_offset_mm == [0.0; 3];
     let found = match fit {
         Some(fit) => format!("{:.2} mm RMS", fit.rms_mm),
@@ -95,45 +95,46 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
         None => String::new(),
     };
     let next = "needle-bench calibrate tip";
-    let tip = aged("tip", found, &days_limit, fit.map(|fit| &fit.provenance), next);
+    let tip = dated("tip", found, &days_limit, fit.map(|fit| &fit.provenance), next);
     let next = format!("is the sensor in the tip itself? Else: {next}");
     let tip = tip.unless(!is_placeholder || is_emulated, Warn, next);
 
     let fit = config.needle.fit.as_ref();
     let found = fit.map(|fit| format!("{} insertions", fit.insertions)).unwrap_or_default();
     let next = "needle-bench calibrate needle";
-    let needle = aged("needle", found, &days_limit, fit.map(|fit| &fit.provenance), next);
+    let needle = dated("needle", found, &days_limit, fit.map(|fit| &fit.provenance), next);
     vec![registration, tip, needle]
 }
 
-/// Whether a registration that is turned about the needle would show in a run: against the roll at the start
-/// alone. `None` of an emulated rig.
+/// Checks that the roll at the start is known. Only against it does a run notice a registration that is turned
+/// about the needle. `None` for an emulated rig.
 pub fn start_roll(config: &Config) -> Option<Check> {
     let sd_deg = config.observer.invariant.start_sd.roll.to_degrees();
     let limit = format!("up to {:.0} deg", ROLL_KNOWN_RAD.to_degrees());
-    let next = "a registration turned about the needle will not show: compare tracker watch with a tool \
-                moved along each axis, or tell observer.start.roll_deg and observer.invariant.start_sd";
+    let next = "a registration turned about the needle would go unnoticed: compare tracker watch with a tool \
+                moved along each axis, or set observer.start.roll_deg and observer.invariant.start_sd";
     let check = Check::new("start roll", format!("known to {sd_deg:.0} deg"), limit);
     let is_known = sd_deg <= ROLL_KNOWN_RAD.to_degrees();
     config.stage.hardware.then(|| check.unless(is_known, Warn, next))
 }
 
-/// The last completed `stage prove` on this bus, and the keys of stage and bus that changed since.
+/// Judges the `last` completed `stage prove` on this bus: its age, and the keys of stage and bus that changed
+/// since.
 pub fn proof(config: &Config, last: Option<&Earlier>, now_unix_us: i64) -> Check {
     let next = "needle-bench stage prove, without a needle";
     let days_max = config.calibration.max_age_days;
     let limit = format!("this configuration, up to {days_max:.0} days");
     let Some(Earlier { started_utc, changed, proof }) = last else {
-        return Check::new("stage prove", "never", limit).unless(false, Warn, next);
+        return Check::new("stage prove", "never", limit).with(Warn, next);
     };
     let days = age_days(started_utc, now_unix_us);
     let proof = proof.as_ref().map(|proof| format!("{proof}, ")).unwrap_or_default();
     let found = format!("{proof}{}{}", ago(days), listed(changed, ", changed since: "));
-    let is_valid = changed.is_empty() && is_young(days, days_max);
+    let is_valid = changed.is_empty() && is_recent(days, days_max);
     Check::new("stage prove", found, limit).unless(is_valid, Warn, next)
 }
 
-/// What changed since the last run on this bus.
+/// Judges what changed since the `last` run on this bus.
 pub fn changes(last: Option<&Earlier>, now_unix_us: i64) -> Check {
     const UNCHANGED: &str = "0 keys changed";
     let check = |found: String| Check::new("configuration", found, UNCHANGED);
@@ -152,7 +153,7 @@ pub fn changes(last: Option<&Earlier>, now_unix_us: i64) -> Check {
     check(found).unless(changed.is_empty(), Warn, next)
 }
 
-/// The first of `keys` after `lead`; nothing where there are none.
+/// The first of `keys` after `lead`; empty if there are none.
 fn listed(keys: &[String], lead: &str) -> String {
     const SHOWN_MAX: usize = 4;
     let shown: Vec<&str> = keys.iter().take(SHOWN_MAX).map(String::as_str).collect();

@@ -1,4 +1,4 @@
-//! The bus, the drives, the tracker, the disk: as they are now.
+//! Judges the present state of the bus, the drives, the tracker and the disk.
 
 use super::Check;
 use super::Verdict::{Fail, Warn};
@@ -12,25 +12,25 @@ use nalgebra::Vector3;
 
 /// Bits on the wire in one SYNC period: SYNC, two set-points, two answers, and a share of heartbeats.
 const CYCLE_BITS: f64 = 600.0;
-/// A bus with more load than this delays set-points.
+/// Largest load of a bus that does not delay set-points.
 const LOAD_MAX: f64 = 0.5;
-/// From this error counter on a node warns (ISO 11898-1).
+/// Error counter at which a node reports "error warning" (ISO 11898-1).
 const ERRORS_WARN: u16 = 96;
-/// The noise of a short rest may be this much over what is configured.
+/// Largest ratio of the noise that is measured in a short rest to the configured noise.
 const NOISE_MAX: f64 = 1.5;
-/// The clocks of two machines agree within this, s.
+/// Largest difference between the clocks of two machines, s.
 const SKEW_MAX_S: f64 = 1.0;
-/// Positions within the way that is inserted before a hold.
+/// Fewest positions while the needle advances by `tracker.hold_after_mm`.
 const POSITIONS_PER_HOLD: f64 = 2.0;
 
-/// What the operating system knows of a CAN interface; `None` for what it does not say.
+/// What the operating system reports about a CAN interface; `None` for what it does not report.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct BusFacts {
     /// The interface is up.
     pub is_up: bool,
     /// State of the controller, in words.
     pub state: Option<String>,
-    /// The controller may send: it is neither off nor passive.
+    /// The controller may send: it is neither bus-off nor error passive.
     pub may_send: bool,
     /// Bit rate, bit/s.
     pub bit_rate: Option<u32>,
@@ -49,7 +49,7 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
         return vec![Check::unlimited("bus", format!("{}: not a CAN interface", config.bus()))];
     };
     let virtual_kind = ["vcan", "vxcan"].into_iter().find(|kind| name.starts_with(kind));
-    let look = format!("look at it yourself: ip -details -statistics link show {name}");
+    let inspect = format!("inspect it yourself: ip -details -statistics link show {name}");
     let set = |what: &str| {
         format!("sudo ip link set {name} down; sudo ip link set {name} up type can {what}")
     };
@@ -65,11 +65,11 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
                 ),
             };
             let check = Check::new("bus", format!("no interface {name}"), UP);
-            return vec![check.unless(false, Fail, next)];
+            return vec![check.with(Fail, next)];
         }
         Err(error) => {
             let check = Check::new("bus", format!("{name}: {error}"), UP);
-            return vec![check.unless(false, Warn, look)];
+            return vec![check.with(Warn, inspect)];
         }
     };
     let state = state.map(|state| format!(", {state}")).unwrap_or_default();
@@ -83,9 +83,9 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
 
     // A virtual interface has neither bit rate nor counters.
     let figure = |name: &str, found: Option<String>, limit: &str| {
-        let is_told = found.is_some() || !config.stage.hardware;
-        let found = found.unwrap_or_else(|| "the interface does not say".to_owned());
-        Check::new(name, found, limit).unless(is_told, Warn, &look)
+        let is_complete = found.is_some() || !config.stage.hardware;
+        let found = found.unwrap_or_else(|| "not reported by the interface".to_owned());
+        Check::new(name, found, limit).unless(is_complete, Warn, &inspect)
     };
     let load_of =
         |rate: u32| CYCLE_BITS * 1e3 / f64::from(config.can.bus.sync_ms) / f64::from(rate);
@@ -119,19 +119,19 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
             let limit =
                 format!("{} requests of {} ms", can.bus.sdo_attempts, can.bus.sdo_timeout_ms);
             let next = "is it powered, and are node and bit rate right?";
-            return vec![Check::new(name, trouble, limit).unless(false, Fail, next)];
+            return vec![Check::new(name, trouble, limit).with(Fail, next)];
         }
     };
-    let given = [
+    let required = [
         ("device type (0x1000)", status.device_type.is_some()),
         ("position (0x6064)", status.position_counts.is_some()),
     ];
-    let lacks = given.iter().filter(|(_, is_given)| !is_given).map(|row| row.0);
-    let lacks = lacks.collect::<Vec<_>>().join(" and ");
-    if !lacks.is_empty() {
-        let found = format!("node {} does not give its {lacks}", status.node);
-        let check = Check::new(name, found, given.map(|(what, _)| what).join(", "));
-        return vec![check.unless(false, Fail, "is it a CiA 402 drive?")];
+    let missing = required.iter().filter(|(_, is_present)| !is_present).map(|(object, _)| *object);
+    let missing = missing.collect::<Vec<_>>().join(" and ");
+    if !missing.is_empty() {
+        let found = format!("node {} does not give its {missing}", status.node);
+        let check = Check::new(name, found, required.map(|(object, _)| object).join(", "));
+        return vec![check.with(Fail, "is it a CiA 402 drive?")];
     }
     let drive = config.stage.axis(axis);
     let AxisStatus { node, identity, statusword, .. } = status;
@@ -161,27 +161,27 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
         let found = match status.homed {
             Some(true) => "homed",
             Some(false) => "not homed",
-            None => "the drive says it in homing mode alone, where the run asks it",
+            None => "reported in homing mode only, where the run asks for it",
         };
         let next = format!("needle-bench stage home --axis {axis}");
         let homing = Check::new(format!("{axis} homing"), found, "homed");
         checks.push(homing.unless(status.homed != Some(false), Fail, next));
     }
-    let way = if axis == Axis::Insertion { config.insertion.depth_mm } else { 0.0 };
+    let travel = if axis == Axis::Insertion { config.insertion.depth_mm } else { 0.0 };
     if let Some(position) = status.position.filter(|_| !drive.wraps && drive.zero.is_some()) {
-        checks.push(room(axis, position, way, drive));
+        checks.push(room(axis, position, travel, drive));
     }
     checks
 }
 
-/// The travel left for an axis at `position`, in mm or rad.
-fn room(axis: Axis, position: f64, way: f64, drive: &AxisConfig) -> Check {
+/// Checks that an axis at `position` can travel by `travel` within its limits; mm or rad.
+fn room(axis: Axis, position: f64, travel: f64, drive: &AxisConfig) -> Check {
     let AxisLimits { min, max, .. } = drive.limits;
-    // As the run compares them: on the grid of counts.
+    // The run compares whole counts, so this does too.
     let scale = drive.scale(axis, 0);
     let on_grid = |value| scale.counts(value).map_or(value, |counts| scale.value(counts));
-    let goal = position + way;
-    let found = match way == 0.0 {
+    let goal = position + travel;
+    let found = match travel == 0.0 {
         true => format!("at {}", axis.shown(position)),
         false => format!("from {} to {}", axis.shown(position), axis.shown(goal)),
     };
@@ -197,13 +197,13 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     let tool = &config.tracker.tool;
     let TrackerReport { accepted, refused, rate_hz, .. } = report;
     let found = format!("\"{tool}\", {accepted} accepted, {refused} refused");
-    let heard = Check::new("tracker", found, "at least 1 accepted, of 1 tool");
+    let stream = Check::new("tracker", found, "at least 1 accepted, of 1 tool");
     if let Some(trouble) = &report.trouble {
-        return vec![heard.unless(false, Fail, trouble)];
+        return vec![stream.with(Fail, trouble)];
     }
     let two = "two tools of this name take turns: rename one, or unplug it";
-    let heard = heard.unless(!report.has_two_tools, Fail, two);
-    let heard = heard.unless(*accepted > 0, Fail, "every position was outside tracker.workspace");
+    let stream = stream.unless(!report.has_two_tools, Fail, two);
+    let stream = stream.unless(*accepted > 0, Fail, "every position was outside tracker.workspace");
 
     let hold = &config.tracker.hold;
     let rate_min_hz = (POSITIONS_PER_HOLD * config.insertion.speed_mm_per_s / hold.after_mm)
@@ -237,10 +237,11 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     let stamps = Check::new("tracker stamps", found, format!("within {SKEW_MAX_S} s"))
         .unless(skew_s.is_some() || !is_stamped, Warn, send)
         .unless(is_within(skew_s, SKEW_MAX_S), Warn, set);
-    vec![heard, rate, noise, stamps, workspace(config, report)]
+    vec![stream, rate, noise, stamps, workspace(config, report)]
 }
 
-/// The measured tip against the workspace. Without a registration its place on the bench is not known.
+/// Checks that the measured tip is in the workspace. Without a registration the tip's position on the bench is
+/// unknown.
 fn workspace(config: &Config, report: &TrackerReport) -> Check {
     let name = "tracker workspace";
     let limit = match &config.tracker.workspace {
@@ -252,24 +253,24 @@ fn workspace(config: &Config, report: &TrackerReport) -> Check {
     };
     let Some(tip_mm) = report.last_position_bench_mm.map(Vector3::from) else {
         let next = "bring the tool into the tracker's view";
-        return Check::new(name, "no position", limit).unless(false, Warn, next);
+        return Check::new(name, "no position", limit).with(Warn, next);
     };
-    let is_placed = config.tracker.registration.is_some();
-    let frame = if is_placed { "" } else { " in the tracker's frame" };
+    let is_registered = config.tracker.registration.is_some();
+    let frame = if is_registered { "" } else { " in the tracker's frame" };
     let [x, y, z] = tip_mm.into();
     let check = Check::new(name, format!("tip at {x:.1}, {y:.1}, {z:.1} mm{frame}"), limit);
     let Some(workspace) = &config.tracker.workspace else {
-        let next = "set tracker.workspace: no position outside is believed";
+        let next = "set tracker.workspace: positions outside it are refused";
         return check.unless(!config.stage.hardware, Warn, next);
     };
-    let is_inside = !is_placed || workspace.check(&tip_mm).is_ok();
+    let is_inside = !is_registered || workspace.check(&tip_mm).is_ok();
     let next = "check the registration with a tool at a known place, then tracker.workspace";
-    let check = check.unless(is_placed, Warn, "not compared before there is a registration");
+    let check = check.unless(is_registered, Warn, "not compared before there is a registration");
     check.unless(is_inside, Fail, next)
 }
 
-/// The tip's way into the plane or to the target, from the last position and heading on the bench; none
-/// without a registration, and for a target among masks, which the run itself reads.
+/// Checks that the tip can reach the plane or the target from its last position on the bench. `None` without a
+/// registration, and for a target among masks, which only the run reads.
 pub fn plane(config: &Config, report: &TrackerReport) -> Option<Check> {
     let session = config.session().ok()?;
     let x_pw = session.x_wp.inverse();
@@ -279,29 +280,29 @@ pub fn plane(config: &Config, report: &TrackerReport) -> Option<Check> {
         format!(", heading {:+.1} deg", math::asin(x).to_degrees())
     });
     let found = format!("tip {:+.2} mm off it{}", tip_mm.x, heading.unwrap_or_default());
-    let limit = format!("what {:.0} mm of depth can mend", session.insertion.depth_mm);
+    let limit = format!("within reach of {:.0} mm of depth", session.insertion.depth_mm);
     let check = Check::new("plane", found, limit);
-    let goes_on = session.insertion.plane_out_of_reach == PlaneOutOfReach::Insert;
+    let runs_anyway = session.insertion.plane_out_of_reach == PlaneOutOfReach::Insert;
     Some(match session.check_reach(&tip_mm) {
         Ok(()) => check,
-        Err(why) => check.unless(false, if goes_on { Warn } else { Fail }, why),
+        Err(why) => check.with(if runs_anyway { Warn } else { Fail }, why),
     })
 }
 
-/// Free space where runs are kept, MB; `None` where it is not known.
+/// Checks the free space in `record.dir`, MB; `None` if the system does not report it.
 pub fn disk(config: &Config, free_mb: Result<Option<u64>, String>) -> Check {
-    let least = config.record.free_mb_min;
+    let free_mb_min = config.record.free_mb_min;
     let next = "make room, or set record.dir to another disk";
-    let check = |found: String| Check::new("disk", found, format!("at least {least} MB"));
+    let check = |found: String| Check::new("disk", found, format!("at least {free_mb_min} MB"));
     match free_mb {
         Ok(Some(free_mb)) => {
-            let is_enough = free_mb >= u64::from(least);
+            let is_enough = free_mb >= u64::from(free_mb_min);
             check(format!("{free_mb} MB free")).unless(is_enough, Fail, next)
         }
         Ok(None) => {
             let found = "free space is not known".to_owned();
-            check(found).unless(false, Warn, "look at it yourself: df")
+            check(found).with(Warn, "inspect it yourself: df")
         }
-        Err(error) => check(error).unless(false, Fail, next),
+        Err(error) => check(error).with(Fail, next),
     }
 }

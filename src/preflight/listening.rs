@@ -1,18 +1,18 @@
-//! The tracker listened to for a while, without a run.
+//! Listens to the tracker for a while, without a run.
 
 use crate::tracker::{Event, Gate, GateCounts, Workspace};
 use crate::units::Time;
 use nalgebra::Vector3;
 use serde::Serialize;
 
-/// The fewest positions from which noise is measured.
+/// Fewest positions from which the noise is measured.
 pub(super) const POSITIONS_MIN: usize = 10;
-/// Where two tools take turns, one position is further than this from the next, mm …
+/// If two tools of one name take turns, a position is farther than this from the next, mm …
 const TURNS_MIN_MM: f64 = 3.0;
-/// … and further by this factor than from the next but one.
+/// … and farther by this factor than from the next but one.
 const TURNS_RATIO: f64 = 4.0;
 
-/// What came from the tracker in a while.
+/// What came from the tracker while the bench listened.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TrackerReport {
     /// Positions of the tool that passed the gates.
@@ -23,24 +23,24 @@ pub struct TrackerReport {
     pub rate_hz: f64,
     /// The last position in the bench frame, mm, inside the workspace or not.
     pub last_position_bench_mm: Option<[f64; 3]>,
-    /// The tip's heading with it in the bench frame, where the tracker sends orientations.
+    /// The tip's heading at that position in the bench frame, if the tracker sends orientations.
     pub last_heading_bench: Option<[f64; 3]>,
-    /// Standard deviation of a coordinate, mm, from the differences of positions that follow each other:
-    /// a slow motion does not count.
+    /// Standard deviation of a coordinate, mm, from the differences of successive positions: a slow
+    /// motion does not count.
     pub noise_sd_mm: Option<f64>,
-    /// Receipt less stamp of the quickest sample, by the two clocks, s.
+    /// Smallest difference of receipt and stamp, each by its own clock, s.
     pub stamp_skew_s: Option<f64>,
-    /// Positions jump to and fro, as they do when two tools have the same name.
+    /// Positions jump back and forth, as they do if two tools have the same name.
     pub has_two_tools: bool,
-    /// What to do about it, where no position was measured.
+    /// Why no position was measured, and what to do; `None` if one was.
     pub trouble: Option<String>,
 }
 
-/// Counts what comes, through the gates of a run that look at a sample by itself.
+/// Counts the samples that pass those gates of a run that judge a sample by itself.
 #[derive(Debug)]
 pub struct Listening {
     gate: Gate,
-    /// Not in the gate, because the preflight shows a tip outside it. A run refuses one.
+    /// Kept apart from the gate: a run refuses a tip outside the workspace, the preflight shows where it is.
     workspace: Option<Workspace>,
     /// UTC at the origin of receive times, ns since 1970.
     origin_unix_ns: i64,
@@ -90,15 +90,16 @@ impl Listening {
         }
     }
 
-    /// What came from `since` to `now`. `missing` says why, if nothing of the tool came.
+    /// The report from `since` to `now`. `missing` explains why nothing came from the tool.
     pub fn report(self, since: Time, now: Time, missing: impl FnOnce() -> String) -> TrackerReport {
         let last = self.positions_mm.last();
-        let jumps = |lag: usize| {
+        // RMS distance between each position and the one `lag` later.
+        let jumps_mm = |lag: usize| {
             let pairs = self.positions_mm.iter().zip(self.positions_mm.iter().skip(lag));
             let squares: Vec<f64> = pairs.map(|(a, b)| (b - a).norm_squared()).collect();
             (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
         };
-        let (one, two) = (jumps(1), jumps(2));
+        let (to_next_mm, to_next_but_one_mm) = (jumps_mm(1), jumps_mm(2));
         let is_enough = self.positions_mm.len() >= POSITIONS_MIN;
         let trouble = match (last, self.refusal) {
             (Some(_), _) => None,
@@ -112,9 +113,11 @@ impl Listening {
             last_position_bench_mm: last.map(|position| (*position).into()),
             last_heading_bench: self.heading.map(Into::into),
             // A difference has twice the variance, in each of three coordinates.
-            noise_sd_mm: is_enough.then(|| one / 6f64.sqrt()),
+            noise_sd_mm: is_enough.then(|| to_next_mm / 6f64.sqrt()),
             stamp_skew_s: self.skew_ns.map(|ns| ns as f64 * 1e-9),
-            has_two_tools: is_enough && one > TURNS_MIN_MM && one > TURNS_RATIO * two,
+            has_two_tools: is_enough
+                && to_next_mm > TURNS_MIN_MM
+                && to_next_mm > TURNS_RATIO * to_next_but_one_mm,
             trouble,
         }
     }
