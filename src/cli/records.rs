@@ -267,7 +267,7 @@ fn rows(
             insertion_meas_mm: at.insertion_mm,
             rotation_meas_rad: at.rotation_rad,
             position_meas_mm,
-            rotation_true: registration.rotation(&sample),
+            sensor_orientation: registration.rotation(&sample),
         });
     }
     rows

@@ -108,7 +108,7 @@ fn steps(recording: &Recording, r_sb: &Rotation3<f64>) -> Result<Vec<Step>, Stri
     let first = &recording.rows[0];
     let lacks_roll = recording.lacks_roll();
     // R_PS0: the sensor's first orientation in the plane frame is the inverse of the mount.
-    let r_ps = r_sb.inverse() * first.rotation_true.unwrap_or_default().inverse();
+    let r_ps = r_sb.inverse() * first.sensor_orientation.unwrap_or_default().inverse();
     let (mut depth_mm, mut rotation_rad) = (0.0, first.rotation_meas_rad);
     let step = |row: &RecordedRow| {
         let refused = |error: NeedleError| format!("line {}: {error}", row.line);
@@ -122,7 +122,7 @@ fn steps(recording: &Recording, r_sb: &Rotation3<f64>) -> Result<Vec<Step>, Stri
             let way = "way from the first position in mm";
             refused(NeedleError::too_large(way, position_mm.amax()))
         })?;
-        let rotation_true = row.rotation_true.filter(|_| !lacks_roll);
+        let rotation_true = row.sensor_orientation.filter(|_| !lacks_roll);
         let rotation_true = rotation_true.map(|rotation| r_ps * rotation * r_sb);
         Ok(Step { increment, depth_mm, tip_meas, rotation_true })
     };
@@ -251,7 +251,7 @@ mod tests {
                 insertion_meas_mm: 0.1 * f64::from(n),
                 rotation_meas_rad: rotation,
                 position_meas_mm: tip.translation,
-                rotation_true: Some(tip.rotation * r_sb.inverse()),
+                sensor_orientation: Some(tip.rotation * r_sb.inverse()),
             });
             let turn = 0.02 * (f64::from(n) * 0.01).sin();
             tip = needle.step(&tip, Increment::new(0.1, turn).unwrap());
@@ -298,13 +298,13 @@ mod tests {
         let mut recording = recording(&r_sb);
         assert!(!recording.lacks_roll());
         for row in &mut recording.rows {
-            row.rotation_true = Some(Rotation3::identity());
+            row.sensor_orientation = Some(Rotation3::identity());
         }
         assert!(recording.lacks_roll());
         let mut observer = FiniteDifference::new(Needle::new(0.0125).unwrap(), 2.0).unwrap();
         let score = evaluate(&mut observer, &recording, &scoring(r_sb, 1.0, 8.0)).unwrap();
         assert!(score.roll_rms_deg.is_none() && score.position_rms_mm.is_some(), "{score:?}");
-        recording.rows.iter_mut().for_each(|row| row.rotation_true = None);
+        recording.rows.iter_mut().for_each(|row| row.sensor_orientation = None);
         assert!(!recording.lacks_roll(), "there are none");
     }
 
@@ -331,7 +331,7 @@ mod tests {
             insertion_meas_mm: depth_mm,
             rotation_meas_rad: 0.0,
             position_meas_mm: Vector3::z() * depth_mm,
-            rotation_true: None,
+            sensor_orientation: None,
         };
         Recording { rows: depths_mm.iter().enumerate().map(row).collect() }
     }

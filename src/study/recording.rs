@@ -24,8 +24,8 @@ pub struct RecordedRow {
     pub rotation_meas_rad: f64,
     /// Measured sensor position, mm.
     pub position_meas_mm: Vector3<f64>,
-    /// Recorded sensor orientation: the truth, used for scoring only.
-    pub rotation_true: Option<Rotation3<f64>>,
+    /// Recorded sensor orientation. Scoring takes it for the truth; `calibrate needle` fits it.
+    pub sensor_orientation: Option<Rotation3<f64>>,
 }
 
 /// A recorded insertion.
@@ -46,12 +46,12 @@ impl Recording {
         let numbers = table.numbers(REQUIRED)?;
         let rows = table.rows().iter().zip(numbers).zip(table.rotations()?);
         let rows: Vec<RecordedRow> = rows
-            .map(|((row, [insertion_mm, rotation_rad, x, y, z]), rotation_true)| RecordedRow {
+            .map(|((row, [insertion_mm, rotation_rad, x, y, z]), sensor_orientation)| RecordedRow {
                 line: row.line,
                 insertion_meas_mm: insertion_mm,
                 rotation_meas_rad: rotation_rad,
                 position_meas_mm: Vector3::new(x, y, z),
-                rotation_true,
+                sensor_orientation,
             })
             .collect();
         match rows.is_empty() {
@@ -66,7 +66,7 @@ impl Recording {
     pub fn lacks_roll(&self) -> bool {
         let first = &self.rows[0];
         let turns = self.rows.iter().filter_map(|row| {
-            let seen_rad = first.rotation_true?.angle_to(&row.rotation_true?);
+            let seen_rad = first.sensor_orientation?.angle_to(&row.sensor_orientation?);
             let base_rad = (row.rotation_meas_rad - first.rotation_meas_rad).rem_euclid(TAU);
             Some((seen_rad, base_rad.min(TAU - base_rad)))
         });
@@ -74,7 +74,7 @@ impl Recording {
             |(seen, base): (f64, f64), turn: (f64, f64)| (seen.max(turn.0), base.max(turn.1));
         let (seen_rad, base_rad) = turns.fold((0.0, 0.0), most);
         self.rows.len() > 1
-            && first.rotation_true.is_some()
+            && first.sensor_orientation.is_some()
             && (seen_rad < SAME_MAX_RAD || (base_rad > TURNED_RAD && seen_rad < 0.5 * TURNED_RAD))
     }
 
@@ -96,11 +96,11 @@ mod tests {
     fn reads_with_and_without_orientation() {
         let plain = Recording::parse(&format!("{HEADER}\n1,0.5,1,2,3\n\n")).unwrap();
         assert_eq!(plain.rows.len(), 1);
-        assert_eq!(plain.rows[0].rotation_true, None);
+        assert_eq!(plain.rows[0].sensor_orientation, None);
         assert_eq!(Recording::parse(&format!("\u{feff}{HEADER}\n1,0.5,1,2,3\n")).unwrap(), plain);
         let posed =
             Recording::parse(&format!("qw,qx,qy,qz,{HEADER}\n2,0,0,0,1,0.5,1,2,3")).unwrap();
-        assert_eq!(posed.rows[0].rotation_true, Some(Rotation3::identity()));
+        assert_eq!(posed.rows[0].sensor_orientation, Some(Rotation3::identity()));
         assert_eq!(posed.rows[0].position_meas_mm, Vector3::new(1.0, 2.0, 3.0));
     }
 
@@ -116,7 +116,7 @@ mod tests {
                     insertion_meas_mm: mm,
                     rotation_meas_rad: 0.35 * mm,
                     position_meas_mm: Vector3::new(0.0, 0.0, mm),
-                    rotation_true: Some(
+                    sensor_orientation: Some(
                         Rotation3::from_axis_angle(&Vector3::x_axis(), bend_rad) * roll,
                     ),
                 }

@@ -249,7 +249,7 @@ fn posed(Insertion { path, recording, .. }: &Insertion) -> Result<Vec<PosedRow>,
             insertion_mm: row.insertion_meas_mm,
             rotation_rad: row.rotation_meas_rad,
             position_mm: row.position_meas_mm,
-            orientation: row.rotation_true?,
+            orientation: row.sensor_orientation?,
         })
     });
     posed.collect::<Option<_>>().ok_or_else(|| {
