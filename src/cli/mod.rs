@@ -313,6 +313,8 @@ mod tests {
             "study --out Cargo.toml",
             "replay runs/none --out Cargo.toml",
             "tracker rest --out Cargo.toml",
+            "calibrate needle none.csv --out Cargo.toml",
+            "calibrate tracker none.csv --out Cargo.toml",
             "calibrate registration none.csv --collect --out Cargo.toml",
             "calibrate tip none.csv --run --out Cargo.toml",
         ] {

@@ -6,7 +6,7 @@
 mod recordings;
 pub(super) mod tracker;
 
-use self::recordings::{collect, turn};
+use self::recordings::{collect_fiducials, record_turn};
 use super::Failure;
 use super::arguments::{Configured, number_in, text_of};
 use super::output::{merged, print_stderr, print_stdout, refuse_existing, write_new};
@@ -29,27 +29,31 @@ use std::time::SystemTime;
 const NEEDLE_HEADER: &str = "\
 # A needle on its sensor, by `needle-bench calibrate needle`. In the rig's configuration, under
 # [needle]: needle_file = \"FILE\"
-# [needle.fit] says how sure they are: standard errors, from how the insertions differ.
+# [needle.fit] says how sure the values are: standard errors, from how the insertions differ.
 
 ";
 const REGISTRATION_HEADER: &str = "\
 # Pose of the tracker frame in the bench frame, by `needle-bench calibrate registration`. In the
 # rig's configuration, under [tracker]: registration_file = \"FILE\"
-# sd_mm: of each coordinate, that the pose's error gives a tip on the planned path.
+# sd_mm: standard deviation of each coordinate of a tip on the planned path that the error of this
+# pose causes.
 
 ";
 const TIP_HEADER: &str = "\
 # The tip in the sensor's frame, by `needle-bench calibrate tip`. In the rig's configuration, under
 # [tracker]: tip_file = \"FILE\"
 ";
+/// Added to [`TIP_HEADER`] if the fit has no [`mount`](TipFit::mount).
 const NO_MOUNT: &str = "\
 # The tracker sends no orientation that turns with the needle: the sensor's distance from the
-# needle's axis cannot be taken off, and is left in the positions.
+# needle's axis cannot be subtracted, and is left in the positions.
 ";
 
-/// Student's t at 95%, both sides, of 3 insertions and more: standard errors from so few are themselves uncertain.
-const STUDENT_95: [f64; 8] = [4.3, 3.2, 2.8, 2.6, 2.4, 2.4, 2.3, 2.3];
-const STUDENT_MANY: f64 = 2.2;
+/// Student's t for a two-sided 95% interval, by the number of insertions from 3 on: standard errors from so few
+/// are themselves uncertain.
+const STUDENT_T_95: [f64; 8] = [4.3, 3.2, 2.8, 2.6, 2.4, 2.4, 2.3, 2.3];
+/// The same for more insertions than the table has.
+const STUDENT_T_95_MANY: f64 = 2.2;
 
 /// Default limit of the RMS distance from the circle, mm.
 const RMS_MAX_MM: f64 = 0.5;
@@ -80,11 +84,11 @@ pub(super) struct RegistrationArguments {
     file: PathBuf,
     #[command(flatten)]
     configured: Configured,
-    /// Collect the points into FILE first, which is new: touch each with the tracked tool and type its
-    /// place on the bench.
+    /// Collect the points first, into FILE, which must not exist: touch each with the tracked tool and type
+    /// its bench coordinates.
     #[arg(long)]
     collect: bool,
-    /// Refuse more than this between the two sets of points, RMS, mm.
+    /// Refuse a larger RMS distance between the two sets of points than this, mm.
     #[arg(long, value_name = "MM", default_value_t = RegistrationConfig::rms_max_mm(), value_parser = number_in(0.001..=100.0, "mm"))]
     rms_max_mm: f64,
     #[command(flatten)]
@@ -98,7 +102,8 @@ pub(super) struct TipArguments {
     file: PathBuf,
     #[command(flatten)]
     configured: Configured,
-    /// Record FILE first, which is new: the stage of CONFIG turns the base once, in air, and back.
+    /// Record first, into FILE, which must not exist: the stage of CONFIG turns the base once, in air, and
+    /// back.
     #[arg(long)]
     run: bool,
     /// With --run: rehearse it on emulated drives and an emulated tracker, in virtual time.
@@ -155,7 +160,7 @@ impl Output {
         self.write_toml(summary, &format!("{header}{toml}"), json)
     }
 
-    /// The same, with the `toml` at hand.
+    /// As [`write`](Self::write), with the whole `toml`.
     fn write_toml(
         &self,
         (summary, more): (&str, Shown),
@@ -166,17 +171,19 @@ impl Output {
         if let Some(path) = &self.out {
             write_new(path, toml)?;
         }
-        match self.out {
-            _ if self.json => print_stdout(json),
-            None => print_stdout(toml.trim_end()),
-            Some(_) => Ok(()),
+        if self.json {
+            print_stdout(json)
+        } else if self.out.is_none() {
+            print_stdout(toml.trim_end())
+        } else {
+            Ok(())
         }
     }
 }
 
-/// What a calibration says of itself: where it came from, computed now from `text`, the content of
-/// `file` if it is one, and what it `found`.
-fn fit_of(file: &str, text: Option<&str>, found: &Value) -> Value {
+/// The `fit` table: source file, SHA-256 of its `text`, version and date, with the fields of `found`. `text` is
+/// `None` if the source is not a file.
+fn fit_table(file: &str, text: Option<&str>, found: &Value) -> Value {
     let source = json!({
         "file": file,
         "sha256": text.map(|text| sha256_hex(text.as_bytes())),
@@ -186,8 +193,8 @@ fn fit_of(file: &str, text: Option<&str>, found: &Value) -> Value {
     merged(source, found)
 }
 
-/// An orientation as a configuration has it.
-fn angles(rotation: &Rotation3<f64>) -> Value {
+/// An orientation in the keys of the configuration.
+fn angles_json(rotation: &Rotation3<f64>) -> Value {
     let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(rotation);
     json!({
         "yaw_deg": yaw.to_degrees(),
@@ -198,8 +205,9 @@ fn angles(rotation: &Rotation3<f64>) -> Value {
 
 /// Curvature, bevel zero, sensor tilt and torsion from insertions.
 fn needle(insertions: &Insertions, output: &Output) -> Result<(), Failure> {
+    output.refuse_existing()?;
     let (config, insertions) = insertions.read(None)?;
-    let posed_rows = insertions.iter().map(posed).collect::<Result<Vec<_>, _>>()?;
+    let posed_rows = insertions.iter().map(posed_rows).collect::<Result<Vec<_>, _>>()?;
     let fit = NeedleFit::of(&posed_rows, &config.path_noise()).map_err(Failure::configuration)?;
     let mut file = insertions[0].path.display().to_string();
     if insertions.len() > 1 {
@@ -213,23 +221,23 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<(), Failure> {
         "tip_ahead_sd_mm": fit.bend.tip_ahead_sd_mm,
         "bend_axis_sd_deg": fit.bend.bend_axis_sd_rad.to_degrees(),
         "offset_spread_deg": fit.torsion.offset_spread_rad.to_degrees(),
-        "torsion_sd": written(&fit.torsion.sd),
+        "torsion_sd": torsion_json(&fit.torsion.sd),
     });
     let overlay = json!({
         "needle": {
             "curvature_per_mm": fit.bend.curvature_per_mm,
             "tip_ahead_mm": fit.bend.tip_ahead_mm,
-            "torsion": written(&fit.torsion.torsion),
-            "fit": fit_of(&file, Some(&text), &found),
+            "torsion": torsion_json(&fit.torsion.torsion),
+            "fit": fit_table(&file, Some(&text), &found),
         },
         "evaluation": {
             "axis": <[f64; 3]>::from(fit.axis),
             "bend_axis": <[f64; 3]>::from(fit.bend.bend_axis),
         },
     });
-    let times = STUDENT_95.get(fit.insertions - 3).unwrap_or(&STUDENT_MANY);
+    let student_t = STUDENT_T_95.get(fit.insertions - 3).unwrap_or(&STUDENT_T_95_MANY);
     output.write(
-        (include_str!("needle.txt"), context! { times }),
+        (include_str!("needle.txt"), context! { student_t }),
         NEEDLE_HEADER,
         &overlay,
         &overlay,
@@ -237,13 +245,13 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<(), Failure> {
 }
 
 /// The rows of an insertion; every row must have an orientation.
-fn posed(Insertion { path, recording, .. }: &Insertion) -> Result<Vec<PosedRow>, Failure> {
+fn posed_rows(Insertion { path, recording, .. }: &Insertion) -> Result<Vec<PosedRow>, Failure> {
     if recording.lacks_roll() {
         let why = "its orientations do not turn with the base; a needle is calibrated from those of a sensor \
                    of six degrees of freedom";
         return Err(Failure::bad_input(path, why));
     }
-    let posed = recording.rows.iter().map(|row| {
+    let rows = recording.rows.iter().map(|row| {
         Some(PosedRow {
             line: row.line,
             insertion_mm: row.insertion_meas_mm,
@@ -252,14 +260,14 @@ fn posed(Insertion { path, recording, .. }: &Insertion) -> Result<Vec<PosedRow>,
             orientation: row.sensor_orientation?,
         })
     });
-    posed.collect::<Option<_>>().ok_or_else(|| {
-        let lacks = "no columns qw,qx,qy,qz; a needle is calibrated from recorded orientations";
-        Failure::bad_input(path, lacks)
+    rows.collect::<Option<_>>().ok_or_else(|| {
+        let why = "no columns qw,qx,qy,qz; a needle is calibrated from recorded orientations";
+        Failure::bad_input(path, why)
     })
 }
 
-/// A torsion as a configuration has it.
-fn written(torsion: &TorsionConfig) -> Value {
+/// A torsion in the keys of the configuration.
+fn torsion_json(torsion: &TorsionConfig) -> Value {
     json!({
         "half_width_deg": torsion.half_width_rad.to_degrees(),
         "half_width_deg_per_mm": torsion.half_width_rad_per_mm.to_degrees(),
@@ -275,7 +283,7 @@ fn registration(arguments: &RegistrationArguments) -> Result<(), Failure> {
     let config = arguments.configured.load(None)?;
     arguments.output.refuse_existing()?;
     if arguments.collect {
-        collect(path, &arguments.configured)?;
+        collect_fiducials(path, &arguments.configured)?;
     }
     let text = text_of(path)?;
     let pairs = FiducialPair::parse(&text).map_err(|error| Failure::bad_input(path, error))?;
@@ -288,9 +296,9 @@ fn registration(arguments: &RegistrationArguments) -> Result<(), Failure> {
         "y_mm": y_mm,
         "z_mm": z_mm,
         "sd_mm": config.registration_sd_of_mm(&fit),
-        "fit": fit_of(&path.display().to_string(), Some(&text), &found),
+        "fit": fit_table(&path.display().to_string(), Some(&text), &found),
     });
-    let registration = merged(angles(&fit.x_wt.rotation), &registration);
+    let registration = merged(angles_json(&fit.x_wt.rotation), &registration);
     let json = json!({
         "registration": registration,
         "worst_point": fit.worst_point,
@@ -309,15 +317,15 @@ fn tip(arguments: &TipArguments) -> Result<(), Failure> {
     arguments.output.refuse_existing()?;
     let mut rms_max_mm = RMS_MAX_MM;
     if arguments.run {
-        let noise_sd_mm = turn(path, &arguments.configured, arguments.rehearse)?;
+        let noise_sd_mm = record_turn(path, &arguments.configured, arguments.rehearse)?;
         rms_max_mm = rms_max_mm.max(2.0 * noise_sd_mm);
     }
     let rms_max_mm = arguments.rms_max_mm.unwrap_or(rms_max_mm);
     let text = text_of(path)?;
     let samples = TurnSample::parse(&text).map_err(|error| Failure::bad_input(path, error))?;
     let fit = TipFit::of(&samples, rms_max_mm).map_err(|error| Failure::bad_input(path, error))?;
-    let oriented = samples.iter().all(|sample| sample.orientation_meas.is_some());
-    if arguments.along_mm != 0.0 && !oriented {
+    let is_oriented = samples.iter().all(|sample| sample.orientation_meas.is_some());
+    if arguments.along_mm != 0.0 && !is_oriented {
         let why = "--along-mm needs the sensor's orientation: record qw,qx,qy,qz, or leave it out";
         return Err(Failure::bad_input(path, why));
     }
@@ -325,8 +333,8 @@ fn tip(arguments: &TipArguments) -> Result<(), Failure> {
     let found = json!({ "points": fit.points, "radius_mm": fit.radius_mm, "rms_mm": fit.rms_mm });
     let tracker = json!({
         "tip_offset_mm": <[f64; 3]>::from(x_sb.translation),
-        "tip_tilt": angles(&x_sb.rotation),
-        "tip_fit": fit_of(&path.display().to_string(), Some(&text), &found),
+        "tip_tilt": angles_json(&x_sb.rotation),
+        "tip_fit": fit_table(&path.display().to_string(), Some(&text), &found),
     });
     let json = json!({
         "tracker": tracker,

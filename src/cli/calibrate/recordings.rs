@@ -1,6 +1,6 @@
-//! The recordings that a calibration makes for itself: fiducials touched one after the other, where the tool
-//! rests on a point and the operator types its place; and the base turned once in air and back, by jogs of the
-//! stage, whose records hold the sensor's circle.
+//! The recordings that a calibration makes for itself. For a registration the operator rests the tool on each
+//! fiducial and types its bench coordinates. For the tip the stage turns the base once in air and back, by two
+//! jogs; their records hold the sensor's circle.
 
 use crate::calibration::{FiducialPair, RegistrationFit};
 use crate::cli::arguments::Configured;
@@ -24,21 +24,21 @@ use std::thread;
 use std::time::Duration;
 
 const HEADER: &str = "x_tracker_mm,y_tracker_mm,z_tracker_mm,x_bench_mm,y_bench_mm,z_bench_mm\n";
-/// A point is the mean of the positions of this time.
+/// A point is the mean of the positions of this time at rest.
 const REST: Duration = Duration::from_secs(1);
-/// Fewer positions than this give no point.
+/// Fewest positions that give a point.
 const POSITIONS_MIN: usize = 5;
 /// Timeout of a point while the tool does not rest.
 const WAIT_MAX: Duration = Duration::from_secs(10);
 /// Largest scatter of a tool at rest, in units of the configured noise.
 const STILL_SDS: f64 = 2.0;
-/// How often a line of the operator is looked for.
-const LOOK: Duration = Duration::from_millis(20);
-/// Residuals are shown, not judged, while points are missing.
+/// Interval at which the operator's next line is checked for.
+const LINE_POLL: Duration = Duration::from_millis(20);
+/// RMS limit while points are missing: residuals are then shown, not judged.
 const ANY_RMS_MM: f64 = 1e4;
 
 /// Collects points of the tracker that `configured` names into the new file `path`.
-pub(super) fn collect(path: &Path, configured: &Configured) -> Result<(), Failure> {
+pub(super) fn collect_fiducials(path: &Path, configured: &Configured) -> Result<(), Failure> {
     let mut listener = listen(configured, false)?;
     if listener.config.tracker.is_standard_input() {
         let why = "--collect reads the operator's lines from standard input, not the tracker's";
@@ -47,13 +47,13 @@ pub(super) fn collect(path: &Path, configured: &Configured) -> Result<(), Failur
     write_new(path, HEADER)?;
     let failed = |error| Failure::io(path, error);
     let mut file = OpenOptions::new().append(true).open(path).map_err(failed)?;
-    let lines = lines();
+    let lines = read_lines();
     let mut text = HEADER.to_owned();
     let mut number = 1_usize;
     loop {
         print_stderr(format_args!(
-            "point {number}: touch it, hold still, and type its place on the bench as x y z in mm; an \
-             empty line ends, `undo` takes the last point back"
+            "point {number}: touch it, hold still, and type its bench coordinates as x y z in mm; an \
+             empty line ends, `undo` removes the last point"
         ));
         let Some(line) = next_line(&lines, &mut listener) else { break };
         if line.trim().is_empty() {
@@ -62,15 +62,15 @@ pub(super) fn collect(path: &Path, configured: &Configured) -> Result<(), Failur
         if line.trim() == "undo" {
             number = number.saturating_sub(1).max(1);
             text = text.split_inclusive('\n').take(number).collect();
-            // The file is opened to append: the next point follows what is left.
+            // The file is in append mode: the next point follows the rows that remain.
             file.set_len(text.len() as u64).map_err(failed)?;
             continue;
         }
-        let Some(bench_mm) = place(&line) else {
+        let Some(bench_mm) = parse_position(&line) else {
             print_stderr(format_args!("not three numbers: {line}"));
             continue;
         };
-        match at_rest(&mut listener) {
+        match position_at_rest(&mut listener) {
             Err(why) => print_stderr(format_args!("not taken: {why}")),
             Ok(tracker_mm) => {
                 let [x, y, z]: [f64; 3] = tracker_mm.into();
@@ -94,7 +94,7 @@ pub(super) fn collect(path: &Path, configured: &Configured) -> Result<(), Failur
 }
 
 /// The operator's lines, read by a thread so that Ctrl-C and the tracker are not kept waiting.
-fn lines() -> Receiver<String> {
+fn read_lines() -> Receiver<String> {
     let (send, lines) = channel();
     thread::spawn(move || {
         for line in stdin().lines().map_while(Result::ok) {
@@ -106,7 +106,7 @@ fn lines() -> Receiver<String> {
     lines
 }
 
-/// The next line; `None` at the end of the input and at Ctrl-C. Positions that come meanwhile are dropped.
+/// The next line; `None` at the end of the input and at Ctrl-C. Drops the positions that come in the meantime.
 fn next_line(lines: &Receiver<String>, listener: &mut Listener) -> Option<String> {
     loop {
         match lines.try_recv() {
@@ -114,15 +114,15 @@ fn next_line(lines: &Receiver<String>, listener: &mut Listener) -> Option<String
             Err(TryRecvError::Disconnected) => return None,
             Err(TryRecvError::Empty) if listener.is_over() => return None,
             Err(TryRecvError::Empty) => {
-                let until = listener.now() + LOOK;
+                let until = listener.now() + LINE_POLL;
                 while listener.next(until).is_some() {}
             }
         }
     }
 }
 
-/// Three numbers, with spaces or commas between them.
-fn place(line: &str) -> Option<[f64; 3]> {
+/// Parses three numbers, separated by spaces or commas.
+fn parse_position(line: &str) -> Option<[f64; 3]> {
     let numbers: Option<Vec<f64>> = line
         .split(|c: char| c.is_whitespace() || c == ',')
         .filter(|part| !part.is_empty())
@@ -131,13 +131,13 @@ fn place(line: &str) -> Option<[f64; 3]> {
     numbers?.try_into().ok()
 }
 
-/// The mean position of the tip, in the tracker's frame, of the first second in which the tool rests. Says
-/// once that it waits for that.
-fn at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
+/// Waits until the tool has rested for a second; returns the mean position of the tip in that second, in the
+/// tracker's frame. Tells the operator once if the tool moves.
+fn position_at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
     let begun = listener.now();
     let limit_mm = STILL_SDS * listener.config.tracker.to_track().noise_sd_mm;
     let tip = Registration::new(Pose::identity()).with_tip(listener.config.tracker.x_sb());
-    let mut rest = Rest { begun, window: VecDeque::new() };
+    let mut last_second = LastSecond { begun, window: VecDeque::new() };
     let mut moved_mm = None;
     while let Some(event) = listener.next(begun + WAIT_MAX) {
         let Event::Sample(sample) = event else { continue };
@@ -145,7 +145,7 @@ fn at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
             continue;
         }
         let tip_mm = tip.tip_mm(&sample).map_err(|refusal| refusal.to_string())?;
-        let Some((mean_mm, sd_mm)) = rest.take(sample.receive_time, tip_mm) else {
+        let Some((mean_mm, sd_mm)) = last_second.take(sample.receive_time, tip_mm) else {
             continue;
         };
         if sd_mm <= limit_mm {
@@ -167,14 +167,14 @@ fn at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
 }
 
 /// The positions of the last second.
-struct Rest {
+struct LastSecond {
     begun: Time,
     window: VecDeque<(Time, Vector3<f64>)>,
 }
 
-impl Rest {
-    /// Takes a position, mm. The mean of the last second and the standard deviation of a coordinate, both
-    /// mm, once there is a whole second with enough positions.
+impl LastSecond {
+    /// Takes a position, mm. Returns the mean of the last second and the standard deviation of a coordinate,
+    /// both mm, once there is a whole second with enough positions.
     fn take(&mut self, now: Time, position_mm: Vector3<f64>) -> Option<(Vector3<f64>, f64)> {
         self.window.push_back((now, position_mm));
         while self.window.front().is_some_and(|(time, _)| now.since(*time) > REST) {
@@ -186,7 +186,8 @@ impl Rest {
         let count = self.window.len() as f64;
         let positions = || self.window.iter().map(|(_, position_mm)| position_mm);
         let mean_mm = positions().sum::<Vector3<f64>>() / count;
-        let square_mm2 = positions().map(|at| (at - mean_mm).norm_squared()).sum::<f64>();
+        let square_mm2 =
+            positions().map(|position| (position - mean_mm).norm_squared()).sum::<f64>();
         Some((mean_mm, (square_mm2 / (3.0 * count)).sqrt()))
     }
 }
@@ -208,14 +209,18 @@ const COLUMNS: &str = "rotation_rad,x_mm,y_mm,z_mm";
 const ORIENTATION: &str = ",qw,qx,qy,qz";
 /// Cells of a row with an orientation.
 const CELLS: usize = 8;
-/// A whole turn, and back: no cable is left wound up, and what lags one way leads the other.
+/// A whole turn, and back: no cable stays wound up, and a lag in one direction is a lead in the other.
 const TURNS: [&str; 2] = ["360deg", "-360deg"];
-/// Minimum distance between two rows of a turn: a rest gives one row.
+/// Smallest rotation between two rows of a turn: a base at rest gives one row.
 const ROWS_APART_DEG: f64 = 0.5;
 
 /// Turns the base of the stage that `configured` names and writes the sensor's positions into the new
-/// file `path`; returns their configured noise, mm. After a turn that did not complete nothing is written.
-pub(super) fn turn(path: &Path, configured: &Configured, rehearse: bool) -> Result<f64, Failure> {
+/// file `path`; returns their configured noise, mm. Writes nothing after a turn that did not complete.
+pub(super) fn record_turn(
+    path: &Path,
+    configured: &Configured,
+    rehearse: bool,
+) -> Result<f64, Failure> {
     refuse_existing(Some(path))?;
     let configured = configured.clone().rehearsed(rehearse);
     let (config, _) = load_stage(configured, rehearse, sensor_off_axis)?;
@@ -240,18 +245,19 @@ pub(super) fn turn(path: &Path, configured: &Configured, rehearse: bool) -> Resu
     Ok(config.tracker.to_track().noise_sd_mm)
 }
 
-/// The base's rotation, the sensor's position and, where the tracker gives it, its orientation. That the
-/// rotation is taken without the tracker's stamps does no harm: the fit needs its sense alone.
+/// Rows of the base's rotation, the sensor's position and, if the tracker gives it, its orientation. The rotation
+/// is taken at the receipt less the latency, not at the tracker's stamp: the fit needs only its direction.
 fn rows_of(turn: ReplayedRun) -> Vec<Vec<f64>> {
     let ReplayedRun { config, stage, samples, .. } = turn;
     let mut rows: Vec<Vec<f64>> = Vec::new();
     for sample in samples.into_iter().map(|sample| sample.received) {
         let acquired = sample.receive_time - config.tracker.latency;
-        let Some(at) = position_at(&stage, acquired).filter(|_| Gate::is_measurement(&sample))
+        let Some(measured) =
+            position_at(&stage, acquired).filter(|_| Gate::is_measurement(&sample))
         else {
             continue;
         };
-        let rotation_rad = at.rotation_rad;
+        let rotation_rad = measured.rotation_rad;
         let is_near = |row: &Vec<f64>| (rotation_rad - row[0]).abs() < ROWS_APART_DEG.to_radians();
         if rows.last().is_some_and(is_near) {
             continue;
@@ -269,21 +275,21 @@ mod tests {
 
     #[test]
     fn a_place_is_three_numbers() {
-        assert_eq!(place(" 1 -2.5,3\n"), Some([1.0, -2.5, 3.0]));
+        assert_eq!(parse_position(" 1 -2.5,3\n"), Some([1.0, -2.5, 3.0]));
         for wrong in ["1 2", "1 2 3 4", "a b c", "1 2 NaN", "1;2;3"] {
-            assert_eq!(place(wrong), None, "{wrong}");
+            assert_eq!(parse_position(wrong), None, "{wrong}");
         }
     }
 
     #[test]
     fn a_point_is_the_mean_of_the_first_second_at_rest() {
-        let mut rest = Rest { begun: Time::ZERO, window: VecDeque::new() };
+        let mut last_second = LastSecond { begun: Time::ZERO, window: VecDeque::new() };
         // It comes to rest after half a second; positions are 0.05 mm to either side.
         let mut first_still = None;
         for k in 1..=80 {
             let now = Time::from_secs_f64(f64::from(k) * 0.025);
             let way_mm = f64::from((20 - k).max(0)) + if k % 2 == 0 { 0.05 } else { -0.05 };
-            match rest.take(now, Vector3::new(7.0, way_mm, 0.0)) {
+            match last_second.take(now, Vector3::new(7.0, way_mm, 0.0)) {
                 None => assert!(k < 40, "a whole second at {k}"),
                 Some((mean_mm, sd_mm)) if sd_mm < 0.06 => {
                     first_still.get_or_insert((k, mean_mm));

@@ -1,6 +1,6 @@
-//! `needle-bench calibrate tracker`: noise, drift and pace of the tracker from a recording at rest.
+//! `needle-bench calibrate tracker`: noise, drift and rate of the tracker from a recording at rest.
 
-use super::{Output, fit_of};
+use super::{Output, fit_table};
 use crate::calibration::{RestSample, TrackerFit};
 use crate::cli::Failure;
 use crate::cli::arguments::{Configured, text_of};
@@ -20,7 +20,7 @@ pub(in crate::cli) const STAMP: &str = "stamp_unix_ns";
 pub(in crate::cli) const POSITION: [&str; 3] = ["x_mm", "y_mm", "z_mm"];
 pub(in crate::cli) const QUATERNION: [&str; 4] = ["qw", "qx", "qy", "qz"];
 
-/// The least noise that a configuration takes, mm.
+/// The smallest noise that the configuration accepts, mm.
 const SD_MIN_MM: f64 = 0.001;
 
 #[derive(Debug, Args)]
@@ -35,16 +35,17 @@ pub(in crate::cli) struct Arguments {
 }
 
 pub(super) fn calibrate(arguments: &Arguments) -> Result<(), Failure> {
+    arguments.output.refuse_existing()?;
     let path = &arguments.file;
     let config = arguments.configured.load(None)?;
     let text = text_of(path)?;
     let samples =
         recorded(&text, &config.tracker).map_err(|error| Failure::bad_input(path, error))?;
-    present(&samples, &path.display().to_string(), Some(&text), &arguments.output)
+    fit_and_write(&samples, &path.display().to_string(), Some(&text), &arguments.output)
 }
 
-/// Prints what is found in the `samples` of `source`, whose content is `text` if it is a file.
-pub(in crate::cli) fn present(
+/// Fits the `samples` of `source` and writes the result. `text` is the content of `source` if it is a file.
+pub(in crate::cli) fn fit_and_write(
     samples: &[RestSample],
     source: &str,
     text: Option<&str>,
@@ -64,14 +65,14 @@ pub(in crate::cli) fn present(
             "gates": { "noise_sd_mm": all.sd_mm.value.max(SD_MIN_MM) },
         },
         "observer": { "invariant": { "position_sd_mm": all.sd_mm.value.max(SD_MIN_MM) } },
-        "fit": fit_of(source, text, &found),
+        "fit": fit_table(source, text, &found),
     });
     let more = context! { source => escaped(source) };
     let toml = screen(include_str!("noise.toml"), &json, more).map_err(Failure::environment)?;
     output.write_toml((include_str!("tracker.txt"), context! {}), &format!("{toml}\n"), &json)
 }
 
-/// A sample as the calibration takes it.
+/// The part of a sample that the calibration uses.
 pub(in crate::cli) fn rest_sample(sample: &Sample) -> RestSample {
     RestSample {
         receive_time: sample.receive_time,
@@ -105,7 +106,7 @@ fn recorded(text: &str, tracker: &TrackerConfig) -> Result<Vec<RestSample>, Stri
     Ok(found)
 }
 
-/// The columns of `tracker record`, where the file has them; else those that are configured.
+/// The columns of `tracker record` if the file has them; else the configured ones.
 fn mapping(text: &str, configured: &CsvMapping) -> CsvMapping {
     let header = Table::parse(text.lines().next().unwrap_or_default());
     let has = |name: &str| header.column(name).is_ok();

@@ -5,7 +5,9 @@ use crate::archive::tracker_line;
 use crate::cli::Failure;
 use crate::cli::arguments::{Configured, number_in};
 use crate::cli::calibrate::Output;
-use crate::cli::calibrate::tracker::{POSITION, QUATERNION, RECEIVED, STAMP, present, rest_sample};
+use crate::cli::calibrate::tracker::{
+    POSITION, QUATERNION, RECEIVED, STAMP, fit_and_write, rest_sample,
+};
 use crate::cli::output::{has_no_reader, print_stderr, print_stdout, refuse_existing};
 use crate::config::TrackerConfig;
 use crate::session::SampleRecord;
@@ -424,7 +426,7 @@ fn rest(arguments: &RestArguments) -> Result<(), Failure> {
         samples.push(rest_sample(sample));
         Ok(())
     })?;
-    present(&samples, &source, None, &arguments.output)
+    fit_and_write(&samples, &source, None, &arguments.output)
 }
 
 #[cfg(test)]
