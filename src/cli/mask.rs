@@ -1,4 +1,4 @@
-//! Obstacles from masks: images in NIfTI-1 format, in the files that `[goal]` names.
+//! Reads obstacles from masks: the NIfTI-1 images that `[goal]` names.
 
 use crate::config::PoseConfig;
 use crate::plan::{Mask, Obstacle};
@@ -11,18 +11,18 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
-/// Reads the masks that the configuration in `file` names. Their paths are relative to its folder.
+/// A reader of the masks that the configuration in `file` names. Their paths are relative to its folder.
 pub(super) fn mask_reader(
     file: Option<&Path>,
 ) -> impl Fn(&str, Option<u32>, &PoseConfig) -> Result<Obstacle, String> + Sync {
     move |name, crc32, pose| {
         let path = file.map_or_else(|| PathBuf::from(name), |file| file.with_file_name(name));
-        mask(&path, crc32, pose).map_err(|error| format!("{}: {error}", path.display()))
+        read_mask(&path, crc32, pose).map_err(|error| format!("{}: {error}", path.display()))
     }
 }
 
 /// The image in `path`, as an obstacle.
-fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, String> {
+fn read_mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, String> {
     check_regular(path).map_err(|error| error.to_string())?;
     let header = NiftiHeader::from_file(path).map_err(|error| reason(&error))?;
     // A record has one checksum for a mask, so the mask must be one file.
@@ -39,27 +39,27 @@ fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, 
     if !is_upright(&header) {
         return Err("its header turns or mirrors the voxels; resample it along x, y, z".to_owned());
     }
-    is_in_mm(&header)?;
+    check_voxel_size(&header)?;
     let [_, x, y, z, ..] = header.pixdim.map(f64::from);
     let spacing_mm = Vector3::new(x, y, z);
     let voxels = Mask::check(size, &spacing_mm)?;
     check_length(path, &header, voxels)?;
     let image = ReaderOptions::new().read_file(path).map_err(|error| reason(&error))?;
     let image = image.into_volume();
-    let mut at = vec![0; dim.len()];
+    let mut index = vec![0; dim.len()];
     let occupied = (0..voxels).map(|voxel| {
         let [nx, ny, _] = size;
-        let indices = [voxel % nx, voxel / nx % ny, voxel / nx / ny];
-        at.iter_mut().zip(indices).for_each(|(at, index)| *at = index as u16);
-        // NaN is not 0: what is not known counts as part of the obstacle.
-        image.get_f64(&at).map(|value| value != 0.0).map_err(|error| reason(&error))
+        let xyz = [voxel % nx, voxel / nx % ny, voxel / nx / ny];
+        index.iter_mut().zip(xyz).for_each(|(index, i)| *index = i as u16);
+        // NaN is not 0: an unknown voxel counts as part of the obstacle.
+        image.get_f64(&index).map(|value| value != 0.0).map_err(|error| reason(&error))
     });
     let occupied: Vec<bool> = occupied.collect::<Result<_, _>>()?;
     let found = file_crc32(path).map_err(|error| error.to_string())?;
     if let Some(crc32) = crc32.filter(|crc32| *crc32 != found) {
         return Err(format!(
-            "the mask has another content: its CRC-32 is {found:#010x}, crc32 says {crc32:#010x}; find \
-             the file that was meant, or mend the key"
+            "the content of the mask differs: its CRC-32 is {found:#010x}, crc32 says {crc32:#010x}; find \
+             the file that was meant, or correct the key"
         ));
     }
     if !occupied.contains(&true) {
@@ -80,11 +80,12 @@ fn check_length(path: &Path, header: &NiftiHeader, voxels: usize) -> Result<(), 
         if is_compressed { Box::new(MultiGzDecoder::new(file)) } else { Box::new(file) };
     let bits = u64::try_from(header.bitpix).unwrap_or_default() * voxels as u64;
     let expected = f64::from(header.vox_offset) as u64 + bits / 8;
-    // Not farther than is needed: a compressed file may be of any length.
+    // Reads no further than needed: a compressed file may expand to any length.
     let length = io::copy(&mut image.take(expected + 1), &mut io::sink()).map_err(unreadable)?;
     match length > expected {
         true => Err(format!(
-            "the mask goes on after the {voxels} voxels of its header: is it cut, or the header another's?"
+            "the file has more data than the {voxels} voxels in its header: was the image cropped without its \
+             header, or is the header of another image?"
         )),
         false => Ok(()),
     }
@@ -94,12 +95,12 @@ fn check_length(path: &Path, header: &NiftiHeader, voxels: usize) -> Result<(), 
 fn check_regular(path: &Path) -> io::Result<()> {
     match std::fs::metadata(path) {
         Ok(found) if !found.is_file() => Err(io::Error::other("not a regular file")),
-        // A path that cannot be looked at fails when it is opened, with the reason.
+        // A missing or unreadable file fails when it is opened, with the reason.
         _ => Ok(()),
     }
 }
 
-/// The CRC-32 of the file in `path`, read in pieces: a file that is no mask may be of any size.
+/// The CRC-32 of the file in `path`, read in pieces: a file that is not a mask may be of any size.
 pub(super) fn file_crc32(path: &Path) -> io::Result<u32> {
     check_regular(path)?;
     let mut file = CrcReader::new(File::open(path)?);
@@ -114,7 +115,7 @@ fn reason(error: &NiftiError) -> String {
 }
 
 /// The largest part of a voxel's side that may point along another axis.
-const TURNED_MAX: f32 = 1e-3;
+const TILT_MAX: f32 = 1e-3;
 
 /// Whether the header neither turns nor mirrors the voxels: the pose alone places them.
 fn is_upright(header: &NiftiHeader) -> bool {
@@ -124,21 +125,23 @@ fn is_upright(header: &NiftiHeader) -> bool {
         (0..3).all(|i| {
             (0..3).all(|j| match i == j {
                 true => rows[i][j] > 0.0,
-                false => rows[i][j].abs() <= TURNED_MAX * sides[j].abs(),
+                false => rows[i][j].abs() <= TILT_MAX * sides[j].abs(),
             })
         })
     } else {
-        let turned = [header.quatern_b, header.quatern_c, header.quatern_d];
-        header.qform_code <= 0 || qfac >= 0.0 && turned.iter().all(|part| part.abs() <= TURNED_MAX)
+        // These are sines of half the angle: a side tilts by twice as much.
+        let half_sines = [header.quatern_b, header.quatern_c, header.quatern_d];
+        let is_turned = half_sines.iter().any(|sine| 2.0 * sine.abs() > TILT_MAX);
+        header.qform_code <= 0 || (qfac >= 0.0 && !is_turned)
     }
 }
 
-/// Refuses an image whose voxels may be of another size than `pixdim` in mm: an obstacle must not be taken for
-/// smaller than it is.
-fn is_in_mm(header: &NiftiHeader) -> Result<(), String> {
+/// Refuses an image whose voxels may not be of the size `pixdim` in mm: an obstacle must not be taken for smaller
+/// than it is.
+fn check_voxel_size(header: &NiftiHeader) -> Result<(), String> {
     // NIfTI-1, xyzt_units: the lowest three bits are the unit of space.
     let unit = match header.xyzt_units & 7 {
-        // Without a unit it is mm, as for other programs.
+        // No unit means mm, as in other programs.
         0 | 2 => None,
         1 => Some("metres".to_owned()),
         3 => Some("micrometres".to_owned()),
@@ -149,12 +152,12 @@ fn is_in_mm(header: &NiftiHeader) -> Result<(), String> {
     }
     let [_, x, y, z, ..] = header.pixdim;
     let rows = [header.srow_x[0], header.srow_y[1], header.srow_z[2]];
-    let differ = |(row, side): (&f32, &f32)| (row - side).abs() > TURNED_MAX * side.abs();
+    let differ = |(row, side): (&f32, &f32)| (row - side).abs() > TILT_MAX * side.abs();
     if header.sform_code > 0 && rows.iter().zip(&[x, y, z]).any(differ) {
         let [a, b, c] = rows;
         return Err(format!(
             "its header gives voxels of two sizes, {x} x {y} x {z} mm (pixdim) and {a} x {b} x {c} mm \
-             (srow); resample it, or mend the header"
+             (srow); resample it, or correct the header"
         ));
     }
     Ok(())
@@ -163,6 +166,21 @@ fn is_in_mm(header: &NiftiHeader) -> Result<(), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A rotation by 1e-3 rad is allowed; the quaternion holds the sine of half of it.
+    #[test]
+    fn a_quaternion_tilts_a_voxel_by_twice_its_sine() {
+        let turned = |quatern_d: f32| {
+            is_upright(&NiftiHeader {
+                sform_code: 0,
+                qform_code: 1,
+                quatern_d,
+                ..NiftiHeader::default()
+            })
+        };
+        assert!(turned(0.49e-3) && turned(-0.49e-3));
+        assert!(!turned(0.51e-3) && !turned(-0.51e-3));
+    }
 
     #[test]
     fn a_device_or_pipe_in_place_of_a_mask_is_refused() {

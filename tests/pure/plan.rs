@@ -263,7 +263,7 @@ fn a_mask_is_kept_clear_of() {
     let said = needle_bench(&scratch, &["replay", &dir]);
     assert_eq!(said.status, 2, "{}", said.stdout);
     assert!(
-        said.stderr.contains("the mask has another content: its CRC-32 is 0x"),
+        said.stderr.contains("the content of the mask differs: its CRC-32 is 0x"),
         "{}",
         said.stderr
     );
