@@ -6,7 +6,7 @@ use crate::archive::file;
 use crate::canopen::cia402::DriveState;
 use crate::config::{Config, OnFailure};
 use crate::runtime::RunReport;
-use crate::session::{Left, Outcome};
+use crate::session::{Outcome, StageAtEnd};
 use crate::stage::{Axis, DriveReport};
 use crate::study::{OFF_PLANE_LIMIT_MM, PlanStatus};
 use crate::telemetry::{Finished, TelemetryError};
@@ -152,7 +152,7 @@ fn stage(operation: &str, path: Option<&Path>, report: &RunReport) -> String {
 }
 
 /// The operation of the stage that its drives need before any other.
-fn needed(config: &Config, left: &Left) -> Option<&'static str> {
+fn needed(config: &Config, left: &StageAtEnd) -> Option<&'static str> {
     let is_in_fault = !left.drives.all(|drive| !is_in_fault(drive));
     match left.unknown {
         Some(_) => Some("status"),
@@ -165,7 +165,7 @@ fn is_in_fault(drive: &DriveReport) -> bool {
 }
 
 /// What the drives are doing.
-fn drives(left: &Left) -> String {
+fn drives(left: &StageAtEnd) -> String {
     let known = match left.had_power {
         true => "both axes stand, power is off",
         false => "no power was given",
@@ -275,7 +275,7 @@ mod tests {
         RunReport {
             outcome,
             figures: RunFigures::default(),
-            left: Left::default(),
+            left: StageAtEnd::default(),
             holds: Holds::default(),
             gates: GateCounts::default(),
             end: Time::ZERO,
@@ -317,7 +317,7 @@ mod tests {
         Configured::new(Some(Path::new("bench-config/vcan.toml")), sets).load(None).unwrap()
     }
 
-    fn stopped(insertion_mm: f64, left: Left) -> RunReport {
+    fn stopped(insertion_mm: f64, left: StageAtEnd) -> RunReport {
         let stopped = Outcome::Stopped("operator: interrupted".to_owned());
         let mut report = RunReport { left, ..report(stopped, &[]) };
         report.figures.take_scored(insertion_mm, None, None);
@@ -325,15 +325,15 @@ mod tests {
     }
 
     /// Both drives had power and stand at 5 mm and 90 degrees.
-    fn stood() -> Left {
+    fn stood() -> StageAtEnd {
         let off = DriveReport { state: Some(DriveState::SwitchOnDisabled), error: None };
         let position = SetPoint { insertion_mm: 5.0, rotation_rad: 90_f64.to_radians() };
         let drives = PerAxis::from_fn(|_| off);
-        Left { had_power: true, unknown: None, drives, position: Some(position) }
+        StageAtEnd { had_power: true, unknown: None, drives, position: Some(position) }
     }
 
     /// The rotation's drive is in Fault besides.
-    fn in_fault() -> Left {
+    fn in_fault() -> StageAtEnd {
         let mut left = stood();
         left.drives.rotation =
             DriveReport { state: Some(DriveState::Fault), error: Some(EmcyCode::HEARTBEAT) };
@@ -360,7 +360,7 @@ mod tests {
     fn drives_that_may_move_are_looked_at_first() {
         let real = config(&[]);
         let unknown = Some("the axes were not seen to stand");
-        let stopped = stopped(5.0, Left { unknown, ..in_fault() });
+        let stopped = stopped(5.0, StageAtEnd { unknown, ..in_fault() });
         let why = withdrawal(&real, &stopped).unwrap_err();
         assert_eq!(why, "the drives are not known to stand; look at the stage");
         let path = Some(Path::new(RIG));
@@ -403,7 +403,7 @@ mod tests {
              off\nnext        needle-bench stage status rig.toml"
         );
         assert_eq!(
-            said(&stopped(0.0, Left::default())).unwrap(),
+            said(&stopped(0.0, StageAtEnd::default())).unwrap(),
             "stage       not known where the axes stand; no power was given\n\
              next        needle-bench stage status rig.toml"
         );

@@ -7,7 +7,9 @@ use super::virtual_time::EmulationReport;
 use crate::archive::DriveIdentity;
 use crate::canopen::NodeId;
 use crate::emulator::Truth;
-use crate::session::{Lane, Left, OperatorCommand, Outcome, Progress, Record, Severity, State};
+use crate::session::{
+    Lane, OperatorCommand, Outcome, Progress, Record, Severity, StageAtEnd, State,
+};
 use crate::stage::{Axis, Identity};
 use crate::study::RunFigures;
 use crate::telemetry::{Entry, Finished, RecordNews, Recorder, TelemetryError};
@@ -68,8 +70,8 @@ pub struct RunReport {
     pub outcome: Outcome,
     /// Its figures.
     pub figures: RunFigures,
-    /// What it has left of the stage.
-    pub left: Left,
+    /// The state in which it left the stage.
+    pub left: StageAtEnd,
     /// How often it was held.
     pub holds: Holds,
     /// What the tracker's gates did with its samples.
@@ -164,7 +166,7 @@ impl<'a> Sink<'a> {
             manifest.timing = object(&timing);
         });
         let (figures, holds) = (self.figures, self.holds);
-        let (left, emulated) = (Left::default(), None);
+        let (left, emulated) = (StageAtEnd::default(), None);
         RunReport { outcome, figures, left, holds, gates, end, timing, run_dir, record, emulated }
     }
 }

@@ -44,7 +44,7 @@ pub fn run_virtual(
     let outcome = drive(&mut run);
     run.witness.progress(run.session.progress());
     run.emulated.update(&run.stage, run.now);
-    let (gates, left) = (run.session.gate_counts(), run.session.left());
+    let (gates, left) = (run.session.gate_counts(), run.session.stage_at_end());
     let report = run.witness.finish(outcome, run.now, gates, None);
     RunReport { emulated: Some(run.emulated), left, ..report }
 }

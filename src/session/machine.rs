@@ -2,7 +2,7 @@
 
 use super::SessionConfig;
 use super::insert::Insert;
-use super::outcome::{Left, Outcome};
+use super::outcome::{Outcome, StageAtEnd};
 use super::record::{Direction, Lane, Record, Severity};
 use super::shell::{Power, Shell};
 use super::state::State;
@@ -139,9 +139,9 @@ pub trait Machine {
     /// they are being stopped.
     fn silence_max(&self) -> Option<Duration>;
 
-    /// What the run has left of the stage.
-    fn left(&self) -> Left {
-        Left::default()
+    /// The state in which the run leaves the stage.
+    fn stage_at_end(&self) -> StageAtEnd {
+        StageAtEnd::default()
     }
 
     /// What the tracker's gates did with its samples.
@@ -309,8 +309,8 @@ impl Machine for Session {
         self.shell.stage.counters()
     }
 
-    fn left(&self) -> Left {
-        self.shell.left()
+    fn stage_at_end(&self) -> StageAtEnd {
+        self.shell.stage_at_end()
     }
 
     fn silence_max(&self) -> Option<Duration> {

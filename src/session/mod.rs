@@ -32,7 +32,7 @@ pub use config::{
 };
 pub use goal::{Approach, Goal};
 pub use machine::{Done, HELD_UP, Input, Machine, OperatorCommand, Output, Progress, Session};
-pub use outcome::{Left, Outcome};
+pub use outcome::{Outcome, StageAtEnd};
 pub use peak::{PROFILE_PEAK, rotation_peak};
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StepRecord};
 pub use state::State;

@@ -23,15 +23,15 @@ impl Outcome {
     }
 }
 
-/// What a run has left of the stage.
+/// The state in which a run left the stage.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Left {
+pub struct StageAtEnd {
     /// The drives had power, or were about to.
     pub had_power: bool,
-    /// What is not known of drives that had power; `None` where they were seen to stand without it.
+    /// The part of a stop that drives with power did not confirm; `None` if they were seen to stand without it.
     pub unknown: Option<&'static str>,
-    /// What each drive has last said of itself.
+    /// The last report of each drive.
     pub drives: PerAxis<DriveReport>,
-    /// Where the axes were last measured; `None` before both drives have said it.
+    /// Last measured position of both axes; `None` before both drives have sent it.
     pub position: Option<SetPoint>,
 }

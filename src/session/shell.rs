@@ -1,6 +1,6 @@
 //! The stage of a run, from its bring-up to power off, and the record of the run.
 
-use super::outcome::{Left, Outcome};
+use super::outcome::{Outcome, StageAtEnd};
 use super::record::{Lane, Record, Severity};
 use super::state::State;
 use super::{Output, left_unknown, news};
@@ -297,9 +297,9 @@ impl Shell {
             || Axis::BOTH.into_iter().any(|axis| reports[axis].says_power())
     }
 
-    /// What the run has left of the stage.
-    pub(super) fn left(&self) -> Left {
-        Left {
+    /// The state in which the run leaves the stage.
+    pub(super) fn stage_at_end(&self) -> StageAtEnd {
+        StageAtEnd {
             had_power: self.had_power(),
             unknown: self.left_unknown,
             drives: self.stage.drive_reports(),

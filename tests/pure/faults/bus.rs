@@ -167,7 +167,7 @@ fn a_bench_held_up_in_its_stop_claims_nothing() {
         }
         bench.hold_up_for(Duration::from_secs(7));
         bench.run_to_end();
-        let unknown = bench.session.left().unknown.expect("something is not known");
+        let unknown = bench.session.stage_at_end().unknown.expect("something is not known");
         assert!(bench.events().any(|text| text == unknown), "{drives_answer}: {unknown}");
     }
 }
