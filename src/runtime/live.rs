@@ -266,9 +266,9 @@ pub fn run_live(
     run.witness.progress(run.session.progress());
     let figures = run.timing.report(run.session.stage_counters());
     let timing = TimingReport { frames_dropped: run.bus.dropped().ok(), realtime, ..figures };
-    let (gates, left) = (run.session.gate_counts(), run.session.stage_at_end());
+    let (gates, stage_at_end) = (run.session.gate_counts(), run.session.stage_at_end());
     let report = run.witness.finish(outcome, clock.now(), gates, Some(timing));
-    RunReport { left, ..report }
+    RunReport { stage_at_end, ..report }
 }
 
 #[cfg(test)]

@@ -71,7 +71,7 @@ pub struct RunReport {
     /// Its figures.
     pub figures: RunFigures,
     /// The state in which it left the stage.
-    pub left: StageAtEnd,
+    pub stage_at_end: StageAtEnd,
     /// How often it was held.
     pub holds: Holds,
     /// What the tracker's gates did with its samples.
@@ -166,8 +166,19 @@ impl<'a> Sink<'a> {
             manifest.timing = object(&timing);
         });
         let (figures, holds) = (self.figures, self.holds);
-        let (left, emulated) = (StageAtEnd::default(), None);
-        RunReport { outcome, figures, left, holds, gates, end, timing, run_dir, record, emulated }
+        let (stage_at_end, emulated) = (StageAtEnd::default(), None);
+        RunReport {
+            outcome,
+            figures,
+            stage_at_end,
+            holds,
+            gates,
+            end,
+            timing,
+            run_dir,
+            record,
+            emulated,
+        }
     }
 }
 

@@ -44,9 +44,9 @@ pub fn run_virtual(
     let outcome = drive(&mut run);
     run.witness.progress(run.session.progress());
     run.emulated.update(&run.stage, run.now);
-    let (gates, left) = (run.session.gate_counts(), run.session.stage_at_end());
+    let (gates, stage_at_end) = (run.session.gate_counts(), run.session.stage_at_end());
     let report = run.witness.finish(outcome, run.now, gates, None);
-    RunReport { emulated: Some(run.emulated), left, ..report }
+    RunReport { emulated: Some(run.emulated), stage_at_end, ..report }
 }
 
 /// Runs `session` against `stage` until it ends, and passes each record to `take`, with the true pose
