@@ -15,14 +15,15 @@ use std::fmt;
 use std::fs;
 use std::path::Path;
 
-/// Success means that the run completed and left its record, whole if `config` requires that.
+/// The exit status of a run. Success means that the run completed and left its record, whole if `config` requires
+/// that.
 pub(super) fn status(config: &Config, report: &RunReport) -> u8 {
-    let is_wanted = config.record.on_failure == OnFailure::Stop;
+    let must_be_whole = config.record.on_failure == OnFailure::Stop;
     match (&report.outcome, &report.record) {
         (_, Err(_)) => ENVIRONMENT_FAILED,
         (Outcome::Stopped(_), Ok(_)) => STOPPED,
         // The record failed while it was being closed, when nothing was left to stop.
-        (Outcome::Completed, Ok(record)) if is_wanted && !record.faults.is_empty() => {
+        (Outcome::Completed, Ok(record)) if must_be_whole && !record.faults.is_empty() => {
             ENVIRONMENT_FAILED
         }
         (Outcome::Completed, Ok(_)) => 0,
@@ -67,14 +68,14 @@ pub(super) fn ending(config: &Config, report: &RunReport) -> String {
         (None, None) => "completed".to_owned(),
         (None, Some(off_mm)) => format!(
             "completed, not in the plane: {off_mm:.1} mm RMS off it over the last third by the estimate \
-             (limit {OFF_PLANE_LIMIT_MM:.1}); start nearer to it or insert deeper"
+             (limit {OFF_PLANE_LIMIT_MM:.1}); start nearer to it, or insert deeper if the tip was still approaching it"
         ),
         (Some(reason), _) => format!("stopped: {reason}"),
     });
     lines.join("\n")
 }
 
-/// The size of the files in `dir`; a file that cannot be seen counts as empty.
+/// The size of the files in `dir`; a file that cannot be read counts as empty.
 pub(super) fn folder_bytes(dir: &Path) -> u64 {
     let Ok(files) = fs::read_dir(dir) else { return 0 };
     files.flatten().filter_map(|file| file.metadata().ok()).map(|file| file.len()).sum()
@@ -92,131 +93,153 @@ pub(super) fn plane_missed_by_mm(report: &RunReport) -> Option<f64> {
     report.figures.plane_missed_by_mm().filter(|_| is_completed)
 }
 
-/// The lines of an insertion on a bus, with the configuration at `path`. On emulated drives nothing is left
-/// to do after a run that completed.
+/// The lines after an insertion with the configuration at `path`: where the needle is, and the next command.
+/// `None` after a run on emulated drives that completed.
 pub(super) fn after_insertion(
     config: &Config,
     path: Option<&Path>,
     report: &RunReport,
 ) -> Option<String> {
     if config.is_emulated() {
-        return report.outcome.stop_reason().map(|_| review(report));
+        return report.outcome.stop_reason().map(|_| next_review(report));
     }
     let inserted_mm = report.figures.report().insertion_mm;
-    let next = match (needed(config, &report.left), withdrawal(config, report)) {
-        (Some(operation), _) => stage(operation, path, report),
-        (None, Err(_)) => review(report),
-        (None, Ok(withdrawal)) => stage("withdraw", path, report) + &withdrawal.options(),
+    let next = match (required(config, &report.stage_at_end), withdrawal(config, report)) {
+        (Some(required), _) => next_stage(required.operation(), path, report),
+        (None, Err(_)) => next_review(report),
+        (None, Ok(withdrawal)) => next_stage("withdraw", path, report) + &withdrawal.options(),
     };
-    Some(format!("needle      {inserted_mm:.1} mm in; {}\n{next}", drives(&report.left)))
+    Some(format!("needle      {inserted_mm:.1} mm in; {}\n{next}", drives(&report.stage_at_end)))
 }
 
-/// The lines of an operation that was stopped, or that left a drive in Fault. Of a withdrawal `rest` are the
-/// words after `stage withdraw` that finish it.
+/// The lines after an operation that was stopped or left a drive in Fault: where the axes are, and the next
+/// command. For a withdrawal, `remaining` holds the options of the `stage withdraw` that finishes it.
 pub(super) fn after_operation(
     config: &Config,
     path: Option<&Path>,
-    rest: Option<&str>,
+    remaining: Option<&str>,
     report: &RunReport,
 ) -> Option<String> {
     let is_stopped = report.outcome.stop_reason().is_some();
     if config.is_emulated() {
-        return is_stopped.then(|| review(report));
+        return is_stopped.then(|| next_review(report));
     }
-    let needed = needed(config, &report.left);
-    if !is_stopped && needed.is_none() {
+    let required = required(config, &report.stage_at_end);
+    if !is_stopped && required.is_none() {
         return None;
     }
-    let place = match report.left.position {
+    let positions = match report.stage_at_end.position {
         Some(position) => {
-            let place = |axis: Axis| format!("{axis} at {}", axis.shown(position.along(axis)));
-            Axis::BOTH.map(place).join(", ")
+            let shown = |axis: Axis| format!("{axis} at {}", axis.shown(position.along(axis)));
+            Axis::BOTH.map(shown).join(", ")
         }
         None => "not known where the axes stand".to_owned(),
     };
-    let next = match (needed, rest) {
-        (None, Some(rest)) => stage("withdraw", path, report) + rest,
-        _ => stage(needed.unwrap_or("status"), path, report),
+    let next = match (required, remaining) {
+        (Some(required), _) => next_stage(required.operation(), path, report),
+        (None, Some(remaining)) => next_stage("withdraw", path, report) + remaining,
+        (None, None) => next_stage("status", path, report),
     };
-    Some(format!("stage       {place}; {}\n{next}", drives(&report.left)))
+    Some(format!("stage       {positions}; {}\n{next}", drives(&report.stage_at_end)))
 }
 
-fn review(report: &RunReport) -> String {
+/// The line with the next command, a review of the run.
+fn next_review(report: &RunReport) -> String {
     format!("next        needle-bench review {}", report.run_dir.display())
 }
 
-/// The next command where it is an `operation` of the stage.
-fn stage(operation: &str, path: Option<&Path>, report: &RunReport) -> String {
+/// The line with the next command, an `operation` of the stage.
+fn next_stage(operation: &str, path: Option<&Path>, report: &RunReport) -> String {
     let path = path.map_or_else(|| report.run_dir.join(file::CONFIG), Path::to_path_buf);
     format!("next        needle-bench stage {operation} {}", path.display())
 }
 
-/// The operation of the stage that its drives need before any other.
-fn needed(config: &Config, left: &StageAtEnd) -> Option<&'static str> {
-    let is_in_fault = !left.drives.all(|drive| !is_in_fault(drive));
-    match left.unknown {
-        Some(_) => Some("status"),
-        None => (is_in_fault && !config.stage.power.fault_reset_on_start).then_some("reset"),
+/// An operation of the stage that is required before any other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Required {
+    /// The drives are not known to stand without power.
+    Status,
+    /// A drive is in Fault, and a run would not reset it.
+    Reset,
+}
+
+impl Required {
+    fn operation(self) -> &'static str {
+        match self {
+            Required::Status => "status",
+            Required::Reset => "reset",
+        }
     }
+}
+
+fn required(config: &Config, stage: &StageAtEnd) -> Option<Required> {
+    if stage.unknown.is_some() {
+        return Some(Required::Status);
+    }
+    let is_any_in_fault = Axis::BOTH.into_iter().any(|axis| is_in_fault(&stage.drives[axis]));
+    (is_any_in_fault && !config.stage.power.fault_reset_on_start).then_some(Required::Reset)
 }
 
 fn is_in_fault(drive: &DriveReport) -> bool {
     drive.state.is_some_and(DriveState::is_fault)
 }
 
-/// What the drives are doing.
-fn drives(left: &StageAtEnd) -> String {
-    let known = match left.had_power {
+/// What the drives were last known to do.
+fn drives(stage: &StageAtEnd) -> String {
+    let known = match stage.had_power {
         true => "both axes stand, power is off",
         false => "no power was given",
     };
-    let mut text = left.unknown.unwrap_or(known).to_owned();
-    for axis in Axis::BOTH.into_iter().filter(|axis| is_in_fault(&left.drives[*axis])) {
-        let error = left.drives[axis].error.map(|error| format!(" ({error})"));
+    let mut text = stage.unknown.unwrap_or(known).to_owned();
+    for axis in Axis::BOTH.into_iter().filter(|axis| is_in_fault(&stage.drives[*axis])) {
+        let error = stage.drives[axis].error.map(|error| format!(" ({error})"));
         text += &format!("; {axis} is in fault{}", error.unwrap_or_default());
     }
     text
 }
 
+/// `--by` is printed in tenths of a mm, so that it may exceed the depth by this.
+const BY_ROUNDING_MM: f64 = 0.05;
+
 /// How `stage withdraw` takes the needle out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Withdrawal {
-    /// How far back, mm; `None` to depth 0, where the axis has one.
+    /// Distance, mm; `None` to depth 0, if the axis has a configured zero.
     by_mm: Option<f64>,
-    /// The position limit that it needs in place of the configured one, mm.
+    /// The lower position limit that this distance requires, mm; `None` if the configured one allows it.
     min_mm: Option<f64>,
 }
 
 impl Withdrawal {
-    /// Out of a depth of `inserted_mm`.
-    fn of(config: &Config, inserted_mm: f64) -> Self {
+    /// The withdrawal from a depth of `inserted_mm`.
+    fn from_depth(config: &Config, inserted_mm: f64) -> Self {
         let insertion = &config.stage.insertion;
         if insertion.zero.is_some() {
             return Withdrawal { by_mm: None, min_mm: None };
         }
         // The axis reads 0 where the withdrawal begins, and its limits count from there.
-        let needed_mm = -(inserted_mm + 0.05).ceil();
+        let needed_mm = -(inserted_mm + BY_ROUNDING_MM).ceil();
         let min_mm = (insertion.limits.min > needed_mm).then_some(needed_mm);
         Withdrawal { by_mm: Some(inserted_mm), min_mm }
     }
 
-    /// The option of `stage withdraw` that says how far.
-    pub(super) fn by(self) -> String {
+    /// The option of `stage withdraw` for the distance; empty for depth 0.
+    pub(super) fn by_option(self) -> String {
         self.by_mm.map_or(String::new(), |mm| format!(" --by {mm:.1}mm"))
     }
 
     /// The options of `stage withdraw`.
     fn options(self) -> String {
         let set = self.min_mm.map(|mm| format!(" --set stage.insertion.min_mm={mm:.1}"));
-        self.by() + &set.unwrap_or_default()
+        self.by_option() + &set.unwrap_or_default()
     }
 
-    /// The configuration that allows it after the run of `report`.
-    pub(super) fn allowed(self, mut config: Config, report: &RunReport) -> Config {
+    /// The configuration for this withdrawal after the run of `report`.
+    pub(super) fn configuration(self, mut config: Config, report: &RunReport) -> Config {
         if config.is_emulated()
-            && let Some(position) = report.left.position
+            && let Some(position) = report.stage_at_end.position
         {
-            // Another emulated stage, which stands where that of the run ended.
+            // The withdrawal has a new emulated stage: it starts where that of the run ended.
             config.emulator.insertion_start_mm = position.insertion_mm;
         }
         if let Some(min_mm) = self.min_mm {
@@ -244,10 +267,12 @@ pub(super) fn withdrawal(config: &Config, report: &RunReport) -> Result<Withdraw
     if inserted_mm <= config.insertion.arrival_mm {
         return Err(format!("the needle is out, at {inserted_mm:.2} mm"));
     }
-    match needed(config, &report.left) {
-        None => Ok(Withdrawal::of(config, inserted_mm)),
-        Some("reset") => Err("a drive is in fault: find why, then stage reset".to_owned()),
-        Some(_) => Err("the drives are not known to stand; look at the stage".to_owned()),
+    match required(config, &report.stage_at_end) {
+        None => Ok(Withdrawal::from_depth(config, inserted_mm)),
+        Some(Required::Reset) => Err("a drive is in fault: find why, then stage reset".to_owned()),
+        Some(Required::Status) => {
+            Err("the drives are not known to stand; look at the stage".to_owned())
+        }
     }
 }
 
@@ -275,7 +300,7 @@ mod tests {
         RunReport {
             outcome,
             figures: RunFigures::default(),
-            left: StageAtEnd::default(),
+            stage_at_end: StageAtEnd::default(),
             holds: Holds::default(),
             gates: GateCounts::default(),
             end: Time::ZERO,
@@ -317,9 +342,9 @@ mod tests {
         Configured::new(Some(Path::new("bench-config/vcan.toml")), sets).load(None).unwrap()
     }
 
-    fn stopped(insertion_mm: f64, left: StageAtEnd) -> RunReport {
+    fn stopped(insertion_mm: f64, stage_at_end: StageAtEnd) -> RunReport {
         let stopped = Outcome::Stopped("operator: interrupted".to_owned());
-        let mut report = RunReport { left, ..report(stopped, &[]) };
+        let mut report = RunReport { stage_at_end, ..report(stopped, &[]) };
         report.figures.take_scored(insertion_mm, None, None);
         report
     }
@@ -334,16 +359,19 @@ mod tests {
 
     /// The rotation's drive is in Fault besides.
     fn in_fault() -> StageAtEnd {
-        let mut left = stood();
-        left.drives.rotation =
+        let mut stage = stood();
+        stage.drives.rotation =
             DriveReport { state: Some(DriveState::Fault), error: Some(EmcyCode::HEARTBEAT) };
-        left
+        stage
     }
 
     #[test]
     fn a_needle_is_withdrawn_after_a_stop_as_after_a_completed_run() {
         let real = config(&[]);
-        assert_eq!(withdrawal(&real, &stopped(5.0, stood())), Ok(Withdrawal::of(&real, 5.0)));
+        assert_eq!(
+            withdrawal(&real, &stopped(5.0, stood())),
+            Ok(Withdrawal::from_depth(&real, 5.0))
+        );
         let out = withdrawal(&real, &stopped(0.01, stood()));
         assert_eq!(out.unwrap_err(), "the needle is out, at 0.01 mm");
         let said = after_insertion(&real, Some(Path::new(RIG)), &stopped(5.0, stood())).unwrap();
@@ -416,7 +444,7 @@ mod tests {
         );
         let done = RunReport { outcome: Outcome::Completed, ..stopped(5.0, stood()) };
         assert_eq!(said(&done), None);
-        let proved = RunReport { left: in_fault(), ..done };
+        let proved = RunReport { stage_at_end: in_fault(), ..done };
         let next = "\nnext        needle-bench stage reset rig.toml";
         assert!(said(&proved).unwrap().ends_with(next));
     }
@@ -427,8 +455,8 @@ mod tests {
         let options = |sets: &[&str]| {
             let sets = sets.iter().map(|set| (*set).to_owned()).collect();
             let config = Configured::new(None, sets).load(None).unwrap();
-            let withdrawal = Withdrawal::of(&config, 12.96);
-            let allowed = withdrawal.allowed(config, &stopped(12.96, stood()));
+            let withdrawal = Withdrawal::from_depth(&config, 12.96);
+            let allowed = withdrawal.configuration(config, &stopped(12.96, stood()));
             assert_eq!(allowed.emulator.insertion_start_mm, 5.0, "where the stage stands");
             assert!(allowed.stage.insertion.limits.min <= -13.0 || withdrawal.by_mm.is_none());
             withdrawal.options()

@@ -74,7 +74,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), Failure> {
         }
         config = config.drawn(seed)?;
     }
-    // A replay finds the masks again, and sees whether they are the same.
+    // The record names each mask by its absolute path and checksum, for a replay to find and check it.
     if let Some(file) = configured.path() {
         let file = std::path::absolute(file)?;
         config = config.recorded_beside(&file, |mask| file_crc32(mask).ok());
@@ -94,24 +94,24 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), Failure> {
         console: arguments.console,
         paced: arguments.console,
     };
-    let after = options.of_withdrawal();
+    let withdrawal_options = options.of_withdrawal();
     let job = Job { config: &config, plan: session.into(), motion: None, options };
     let Performed { report, wants_withdrawal, .. } = job.perform()?;
     let object = to_json(&config, &report, &preflight);
-    let more = more(&config, configured.whole_path(), &report);
+    let more = screen_values(&config, configured.whole_path(), &report);
     print_result(arguments.json, &object, || screen(include_str!("run.txt"), &object, more))?;
     let mut worst = status(&config, &report);
     if wants_withdrawal && let Ok(withdrawal) = withdrawal(&config, &report) {
-        let config = withdrawal.allowed(config, &report);
-        let words = format!("withdraw{}", withdrawal.by());
-        let (report, summary) = stage::perform(&config, &words, after)?;
+        let config = withdrawal.configuration(config, &report);
+        let command = format!("withdraw{}", withdrawal.by_option());
+        let (report, summary) = stage::perform(&config, &command, withdrawal_options)?;
         print_stderr(summary);
         worst = worst.max(status(&config, &report));
     }
     ended(worst)
 }
 
-/// The figures and the result of the run.
+/// The figures and the outcome of the run.
 fn to_json(config: &Config, report: &RunReport, preflight: &[Check]) -> Value {
     let figures = merged(json!(report.figures.report()), &end_json(report));
     let more = json!({
@@ -127,8 +127,8 @@ fn to_json(config: &Config, report: &RunReport, preflight: &[Check]) -> Value {
     merged(figures, &more)
 }
 
-/// What the screen shows besides the object.
-fn more(config: &Config, path: Option<&Path>, report: &RunReport) -> Shown {
+/// The values that the screen shows and the JSON object lacks.
+fn screen_values(config: &Config, path: Option<&Path>, report: &RunReport) -> Shown {
     let figures = report.figures.report();
     context! {
         depth_mm => config.insertion.depth_mm,

@@ -112,7 +112,10 @@ fn a_plane_out_of_reach_is_refused_or_told_at_the_end() {
     let said = needle_bench(&scratch, &["run", "--set", insert]);
     assert_eq!(said.status, 0, "{}", said.stderr);
     let last = said.stdout.lines().last().unwrap_or_default();
-    let (start, end) = ("completed, not in the plane: ", "; start nearer to it or insert deeper");
+    let (start, end) = (
+        "completed, not in the plane: ",
+        "; start nearer to it, or insert deeper if the tip was still approaching it",
+    );
     assert!(last.starts_with(start) && last.ends_with(end), "{last}");
     let json = needle_bench(&scratch, &["run", "-q", "--json", "--set", insert]).json();
     assert_eq!(json["outcome"], "completed");
