@@ -9,7 +9,8 @@ use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::thread;
 
-/// The configuration of a command: its first argument or `--config`, and keys set over it.
+/// The arguments that name a command's configuration: a file, as the first argument or by `--config`, and keys
+/// that override it.
 #[derive(Debug, Clone, Default, Args)]
 pub(super) struct Configured {
     /// Configuration (TOML); each key that it leaves out is as in bench-config/virtual.toml.
@@ -24,7 +25,7 @@ pub(super) struct Configured {
 }
 
 impl Configured {
-    /// The configuration in the file `path`, with the keys `set` over it.
+    /// The configuration in the file `path`, overridden by the keys `set`.
     pub(super) fn new(path: Option<&Path>, set: Vec<String>) -> Self {
         Configured { config: path.map(Path::to_owned), named: None, set }
     }
@@ -34,23 +35,23 @@ impl Configured {
         self.config.as_deref().or(self.named.as_deref())
     }
 
-    /// The file, if no key is set over it: it is then the whole configuration.
+    /// The file, if no key overrides it: then it is the whole configuration.
     pub(super) fn whole_path(&self) -> Option<&Path> {
         self.path().filter(|_| self.set.is_empty())
     }
 
-    /// The same, rehearsed on the emulated stage if `rehearse`.
+    /// The same configuration; if `rehearse`, rehearsed on the emulated stage.
     pub(super) fn rehearsed(mut self, rehearse: bool) -> Self {
         self.set.extend(rehearse.then(|| "emulator.rehearse=true".to_owned()));
         self
     }
 
-    /// The configuration; where no file is named the built-in `fallback` (name, text) or the defaults.
+    /// Loads the configuration. If no file is named, loads the built-in `fallback` (name, text) or the defaults.
     pub(super) fn load(&self, fallback: Option<(&str, &str)>) -> Result<Config, Failure> {
         self.read(fallback).map(|(config, _)| config)
     }
 
-    /// The configuration and its warnings, which are printed as well.
+    /// Loads the configuration and its warnings, and prints the warnings.
     pub(super) fn load_with_warnings(&self) -> Result<(Config, Vec<String>), Failure> {
         let (config, warnings) = self.read(None)?;
         for warning in &warnings {
@@ -65,32 +66,32 @@ impl Configured {
             None => fallback.map(|(name, text)| (name.to_owned(), text.to_owned())),
         };
         let source = source.as_ref().map(|(name, text)| Source { name, text });
-        let calibration =
-            |path: &Path| text(path).map_err(|error| format!("{} {error}", path.display()));
-        Ok(Config::with_warnings(source.as_slice(), &self.set, &calibration)?)
+        let read_calibration =
+            |path: &Path| read_text(path).map_err(|error| format!("{} {error}", path.display()));
+        Ok(Config::with_warnings(source.as_slice(), &self.set, &read_calibration)?)
     }
 }
 
 /// The text of a file that the arguments name.
 pub(super) fn text_of(path: &Path) -> Result<String, Failure> {
-    text(path).map_err(|error| Failure::bad_input(path, error))
+    read_text(path).map_err(|error| Failure::bad_input(path, error))
 }
 
 /// The text of the file `path`, or why it cannot be read.
-fn text(path: &Path) -> Result<String, String> {
+fn read_text(path: &Path) -> Result<String, String> {
     if path.is_dir() {
         return Err("cannot be read: it is a folder; name a file in it".to_owned());
     }
     let bytes = std::fs::read(path).map_err(|error| format!("cannot be read: {error}"))?;
-    let valid = std::str::from_utf8(&bytes).map_or_else(|error| error.valid_up_to(), str::len);
+    let valid_len = std::str::from_utf8(&bytes).map_or_else(|error| error.valid_up_to(), str::len);
     // A text file has no zero byte, although UTF-8 allows it.
-    let zero = bytes[..valid].iter().position(|byte| *byte == 0);
-    let at = zero.unwrap_or(valid);
-    match bytes.get(at) {
+    let zero = bytes[..valid_len].iter().position(|byte| *byte == 0);
+    let end = zero.unwrap_or(valid_len);
+    match bytes.get(end) {
         None => Ok(String::from_utf8_lossy(&bytes).into_owned()),
         Some(byte) => Err(format!(
             "cannot be read: not a text file (byte {} is {byte:#04x}); name a text file",
-            at + 1
+            end + 1
         )),
     }
 }
@@ -122,29 +123,29 @@ pub(super) struct RealTimeArguments {
 }
 
 impl RealTimeArguments {
-    /// Refuses them for the reason `why`.
-    pub(super) fn refuse(self, why: &str) -> Result<(), Failure> {
+    /// Refuses `--realtime`, if it was given, for the reason `why`.
+    pub(super) fn refuse_if_given(self, why: &str) -> Result<(), Failure> {
         match self.realtime {
             false => Ok(()),
             true => Err(Failure::configuration(format_args!("--realtime: {why}"))),
         }
     }
 
-    /// Checks that this process has the right, on a thread that then ends: threads created later
-    /// must not inherit the priority.
-    pub(super) fn try_out(self) -> Result<(), Failure> {
+    /// Checks that this process may take real-time priority. Tries it on a thread that then ends: threads created
+    /// later must not inherit the priority.
+    pub(super) fn check_permission(self) -> Result<(), Failure> {
         let tried = thread::spawn(move || self.enter()).join();
         tried.map_err(|_| Failure::environment("--realtime: the trial ended in a panic"))?.map(drop)
     }
 
-    /// Calls `run`, which may [`enter`](Self::enter) real time: on a thread of its own, with which the priority ends. What
-    /// comes after a run, and the threads that it starts, must not have it.
-    pub(super) fn around<T: Send>(self, run: impl FnOnce() -> T + Send) -> T {
+    /// Calls `run`, which may [`enter`](Self::enter) real time, on a thread of its own: the priority ends with the
+    /// thread. What comes after a run, and the threads that it starts, must not have the priority.
+    pub(super) fn run_isolated<T: Send>(self, run: impl FnOnce() -> T + Send) -> T {
         if !self.realtime {
             return run();
         }
-        let ran = thread::scope(|scope| scope.spawn(run).join());
-        ran.unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+        let result = thread::scope(|scope| scope.spawn(run).join());
+        result.unwrap_or_else(|panic| std::panic::resume_unwind(panic))
     }
 
     /// Gives this thread, the SYNC thread, its real-time priority if asked. Call it after all other
@@ -166,8 +167,8 @@ pub(super) fn number_in(
     }
 }
 
-/// A seed of the command line.
-pub(super) fn seed(text: &str) -> Result<u64, String> {
+/// Parses a seed, for clap.
+pub(super) fn parse_seed(text: &str) -> Result<u64, String> {
     let seed = text.parse().ok().filter(|seed| *seed <= SEED_MAX);
     seed.ok_or_else(|| format!("a whole number from 0 to {SEED_MAX}"))
 }
@@ -178,8 +179,9 @@ mod tests {
 
     #[test]
     fn a_priority_ends_with_the_run() {
-        let ran_on =
-            |realtime| RealTimeArguments { realtime, cpu: None }.around(|| thread::current().id());
+        let ran_on = |realtime| {
+            RealTimeArguments { realtime, cpu: None }.run_isolated(|| thread::current().id())
+        };
         let this = thread::current().id();
         assert_ne!(ran_on(true), this);
         assert_eq!(ran_on(false), this);

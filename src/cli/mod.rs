@@ -72,7 +72,7 @@ enum Command {
     Study(study::Arguments),
     /// Look at the tracker without a run: list its tools, watch, record, or measure it at rest.
     #[command(subcommand)]
-    Tracker(tracker::Look),
+    Tracker(tracker::TrackerCommand),
     /// Calibrate the rig: from recordings to numbers for the configuration.
     #[command(subcommand)]
     Calibrate(calibrate::Calibration),
@@ -224,7 +224,7 @@ impl Command {
             Command::Review(arguments) => review::review(arguments),
             Command::Evaluate(arguments) => evaluate::evaluate(arguments),
             Command::Study(arguments) => study::study(arguments),
-            Command::Tracker(look) => tracker::tracker(look),
+            Command::Tracker(command) => tracker::tracker(command),
             Command::Calibrate(calibration) => calibrate::calibrate(calibration),
             Command::Generate(what) => generate::generate(what),
         }

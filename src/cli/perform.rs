@@ -8,7 +8,7 @@ use super::operator::Terminal;
 use super::output::print_stderr;
 use super::records::describe;
 use super::stage::Motion;
-use super::tracker::{described, open_tracker, replay};
+use super::tracker::{load_replay, open_tracker, source_label};
 use super::{Failure, io_runtime};
 use crate::archive::{Manifest, RunOutcome, sha256_hex};
 use crate::config::{
@@ -34,14 +34,14 @@ use std::path::Path;
 use std::time::SystemTime;
 use tokio::runtime::Runtime;
 
-/// Where viewers look for a run by default.
+/// The default address of `--live`, where viewers look for a run.
 pub(super) const LIVE_ADDRESS: &str = "127.0.0.1:9876";
 
-/// A session to run, and what its record says of it.
+/// A session to run, and what its record says about it.
 pub(super) struct Job<'a> {
     pub(super) config: &'a Config,
     pub(super) plan: Plan,
-    /// The motion of the stage; `None` for an insertion.
+    /// The motion of the stage that is recorded; `None` for an insertion.
     pub(super) motion: Option<&'a Motion>,
     pub(super) options: Options,
 }
@@ -57,7 +57,7 @@ pub(super) struct Options {
     pub(super) quiet: bool,
     /// Shows the run on the whole terminal, and takes its keys.
     pub(super) console: bool,
-    /// An emulated stage takes as long as a rig, for an operator to practise.
+    /// Runs an emulated stage in real time, so that an operator can practise.
     pub(super) paced: bool,
 }
 
@@ -71,7 +71,7 @@ pub(super) struct Performed {
 }
 
 impl Options {
-    /// Those of the withdrawal after a run on the console. Viewers stay with the run.
+    /// The options for the withdrawal after a run on the console. Viewers keep showing the run.
     pub(super) fn of_withdrawal(&self) -> Self {
         Options { live: None, console: false, ..self.clone() }
     }
@@ -85,33 +85,33 @@ impl Job<'_> {
         let interrupt = Interrupt::listen()?;
         let performed = if self.options.console {
             let mut console = Console::open(self.config, interrupt.clone())?;
-            let performed = self.attended(&mut console, &runtime, &interrupt);
-            let left = performed.as_ref().map(|Performed { report, .. }| {
+            let performed = self.run_and_complete(&mut console, &runtime, &interrupt);
+            let withdrawal = performed.as_ref().map(|Performed { report, .. }| {
                 withdrawal(self.config, report).map(|withdrawal| withdrawal.to_string())
             });
-            let wants_withdrawal = console.finish(left.ok());
+            let wants_withdrawal = console.finish(withdrawal.ok());
             performed.map(|performed| Performed { wants_withdrawal, ..performed })
         } else {
             let quiet = self.options.quiet;
             let mut terminal = Terminal::new(quiet, self.motion.is_none() && !quiet);
-            let performed = self.attended(&mut terminal, &runtime, &interrupt);
+            let performed = self.run_and_complete(&mut terminal, &runtime, &interrupt);
             terminal.finish();
             performed
         };
-        // Until here it listens to signals.
+        // Last: until here the runtime listens for signals.
         runtime.shutdown_background();
         performed
     }
 
     /// Runs the session and completes its record.
-    fn attended(
+    fn run_and_complete(
         &self,
         operator: &mut (dyn Operator + Send),
         runtime: &Runtime,
         interrupt: &Interrupt,
     ) -> Result<Performed, Failure> {
         let run = || self.run(operator, runtime, interrupt);
-        let (mut report, done) = self.options.realtime.around(run)?;
+        let (mut report, done) = self.options.realtime.run_isolated(run)?;
         complete_record(&mut report, describe(self.config.clone()), operator);
         Ok(Performed { report, done, wants_withdrawal: false })
     }
@@ -126,29 +126,33 @@ impl Job<'_> {
         let stops_on_record_failure = config.record.on_failure == OnFailure::Stop;
         let begin = |now| self.plan.clone().begin(now).map_err(Failure::configuration);
         let Options { realtime, live, paced, .. } = self.options;
-        live.map_or(Ok(()), is_free)?;
+        live.map_or(Ok(()), check_live_address)?;
         if config.is_emulated() {
-            realtime.refuse("a run with can.interface = \"memory\" is in virtual time")?;
+            realtime.refuse_if_given("a run with can.interface = \"memory\" is in virtual time")?;
             let stage = VirtualStage::new(config.virtual_stage()?, Time::ZERO);
             let (tool, target) = (config.tracker.tool.clone(), config.goal.tool.clone());
             let emulated = TipSource::Emulated { tool, target };
-            let tips =
-                self.records_tracker().then(|| replay(&config.tracker, Time::ZERO)).transpose()?;
-            let tips = tips.map(|replay| replay.map_or(emulated, TipSource::Recorded));
-            let (recorder, _) = self.record(SystemTime::now(), Backpressure::Block)?;
+            let tips = match self.records_tracker() {
+                true => Some(
+                    load_replay(&config.tracker, Time::ZERO)?.map_or(emulated, TipSource::Recorded),
+                ),
+                false => None,
+            };
+            let (recorder, _) = self.start_recording(SystemTime::now(), Backpressure::Block)?;
             let sink = Sink::new(recorder, stops_on_record_failure, operator, interrupt);
             let mut session = begin(Time::ZERO)?;
             let pace = paced.then(Pace::begin);
             let report = run_virtual(&mut session, stage, tips, pace, sink);
             return Ok((report, session.done().to_vec()));
         }
-        realtime.try_out()?;
+        realtime.check_permission()?;
         let mut bus = open_stage_bus(config)?;
         let clock = Clock::start();
         let mut tracker = self.open_tracker(runtime, clock)?;
-        let (recorder, realtime) = self.record(clock.origin_utc(), Backpressure::DropAndCount)?;
+        let (recorder, realtime) =
+            self.start_recording(clock.origin_utc(), Backpressure::DropAndCount)?;
         let sink = Sink::new(recorder, stops_on_record_failure, operator, interrupt);
-        // Last, since the session's deadlines begin to run.
+        // Last: the session's deadlines start to run here.
         let mut session = begin(clock.now())?;
         let (bus, tips) = (bus.as_mut(), tracker.as_mut());
         let report = run_live(&mut session, bus, tips, clock, realtime, sink);
@@ -157,7 +161,10 @@ impl Job<'_> {
     }
 
     fn needs_tracker(&self) -> bool {
-        !matches!(&self.plan, Plan::Operation(plan) if !plan.operation.needs_tracker())
+        match &self.plan {
+            Plan::Insertion(_) => true,
+            Plan::Operation(plan) => plan.operation.needs_tracker(),
+        }
     }
 
     /// Whether the session receives the tracker's stream. An operation that does not need it receives a live
@@ -175,16 +182,16 @@ impl Job<'_> {
         }
         match open_tracker(self.config, runtime, clock) {
             Err(failure) if !self.needs_tracker() => {
-                print_stderr(format_args!("warning: {failure}; the record is without the tracker"));
+                print_stderr(format_args!("warning: {failure}; the tracker is not recorded"));
                 Ok(None)
             }
             opened => opened.map(Some),
         }
     }
 
-    /// Makes the folder of the run, where there is room for one, serves it to viewers, and gives this
-    /// thread its real-time priority.
-    fn record(
+    /// Creates the run folder if the disk has room, serves the run to viewers, and gives this thread its
+    /// real-time priority.
+    fn start_recording(
         &self,
         started_utc: SystemTime,
         backpressure: Backpressure,
@@ -227,7 +234,7 @@ impl Job<'_> {
             git: option_env!("NEEDLE_BENCH_GIT").map(str::to_owned),
             rehearsal,
             bus: config.bus().to_string(),
-            tracker: described(config),
+            tracker: source_label(config),
             seed: config.is_emulated().then_some(config.emulator.seed),
             operator: about.operator.clone().or_else(|| config.record.operator.clone()),
             phantom: about.phantom.clone().or_else(|| config.record.phantom.clone()),
@@ -236,7 +243,7 @@ impl Job<'_> {
         })
     }
 
-    /// Serves the run to viewers, where there is an address for them, and says how to look.
+    /// Serves the run to viewers if an address is given, and prints the command that shows it.
     fn serve(&self, recorder: &mut Recorder) -> Result<(), Failure> {
         let Some(address) = self.options.live else { return Ok(()) };
         recorder.serve(address, scene(self.config)?).map_err(Failure::environment)?;
@@ -245,7 +252,7 @@ impl Job<'_> {
     }
 }
 
-/// What the viewer shows of a run of `config` besides its records.
+/// What the viewer shows for a run of `config` besides its records.
 pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
     Ok(Scene {
         x_wp: config.plane.to_pose(),
@@ -263,8 +270,8 @@ pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
     })
 }
 
-/// The bus of `config`, on which the bench hears what `can.listen` says and every frame that it sends
-/// must be seen to leave.
+/// Opens the bus of `config`. The bench receives only what `can.listen` selects, and each frame that it sends must
+/// be confirmed on the bus.
 pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure> {
     let CanInterface::Socket(name) = config.bus() else { return open_bus(config.bus()) };
     if !config.stage.hardware && has_device(name) {
@@ -274,7 +281,7 @@ pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure
         )));
     }
     let mut bus = SocketCan::open(name)?;
-    // As many as may go unanswered, and the one under way.
+    // As many as may go unanswered, plus the current one.
     let syncs_max = usize::from(config.can.bus.missed_feedback_max) + 1;
     bus.confirm_sending(syncs_max)?;
     if config.can.listen == Listen::Stage {
@@ -285,7 +292,7 @@ pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure
     Ok(Box::new(bus))
 }
 
-/// The bus that `interface` names.
+/// Opens the bus that `interface` names.
 pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Failure> {
     match interface {
         CanInterface::Socket(name) => Ok(Box::new(SocketCan::open(name)?)),
@@ -297,12 +304,11 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
     }
 }
 
-/// Whether viewers can be served at `address`: asked before there is a run folder.
-fn is_free(address: SocketAddr) -> Result<(), Failure> {
+/// Checks that viewers can be served at `address`, before the run folder is created.
+fn check_live_address(address: SocketAddr) -> Result<(), Failure> {
     if address.port() == 0 {
         return Err(Failure::configuration(format_args!(
-            "--live: {address}: viewers have to know the port; name one, as in \
-             --live={LIVE_ADDRESS}"
+            "--live: {address}: viewers must know the port; name one, as in --live={LIVE_ADDRESS}"
         )));
     }
     TcpListener::bind(address).map(drop).map_err(|error| {
@@ -312,7 +318,7 @@ fn is_free(address: SocketAddr) -> Result<(), Failure> {
     })
 }
 
-/// What every session's JSON says of its end.
+/// The fields about the end of a session that are in the JSON of every session.
 pub(super) fn end_json(report: &RunReport) -> Value {
     json!({
         "outcome": RunOutcome::from(&report.outcome),
@@ -324,7 +330,7 @@ pub(super) fn end_json(report: &RunReport) -> Value {
     })
 }
 
-/// What can be known only of an emulated run: its faults, and the true positions of its axes.
+/// What is known only in an emulated run: its faults, and the true positions of its axes.
 fn emulated_json(emulated: &EmulationReport) -> Value {
     let moment = |moment: &Moment| {
         json!({

@@ -251,7 +251,7 @@ fn listen_to_tracker(config: &Config, listen: Duration) -> Result<Option<Tracker
         listening.take(&event);
     }
     let now = listener.now();
-    Ok(Some(listening.report(since, now, || listener.missing())))
+    Ok(Some(listening.report(since, now, || listener.explain_missing())))
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! `needle-bench run`: one insertion.
 
-use super::arguments::{About, Configured, RealTimeArguments, seed};
+use super::arguments::{About, Configured, RealTimeArguments, parse_seed};
 use super::console::Console;
 use super::ending::{after_insertion, ending, plan_status, plane_missed_by_mm, status, withdrawal};
 use super::mask::{file_crc32, mask_reader};
@@ -36,7 +36,7 @@ pub(super) struct Arguments {
     yes: bool,
     /// Draw the emulated start and needle from [study] by this seed, and the noise: the trial of a
     /// study that has this seed. (The noise alone: --set emulator.seed=SEED.)
-    #[arg(long, value_parser = seed, allow_negative_numbers = true)]
+    #[arg(long, value_parser = parse_seed, allow_negative_numbers = true)]
     seed: Option<u64>,
     #[command(flatten)]
     realtime: RealTimeArguments,

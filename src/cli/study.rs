@@ -1,7 +1,7 @@
 //! `needle-bench study`: Monte Carlo.
 
 use super::Failure;
-use super::arguments::{Configured, seed};
+use super::arguments::{Configured, parse_seed};
 use super::mask::mask_reader;
 use super::output::{print_result, refuse_existing, shell_word, write_new};
 use crate::config::Config;
@@ -29,7 +29,7 @@ pub(super) struct Arguments {
     #[arg(long, default_value_t = 1000, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
     trials: u32,
     /// Seed of the study: the same seed gives the same trials.
-    #[arg(long, default_value_t = 1, value_parser = seed, allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 1, value_parser = parse_seed, allow_negative_numbers = true)]
     seed: u64,
     /// One JSON object on stdout.
     #[arg(long)]

@@ -162,7 +162,7 @@ fn position_at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
              tracker.gates.noise_sd_mm): hold it still, or measure the noise",
             WAIT_MAX.as_secs()
         ),
-        None => listener.missing(),
+        None => listener.explain_missing(),
     })
 }
 

@@ -300,7 +300,7 @@ pub(super) fn stage(arguments: &Arguments) -> Result<(), Failure> {
         )));
     }
     if !matches!(operation, Operation::Motion(_)) {
-        realtime.refuse("`stage status` and `reset` have no SYNC thread")?;
+        realtime.refuse_if_given("`stage status` and `reset` have no SYNC thread")?;
     }
     let configured = configured.rehearsed(rehearse);
     let key = |config: &Config| match operation {

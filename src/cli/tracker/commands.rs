@@ -1,6 +1,6 @@
 //! `needle-bench tracker`: lists, watches, records and measures the tracker without a run.
 
-use super::{Listener, described, listen};
+use super::{Listener, listen, source_label};
 use crate::archive::tracker_line;
 use crate::cli::Failure;
 use crate::cli::arguments::{Configured, number_in};
@@ -26,7 +26,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 #[derive(Debug, Subcommand)]
-pub(in crate::cli) enum Look {
+pub(in crate::cli) enum TrackerCommand {
     /// The tools that the tracker sends, with types and rates.
     List(ListArguments),
     /// One line a second: position, rate, age, refusals; until Ctrl-C.
@@ -37,18 +37,18 @@ pub(in crate::cli) enum Look {
     Rest(RestArguments),
 }
 
-pub(in crate::cli) fn tracker(look: &Look) -> Result<(), Failure> {
-    match look {
-        Look::List(arguments) => list(arguments),
-        Look::Watch(arguments) => watch(arguments),
-        Look::Record(arguments) => record(arguments),
-        Look::Rest(arguments) => rest(arguments),
+pub(in crate::cli) fn tracker(command: &TrackerCommand) -> Result<(), Failure> {
+    match command {
+        TrackerCommand::List(arguments) => list(arguments),
+        TrackerCommand::Watch(arguments) => watch(arguments),
+        TrackerCommand::Record(arguments) => record(arguments),
+        TrackerCommand::Rest(arguments) => rest(arguments),
     }
 }
 
-/// The most tools that are listed: a peer with more is faulty or hostile.
+/// Most tools that are listed: a peer with more is faulty or hostile.
 const TOOLS_MAX: usize = 64;
-/// Characters of a name or a status that are shown.
+/// Most characters of a name or a status that are shown.
 const SHOWN_MAX: usize = 40;
 
 #[derive(Debug, Args)]
@@ -71,7 +71,7 @@ struct Tool {
     valid: u64,
     /// When the first and the last sample came.
     received: Option<(Time, Time)>,
-    /// The tracker's last word on an invalid sample.
+    /// The validity of the last invalid sample.
     status: Option<Validity>,
 }
 
@@ -86,7 +86,7 @@ impl Tool {
         self.received = Some((self.received.map_or(now, |(first, _)| first), now));
     }
 
-    /// Samples a second; `None` of less than two.
+    /// Samples a second; `None` for fewer than two.
     fn rate_hz(&self) -> Option<f64> {
         let seconds = self.received.map(|(first, last)| last.seconds_after(first))?;
         (seconds > 0.0).then(|| (self.samples - 1) as f64 / seconds)
@@ -146,7 +146,7 @@ fn list(arguments: &ListArguments) -> Result<(), Failure> {
         }
     }
     if tools.is_empty() {
-        return Err(listener.nothing());
+        return Err(listener.no_samples());
     }
     let configured = &listener.config.tracker.tool;
     let is_configured = |name: &String| is_tool(name, configured);
@@ -179,19 +179,19 @@ pub(in crate::cli) struct WatchArguments {
     seconds: Option<f64>,
 }
 
-/// The tool's samples, each judged by itself as a run would.
+/// The tool's samples, each judged by itself as in a run.
 struct Watch {
     gate: Gate,
     /// The frame of the positions.
     frame: &'static str,
-    dates: AcquisitionClock,
+    clock: AcquisitionClock,
     counts: GateCounts,
     /// The last position, and when it was measured.
     last: Option<(Time, Vector3<f64>)>,
     /// How often that position has come in a row.
-    times: u32,
+    repeats: u32,
     refusal: Option<Refusal>,
-    /// Since the last line.
+    /// Accepted positions since the last line.
     positions: u64,
 }
 
@@ -204,10 +204,10 @@ impl Watch {
         Watch {
             gate,
             frame,
-            dates: tracker.to_clock(),
+            clock: tracker.to_clock(),
             counts: GateCounts::default(),
             last: None,
-            times: 0,
+            repeats: 0,
             refusal: None,
             positions: 0,
         }
@@ -215,18 +215,18 @@ impl Watch {
 
     fn take(&mut self, event: &Event) {
         let sample = match event {
-            Event::Connected { .. } => return self.dates.reconnected(),
+            Event::Connected { .. } => return self.clock.reconnected(),
             Event::Sample(sample) => sample,
             _ => return,
         };
         let admitted = self.gate.admit(sample).and_then(|position_mm| {
-            let time = self.dates.acquisition_time(sample)?;
-            // A value that is sent again is no new measurement, whatever its stamp.
+            let time = self.clock.acquisition_time(sample)?;
+            // A repeated value is not a new measurement, whatever its stamp.
             if self.last.is_some_and(|(_, last_mm)| last_mm == position_mm) {
-                self.times += 1;
-                return Err(Refusal::repeat(self.times));
+                self.repeats += 1;
+                return Err(Refusal::repeat(self.repeats));
             }
-            self.times = 1;
+            self.repeats = 1;
             Ok((time, position_mm))
         });
         self.counts.count(admitted.as_ref().err());
@@ -239,12 +239,15 @@ impl Watch {
         }
     }
 
-    /// The line of the last `seconds`.
+    /// The line at `now` for the last `seconds`.
     fn line(&mut self, now: Time, seconds: f64, listener: &mut Listener) -> String {
         let at = now.as_secs_f64();
         let Some((time, p_mm)) = self.last else {
             let refusal = self.refusal.take().map(|refusal| format!("tracker: {refusal}"));
-            return format!("{at:7.1} s  {}", refusal.unwrap_or_else(|| listener.missing()));
+            return format!(
+                "{at:7.1} s  {}",
+                refusal.unwrap_or_else(|| listener.explain_missing())
+            );
         };
         let rate_hz = std::mem::take(&mut self.positions) as f64 / seconds;
         let refusal = self.refusal.take().map(|refusal| format!("; {refusal}")).unwrap_or_default();
@@ -280,7 +283,7 @@ fn watch(arguments: &WatchArguments) -> Result<(), Failure> {
     if has_no_reader(&io::stdout()) {
         return Ok(());
     }
-    watch.last.map(|_| ()).ok_or_else(|| listener.nothing())
+    watch.last.map(|_| ()).ok_or_else(|| listener.no_samples())
 }
 
 /// Interval between two flushes of a recording.
@@ -290,7 +293,7 @@ const FLUSH_PERIOD: Duration = Duration::from_secs(1);
 pub(in crate::cli) struct RecordArguments {
     /// A new file: .csv for valid positions in the columns of `calibrate` and `evaluate` (the stage's
     /// rotation_rad and insertion_mm are not in it); .ndjson for every sample as it was received.
-    #[arg(value_parser = file)]
+    #[arg(value_parser = recording_path)]
     file: PathBuf,
     #[command(flatten)]
     configured: Configured,
@@ -299,7 +302,7 @@ pub(in crate::cli) struct RecordArguments {
     seconds: Option<f64>,
 }
 
-fn file(text: &str) -> Result<PathBuf, String> {
+fn recording_path(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
     match path.extension().and_then(OsStr::to_str) {
         Some("csv" | "ndjson") => Ok(path),
@@ -307,7 +310,7 @@ fn file(text: &str) -> Result<PathBuf, String> {
     }
 }
 
-/// A recording under way.
+/// A recording in progress.
 struct Recording {
     out: BufWriter<File>,
     /// The number of columns of a CSV file, with or without an orientation; `None` for NDJSON.
@@ -320,8 +323,8 @@ impl Recording {
     fn create(path: &Path, is_csv: bool, first: &Sample) -> io::Result<Self> {
         let mut out = BufWriter::new(File::create_new(path)?);
         let names = [&[RECEIVED, STAMP], &POSITION[..], &QUATERNION].concat();
-        let orientation = if first.orientation.is_some() { 0 } else { QUATERNION.len() };
-        let columns = is_csv.then_some(names.len() - orientation);
+        let missing = if first.orientation.is_some() { 0 } else { QUATERNION.len() };
+        let columns = is_csv.then_some(names.len() - missing);
         if let Some(columns) = columns {
             writeln!(out, "{}", names[..columns].join(","))?;
         }
@@ -335,7 +338,7 @@ impl Recording {
                 let stamp = sample.source_unix_ns.unwrap_or(0);
                 let times = [sample.receive_time.as_nanos(), stamp].map(|ns| ns.to_string());
                 let position = sample.position_mm.iter().map(f64::to_string);
-                // Empty where this sample has none: no orientation is made up.
+                // Empty if this sample has none: no orientation is made up.
                 let quaternion = match sample.orientation {
                     Some(q) => [q.w, q.i, q.j, q.k].map(|part| part.to_string()),
                     None => Default::default(),
@@ -365,7 +368,7 @@ fn record(arguments: &RecordArguments) -> Result<(), Failure> {
             path.display()
         ))
     };
-    listener.samples(arguments.seconds, |sample| {
+    listener.for_each_sample(arguments.seconds, |sample| {
         let is_valid = Gate::is_measurement(sample);
         invalid += u64::from(!is_valid);
         if is_csv && !is_valid {
@@ -392,7 +395,7 @@ fn record(arguments: &RecordArguments) -> Result<(), Failure> {
     }
     let left_out = match (is_csv, invalid) {
         (_, 0) => String::new(),
-        (true, invalid) => format!("; {invalid} invalid ones are not in it"),
+        (true, invalid) => format!("; {invalid} invalid ones were left out"),
         (false, invalid) => format!(", {invalid} of them invalid"),
     };
     print_stderr(format_args!(
@@ -416,13 +419,13 @@ pub(in crate::cli) struct RestArguments {
 fn rest(arguments: &RestArguments) -> Result<(), Failure> {
     arguments.output.refuse_existing()?;
     let mut listener = listen(&arguments.configured, false)?;
-    let source = described(&listener.config);
+    let source = source_label(&listener.config);
     print_stderr(format_args!(
         "tracker: hold \"{}\" still for {} s",
         listener.config.tracker.tool, arguments.seconds
     ));
     let mut samples = Vec::new();
-    listener.samples(Some(arguments.seconds), |sample| {
+    listener.for_each_sample(Some(arguments.seconds), |sample| {
         samples.push(rest_sample(sample));
         Ok(())
     })?;

@@ -1,8 +1,9 @@
-//! The source of tip positions that the configuration names, and the tracker looked at without a run.
+//! The source of tip positions that the configuration names; and `needle-bench tracker`, which listens to it
+//! without a run.
 
 mod commands;
 
-pub(super) use self::commands::{Look, tracker};
+pub(super) use self::commands::{TrackerCommand, tracker};
 
 use super::arguments::{Configured, text_of};
 use super::output::print_stderr;
@@ -17,7 +18,7 @@ use std::time::{Duration, UNIX_EPOCH};
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 
-/// The stream of the tracker's tool, and of the target where that is one, in real time.
+/// Opens the stream of the tracker's tool and, if the target is tracked, of the target's, in real time.
 pub(super) fn open_tracker(
     config: &Config,
     runtime: &Runtime,
@@ -27,7 +28,7 @@ pub(super) fn open_tracker(
     open(config, tools.into_iter().flatten().cloned().collect(), runtime, clock)
 }
 
-/// The stream of `tools`, or of every tool where none is named, in real time.
+/// Opens the stream of `tools`, or of every tool if none is named, in real time.
 fn open(
     config: &Config,
     tools: Vec<String>,
@@ -44,7 +45,7 @@ fn open(
         ..LinkSettings::default()
     };
     let _in_runtime = runtime.enter();
-    if let Some(replay) = replay(tracker, clock.now())? {
+    if let Some(replay) = load_replay(tracker, clock.now())? {
         return Ok(Link::replay(replay, &settings, now));
     }
     if config.tip_source() == TrackerSource::Emulated {
@@ -66,8 +67,8 @@ fn open(
     }
 }
 
-/// The recording that replaces a tracker, from `start` on; `None` if the configuration names none.
-pub(super) fn replay(tracker: &TrackerConfig, start: Time) -> Result<Option<Replay>, Failure> {
+/// Loads the recording that replaces a tracker, to begin at `start`; `None` if the configuration names none.
+pub(super) fn load_replay(tracker: &TrackerConfig, start: Time) -> Result<Option<Replay>, Failure> {
     let Some(file) = &tracker.file else { return Ok(None) };
     let text = text_of(Path::new(file))?;
     let recording = match tracker.source {
@@ -79,7 +80,7 @@ pub(super) fn replay(tracker: &TrackerConfig, start: Time) -> Result<Option<Repl
 }
 
 /// The source in a few words, for the manifest.
-pub(super) fn described(config: &Config) -> String {
+pub(super) fn source_label(config: &Config) -> String {
     let tracker = &config.tracker;
     let TrackerConfig { mode, address, .. } = tracker;
     let source = config.tip_source();
@@ -91,10 +92,10 @@ pub(super) fn described(config: &Config) -> String {
     }
 }
 
-/// How often a listener looks at Ctrl-C.
-const LOOK_PERIOD: Duration = Duration::from_millis(100);
+/// Interval at which a listener checks for Ctrl-C.
+const SIGNAL_POLL: Duration = Duration::from_millis(100);
 
-/// The configuration if none is named: the tracker alone is opened, the stage is not touched.
+/// The configuration if none is named: only the tracker is opened, never the stage.
 const ANY_STAGE: (&str, &str) =
     ("no configuration", "can.interface = \"vcan0\"\ntracker.source = \"openigtlink\"\n");
 const NO_TRACKER: &str = "give --config my-rig.toml, or --set 'tracker.address=\"HOST:PORT\"'";
@@ -109,11 +110,11 @@ pub(super) struct Listener {
     /// Why there is no connection, or what was wrong with the last message.
     trouble: Option<String>,
     has_ended: bool,
-    // Dropped last: the link uses it.
+    // The last field, so dropped last: the link uses it.
     runtime: Runtime,
 }
 
-/// Opens the stream of the tool that `configured` names, or of every tool.
+/// Opens the stream of the tool that `configured` names, or of every tool. Refuses an emulated tracker.
 pub(super) fn listen(configured: &Configured, every_tool: bool) -> Result<Listener, Failure> {
     if configured.path().is_none() && configured.set.is_empty() {
         return Err(Failure::configuration(format!("tracker: none is named; {NO_TRACKER}")));
@@ -150,7 +151,7 @@ impl Listener {
     /// The next event; `None` at `until`, at Ctrl-C and at the end of the stream.
     pub(super) fn next(&mut self, until: Time) -> Option<Event> {
         while !self.is_over() && self.clock.now() < until {
-            let wait = until.since(self.clock.now()).min(LOOK_PERIOD);
+            let wait = until.since(self.clock.now()).min(SIGNAL_POLL);
             let next = async { tokio::time::timeout(wait, self.link.next()).await };
             match self.runtime.block_on(next) {
                 Ok(Some(event)) => {
@@ -196,36 +197,36 @@ impl Listener {
     ///
     /// # Errors
     /// No sample within `tracker.timeout_s`; those of `take`.
-    pub(super) fn samples(
+    pub(super) fn for_each_sample(
         &mut self,
         seconds: Option<f64>,
         mut take: impl FnMut(&Sample) -> Result<(), Failure>,
     ) -> Result<(), Failure> {
         let timeout = self.now() + self.config.tracker.timeout;
-        let (mut until, mut has_any) = (timeout, false);
+        let (mut until, mut has_sample) = (timeout, false);
         while let Some(event) = self.next(until) {
             let Event::Sample(sample) = event else { continue };
-            if !has_any {
-                has_any = true;
+            if !has_sample {
+                has_sample = true;
                 until = seconds
                     .map_or(Time::NEVER, |seconds| self.now() + Duration::from_secs_f64(seconds));
             }
             take(&sample)?;
         }
-        if !has_any {
-            return Err(self.nothing());
+        if !has_sample {
+            return Err(self.no_samples());
         }
         match self.link.dropped() {
             0 => {}
-            lost => {
-                print_stderr(format_args!("warning: {lost} samples were lost, they came too fast"))
-            }
+            lost => print_stderr(format_args!(
+                "warning: {lost} samples were lost: they came faster than they were read"
+            )),
         }
         Ok(())
     }
 
-    /// Why nothing of the tool came, and what did.
-    pub(super) fn missing(&mut self) -> String {
+    /// Why no sample of the tool came, and what came instead.
+    pub(super) fn explain_missing(&mut self) -> String {
         self.link.passed_over().iter().for_each(|event| self.census.note(event));
         match &self.trouble {
             Some(trouble) if self.census.messages() == 0 => trouble.clone(),
@@ -233,8 +234,8 @@ impl Listener {
         }
     }
 
-    /// The failure of a command that got nothing of the tool.
-    pub(super) fn nothing(&mut self) -> Failure {
-        Failure::environment(self.missing())
+    /// The failure of a command that received no sample of the tool.
+    pub(super) fn no_samples(&mut self) -> Failure {
+        Failure::environment(self.explain_missing())
     }
 }
