@@ -362,7 +362,7 @@ fn the_console_in_tmux() {
     thread::sleep(Duration::from_millis(300));
     resize("120", "40");
     press("?");
-    let last = "withdraw the needle, after a y";
+    let last = "withdraw the needle; y confirms";
     let helped = tmux.wait_until(|screen| screen.contains("┌keys─") && screen.contains(last));
     assert!(helped.starts_with(" HELD BY OPERATOR"), "{helped}");
     press("?");

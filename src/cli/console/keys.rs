@@ -9,20 +9,20 @@ use std::sync::atomic::Ordering;
 
 const CTRL_C: u8 = 3;
 const ESCAPE: u8 = 27;
-/// No escape sequence of a key is longer.
+/// Longest escape sequence of a key.
 const SEQUENCE_MAX: usize = 16;
 
-/// What came from the keyboard.
+/// Turns the bytes of the keyboard into commands.
 #[derive(Debug, Default)]
 pub(super) struct Keys {
-    /// The beginning of an escape sequence whose end has not come.
+    /// The start of an escape sequence whose end has not come yet.
     pending: Vec<u8>,
-    /// Within a paste: its text holds and stops, and lets nothing go on.
-    is_pasted: bool,
+    /// Between the markers of a paste: only the keys that hold or stop act.
+    is_pasting: bool,
 }
 
 impl Keys {
-    /// Does what the keys say.
+    /// Takes what was read from the terminal, and does what its keys say.
     pub(super) fn take(
         &mut self,
         pressed: &[u8],
@@ -30,15 +30,15 @@ impl Keys {
         commands: &mut Producer<OperatorCommand>,
     ) {
         self.pending.extend(pressed);
-        // The speed after the keys + and − that came together.
+        // The speed asked for so far by the `+` and `-` of this read.
         let mut speed_mm_per_s = None;
         while let Some(len) = first_len(&self.pending) {
-            let first: Vec<u8> = self.pending.drain(..len).collect();
-            match &first[..] {
+            let sequence: Vec<u8> = self.pending.drain(..len).collect();
+            match &sequence[..] {
                 [key] => self.press(*key, shared, commands, &mut speed_mm_per_s),
-                // What a terminal puts around a paste.
-                b"\x1b[200~" => self.is_pasted = true,
-                b"\x1b[201~" => self.is_pasted = false,
+                // The markers of a bracketed paste.
+                b"\x1b[200~" => self.is_pasting = true,
+                b"\x1b[201~" => self.is_pasting = false,
                 _ => {}
             }
         }
@@ -52,12 +52,12 @@ impl Keys {
         speed_mm_per_s: &mut Option<f64>,
     ) {
         let is_over = shared.is_over.load(Ordering::Relaxed);
-        // A hold and a stop do not wait for the lock on the screen.
+        // A hold and a stop must not wait for the lock on the screen.
         match key {
             b'q' | CTRL_C if is_over => shared.is_leaving.store(true, Ordering::Relaxed),
             b'q' | CTRL_C => shared.interrupt.raise(),
             b' ' if !is_over => shared.hold.store(true, Ordering::Relaxed),
-            _ if self.is_pasted => {}
+            _ if self.is_pasting => {}
             b'?' => {
                 let mut screen = lock(&shared.screen);
                 screen.has_help = !screen.has_help;
@@ -73,8 +73,8 @@ impl Keys {
     }
 }
 
-/// Length of the first key in `bytes`, or of the first escape sequence (an arrow key's, say), which is no key of
-/// the console; `None` where the end of a sequence has not come.
+/// Length of the first key in `bytes`, or of the first escape sequence (an arrow key's, say), which the console
+/// ignores; `None` if the end of a sequence has not come yet.
 fn first_len(bytes: &[u8]) -> Option<usize> {
     match bytes {
         [] | [ESCAPE] | [ESCAPE, b'O'] => None,
@@ -93,32 +93,32 @@ fn first_len(bytes: &[u8]) -> Option<usize> {
     }
 }
 
-/// What `key` asks of the session, which refuses what is out of its limits.
+/// The command for `key`. It may be outside the limits: the session refuses it then.
 fn command(key: u8, shared: &Shared, speed_mm_per_s: &mut Option<f64>) -> Option<OperatorCommand> {
     let (set_mm_per_s, speed_max, step_mm) = {
         let screen = lock(&shared.screen);
         let Setup { speed_max_mm_per_s, step_mm, .. } = screen.setup;
         (screen.progress.speed_mm_per_s, speed_max_mm_per_s, step_mm)
     };
-    let mut tenths = |by: f64| {
-        // Before the first news of an insertion, which begins at the highest speed, none is set.
+    let mut change_by_tenths = |tenths: f64| {
+        // An insertion begins at the highest speed; until its first progress report, the speed here is 0.
         let set_mm_per_s = if set_mm_per_s > 0.0 { set_mm_per_s } else { speed_max };
         let from_mm_per_s = speed_mm_per_s.unwrap_or(set_mm_per_s);
-        let mm_per_s = ((from_mm_per_s / speed_max * 10.0).round() + by) * 0.1 * speed_max;
-        // What the session refuses does not add up.
+        let mm_per_s = ((from_mm_per_s / speed_max * 10.0).round() + tenths) * 0.1 * speed_max;
+        // Kept within the limits, so that presses which the session refuses do not accumulate.
         *speed_mm_per_s = Some(mm_per_s.clamp(0.1 * speed_max, speed_max));
         Some(OperatorCommand::Speed { mm_per_s })
     };
     match key {
         b'r' => Some(OperatorCommand::Resume),
         b's' => Some(OperatorCommand::Step { mm: step_mm }),
-        b'+' | b'=' => tenths(1.0),
-        b'-' => tenths(-1.0),
+        b'+' | b'=' => change_by_tenths(1.0),
+        b'-' => change_by_tenths(-1.0),
         _ => None,
     }
 }
 
-/// A key after the end of the run. The needle is withdrawn after w and y.
+/// A key after the end of the run: `w` asks whether to withdraw the needle, `y` confirms; any other key cancels.
 fn press_at_end(key: u8, shared: &Shared) {
     let mut screen = lock(&shared.screen);
     let was_asked = mem::take(&mut screen.asks_to_withdraw);
@@ -127,7 +127,7 @@ fn press_at_end(key: u8, shared: &Shared) {
             shared.wants_withdrawal.store(true, Ordering::Relaxed);
             shared.is_leaving.store(true, Ordering::Relaxed);
         }
-        b'w' => screen.asks_to_withdraw = matches!(screen.left, Some(Ok(_))),
+        b'w' => screen.asks_to_withdraw = matches!(screen.withdrawal, Some(Ok(_))),
         _ => {}
     }
 }

@@ -1,8 +1,8 @@
 //! `run --console`: the run on the whole terminal, and its keys.
 //!
 //! Two threads serve it. One reads the keys and gathers the records, and never writes; the other draws.
-//! A terminal that takes no output therefore delays neither the keys nor the run. The control thread only
-//! fills queues of fixed size: what finds them full is dropped and counted.
+//! A terminal that accepts no output therefore delays neither the keys nor the run. The control thread only
+//! fills queues of fixed size; messages that find their queue full are dropped and counted.
 
 mod keys;
 mod screen;
@@ -47,21 +47,21 @@ use thread_priority::{
 
 /// Capacity of the queue of records and events.
 const QUEUE: usize = 8192;
-/// Commands that may wait for the control thread.
+/// Capacity of the queue of commands to the control thread.
 const COMMANDS: usize = 8;
-/// How often the queue is emptied, the keys wait at most this long.
+/// Interval at which the queue is emptied if no key is pressed.
 const GATHER_MS: u16 = 20;
 const REDRAW: Duration = Duration::from_millis(100);
-/// Redraws after which the size of the record is looked at.
-const LOOK_EVERY: u32 = 10;
-/// How long the end waits for a terminal that takes no output.
+/// The size of the record is measured once in this many redraws.
+const MEASURE_EVERY: u32 = 10;
+/// How long the end waits for a terminal that accepts no output.
 const FINISH: Duration = Duration::from_secs(1);
-/// Redraws after which the whole screen is drawn anew: 2 s. A size that comes and goes between two redraws
-/// is not seen otherwise.
+/// The whole screen is drawn anew once in this many redraws, every 2 s. Otherwise a size that changes and changes
+/// back between two redraws would go unnoticed.
 const CLEAR_EVERY: u32 = 20;
 const BELL: &[u8] = b"\x07";
 
-/// The console has taken the terminal. The thread that clears this gives it back.
+/// The console has taken the terminal. The thread that clears this flag gives the terminal back.
 static TAKEN: AtomicBool = AtomicBool::new(false);
 
 enum Message {
@@ -71,12 +71,12 @@ enum Message {
     Folder(PathBuf),
 }
 
-/// What the threads share.
+/// What the console's threads and the control thread share.
 #[derive(Default)]
 struct Shared {
     screen: Mutex<Screen>,
     latest: Mutex<Progress>,
-    /// The operator has asked for a hold, which overtakes every other command.
+    /// The operator has asked for a hold. A hold overtakes every other command.
     hold: AtomicBool,
     dropped: AtomicU64,
     is_over: AtomicBool,
@@ -94,14 +94,14 @@ impl Shared {
     }
 }
 
-/// Locks `mutex`, also after a panic of another thread that had it locked.
+/// Locks `mutex`, even if a thread panicked while it held the lock.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 pub(super) struct Console {
     shared: Arc<Shared>,
-    /// No preempted thread at the other end of these rings makes this one wait
+    /// These rings never block: the control thread does not wait for a preempted thread at their other end
     /// (docs/decisions/0018-tracker-queue.md).
     messages: Producer<Message>,
     commands: Consumer<OperatorCommand>,
@@ -110,7 +110,7 @@ pub(super) struct Console {
 }
 
 impl Console {
-    /// The keys of the terminal.
+    /// Opens the terminal's input, for its keys.
     ///
     /// # Errors
     /// There is no terminal.
@@ -129,9 +129,9 @@ impl Console {
         let shared = Arc::new(Shared::new(Setup::of(config), interrupt));
         let terminal = take_terminal()?;
         let (messages, mut queue) = RingBuffer::new(QUEUE);
-        let (mut orders, commands) = RingBuffer::new(COMMANDS);
+        let (mut command_sender, commands) = RingBuffer::new(COMMANDS);
         let (drawing, drawn) = sync_channel::<()>(0);
-        let (seen, shown) = (Arc::clone(&shared), Arc::clone(&shared));
+        let (keys_shared, draw_shared) = (Arc::clone(&shared), Arc::clone(&shared));
         let spawn = |name: &str, serve: Box<dyn FnOnce() + Send>| {
             thread::Builder::new().name(name.to_owned()).spawn(serve).map_err(|error| {
                 give_terminal_back();
@@ -141,12 +141,15 @@ impl Console {
         spawn(
             "console-draw",
             Box::new(move || {
-                draw(terminal, &shown);
+                draw(terminal, &draw_shared);
                 give_terminal_back();
                 drop(drawing);
             }),
         )?;
-        spawn("console-keys", Box::new(move || serve_keys(keys, &seen, &mut queue, &mut orders)))?;
+        spawn(
+            "console-keys",
+            Box::new(move || serve_keys(keys, &keys_shared, &mut queue, &mut command_sender)),
+        )?;
         Ok(Console { shared, messages, commands, drawn })
     }
 
@@ -156,14 +159,14 @@ impl Console {
         }
     }
 
-    /// After a run, whose needle can be withdrawn or why it cannot is `withdrawal`, the screen stays until
-    /// the operator leaves it or a signal comes. Then the terminal is given back. True where the operator
-    /// has asked for the withdrawal of the needle.
+    /// Gives the terminal back. After a run, the screen stays first until the operator leaves it or a signal
+    /// comes; `withdrawal` says how the needle can be withdrawn, or why it cannot. It is `None` if there was no
+    /// run. True if the operator has asked for the withdrawal of the needle.
     pub(super) fn finish(self, withdrawal: Option<Result<String, String>>) -> bool {
         let Shared { is_over, is_leaving, wants_withdrawal, is_closing, interrupt, .. } =
             &*self.shared;
         let stays = withdrawal.is_some();
-        lock(&self.shared.screen).left = withdrawal;
+        lock(&self.shared.screen).withdrawal = withdrawal;
         is_over.store(true, Ordering::Relaxed);
         // A panic has given the terminal back already.
         let is_watched = || TAKEN.load(Ordering::Relaxed) && !interrupt.is_signalled();
@@ -173,7 +176,7 @@ impl Console {
         is_closing.store(true, Ordering::Relaxed);
         let _ = self.drawn.recv_timeout(FINISH);
         if TAKEN.load(Ordering::Relaxed) {
-            // The terminal takes no output; its modes can be restored all the same.
+            // The terminal accepts no output, but its modes can still be restored.
             let _ = disable_raw_mode();
         }
         wants_withdrawal.load(Ordering::Relaxed)
@@ -216,19 +219,20 @@ impl Operator for Console {
 
     fn command(&mut self) -> Option<OperatorCommand> {
         if self.shared.hold.swap(false, Ordering::Relaxed) {
-            // Commands from before the hold are dropped, and those that came together with it.
-            let void = std::iter::from_fn(|| self.commands.pop().ok()).count() as u64;
-            self.shared.dropped.fetch_add(void, Ordering::Relaxed);
+            // The hold cancels the commands that came before it or together with it.
+            let cancelled = std::iter::from_fn(|| self.commands.pop().ok()).count() as u64;
+            self.shared.dropped.fetch_add(cancelled, Ordering::Relaxed);
             return Some(OperatorCommand::Hold);
         }
         self.commands.pop().ok()
     }
 }
 
-type Screens = Terminal<CrosstermBackend<BufWriter<Stderr>>>;
+type ConsoleTerminal = Terminal<CrosstermBackend<BufWriter<Stderr>>>;
 
-/// Puts the terminal into raw mode on its other screen; a panic of any thread gives it back first.
-fn take_terminal() -> std::io::Result<Screens> {
+/// Puts the terminal into raw mode on its alternate screen. A panic of any thread gives the terminal back before
+/// it is reported.
+fn take_terminal() -> std::io::Result<ConsoleTerminal> {
     enable_raw_mode()?;
     TAKEN.store(true, Ordering::Relaxed);
     give_back_on_panic();
@@ -253,13 +257,13 @@ fn give_terminal_back() {
 }
 
 /// Draws until the console closes.
-fn draw(mut terminal: Screens, shared: &Shared) {
-    // A control thread that wakes does not wait for a drawing one.
+fn draw(mut terminal: ConsoleTerminal, shared: &Shared) {
+    // With the lowest priority, drawing never delays the control thread.
     let idle = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Idle);
     let _ = set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Min, idle);
-    let mut drawn = Drawn::default();
+    let mut drawing = Drawing::default();
     loop {
-        drawn.again(&mut terminal, &mut stderr(), shared);
+        drawing.redraw(&mut terminal, &mut stderr(), shared);
         // A panic has given the terminal back already.
         if shared.is_closing.load(Ordering::Relaxed) || !TAKEN.load(Ordering::Relaxed) {
             return;
@@ -268,36 +272,36 @@ fn draw(mut terminal: Screens, shared: &Shared) {
     }
 }
 
-/// What has been drawn so far.
+/// The progress of the drawing thread.
 #[derive(Default)]
-struct Drawn {
-    times: u32,
+struct Drawing {
+    redraws: u32,
     /// Alarms that have rung the bell.
     alarms: u32,
 }
 
-impl Drawn {
-    fn again<B: Backend>(
+impl Drawing {
+    fn redraw<B: Backend>(
         &mut self,
         terminal: &mut Terminal<B>,
         bell: &mut impl Write,
         shared: &Shared,
     ) {
-        if self.times.is_multiple_of(LOOK_EVERY) {
+        if self.redraws.is_multiple_of(MEASURE_EVERY) {
             let folder = lock(&shared.screen).folder.clone();
             let bytes = folder.map_or(0, |dir| folder_bytes(&dir));
             lock(&shared.screen).record_bytes = bytes;
         }
         // Something else may have written to the terminal. (Terminal::clear would ask it for its cursor.)
-        if self.times % CLEAR_EVERY == CLEAR_EVERY - 1
+        if self.redraws % CLEAR_EVERY == CLEAR_EVERY - 1
             && let Ok(size) = terminal.size()
         {
             let _ = terminal.resize(Rect::new(0, 0, size.width, size.height));
         }
-        self.times = self.times.wrapping_add(1);
-        // Nothing is locked while this thread, which may wait long for a processor, draws and writes.
+        self.redraws = self.redraws.wrapping_add(1);
+        // Cloned, so that no lock is held while this thread draws and writes: it may be descheduled for long.
         let screen = lock(&shared.screen).clone();
-        // A terminal that refuses may take it the next time; its keys are read all the same.
+        // A failed draw may succeed the next time; the keys are read in any case.
         let _ = terminal.draw(|frame| view::render(&screen, frame));
         if screen.alarms > self.alarms {
             self.alarms = screen.alarms;
@@ -314,13 +318,13 @@ fn serve_keys(
     commands: &mut Producer<OperatorCommand>,
 ) {
     let mut pressed = [0; 64];
-    let mut pending = Keys::default();
+    let mut parser = Keys::default();
     while !shared.is_closing.load(Ordering::Relaxed) {
         let mut ready = [PollFd::new(keys.as_fd(), PollFlags::POLLIN)];
         let is_ready = poll(&mut ready, PollTimeout::from(GATHER_MS)).is_ok_and(|count| count > 0);
         if is_ready {
             match keys.read(&mut pressed) {
-                Ok(count) if count > 0 => pending.take(&pressed[..count], shared, commands),
+                Ok(count) if count > 0 => parser.take(&pressed[..count], shared, commands),
                 // The terminal is gone, and with it the operator's way to hold or stop.
                 _ => {
                     shared.interrupt.raise();

@@ -17,8 +17,8 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 /// The time over which rates are counted.
-const SECOND: Duration = Duration::from_secs(1);
-/// Innovations over which the noise is judged.
+const RATE_WINDOW: Duration = Duration::from_secs(1);
+/// Number of innovations from which the noise is measured.
 const INNOVATIONS: usize = 20;
 /// Events kept.
 const EVENTS: usize = 40;
@@ -60,8 +60,8 @@ pub(super) struct Drive {
     pub(super) state: Option<DriveState>,
     /// Position from the start, mm or rad.
     pub(super) position: f64,
-    /// Target less position, mm or rad.
-    pub(super) off: f64,
+    /// Set-point less position, mm or rad.
+    pub(super) following_error: f64,
     pub(super) emergency: Option<(Time, Emcy)>,
 }
 
@@ -82,7 +82,7 @@ pub(super) struct Screen {
     is_answer_due: bool,
     /// x, y, z in mm and yaw, pitch, roll in rad, with their standard deviations.
     pub(super) pose: Option<([f64; 6], Option<[f64; 6]>)>,
-    /// How far it is to the target; empty without one.
+    /// The line about the target; empty without one.
     pub(super) target: String,
     /// Depth, and the estimated x, y and z at each step, mm.
     pub(super) path: Vec<[f64; 4]>,
@@ -99,17 +99,18 @@ pub(super) struct Screen {
     pub(super) record_trouble: Option<String>,
     pub(super) events: VecDeque<(Severity, String)>,
     pub(super) faults: u32,
-    /// Each rings the bell: the first hold by the tracker or fault since the needle last moved on.
+    /// Number of alarms; each rings the bell. The first fault or hold by the tracker since the needle last moved
+    /// is an alarm.
     pub(super) alarms: u32,
     is_alarmed: bool,
-    /// The operator stops the run, which is no alarm.
+    /// The operator has stopped the run, which is not an alarm.
     pub(super) is_interrupted: bool,
-    /// Records that the screen could not take in time.
+    /// Messages and commands that found their queue full.
     pub(super) dropped: u64,
     pub(super) is_over: bool,
-    /// How the needle can be withdrawn after the run, or why it cannot, once that is known.
-    pub(super) left: Option<Result<String, String>>,
-    /// The operator is asked whether the needle is to be withdrawn.
+    /// How the needle can be withdrawn after the run, or why it cannot; `None` until that is known.
+    pub(super) withdrawal: Option<Result<String, String>>,
+    /// The operator is asked whether to withdraw the needle.
     pub(super) asks_to_withdraw: bool,
     pub(super) has_help: bool,
 }
@@ -129,7 +130,7 @@ impl Screen {
                 self.time = stage.time;
                 for (drive, axis) in self.drives.iter_mut().zip([Axis::Insertion, Axis::Rotation]) {
                     drive.position = stage.measured.along(axis);
-                    drive.off = stage.commanded.along(axis) - drive.position;
+                    drive.following_error = stage.commanded.along(axis) - drive.position;
                 }
             }
             Record::State { state, .. } => self.take_state(*state),
@@ -242,7 +243,7 @@ impl Screen {
         }
     }
 
-    /// A hold that ends the run is one alarm.
+    /// Rings the bell, but only once until the needle moves again: a hold and the fault that ends it are one alarm.
     fn alarm(&mut self) {
         let is_new = !self.is_interrupted && !mem::replace(&mut self.is_alarmed, true);
         self.alarms += u32::from(is_new);
@@ -250,7 +251,7 @@ impl Screen {
 
     /// Samples of the tool a second.
     pub(super) fn samples_per_s(&self) -> usize {
-        self.samples.iter().filter(|(at, ())| self.time.since(*at) < SECOND).count()
+        self.samples.iter().filter(|(at, ())| self.time.since(*at) < RATE_WINDOW).count()
     }
 
     /// RMS of the last innovations, per coordinate, mm.
@@ -268,7 +269,7 @@ impl Screen {
 /// Adds `item`, and removes those that are older than a second.
 fn push_recent<T>(queue: &mut VecDeque<(Time, T)>, now: Time, item: T) {
     queue.push_back((now, item));
-    while queue.front().is_some_and(|(time, _)| now.since(*time) >= SECOND) {
+    while queue.front().is_some_and(|(time, _)| now.since(*time) >= RATE_WINDOW) {
         queue.pop_front();
     }
 }

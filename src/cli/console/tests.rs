@@ -128,7 +128,7 @@ fn stopped() -> Screen {
     screen.event(at(20.0), Lane::Stage, severity, &text);
     screen.event(at(20.0), Lane::Session, Severity::Fault, why);
     screen.is_over = true;
-    screen.left = Some(Ok("by 40.0 mm".to_owned()));
+    screen.withdrawal = Some(Ok("by 40.0 mm".to_owned()));
     screen
 }
 

@@ -12,26 +12,26 @@ use ratatui::text::Line;
 use ratatui::widgets::{Axis, Block, Chart, Clear, Dataset, Gauge, GraphType, Paragraph};
 use std::cmp::Reverse;
 
-/// Below this width the panels have no columns.
-const WIDE: u16 = 72;
+/// Below this width the panels are one column.
+const WIDE_MIN: u16 = 72;
 const HELP: &str = "\
 space  hold: the needle brakes, both axes stay enabled
 r      resume, with a fresh tip only
 s      single step, then hold
 + -    speed, in tenths of the configured one
 q      stop the run (also Ctrl-C); after it: leave
-w      after the run: withdraw the needle, after a y
+w      after the run: withdraw the needle; y confirms
 ?      this help";
 
 pub(super) fn render(screen: &Screen, frame: &mut Frame<'_>) {
     let area = frame.area();
-    let is_wide = area.width >= WIDE;
-    let panels = if is_wide { 5 } else { 4 };
-    // What a low terminal has no room for goes in this order: plots, panels, events.
-    let plots = area.height.saturating_sub(4 + panels + 4).min(16);
-    let plots = if plots < 6 { 0 } else { plots };
-    let panels = if area.height < 4 + panels { 0 } else { panels };
-    let rows = [1, 1, 1, plots, panels];
+    let is_wide = area.width >= WIDE_MIN;
+    let panel_rows = if is_wide { 5 } else { 4 };
+    // On a low terminal the plots are left out first, then the panels, then the events.
+    let plot_rows = area.height.saturating_sub(4 + panel_rows + 4).min(16);
+    let plot_rows = if plot_rows < 6 { 0 } else { plot_rows };
+    let panel_rows = if area.height < 4 + panel_rows { 0 } else { panel_rows };
+    let rows = [1, 1, 1, plot_rows, panel_rows];
     let [head, depth, pose, plots, panels, events, keys] = Layout::vertical(
         rows.map(Constraint::Length)
             .into_iter()
@@ -71,9 +71,9 @@ fn render_head(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
         _ => state.as_str().to_uppercase(),
     };
     let style = Style::new().fg(Color::Black).bg(colour);
-    let said = [&screen.why, &screen.answer].into_iter().filter(|text| !text.is_empty());
-    let said: Vec<&str> = said.map(String::as_str).collect();
-    let text = format!(" {name}  {}", said.join(" | "));
+    let notes = [&screen.why, &screen.answer].into_iter().filter(|text| !text.is_empty());
+    let notes: Vec<&str> = notes.map(String::as_str).collect();
+    let text = format!(" {name}  {}", notes.join(" | "));
     frame.render_widget(Line::from(text).style(style), area);
 }
 
@@ -91,7 +91,7 @@ fn render_depth(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
     frame.render_widget(gauge, area);
 }
 
-/// A time to go, as `1:58`.
+/// A time in minutes and seconds, such as `1:58`.
 pub(in crate::cli) fn minutes(s: f64) -> String {
     // The cast saturates.
     let s = s.round() as u64;
@@ -100,7 +100,7 @@ pub(in crate::cli) fn minutes(s: f64) -> String {
 
 fn pose_line(screen: &Screen) -> String {
     let Some((pose, sd)) = &screen.pose else { return " no estimate yet".to_owned() };
-    let within = |n: usize, scale: f64, decimals: usize| match sd {
+    let plus_minus = |n: usize, scale: f64, decimals: usize| match sd {
         Some(sd) => format!(" ± {:.decimals$}", 2.0 * sd[n] * scale),
         None => String::new(),
     };
@@ -108,22 +108,22 @@ fn pose_line(screen: &Screen) -> String {
     format!(
         " x {:+.2}{} mm   pitch {:+.1}{}°   roll {:+.0}{}°   (2σ)",
         pose[0],
-        within(0, 1.0, 2),
+        plus_minus(0, 1.0, 2),
         pose[4] * deg,
-        within(4, deg, 1),
+        plus_minus(4, deg, 1),
         pose[5] * deg,
-        within(5, deg, 0),
+        plus_minus(5, deg, 0),
     )
 }
 
-/// The course of x over depth, and the needle from above (z, x) and from the side (z, y).
+/// Plots x over depth, and the needle from above (x over z) and from the side (y over z).
 fn render_plots(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
-    let [course, above, side] = Layout::horizontal([Constraint::Fill(1); 3]).areas(area);
+    let [x_over_depth, above, side] = Layout::horizontal([Constraint::Fill(1); 3]).areas(area);
     let points = |x: usize, y: usize| -> Vec<(f64, f64)> {
         screen.path.iter().map(|point| (point[x], point[y])).collect()
     };
     let depth_mm = screen.progress.depth_mm;
-    plot(frame, course, "x mm over depth", &points(0, 1), [0.0, depth_mm], 1.0);
+    plot(frame, x_over_depth, "x mm over depth", &points(0, 1), [0.0, depth_mm], 1.0);
     let z = screen.path.first().map_or(0.0, |point| point[3]);
     for (area, title, n) in [(above, "from above: x", 1), (side, "from the side: y", 2)] {
         plot(frame, area, title, &points(3, n), [z, z + depth_mm], 5.0);
@@ -201,8 +201,8 @@ fn drive_lines(screen: &Screen) -> [String; 3] {
             StageAxis::Rotation => (f64::to_degrees(1.0), "°"),
         };
         let state = drive.state.map_or("-", short_name);
-        let (position, off) = (drive.position * scale, drive.off * scale);
-        format!("{position:.2} {unit} {off:+.2} {state}")
+        let (position, error) = (drive.position * scale, drive.following_error * scale);
+        format!("{position:.2} {unit} {error:+.2} {state}")
     };
     let [insertion, rotation] = &screen.drives;
     // The newest of both drives.
@@ -216,8 +216,7 @@ fn drive_lines(screen: &Screen) -> [String; 3] {
     ]
 }
 
-/// The name of a state that has room in a panel: "switch on" must not be what is left of "switch on
-/// disabled".
+/// A name that fits into a panel: "switch on disabled" must not be clipped to "switch on".
 fn short_name(state: DriveState) -> &'static str {
     match state {
         DriveState::NotReadyToSwitchOn => "not ready",
@@ -258,9 +257,9 @@ fn render_events(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
     frame.render_widget(Paragraph::new(lines.collect::<Vec<_>>()), area);
 }
 
-/// The keys, in the words that `width` has room for.
+/// The keys, in as many words as fit into `width`.
 fn key_line(screen: &Screen, width: u16) -> String {
-    match &screen.left {
+    match &screen.withdrawal {
         Some(Ok(how)) if screen.is_over && screen.asks_to_withdraw => {
             return format!(" withdraw the needle {how}?   y yes   any other key no");
         }

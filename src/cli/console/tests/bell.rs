@@ -30,12 +30,12 @@ fn bells(messages: Vec<Message>, is_interrupted: bool) -> usize {
     let backend = CrosstermBackend::new(written.clone());
     let mut terminal =
         Terminal::with_options(backend, TerminalOptions { viewport }).expect("a terminal");
-    let mut drawn = Drawn::default();
+    let mut drawing = Drawing::default();
     for message in messages {
         sender.push(message).expect("a queue");
         gather(&shared, &mut queue);
         for _ in 0..2 {
-            drawn.again(&mut terminal, &mut written.clone(), &shared);
+            drawing.redraw(&mut terminal, &mut written.clone(), &shared);
         }
     }
     let bytes = lock(&written.0);

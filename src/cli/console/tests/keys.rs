@@ -57,7 +57,7 @@ fn a_paste_holds_and_stops_and_lets_nothing_go_on() {
     assert_eq!(asked(b"\x1b[ "), (0, true));
     assert_eq!(asked(b"\x1bO "), (0, true));
     shared.is_over.store(true, Ordering::Relaxed);
-    lock(&shared.screen).left = Some(Ok("to depth 0".to_owned()));
+    lock(&shared.screen).withdrawal = Some(Ok("to depth 0".to_owned()));
     asked(b"\x1b[200~wy\x1b[201~");
     assert!(!shared.wants_withdrawal.load(Ordering::Relaxed));
 }
@@ -103,7 +103,7 @@ fn the_needle_is_withdrawn_after_a_w_and_a_y() {
     let pressed = |keys: &[u8], can_withdraw: bool| {
         let shared = Shared::new(setup(), Interrupt::default());
         let left = can_withdraw.then(|| "to depth 0".to_owned());
-        lock(&shared.screen).left = Some(left.ok_or_else(|| "it is out".to_owned()));
+        lock(&shared.screen).withdrawal = Some(left.ok_or_else(|| "it is out".to_owned()));
         let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
         shared.is_over.store(true, Ordering::Relaxed);
         Keys::default().take(keys, &shared, &mut orders);

@@ -31,9 +31,9 @@ fn a_size_that_comes_and_goes_is_redrawn_whole() {
     let shared = Shared::new(setup(), Interrupt::default());
     *lock(&shared.screen) = inserted();
     let mut terminal = Terminal::new(TestBackend::new(80, 24)).expect("a screen");
-    let mut drawn = Drawn::default();
+    let mut drawing = Drawing::default();
     let mut redraw = |terminal: &mut Terminal<TestBackend>| {
-        drawn.again(terminal, &mut std::io::sink(), &shared);
+        drawing.redraw(terminal, &mut std::io::sink(), &shared);
         terminal.backend().to_string()
     };
     let whole = redraw(&mut terminal);

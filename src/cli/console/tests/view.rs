@@ -121,7 +121,7 @@ fn why_a_needle_is_not_withdrawn_is_on_the_screen() {
     };
     let mut screen = stopped();
     assert_eq!(keys(&screen), "the run is over:   q leave   w withdraw the needle");
-    screen.left = Some(Err("the needle is out, at 0.01 mm".to_owned()));
+    screen.withdrawal = Some(Err("the needle is out, at 0.01 mm".to_owned()));
     assert_eq!(keys(&screen), "q leave   no withdrawal: the needle is out, at 0.01 mm");
     screen.is_over = false;
     assert_eq!(keys(&screen), "the run is over; its record is being closed");
