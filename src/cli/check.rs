@@ -1,11 +1,11 @@
-//! `needle-bench check`: what a run would start with. Nothing moves.
+//! `needle-bench check`: checks a configuration and, with --connect, the equipment. Nothing moves.
 
 use super::arguments::{Configured, number_in};
 use super::mask::mask_reader;
 use super::output::{print_stderr, print_stdout, print_wrapped};
 use super::preflight::Preflight;
 use super::stage::drive_json;
-use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure, ended};
+use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure, finish_with};
 use crate::config::Config;
 use crate::preflight::to_text;
 use clap::Args;
@@ -76,7 +76,7 @@ pub(super) fn check(arguments: &Arguments) -> Result<(), Failure> {
             }
         };
         report["tracker"] = match &preflight.tracker {
-            Some(heard) => json!(heard),
+            Some(report) => json!(report),
             None => json!("emulated, nothing to listen to"),
         };
         report["troubles"] = json!(troubles);
@@ -85,9 +85,9 @@ pub(super) fn check(arguments: &Arguments) -> Result<(), Failure> {
     } else {
         print_wrapped(to_text(&preflight.checks))?;
     }
-    ended(match (troubles.len(), config.tracker.registration.is_none()) {
+    finish_with(match (troubles.len(), config.tracker.registration.is_none()) {
         (0, _) => 0,
-        // The registration that is missing is the only trouble.
+        // The missing registration is the only trouble.
         (1, true) => BAD_CONFIGURATION,
         _ => ENVIRONMENT_FAILED,
     })
@@ -97,7 +97,7 @@ pub(super) fn check(arguments: &Arguments) -> Result<(), Failure> {
 fn check_goal(config: &Config, arguments: &Arguments) -> Result<(), Failure> {
     let goal = config.to_goal(&mask_reader(arguments.configured.path()))?;
     goal.map_err(Failure::configuration)?;
-    // Without a registration the tracker can still be looked at; the list says that it is missing.
+    // Without a registration the tracker can still be checked; the checks say that it is missing.
     if arguments.connect && config.tracker.registration.is_none() {
         return Ok(());
     }

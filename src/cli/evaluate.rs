@@ -4,7 +4,7 @@ use super::Failure;
 use super::output::{merged, print_result, print_stderr};
 use super::records::{Insertion, Insertions};
 use crate::session::ObserverConfig;
-use crate::study::{Evaluation, Recording, Score, evaluate as score};
+use crate::study::{Evaluation, Recording, Score, evaluate as evaluate_observer};
 use crate::text::screen;
 use clap::Args;
 use minijinja::context;
@@ -27,9 +27,9 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<(), Failure> {
     let (config, insertions) = arguments.insertions.read(observer)?;
     let (needle, torsion) = (config.believed_needle()?, config.believed_torsion()?);
     let scoring = config.scoring()?;
-    let scored_by = |observer: &ObserverConfig, recording: &Recording| {
+    let score_observer = |observer: &ObserverConfig, recording: &Recording| {
         let mut observer = observer.build(needle, torsion).map_err(|error| error.to_string())?;
-        score(observer.as_mut(), recording, &scoring)
+        evaluate_observer(observer.as_mut(), recording, &scoring)
     };
     for Insertion { path, recording, .. } in &insertions {
         if recording.lacks_roll() {
@@ -43,14 +43,16 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<(), Failure> {
     for observer in config.observers() {
         let (mut scores, mut files) = (Vec::new(), Vec::new());
         for Insertion { path, recording, .. } in &insertions {
-            let score = one(&observer, |observer| scored_by(observer, recording));
+            let score = score_with_and_without_roll(&observer, |observer| {
+                score_observer(observer, recording)
+            });
             let score = score.map_err(|error| Failure::bad_input(path, error))?;
             files.push(merged(json!({ "file": path.display().to_string() }), &json!(score)));
             scores.push(score);
         }
         let figures = json!(Evaluation::of(scores.iter()));
-        let scored = json!({ "observer": observer.name(), "files": files });
-        observers.push(merged(scored, &figures));
+        let named = json!({ "observer": observer.name(), "files": files });
+        observers.push(merged(named, &figures));
     }
     // The figures of the first observer are at the top, those of all observers under `observers`.
     let first = observers.first().cloned().unwrap_or_default();
@@ -59,13 +61,12 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<(), Failure> {
     print_result(arguments.json, &object, text)
 }
 
-/// The score of `observer`, and of the same observer that does not know the roll at the start.
-fn one(
+/// Scores `observer`, and adds the roll error of the same observer if it does not know the roll at the start.
+fn score_with_and_without_roll(
     observer: &ObserverConfig,
-    scored: impl Fn(&ObserverConfig) -> Result<Score, String>,
+    score: impl Fn(&ObserverConfig) -> Result<Score, String>,
 ) -> Result<Score, String> {
-    let score = scored(observer)?;
-    let unknown = observer.with_roll_unknown().as_ref().map(&scored).transpose()?;
-    let roll_unknown_rms_deg = unknown.and_then(|score| score.roll_rms_deg);
-    Ok(Score { roll_unknown_rms_deg, ..score })
+    let roll_unknown = observer.with_roll_unknown().as_ref().map(&score).transpose()?;
+    let roll_unknown_rms_deg = roll_unknown.and_then(|score| score.roll_rms_deg);
+    Ok(Score { roll_unknown_rms_deg, ..score(observer)? })
 }

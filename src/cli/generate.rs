@@ -7,7 +7,7 @@ use clap_complete::Shell;
 use std::path::PathBuf;
 
 #[derive(Debug, Subcommand)]
-pub(super) enum What {
+pub(super) enum Artifact {
     /// Completions for bash, on stdout.
     Bash,
     /// Completions for zsh, on stdout.
@@ -21,18 +21,18 @@ pub(super) enum What {
     },
 }
 
-pub(super) fn generate(what: &What) -> Result<(), Failure> {
-    let shell = match what {
-        What::Bash => Shell::Bash,
-        What::Zsh => Shell::Zsh,
-        What::Fish => Shell::Fish,
-        What::Man { dir } => {
+pub(super) fn generate(artifact: &Artifact) -> Result<(), Failure> {
+    let shell = match artifact {
+        Artifact::Bash => Shell::Bash,
+        Artifact::Zsh => Shell::Zsh,
+        Artifact::Fish => Shell::Fish,
+        Artifact::Man { dir } => {
             let written = std::fs::create_dir_all(dir)
                 .and_then(|()| clap_mangen::generate_to(command_line(), dir));
             return written.map_err(|error| Failure::io(dir, error));
         }
     };
-    // Not to stdout: clap_complete panics if that is closed.
+    // Into memory first: clap_complete panics if stdout is closed.
     let mut script = Vec::new();
     clap_complete::generate(shell, &mut command_line(), "needle-bench", &mut script);
     print_stdout(String::from_utf8_lossy(&script).trim_end())

@@ -78,7 +78,7 @@ enum Command {
     Calibrate(calibrate::Calibration),
     /// Print completions for a shell, or write man pages to a folder.
     #[command(subcommand)]
-    Generate(generate::What),
+    Generate(generate::Artifact),
 }
 
 /// Why a command did not succeed.
@@ -120,7 +120,7 @@ impl Display for Failure {
 }
 
 /// The end of a command that has printed its result: a failure unless `status` is 0.
-fn ended(status: u8) -> Result<(), Failure> {
+fn finish_with(status: u8) -> Result<(), Failure> {
     match status {
         0 => Ok(()),
         _ => Err(Failure { message: None, status }),
@@ -145,7 +145,7 @@ impl From<io::Error> for Failure {
     }
 }
 
-/// A folder that is no run, or a run that is not whole, is bad input; a disk that fails is not.
+/// A folder without a run, or with an incomplete run, is bad input; a failing disk is not.
 impl From<TelemetryError> for Failure {
     fn from(error: TelemetryError) -> Self {
         use TelemetryError::{File, NotARun, Record};
@@ -163,7 +163,7 @@ impl From<TelemetryError> for Failure {
     }
 }
 
-/// The thread for sockets and signals, beside the control thread.
+/// A runtime with one thread for sockets and signals, beside the control thread.
 fn io_runtime() -> io::Result<Runtime> {
     tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()
 }
@@ -181,9 +181,9 @@ fn command_line() -> clap::Command {
     Bench::command().mut_subcommands(|command| with_examples(command, ""))
 }
 
-/// Adds the examples to `command`, which is typed after `before`, and to its subcommands.
-fn with_examples(command: clap::Command, before: &str) -> clap::Command {
-    let name = format!("{before}{}", command.get_name());
+/// Adds the examples to `command`, which is typed after `prefix`, and to its subcommands.
+fn with_examples(command: clap::Command, prefix: &str) -> clap::Command {
+    let name = format!("{prefix}{}", command.get_name());
     let paragraphs = EXAMPLES.split("\n\n").filter_map(|paragraph| paragraph.split_once('\n'));
     let examples: String =
         paragraphs.filter(|(title, _)| *title == name).map(|(_, examples)| examples).collect();
@@ -204,7 +204,7 @@ pub fn bench() -> ExitCode {
         }
         error.exit()
     });
-    listen_to_logs();
+    start_logging();
     let no_result = match bench.command {
         Command::Run(_) => json!({ "outcome": null }),
         _ => json!({}),
@@ -226,7 +226,7 @@ impl Command {
             Command::Study(arguments) => study::study(arguments),
             Command::Tracker(command) => tracker::tracker(command),
             Command::Calibrate(calibration) => calibrate::calibrate(calibration),
-            Command::Generate(what) => generate::generate(what),
+            Command::Generate(artifact) => generate::generate(artifact),
         }
     }
 }
@@ -246,7 +246,7 @@ fn with_suggestion(mut error: clap::Error) -> clap::Error {
         .map(|command| (edits_to(command.get_name()), command.get_name()))
         .min()
         .filter(|(edits, name)| 2 * edits < name.len());
-    // The word before it was left out, as in `needle-bench jog`.
+    // `needle-bench jog` lacks the word before it: suggest `stage jog`.
     let is_typed = |command: &&clap::Command| command.get_name() == typed;
     let inside = command.get_subcommands().find_map(|command| {
         let inside = command.get_subcommands().find(is_typed)?;
@@ -262,7 +262,7 @@ fn with_suggestion(mut error: clap::Error) -> clap::Error {
 /// Runs the virtual stage's command line.
 pub fn virtual_stage() -> ExitCode {
     let arguments = virtual_stage::Arguments::parse();
-    listen_to_logs();
+    start_logging();
     exit(virtual_stage::serve(&arguments), None)
 }
 
@@ -282,10 +282,10 @@ fn exit(result: Result<(), Failure>, json: Option<Value>) -> ExitCode {
 }
 
 /// Warnings of the libraries go to stderr; `RUST_LOG` sets the level.
-fn listen_to_logs() {
+fn start_logging() {
     use tracing_subscriber::EnvFilter;
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn"));
-    // A test may have set a subscriber already; that one stays.
+    // A test may have set a subscriber already; it is kept.
     let _ = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)

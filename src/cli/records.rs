@@ -1,4 +1,4 @@
-//! Recorded runs: their folders, what they were to do, and the insertions in them.
+//! Recorded runs: their folders, their plans, and the insertions in them.
 
 use super::Failure;
 use super::arguments::{Configured, text_of};
@@ -31,7 +31,7 @@ pub(super) const RUNS: &str = "runs";
 const RECORDINGS_TOML: (&str, &str) =
     ("bench-config/recordings.toml", include_str!("../../bench-config/recordings.toml"));
 
-/// Minimum distance between two rows of a run, mm: a hold gives one row.
+/// Smallest distance between two rows of a run, mm: a hold gives one row.
 const ROWS_APART_MM: f64 = 0.05;
 
 /// The runs in `dir`, the newest first.
@@ -50,25 +50,25 @@ pub(super) fn folders_in(dir: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(folders)
 }
 
-/// Names the newest run that was on a bus (not on the emulated stage in memory), in a line of its own: `before`,
-/// then `--config` and its file. Empty without such a run.
-pub(super) fn last_run_on_a_bus(before: &str) -> String {
+/// A line that names the newest run on a bus (not on the emulated stage in memory): `command`, then `--config` and
+/// the file of that run. Empty without such a run.
+pub(super) fn last_run_on_a_bus(command: &str) -> String {
     let memory = CanInterface::Memory.to_string();
     newest_first(Path::new(RUNS))
         .filter(|run| run.manifest().bus != memory)
         .map(|run| run.dir().join(file::CONFIG))
         .find(|config| config.is_file())
         .map_or(String::new(), |config| {
-            format!("\nthe last run on a bus: {before}--config {}", config.display())
+            format!("\nthe last run on a bus: {command}--config {}", config.display())
         })
 }
 
-/// The newest run on the bus of `config` that `is_wanted`, and the keys changed since then that
-/// `counts` takes into account.
+/// The newest run on the bus of `config` that `is_wanted`, and those keys changed since then that
+/// `is_compared` selects.
 pub(super) fn earlier_run(
     config: &Config,
     is_wanted: impl Fn(&Manifest) -> bool,
-    counts: impl Fn(&str) -> bool,
+    is_compared: impl Fn(&str) -> bool,
 ) -> Option<Earlier> {
     let bus = config.bus().to_string();
     let mut runs = newest_first(Path::new(&config.record.dir));
@@ -79,11 +79,11 @@ pub(super) fn earlier_run(
     Some(Earlier {
         started_utc: run.manifest().started_utc.clone(),
         proof: run.text(file::EVENTS).ok().and_then(|events| proof(&events)),
-        changed: changed.filter(|key| counts(key)).collect(),
+        changed: changed.filter(|key| is_compared(key)).collect(),
     })
 }
 
-/// The record of a run in the folder `path`, unchanged since then, and its configuration.
+/// Opens the record of a run in the folder `path`, and its configuration. Refuses a record that was changed.
 pub(super) fn open(path: &Path) -> Result<(RunFolder, Config), Failure> {
     let folder = RunFolder::open(path)?;
     folder.verify()?;
@@ -92,7 +92,7 @@ pub(super) fn open(path: &Path) -> Result<(RunFolder, Config), Failure> {
     Ok((folder, Config::from_sources(&[source], &[])?))
 }
 
-/// What the recording of a run of `config` needs beside the record.
+/// A function that tells `make_recording` what it needs to know of a run of `config` beside the record.
 pub(super) fn describe(config: Config) -> Describe {
     Box::new(move |manifest| {
         let plan = recorded_plan(manifest, &config).map_err(|failure| failure.to_string())?;
@@ -100,7 +100,7 @@ pub(super) fn describe(config: Config) -> Describe {
     })
 }
 
-/// What the run of `manifest` was to do, as its configuration and arguments say.
+/// The plan of the run of `manifest`, from its configuration and arguments.
 pub(super) fn recorded_plan(manifest: &Manifest, config: &Config) -> Result<Plan, Failure> {
     Ok(match stage::recorded(manifest, config)? {
         Some(operation) => Plan::from(operation),
@@ -137,7 +137,7 @@ pub(super) fn replay_run(path: &Path) -> Result<ReplayedRun, Failure> {
     }
 }
 
-/// Where the stage was between the two SYNCs around `time`; `None` outside of all.
+/// Where the stage was at `time`, interpolated between two SYNCs; `None` before the first and after the last.
 pub(super) fn position_at(stage: &[(Time, SetPoint)], time: Time) -> Option<SetPoint> {
     let after = stage.partition_point(|(at, _)| *at <= time);
     let ((t0, a), (t1, b)) = (stage.get(after.checked_sub(1)?)?, stage.get(after)?);
@@ -173,27 +173,32 @@ pub(super) struct Insertion {
 }
 
 impl Insertions {
-    /// The configuration, with the key `more` over it, and the insertions. An insertion that is named twice
-    /// is refused.
-    pub(super) fn read(&self, more: Option<String>) -> Result<(Config, Vec<Insertion>), Failure> {
-        let (configuration, files) = self.sorted()?;
-        let config = Configured::new(configuration, self.set.iter().cloned().chain(more).collect());
+    /// Reads the configuration, with the key `extra_key` over it, and the insertions. Refuses an insertion that is
+    /// named twice.
+    pub(super) fn read(
+        &self,
+        extra_key: Option<String>,
+    ) -> Result<(Config, Vec<Insertion>), Failure> {
+        let (configuration, files) = self.split_files()?;
+        let set = self.set.iter().cloned().chain(extra_key).collect();
+        let config = Configured::new(configuration, set);
         let config = config.load(Some(RECORDINGS_TOML))?;
-        let mut all: Vec<Insertion> = Vec::new();
+        let mut insertions: Vec<Insertion> = Vec::new();
         for &path in &files {
-            let (text, recording) = insertion(path)?;
-            if let Some(first) = all.iter().find(|other| other.recording.is_same(&recording)) {
+            let (text, recording) = read_insertion(path)?;
+            if let Some(first) = insertions.iter().find(|other| other.recording.is_same(&recording))
+            {
                 let first = first.path.display();
                 let error =
                     format!("the same recording as {first}: it would count twice, give each once");
                 return Err(Failure::bad_input(path, error));
             }
-            all.push(Insertion { path: path.to_owned(), text, recording });
+            insertions.push(Insertion { path: path.to_owned(), text, recording });
         }
         if let (None, Some(run)) = (configuration, files.iter().find(|path| path.is_dir())) {
             print_stderr(format_args!(
-                "warning: judged with the needle, noises and mount of bench-config/recordings.toml; those of the \
-                 run itself: --config {}",
+                "warning: judged with the needle, noises and mount of bench-config/recordings.toml; for those of \
+                 the run itself: --config {}",
                 run.join(file::CONFIG).display()
             ));
         }
@@ -202,20 +207,20 @@ impl Insertions {
                 "warning: positions in a CSV file are taken as the tip's: tracker.tip_offset_mm is not added",
             );
         }
-        Ok((config, all))
+        Ok((config, insertions))
     }
 
-    /// The configuration, which is named or the TOML file among the files, and the other files.
-    fn sorted(&self) -> Result<(Option<&Path>, Vec<&Path>), Failure> {
+    /// The configuration, named by `--config` or as the TOML file among the files; and the other files.
+    fn split_files(&self) -> Result<(Option<&Path>, Vec<&Path>), Failure> {
         let is_toml = |file: &&Path| file.extension().is_some_and(|ending| ending == "toml");
         let (mut configurations, files): (Vec<_>, Vec<_>) =
             self.files.iter().map(PathBuf::as_path).partition(is_toml);
         configurations.splice(0..0, self.config.as_deref());
         match configurations[..] {
-            [one, other, ..] => Err(Failure::configuration(format_args!(
+            [first, second, ..] => Err(Failure::configuration(format_args!(
                 "two configurations, {} and {}: give one",
-                one.display(),
-                other.display()
+                first.display(),
+                second.display()
             ))),
             _ if files.is_empty() => Err(Failure::configuration(
                 "no recorded insertion is named: give run folders or CSV files",
@@ -225,8 +230,8 @@ impl Insertions {
     }
 }
 
-/// The insertion in `path`, a CSV file or a run folder, and the text that it was read from.
-fn insertion(path: &Path) -> Result<(String, Recording), Failure> {
+/// Reads the insertion in `path`, a CSV file or a run folder; returns also the text that it was read from.
+fn read_insertion(path: &Path) -> Result<(String, Recording), Failure> {
     if !path.is_dir() {
         let text = text_of(path)?;
         let recording = Recording::parse(&text).map_err(|error| Failure::bad_input(path, error))?;
@@ -234,20 +239,19 @@ fn insertion(path: &Path) -> Result<(String, Recording), Failure> {
     }
     let ReplayedRun { folder, config, stage, samples } = replay_run(path)?;
     let registration = config.tracker.to_registration()?;
-    let numbered = (1..).zip(samples);
-    let dated = numbered
+    let acquired = (1..)
+        .zip(samples)
         .filter_map(|(line, sample)| Some((line, sample.acquisition_time?, sample.received)));
-    let rows = rows(&stage, &registration, dated);
-    match rows.is_empty() {
-        true => {
-            let why = "no position was accepted while the needle was inserted";
-            Err(Failure::bad_input(path, why))
-        }
-        false => Ok((folder.text(file::TRACKER)?, Recording { rows })),
+    let rows = rows(&stage, &registration, acquired);
+    if rows.is_empty() {
+        let why = "no position was accepted while the needle was inserted";
+        return Err(Failure::bad_input(path, why));
     }
+    Ok((folder.text(file::TRACKER)?, Recording { rows }))
 }
 
-/// The tip on the bench, and the stage when it was there, as far as the insertion advances.
+/// Rows of the tip on the bench and of the stage at that time. `samples` are lines, acquisition times and samples;
+/// one gives a row only if the needle is deeper by [`ROWS_APART_MM`] than at the row before.
 fn rows(
     stage: &[(Time, SetPoint)],
     registration: &Registration,
@@ -255,17 +259,17 @@ fn rows(
 ) -> Vec<RecordedRow> {
     let mut rows: Vec<RecordedRow> = Vec::new();
     for (line, time, sample) in samples {
-        let Some(at) = position_at(stage, time) else { continue };
+        let Some(measured) = position_at(stage, time) else { continue };
         let next_mm =
             rows.last().map_or(f64::NEG_INFINITY, |row| row.insertion_meas_mm + ROWS_APART_MM);
-        if at.insertion_mm < next_mm {
+        if measured.insertion_mm < next_mm {
             continue;
         }
         let Ok(position_meas_mm) = registration.tip_mm(&sample) else { continue };
         rows.push(RecordedRow {
             line,
-            insertion_meas_mm: at.insertion_mm,
-            rotation_meas_rad: at.rotation_rad,
+            insertion_meas_mm: measured.insertion_mm,
+            rotation_meas_rad: measured.rotation_rad,
             position_meas_mm,
             sensor_orientation: registration.rotation(&sample),
         });
@@ -305,7 +309,7 @@ mod tests {
         let among = |files: &[&str], named: Option<&str>| {
             let files = files.iter().map(PathBuf::from).collect();
             let insertions = Insertions { files, config: named.map(PathBuf::from), set: vec![] };
-            match insertions.sorted() {
+            match insertions.split_files() {
                 Ok((config, others)) => format!("{config:?} {others:?}"),
                 Err(failure) => failure.to_string(),
             }

@@ -2,7 +2,7 @@
 
 use super::output::{print_result, refuse_existing, write_new};
 use super::records::{open, recorded_plan};
-use super::{Failure, STOPPED, ended};
+use super::{Failure, STOPPED, finish_with};
 use crate::archive::file;
 use crate::config::{Config, Source};
 use crate::operation::Plan;
@@ -91,7 +91,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
     let more = context! { figures => shown };
     let text = || screen(include_str!("replay.txt"), &object, more);
     print_result(arguments.json, &object, text)?;
-    ended(replayed.difference.map_or(0, |_| STOPPED))
+    finish_with(replayed.difference.map_or(0, |_| STOPPED))
 }
 
 /// The observer that `sets` over the configuration `text` describe; `None` without any.

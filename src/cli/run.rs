@@ -7,7 +7,7 @@ use super::mask::{file_crc32, mask_reader};
 use super::output::{merged, print_result, print_stderr};
 use super::perform::{Job, LIVE_ADDRESS, Options, Performed, end_json};
 use super::preflight::{before_rehearsal, before_run};
-use super::{Failure, ended, stage};
+use super::{Failure, finish_with, stage};
 use crate::config::Config;
 use crate::preflight::Check;
 use crate::runtime::{RunReport, gates_to_json};
@@ -108,7 +108,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), Failure> {
         print_stderr(summary);
         worst = worst.max(status(&config, &report));
     }
-    ended(worst)
+    finish_with(worst)
 }
 
 /// The figures and the outcome of the run.

@@ -4,7 +4,7 @@ use super::arguments::Configured;
 use super::output::{print_stderr, print_stdout};
 use super::perform::open_bus;
 use super::records::last_run_on_a_bus;
-use super::{ENVIRONMENT_FAILED, Failure, ended};
+use super::{ENVIRONMENT_FAILED, Failure, finish_with};
 use crate::canopen::Frame;
 use crate::config::{Source, StopConfig};
 use crate::runtime::{BusTrouble, Clock, talk_despite_errors};
@@ -20,7 +20,7 @@ pub(super) struct Arguments {
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
-    /// Flags of other commands that a hurried operator may leave: no stop is refused for them.
+    /// Flags of other commands, accepted without effect: a stop must not fail because they were left in.
     #[arg(long, short, hide = true)]
     quiet: bool,
     #[arg(long, hide = true)]
@@ -39,8 +39,8 @@ pub(super) fn stop(configured: &Configured, as_json: bool) -> Result<(), Failure
     let clock = Clock::start();
     let begun = clock.now();
     let mut halt = Halt::new(&settings.stage, begun);
-    let give_up = begun + settings.stage.power.stop_timeout;
-    let trouble = talk_despite_errors(&mut halt, bus.as_mut(), clock, give_up);
+    let deadline = begun + settings.stage.power.stop_timeout;
+    let trouble = talk_despite_errors(&mut halt, bus.as_mut(), clock, deadline);
     let status = report(&halt, &trouble, as_json);
     let checked =
         configured.load(None).and_then(|config| Ok(config.stage.to_stage(&config.can)?));
@@ -58,7 +58,7 @@ fn settings(configured: &Configured) -> Result<StopConfig, Failure> {
     if let Some(path) = configured.path() {
         let name = path.display().to_string();
         match fs::read(path) {
-            // A byte that is no text, in a comment, does not keep a stop from being sent.
+            // A byte that is not UTF-8, in a comment say, must not prevent the stop.
             Ok(bytes) => source = Some((name, String::from_utf8_lossy(&bytes).into_owned())),
             Err(error) => problems.push(format!("{name}: cannot be read: {error}")),
         }
@@ -78,22 +78,22 @@ fn settings(configured: &Configured) -> Result<StopConfig, Failure> {
 /// Reports which stops were confirmed, which were not, and which frames were not sent.
 fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<(), Failure> {
     let mut object = json!({});
-    let (mut errors, mut stands) = (Vec::new(), Vec::new());
+    let (mut errors, mut confirmed) = (Vec::new(), Vec::new());
     for axis in Axis::BOTH {
         let counts = halt.result(axis).and_then(|result| result.map_err(|e| errors.push(e)).ok());
         if let (Some(counts), false) = (counts, as_json) {
-            stands.push(format!("{axis:<11} stands without power, at {counts} counts"));
+            confirmed.push(format!("{axis:<11} stands without power, at {counts} counts"));
         }
         let is_standing = counts.is_some();
         object[axis.to_string()] = json!({ "stands": is_standing, "position_counts": counts });
     }
-    let first = trouble.first.as_ref().map(ToString::to_string).unwrap_or_default();
+    let first_error = trouble.first.as_ref().map(ToString::to_string).unwrap_or_default();
     if !trouble.unsent.is_empty() {
         let unsent: Vec<String> = trouble.unsent.iter().map(Frame::to_string).collect();
-        errors.push(format!("not sent: {}: {first}", unsent.join(", ")));
+        errors.push(format!("not sent: {}: {first_error}", unsent.join(", ")));
     } else if trouble.first.is_some() {
         print_stderr(format_args!(
-            "warning: every frame was sent in the end, after {} refusals: {first}",
+            "warning: every frame was sent in the end, after {} refusals: {first_error}",
             trouble.refused
         ));
     }
@@ -105,7 +105,7 @@ fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<(), Failur
         print_stderr("an axis whose stop was not confirmed may still move: use the emergency stop");
     }
     // Stdout comes last: if it blocks, everything on stderr was written already.
-    for line in stands {
+    for line in confirmed {
         print_stdout(line)?;
     }
     if as_json {
@@ -114,7 +114,7 @@ fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<(), Failur
         }
         print_stdout(object)?;
     }
-    ended(if is_confirmed { 0 } else { ENVIRONMENT_FAILED })
+    finish_with(if is_confirmed { 0 } else { ENVIRONMENT_FAILED })
 }
 
 #[cfg(test)]

@@ -20,8 +20,8 @@ const VCAN_TOML: (&str, &str) =
     ("bench-config/vcan.toml", include_str!("../../bench-config/vcan.toml"));
 
 /// Two emulated CiA 402 drives on a CAN interface, a needle in tissue behind them, and an
-/// OpenIGTLink tracker server in front. It runs until it is interrupted. Of CONFIG, by default
-/// bench-config/vcan.toml, the sections can, stage, plane, tracker, goal (a tracked target) and emulator are used.
+/// OpenIGTLink tracker server in front. It runs until it is interrupted. It uses the sections can, stage, plane,
+/// tracker, goal (a tracked target) and emulator of CONFIG, by default bench-config/vcan.toml.
 #[derive(Debug, Parser)]
 #[command(name = "vcan-stage", version)]
 pub(super) struct Arguments {
@@ -80,7 +80,7 @@ pub(super) fn serve(arguments: &Arguments) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Writes every frame to a new file at `path`; without a path, none.
+/// Returns a function that writes a frame to a new file at `path`; without a path it does nothing.
 fn frame_log(
     path: Option<&Path>,
     interface: &str,

@@ -10,7 +10,7 @@ use crate::cli::perform::Options;
 use crate::cli::records::{ReplayedRun, position_at, replay_run};
 use crate::cli::stage::{load_stage, perform, sensor_off_axis};
 use crate::cli::tracker::{Listener, listen};
-use crate::cli::{Failure, ended};
+use crate::cli::{Failure, finish_with};
 use crate::geometry::Pose;
 use crate::tracker::{Event, Gate, Registration};
 use crate::units::Time;
@@ -229,7 +229,7 @@ pub(super) fn record_turn(
         let line = format!("jog --axis rotation --by {by}");
         let (report, summary) = perform(&config, &line, Options::default())?;
         print_stderr(summary);
-        ended(status(&config, &report))?;
+        finish_with(status(&config, &report))?;
         for row in rows_of(replay_run(&report.run_dir)?) {
             has_orientation &= row.len() == CELLS;
             rows.push(row);

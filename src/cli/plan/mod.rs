@@ -6,7 +6,7 @@ use self::picture::picture;
 use super::arguments::Configured;
 use super::mask::mask_reader;
 use super::output::{print_result, refuse_existing, write_new};
-use super::{Failure, STOPPED, ended};
+use super::{Failure, STOPPED, finish_with};
 use crate::geometry::FixedAngles;
 use crate::plan::{Answer, Arc, Problem, Status, Tip, World, plan as solve, plan_with_reserve};
 use crate::text::screen;
@@ -54,7 +54,7 @@ pub(super) fn plan(arguments: &Arguments) -> Result<(), Failure> {
     }
     let text = || screen(include_str!("plan.txt"), &object, context! {});
     print_result(arguments.json, &object, text)?;
-    ended(match answer.status {
+    finish_with(match answer.status {
         Status::Plan => 0,
         Status::None | Status::Budget => STOPPED,
     })

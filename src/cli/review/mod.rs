@@ -4,7 +4,7 @@ mod read;
 
 use super::output::{print_result, print_stderr};
 use super::records::{RUNS, describe, newest_first, open};
-use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure, ended};
+use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure, finish_with};
 use crate::archive::{Verdict, VerdictKind, file};
 use crate::review::{
     Campaign, Comparison, Condition, Folder, GENERATOR, Run, html, to_json, to_text,
@@ -127,7 +127,7 @@ fn one(path: &Path, arguments: &Arguments) -> Result<(), Failure> {
         // The summary was printed already; the error follows it.
         Some(Err(error)) => {
             print_stderr(format_args!("error: {error}"));
-            ended(ENVIRONMENT_FAILED)
+            finish_with(ENVIRONMENT_FAILED)
         }
         _ if arguments.open => open_viewer(path).and_then(|()| status(&[&run])),
         _ => status(&[&run]),
@@ -172,7 +172,7 @@ fn write_report(path: &Path, page: &str) -> io::Result<()> {
 /// An edited record is bad input: it is not what the run recorded.
 fn status(runs: &[&Run]) -> Result<(), Failure> {
     let is_edited = |run: &&Run| matches!(run.folder.condition, Condition::Changed(_));
-    ended(if runs.iter().any(is_edited) { BAD_CONFIGURATION } else { 0 })
+    finish_with(if runs.iter().any(is_edited) { BAD_CONFIGURATION } else { 0 })
 }
 
 /// A parser of a verdict's name, for clap.

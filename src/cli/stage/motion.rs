@@ -5,7 +5,7 @@ use crate::archive::{file, proof};
 use crate::cli::ending::{after_operation, ending, status};
 use crate::cli::output::{merged, print_stdout, print_wrapped};
 use crate::cli::perform::{Job, Options, Performed, end_json};
-use crate::cli::{Failure, ended};
+use crate::cli::{Failure, finish_with};
 use crate::config::Config;
 use crate::runtime::RunReport;
 use crate::session::Done;
@@ -34,7 +34,7 @@ pub(super) fn operate(
             proof_of(&report).map_or(Ok(()), print_wrapped)?;
         }
     }
-    ended(status(config, &report))
+    finish_with(status(config, &report))
 }
 
 /// Runs the motion in `line`, written as on the command line of `stage`, and returns the report and the summary.

@@ -2,7 +2,7 @@
 
 use crate::cli::output::{has_no_reader, print_stderr, print_stdout, print_wrapped};
 use crate::cli::perform::open_bus;
-use crate::cli::{ENVIRONMENT_FAILED, Failure, ended};
+use crate::cli::{ENVIRONMENT_FAILED, Failure, finish_with};
 use crate::config::Config;
 use crate::emulator::VirtualStage;
 use crate::runtime::{Clock, Interrupt, talk_live, talk_virtual};
@@ -90,7 +90,7 @@ pub(super) fn status(config: &Config, as_json: bool) -> Result<(), Failure> {
     for error in &errors {
         print_stderr(format_args!("error: {error}"));
     }
-    ended(if errors.is_empty() { 0 } else { ENVIRONMENT_FAILED })
+    finish_with(if errors.is_empty() { 0 } else { ENVIRONMENT_FAILED })
 }
 
 /// A drive as it describes itself.
