@@ -66,7 +66,8 @@ fn score_with_and_without_roll(
     observer: &ObserverConfig,
     score: impl Fn(&ObserverConfig) -> Result<Score, String>,
 ) -> Result<Score, String> {
-    let roll_unknown = observer.with_roll_unknown().as_ref().map(&score).transpose()?;
-    let roll_unknown_rms_deg = roll_unknown.and_then(|score| score.roll_rms_deg);
-    Ok(Score { roll_unknown_rms_deg, ..score(observer)? })
+    let with_roll = score(observer)?;
+    let without_roll = observer.with_roll_unknown().as_ref().map(&score).transpose()?;
+    let roll_unknown_rms_deg = without_roll.and_then(|score| score.roll_rms_deg);
+    Ok(Score { roll_unknown_rms_deg, ..with_roll })
 }

@@ -156,7 +156,7 @@ fn position_at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
         }
     }
     Err(match moved_mm {
-        _ if listener.is_over() => "the command is ended".to_owned(),
+        _ if listener.is_over() => "interrupted, or the tracker's stream has ended".to_owned(),
         Some(sd_mm) => format!(
             "the tool scattered by {sd_mm:.2} mm for {} s (limit {limit_mm:.2}, from \
              tracker.gates.noise_sd_mm): hold it still, or measure the noise",

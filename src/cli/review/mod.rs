@@ -1,4 +1,4 @@
-//! `needle-bench review`: shows, compares, judges and repairs recorded runs.
+//! `needle-bench review`: shows, compares and repairs recorded runs, and records verdicts on them.
 
 mod read;
 
@@ -42,12 +42,12 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "KEY")]
     by: Option<String>,
     /// Record whether the run counts. The manifest keeps earlier verdicts.
-    #[arg(long, requires = "reason", value_parser = verdict())]
+    #[arg(long, requires = "reason", value_parser = verdict_parser())]
     verdict: Option<VerdictKind>,
     /// The reason for the verdict.
     #[arg(long, value_name = "TEXT", requires = "verdict")]
     reason: Option<String>,
-    /// Close the record of a run whose bench was ended before it could: killed, or without power.
+    /// Close the record of a run whose bench was killed or lost power before it closed the record.
     #[arg(long, conflicts_with = "verdict")]
     repair: bool,
     /// One JSON object on stdout.
@@ -62,79 +62,80 @@ pub(super) fn review(arguments: &Arguments) -> Result<(), Failure> {
         let none = || Failure::configuration(format_args!("no run in {RUNS}: name a run folder"));
         paths.push(newest.ok_or_else(none)?.dir().to_path_buf());
     }
-    let is_judged = arguments.verdict.is_some() || arguments.repair;
-    let (is_one, is_campaign) = match &paths[..] {
-        _ if is_judged => (false, false),
-        [path] => (!read::is_folder_of_runs(path), read::is_folder_of_runs(path)),
-        paths => (false, paths.len() > 2),
-    };
+    let changes_record = arguments.verdict.is_some() || arguments.repair;
+    let is_campaign = !changes_record
+        && match &paths[..] {
+            [path] => read::is_folder_of_runs(path),
+            paths => paths.len() > 2,
+        };
+    let is_one_run = !changes_record && !is_campaign && paths.len() == 1;
     for (flag, is_given, applies, to) in [
         ("--by", arguments.by.is_some(), is_campaign, "a campaign: name a folder of runs"),
-        ("--html", arguments.html.is_some(), is_one, "one run, which has a page: name one"),
-        ("--open", arguments.open, is_one, "one run: name one"),
+        ("--html", arguments.html.is_some(), is_one_run, "the review of one run"),
+        ("--open", arguments.open, is_one_run, "the review of one run"),
     ] {
         if is_given && !applies {
-            return Err(Failure::configuration(format_args!("{flag} is about {to}")));
+            return Err(Failure::configuration(format_args!("{flag} applies only to {to}")));
         }
     }
     match &paths[..] {
-        [path] if is_judged => match (arguments.verdict, &arguments.reason) {
-            (Some(verdict), Some(reason)) => judge(path, verdict, reason, arguments.json),
-            _ => close(path, arguments.json),
+        [path] if changes_record => match (arguments.verdict, &arguments.reason) {
+            (Some(verdict), Some(reason)) => add_verdict(path, verdict, reason, arguments.json),
+            _ => close_record(path, arguments.json),
         },
-        _ if is_judged => Err(Failure::configuration(
-            "--verdict and --repair are about one run: name one run folder",
+        _ if changes_record => Err(Failure::configuration(
+            "--verdict and --repair apply to one run: name one run folder",
         )),
-        [path] if is_one => one(path, arguments),
+        [path] if is_one_run => review_one(path, arguments),
         [a, b] => {
             let (a, b) = (read::run(a)?, read::run(b)?);
             let comparison = Comparison::of(&a, &b);
             print_result(arguments.json, &comparison.to_json(), || comparison.to_text())?;
-            status(&[&a, &b])
+            check_unchanged(&[&a, &b])
         }
-        many => {
-            let entries = many.iter().map(|path| read::entries(path));
-            let entries = entries.collect::<io::Result<Vec<_>>>()?.concat();
-            let campaign = Campaign::of(entries, arguments.by.as_deref());
+        paths => {
+            let lines = paths.iter().map(|path| read::campaign_lines(path));
+            let lines = lines.collect::<io::Result<Vec<_>>>()?.concat();
+            let campaign = Campaign::of(lines, arguments.by.as_deref());
             let campaign = campaign.map_err(Failure::configuration)?;
             print_result(arguments.json, &campaign.to_json(), || campaign.to_text())
         }
     }
 }
 
-/// One run: its page, then its summary.
-fn one(path: &Path, arguments: &Arguments) -> Result<(), Failure> {
+/// Reviews one run: writes its page, then prints its summary.
+fn review_one(path: &Path, arguments: &Arguments) -> Result<(), Failure> {
     let run = read::run(path)?;
     let page = match &arguments.html {
         _ if arguments.no_html => None,
         Some(file) => Some(file.clone()),
         None => Some(path.join(file::REPORT)),
     };
-    let written = page.map(|page| {
+    let page_written = page.map(|page| {
         let written = html(&run).map_err(io::Error::other).and_then(|text| match arguments.html {
             None => write_report(&page, &text),
             Some(_) => File::create_new(&page)?.write_all(text.as_bytes()),
         });
         let path = page.display();
-        let hint = "--html FILE puts it into a new file, --no-html leaves it";
+        let hint = "--html FILE writes it to a new file, --no-html leaves it out";
         written.map(|()| path.to_string()).map_err(|error| format!("{path}: {error}; {hint}"))
     });
-    let report = written.as_ref().and_then(|written| written.as_deref().ok());
+    let report = page_written.as_ref().and_then(|written| written.as_deref().ok());
     let mut object = to_json(&run);
     object["report"] = json!(report);
     print_result(arguments.json, &object, || to_text(&run, report))?;
-    match written {
-        // The summary was printed already; the error follows it.
+    match page_written {
+        // The summary is printed; the error follows it.
         Some(Err(error)) => {
             print_stderr(format_args!("error: {error}"));
             finish_with(ENVIRONMENT_FAILED)
         }
-        _ if arguments.open => open_viewer(path).and_then(|()| status(&[&run])),
-        _ => status(&[&run]),
+        _ if arguments.open => open_viewer(path).and_then(|()| check_unchanged(&[&run])),
+        _ => check_unchanged(&[&run]),
     }
 }
 
-/// Starts the viewer with the recording of the run in `path`, and does not wait for it.
+/// Starts the viewer with the recording of the run in `path`, without waiting for it to end.
 fn open_viewer(path: &Path) -> Result<(), Failure> {
     let recording = path.join(file::RECORDING);
     let shown = recording.display();
@@ -150,7 +151,7 @@ fn open_viewer(path: &Path) -> Result<(), Failure> {
     })
 }
 
-/// Writes the report beside the record atomically; it replaces an earlier report.
+/// Writes the report beside the record, atomically. Replaces an earlier report, but no other file.
 fn write_report(path: &Path, page: &str) -> io::Result<()> {
     let is_ours = || -> io::Result<bool> {
         let is_file = fs::symlink_metadata(path)?.is_file();
@@ -169,22 +170,22 @@ fn write_report(path: &Path, page: &str) -> io::Result<()> {
     })
 }
 
-/// An edited record is bad input: it is not what the run recorded.
-fn status(runs: &[&Run]) -> Result<(), Failure> {
+/// The exit status of a review: an edited record is bad input, since it is not what the run recorded.
+fn check_unchanged(runs: &[&Run]) -> Result<(), Failure> {
     let is_edited = |run: &&Run| matches!(run.folder.condition, Condition::Changed(_));
     finish_with(if runs.iter().any(is_edited) { BAD_CONFIGURATION } else { 0 })
 }
 
 /// A parser of a verdict's name, for clap.
-fn verdict() -> impl TypedValueParser<Value = VerdictKind> {
+fn verdict_parser() -> impl TypedValueParser<Value = VerdictKind> {
     PossibleValuesParser::new(["valid", "invalid"]).map(|name| match name.as_str() {
         "valid" => VerdictKind::Valid,
         _ => VerdictKind::Invalid,
     })
 }
 
-/// Closes a record that was left open.
-fn close(path: &Path, json: bool) -> Result<(), Failure> {
+/// Closes a record that was left open, and makes its `run.rrd` if that is missing.
+fn close_record(path: &Path, json: bool) -> Result<(), Failure> {
     let is_closed = RunFolder::open(path)?.is_closed() && !is_being_written(path);
     let repaired = match is_closed && lacks_recording(path) {
         true => note_recording(path, None).map(|()| None),
@@ -220,14 +221,14 @@ fn close(path: &Path, json: bool) -> Result<(), Failure> {
     print_result(json, &object, || Ok(format!("{dir}: closed: {repaired}")))
 }
 
-/// Whether the record in `path` has no `run.rrd`, or none that its manifest knows.
+/// True if the record in `path` has no `run.rrd`, or one that its manifest does not list.
 fn lacks_recording(path: &Path) -> bool {
     let is_known = |run: RunFolder| run.manifest().files.contains_key(file::RECORDING);
     !path.join(file::RECORDING).exists() || !RunFolder::open(path).is_ok_and(is_known)
 }
 
 /// Adds a verdict to the manifest of a record that is closed and unchanged.
-fn judge(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<(), Failure> {
+fn add_verdict(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<(), Failure> {
     if reason.trim().is_empty() {
         return Err(Failure::configuration("--reason is empty: say why"));
     }
@@ -241,11 +242,11 @@ fn judge(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<
     let (_, Folder { dir, condition, mut manifest, .. }) = read::open(path)?;
     let why = match condition {
         Condition::Whole => None,
-        // This program has the lock, so the bench has ended.
+        // This program has the lock, so no bench is writing the record.
         Condition::Open | Condition::BeingWritten => Some(format!(
-            "the record is not closed, and only a whole one is judged: needle-bench review {dir} --repair"
+            "a verdict needs a closed record; close it: needle-bench review {dir} --repair"
         )),
-        Condition::Changed(what) => Some(format!("{what}: it is not judged")),
+        Condition::Changed(what) => Some(format!("{what}; a verdict needs the unchanged record")),
     };
     if let Some(why) = why {
         return Err(Failure::configuration(format_args!("{dir}: {why}")));

@@ -10,9 +10,9 @@ use std::path::Path;
 
 /// The whole run in `path`. [`Run::unreadable`] names the files that cannot be read.
 pub(super) fn run(path: &Path) -> Result<Run, Failure> {
-    let (opened, folder) = open(path)?;
+    let (record, folder) = open(path)?;
     let mut unreadable = Vec::new();
-    let steps = opened.text(file::STEPS).unwrap_or_else(|error| {
+    let steps = record.text(file::STEPS).unwrap_or_else(|error| {
         unreadable.push(error.to_string());
         String::new()
     });
@@ -20,13 +20,13 @@ pub(super) fn run(path: &Path) -> Result<Run, Failure> {
         unreadable.push(format!("{}: {error}", path.join(file::STEPS).display()));
         StepsTable::default()
     });
-    let samples = lines(&opened, file::TRACKER, TrackerTimes::parse, &mut unreadable);
+    let samples = lines(&record, file::TRACKER, TrackerTimes::parse, &mut unreadable);
     let motion = match folder.manifest.operation {
-        Some(_) => Motion::new(&lines(&opened, file::CAN, stamped, &mut unreadable), &folder),
+        Some(_) => Motion::new(&lines(&record, file::CAN, stamped, &mut unreadable), &folder),
         None => Motion::default(),
     };
-    let events = lines(&opened, file::EVENTS, event, &mut unreadable);
-    // A record that is not closed has none yet.
+    let events = lines(&record, file::EVENTS, event, &mut unreadable);
+    // A record that is not closed has no `run.rrd` yet.
     let is_closed = !matches!(folder.condition, Condition::BeingWritten | Condition::Open);
     if is_closed && !path.join(file::RECORDING).exists() {
         let (name, dir) = (file::RECORDING, path.display());
@@ -35,19 +35,19 @@ pub(super) fn run(path: &Path) -> Result<Run, Failure> {
     Ok(Run { folder, steps, samples, motion, events, unreadable })
 }
 
-/// The lines of the file `name`, parsed by `read`; those that it cannot parse are `unreadable`.
+/// The lines of the file `name`, parsed by `parse`. Adds to `unreadable` what cannot be read or parsed.
 fn lines<T>(
     folder: &RunFolder,
     name: &str,
-    read: impl Fn(&str) -> Option<T>,
+    parse: impl Fn(&str) -> Option<T>,
     unreadable: &mut Vec<String>,
 ) -> Vec<T> {
     let path = folder.dir().join(name);
-    match folder.lines(name).and_then(|lines| lines.read(read)) {
+    match folder.lines(name).and_then(|lines| lines.read(parse)) {
         Ok((values, damaged)) => {
-            let n = damaged.len();
+            let count = damaged.len();
             unreadable.extend(damaged.first().map(|first| {
-                format!("{} line {first} cannot be read, {n} in all", path.display())
+                format!("{} line {first} cannot be read, {count} in all", path.display())
             }));
             values
         }
@@ -58,51 +58,51 @@ fn lines<T>(
     }
 }
 
-/// A folder of a campaign.
-fn entry(path: &Path) -> Line {
+/// The line of a run folder in a campaign.
+fn campaign_line(path: &Path) -> Line {
     match open(path) {
         Ok((_, folder)) => Line::run(folder),
         Err(error) => Line::unreadable(path.display().to_string(), error.to_string()),
     }
 }
 
-/// The run folder `path`, or the folders in it, by name.
-pub(super) fn entries(path: &Path) -> io::Result<Vec<Line>> {
+/// The lines of a campaign for the run folder `path`, or for the folders in it, by name.
+pub(super) fn campaign_lines(path: &Path) -> io::Result<Vec<Line>> {
     match is_folder_of_runs(path) {
-        true => Ok(folders_in(path)?.iter().map(|path| entry(path)).collect()),
-        false => Ok(vec![entry(path)]),
+        true => Ok(folders_in(path)?.iter().map(|path| campaign_line(path)).collect()),
+        false => Ok(vec![campaign_line(path)]),
     }
 }
 
-/// Whether `path` is not a run but contains runs.
+/// True if `path` is not a run folder but contains some.
 pub(super) fn is_folder_of_runs(path: &Path) -> bool {
     let is_run = |path: &Path| path.join(file::MANIFEST).exists();
     let folders = folders_in(path).unwrap_or_default();
     !is_run(path) && folders.iter().any(|folder| is_run(folder))
 }
 
-/// The manifest and the configuration in `path`, and the condition of the folder.
+/// Opens the run folder `path`; returns also its manifest, configuration and condition.
 pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), TelemetryError> {
-    let opened = RunFolder::open(path)?;
-    let condition = match opened.verify() {
-        Ok(()) if opened.is_closed() => Condition::Whole,
+    let record = RunFolder::open(path)?;
+    let condition = match record.verify() {
+        Ok(()) if record.is_closed() => Condition::Whole,
         Ok(()) if is_being_written(path) => Condition::BeingWritten,
         Ok(()) => Condition::Open,
         Err(TelemetryError::Record { reason, .. }) => Condition::Changed(reason),
         Err(error) => return Err(error),
     };
-    let has_figures = !opened.manifest().figures.is_empty();
+    let has_figures = !record.manifest().figures.is_empty();
     let figures_of_steps = match has_figures {
         true => None,
-        false => opened.text(file::STEPS).ok().and_then(|text| figures_of_steps(&text)),
+        false => record.text(file::STEPS).ok().and_then(|text| figures_of_steps(&text)),
     };
     let folder = Folder {
         figures_of_steps,
         dir: path.display().to_string(),
-        manifest: opened.manifest().clone(),
+        manifest: record.manifest().clone(),
         condition,
         // If it is missing, the condition says so.
-        config_toml: opened.text(file::CONFIG).ok(),
+        config_toml: record.text(file::CONFIG).ok(),
     };
-    Ok((opened, folder))
+    Ok((record, folder))
 }
