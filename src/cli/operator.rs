@@ -1,4 +1,4 @@
-//! What the operator sees during a run without the console: one line of progress and the events, on stderr.
+//! What the operator sees on stderr during a run without the console: a line of progress, and the events.
 
 use super::console::minutes;
 use super::output::{plain, print_stderr};
@@ -19,24 +19,25 @@ use std::time::Duration;
 const QUEUE: usize = 1024;
 /// Interval at which the queue is emptied and the line of progress refreshed.
 const REFRESH: Duration = Duration::from_millis(100);
-/// Depth between two lines of progress where there is no terminal, mm.
+/// Depth between two lines of progress without a terminal, mm.
 const LINE_MM: f64 = 10.0;
 /// How long the end of a run waits for the remaining output.
 const FINISH: Duration = Duration::from_secs(1);
 
-/// A line of progress that stays at the bottom of a terminal; otherwise a line each 10 mm, and one for each
-/// event.
+/// Prints a line for each event. A terminal has the progress in its last line; elsewhere a line is printed every
+/// 10 mm.
 ///
 /// A separate thread prints, so a blocked stderr never delays the control thread. Events that find
 /// the queue full are dropped and counted.
 pub(super) struct Terminal {
-    /// A preempted printer never makes its sender wait (docs/decisions/0018-tracker-queue.md).
+    /// This ring never blocks: the control thread does not wait for a preempted printing thread
+    /// (docs/decisions/0018-tracker-queue.md).
     events: Producer<String>,
     /// Closed when everything is printed; nothing is ever sent.
     done: Receiver<()>,
     latest: Arc<Latest>,
     severity_min: Severity,
-    /// Depth at which the next line of progress is due, mm, where no terminal shows it all the time.
+    /// Depth at which the next line of progress is due, mm; `None` with a terminal or without progress.
     line_due_mm: Option<f64>,
 }
 
@@ -48,7 +49,7 @@ struct Latest {
 }
 
 impl Terminal {
-    /// Shows everything, or warnings and faults only when `quiet`; with its progress if `has_progress`.
+    /// Shows all events, or only warnings and faults if `quiet`; and the progress if `has_progress`.
     pub(super) fn new(quiet: bool, has_progress: bool) -> Self {
         let is_terminal = std::io::stderr().is_terminal();
         let (events, mut queue) = RingBuffer::new(QUEUE);
@@ -117,7 +118,7 @@ fn progress_line(is_shown: bool) -> ProgressBar {
 /// Prints until the run closes the queue.
 fn print(queue: &mut Consumer<String>, latest: &Latest, bar: &ProgressBar) {
     loop {
-        // Asked before the queue is emptied: the last line may come just before its end.
+        // Read before the queue is emptied: the last line may come just before the queue is closed.
         let is_closed = queue.is_abandoned();
         while let Ok(line) = queue.pop() {
             match bar.is_hidden() {

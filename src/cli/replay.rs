@@ -1,4 +1,4 @@
-//! `needle-bench replay`: runs a recorded session again.
+//! `needle-bench replay`: runs a recorded session again and compares the results.
 
 use super::output::{print_result, refuse_existing, write_new};
 use super::records::{open, recorded_plan};
@@ -50,8 +50,9 @@ pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
         write_new(path, &replayed.steps_csv())?;
     }
     let mut observers = vec![("recorded", observer, &replayed.figures)];
-    let asked = what_if.map(|observer| observer.name());
-    observers.extend(replayed.what_if.as_ref().map(|figures| ("what_if", asked, figures)));
+    let what_if_observer = what_if.map(|observer| observer.name());
+    observers
+        .extend(replayed.what_if.as_ref().map(|figures| ("what_if", what_if_observer, figures)));
     let mut object = json!({
         "run_dir": arguments.run.display().to_string(),
         "recorded_by": { "version": folder.manifest().version, "git": folder.manifest().git },
@@ -75,7 +76,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
         "real_time_factor": speed,
         "what_if": null,
     });
-    let mut shown = Vec::new();
+    let mut rows = Vec::new();
     for (title, observer, FigureReport { estimate_rms, final_error, .. }) in observers {
         object[title] = json!({
             "observer": observer,
@@ -85,16 +86,16 @@ pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
         if let (Some(observer), Some(rms), Some(last)) = (observer, estimate_rms, final_error) {
             let title = title.replace('_', " ");
             let (rms, last) = (rms.to_string(), last.to_string());
-            shown.push(context! { title, observer, rms, last });
+            rows.push(context! { title, observer, rms, last });
         }
     }
-    let more = context! { figures => shown };
+    let more = context! { figures => rows };
     let text = || screen(include_str!("replay.txt"), &object, more);
     print_result(arguments.json, &object, text)?;
     finish_with(replayed.difference.map_or(0, |_| STOPPED))
 }
 
-/// The observer that `sets` over the configuration `text` describe; `None` without any.
+/// The observer that the keys `sets` describe over the configuration `text`; `None` without any key.
 fn what_if(text: &str, sets: &[String]) -> Result<Option<ObserverConfig>, Failure> {
     if sets.is_empty() {
         return Ok(None);
@@ -104,13 +105,13 @@ fn what_if(text: &str, sets: &[String]) -> Result<Option<ObserverConfig>, Failur
         let key = set.split('=').next().unwrap_or_default().trim();
         if key == "observer.shadows" {
             return Err(Failure::configuration(format_args!(
-                "--set {key}: shadows are not asked about; name the observer by observer.kind"
+                "--set {key}: a replay shows one other observer; name it by observer.kind"
             )));
         }
         if !key.starts_with("observer.") {
             return Err(Failure::configuration(format_args!(
                 "--set {key}: a replay takes observer.… alone, since the needle's path is as \
-                 recorded; for another path insert again, by needle-bench run or study"
+                 recorded; for another path insert again, with needle-bench run or study"
             )));
         }
     }

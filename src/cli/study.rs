@@ -1,4 +1,4 @@
-//! `needle-bench study`: Monte Carlo.
+//! `needle-bench study`: Monte Carlo trials of emulated insertions.
 
 use super::Failure;
 use super::arguments::{Configured, parse_seed};
@@ -25,7 +25,7 @@ const FAILED_MAX: usize = 20;
 pub(super) struct Arguments {
     #[command(flatten)]
     configured: Configured,
-    /// Insertions.
+    /// Number of insertions.
     #[arg(long, default_value_t = 1000, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
     trials: u32,
     /// Seed of the study: the same seed gives the same trials.
@@ -37,8 +37,8 @@ pub(super) struct Arguments {
     /// Write a CSV row for each trial.
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Make each insertion through drives and CAN frames: slower, with the same result, but that a start is also
-    /// refused if no path leads to the target from where the tip is seen.
+    /// Make each insertion through drives and CAN frames: slower. The result is the same, except that a start is
+    /// also refused if no path leads to the target from the tip's measured position.
     #[arg(long)]
     through_session: bool,
     /// Number of threads, by default the number of processors.
@@ -62,8 +62,8 @@ pub(super) fn study(arguments: &Arguments) -> Result<(), Failure> {
     session.check().map_err(Failure::configuration)?;
     let drawn = |seed| config.drawn(seed).map_err(|error| error.to_string());
     let stage = |seed| drawn(seed)?.virtual_stage().map_err(|error| error.to_string());
-    let read = mask_reader(arguments.configured.path());
-    let goal = |seed| drawn(seed)?.to_goal(&read).map_err(|error| error.to_string());
+    let read_mask = mask_reader(arguments.configured.path());
+    let goal = |seed| drawn(seed)?.to_goal(&read_mask).map_err(|error| error.to_string());
     let (tool, prior) = (&config.tracker.tool, config.prior());
     let study = Study { session, tool, prior, stage: &stage, goal: &goal };
     let seeds: Vec<u64> =
@@ -74,18 +74,18 @@ pub(super) fn study(arguments: &Arguments) -> Result<(), Failure> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let begun = Instant::now();
     let trials = pool.map_err(Failure::environment)?.install(|| {
-        let done = || bar.inc(1);
+        let on_trial_done = || bar.inc(1);
         if arguments.through_session {
-            study.run_through_sessions(&seeds, &done)
+            study.run_through_sessions(&seeds, &on_trial_done)
         } else {
-            study.run(&seeds, &done)
+            study.run(&seeds, &on_trial_done)
         }
     });
     let elapsed_s = begun.elapsed().as_secs_f64();
     bar.finish_and_clear();
     let trials = trials.map_err(Failure::configuration)?;
     if let Some(path) = &arguments.out {
-        write(path, &trials, &config)?;
+        write_csv(path, &trials, &config)?;
     }
     let inserted_mm: f64 = trials.iter().map(|trial| trial.figures.insertion_mm).sum();
     let summary = StudySummary::of(&trials)
@@ -97,23 +97,23 @@ pub(super) fn study(arguments: &Arguments) -> Result<(), Failure> {
         control => config.control.kind.to_string(),
         rms => summary.estimate_rms.map(|rms| rms.to_string()),
         failed_max => FAILED_MAX,
-        repeat => repeat(&arguments.configured, config.insertion.plane_out_of_reach),
+        repeat => repeat_command(&arguments.configured, config.insertion.plane_out_of_reach),
     };
     let text = || screen(include_str!("study.txt"), &report, more);
     print_result(arguments.json, &report, text)
 }
 
-/// The command that repeats a trial, but for its seed. A run refuses what a study counts.
-fn repeat(configured: &Configured, plane_out_of_reach: PlaneOutOfReach) -> String {
+/// The command that repeats a trial, without its seed. A run refuses a plane out of reach, which a study counts.
+fn repeat_command(configured: &Configured, plane_out_of_reach: PlaneOutOfReach) -> String {
     let path = configured.path().map(|path| path.display().to_string());
-    let inserts = "insertion.plane_out_of_reach=insert".to_owned();
-    let inserts = (plane_out_of_reach != PlaneOutOfReach::Insert).then_some(inserts);
-    let sets = configured.set.iter().cloned().chain(inserts);
+    let is_refused = plane_out_of_reach != PlaneOutOfReach::Insert;
+    let inserts_anyway = is_refused.then(|| "insertion.plane_out_of_reach=insert".to_owned());
+    let sets = configured.set.iter().cloned().chain(inserts_anyway);
     let words = path.into_iter().chain(sets.flat_map(|set| ["--set".to_owned(), set]));
     words.fold("needle-bench run".to_owned(), |line, word| line + " " + &shell_word(&word))
 }
 
-/// The summary, with the speed of the computer.
+/// The summary, and how fast this computer made the trials.
 #[derive(Serialize)]
 struct Report<'a> {
     #[serde(flatten)]
@@ -127,15 +127,15 @@ fn progress_bar(trials: usize) -> ProgressBar {
     ProgressBar::new(trials as u64).with_style(style)
 }
 
-/// Writes a CSV row for each trial; a field that the trial has no number for is empty.
-fn write(path: &Path, trials: &[TrialResult], config: &Config) -> Result<(), Failure> {
+/// Writes a CSV row for each trial; a cell for which the trial has no number is empty.
+fn write_csv(path: &Path, trials: &[TrialResult], config: &Config) -> Result<(), Failure> {
     let mut writer = csv::Writer::from_writer(Vec::new());
     for (number, trial) in trials.iter().enumerate() {
         let target_mm = match trial.target {
             Some(_) => config.drawn(trial.seed)?.goal.position_mm,
             None => None,
         };
-        let row = row(number, trial, target_mm);
+        let row = trial_row(number, trial, target_mm);
         let (names, cells): (Vec<_>, Vec<_>) = row.into_iter().unzip();
         if number == 0 {
             writer.write_record(names).map_err(Failure::environment)?;
@@ -146,8 +146,8 @@ fn write(path: &Path, trials: &[TrialResult], config: &Config) -> Result<(), Fai
     write_new(path, &String::from_utf8_lossy(&written))
 }
 
-/// The columns of a trial with their names; its target is there at the start, plane frame, mm.
-fn row(
+/// The names and cells of a trial's row. `target_mm` is the target at the start, plane frame.
+fn trial_row(
     number: usize,
     trial: &TrialResult,
     target_mm: Option<Vector3<f64>>,

@@ -1,4 +1,4 @@
-//! `needle-bench plan`: the path to the target, without a stage.
+//! `needle-bench plan`: plans the path to the target, without a stage.
 
 mod picture;
 
@@ -39,15 +39,15 @@ pub(super) fn plan(arguments: &Arguments) -> Result<(), Failure> {
     let begun = Instant::now();
     let mut answer = solve(&world, &problem);
     let seconds = begun.elapsed().as_secs_f64();
-    let roomy = plan_with_reserve(&world, &problem, config.goal.reserve_mm, &answer);
-    // A path that no run may take is no plan.
-    if let (Status::Plan, Err(refusal)) = (answer.status, &roomy) {
+    let run_plan = plan_with_reserve(&world, &problem, config.goal.reserve_mm, &answer);
+    // A run refuses a path without the reserve, so such a path is no plan.
+    if let (Status::Plan, Err(refusal)) = (answer.status, &run_plan) {
         (answer.status, answer.reason) = (Status::None, Some(refusal.clone()));
     }
     let mut object = to_json(&world, &problem, &answer, seconds);
-    let reserve_mm = roomy.as_ref().ok().filter(|_| !world.obstacles.is_empty());
-    object["run_reserve_mm"] = json!(reserve_mm.map(|roomy| roomy.reserve_mm));
-    object["run_refusal"] = json!(roomy.err());
+    let with_obstacles = run_plan.as_ref().ok().filter(|_| !world.obstacles.is_empty());
+    object["run_reserve_mm"] = json!(with_obstacles.map(|run_plan| run_plan.reserve_mm));
+    object["run_refusal"] = json!(run_plan.err());
     object["curvature_margin"] = json!(config.goal.curvature_margin());
     if let Some(path) = &arguments.out {
         write_new(path, &picture(&world, &problem, &answer)?)?;
@@ -60,7 +60,7 @@ pub(super) fn plan(arguments: &Arguments) -> Result<(), Failure> {
     })
 }
 
-/// The name of a picture, for clap.
+/// Parses the name of a picture, for clap.
 fn svg_file(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
     match path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("svg")) {
@@ -105,11 +105,11 @@ fn to_json(world: &World, problem: &Problem, answer: &Answer, seconds: f64) -> V
     })
 }
 
-/// The roll with which the tip bends toward `bend`: an unturned tip bends toward its own -y.
+/// The roll at which the tip bends toward `bend`: a tip with roll 0 bends toward its own -y.
 fn roll_rad(tip: &Tip, bend: &Vector3<f64>) -> f64 {
     let y = -bend;
     let axes = Matrix3::from_columns(&[y.cross(&tip.heading), y, tip.heading]);
     let roll_rad = FixedAngles::from_rotation(&Rotation3::from_matrix_unchecked(axes)).roll;
-    // Rounding must not turn half a turn into its negative.
+    // Rounding must not make -180 deg of 180 deg.
     if roll_rad < -std::f64::consts::PI + 1e-9 { -roll_rad } else { roll_rad }
 }

@@ -11,10 +11,10 @@ use std::collections::BTreeSet;
 
 /// Points of the outline of a circle.
 const CIRCLE_POINTS: u32 = 48;
-/// The smallest side of the squares of which a mask is drawn, mm.
+/// Smallest side of the squares that show a mask, mm.
 const MASK_STEP_MM: f64 = 2.0;
 
-/// The plan as SVG: from the side, y over z, and from above, x over z.
+/// Draws the plan as SVG: from the side, y over z, and from above, x over z.
 pub(super) fn picture(
     world: &World,
     problem: &Problem,
@@ -72,9 +72,9 @@ fn outlines(obstacle: &Obstacle, up: usize) -> Vec<Vec<Vector3<f64>>> {
         }
         Obstacle::Mask(mask) => {
             let side_mm = MASK_STEP_MM.max(mask.spacing_mm().max());
-            let square = |mm: f64| (mm / side_mm).floor() as i64;
+            let index = |mm: f64| (mm / side_mm).floor() as i64;
             let squares: BTreeSet<_> =
-                mask.occupied_mm().map(|at| (square(at.z), square(at[up]))).collect();
+                mask.occupied_mm().map(|point| (index(point.z), index(point[up]))).collect();
             let outline = |(z, v): (i64, i64)| {
                 [(0, 0), (1, 0), (1, 1), (0, 1)].map(|(dz, dv)| {
                     let mm = |index: i64| index as f64 * side_mm;

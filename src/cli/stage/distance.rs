@@ -3,12 +3,13 @@
 use crate::stage::{Axis, CountsRatio};
 use std::fmt;
 
-/// The longest travel of each axis, in its unit: as far as the configuration allows its limits to be.
-const FARTHEST: [(Axis, f64); 2] = [(Axis::Insertion, 1000.0), (Axis::Rotation, 360_000.0)];
+/// Longest distance along each axis, in its unit: the largest limits that the configuration allows.
+const DISTANCE_MAX: [(Axis, f64); 2] = [(Axis::Insertion, 1000.0), (Axis::Rotation, 360_000.0)];
 
-/// A distance along an axis in its unit, `2mm` or `10deg`; or a speed, the distance a second.
+/// A distance along an axis, such as `2mm` or `10deg`; or a speed, the distance a second.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::cli) struct Distance {
+    /// In the unit of `axis`: mm or deg.
     value: f64,
     axis: Axis,
 }
@@ -16,7 +17,7 @@ pub(in crate::cli) struct Distance {
 impl Distance {
     /// Reads a distance.
     pub(super) fn parse(text: &str) -> Result<Self, String> {
-        for (axis, max) in FARTHEST {
+        for (axis, max) in DISTANCE_MAX {
             let number = text.strip_suffix(axis.unit());
             let number = number.and_then(|number| number.trim_end().parse().ok());
             match number.filter(|value: &f64| value.is_finite()) {
@@ -34,10 +35,10 @@ impl Distance {
         distance.ok_or_else(|| "a number with its unit, such as 0.5mm/s or 20deg/s, at most 1000mm/s or 360000deg/s".to_owned())
     }
 
-    /// In the unit of `axis`, mm or rad.
+    /// The distance along `axis`, mm or rad.
     ///
     /// # Errors
-    /// A distance along the other axis.
+    /// The unit is that of the other axis.
     pub(super) fn along(self, axis: Axis) -> Result<f64, String> {
         match axis {
             _ if self.axis != axis => {
@@ -49,11 +50,11 @@ impl Distance {
         }
     }
 
-    /// The same, for an axis with `ratio` counts per mm or per turn.
+    /// As [`along`](Self::along), for an axis with `ratio` counts per mm or per turn.
     ///
     /// # Errors
     /// Also a distance that rounds to 0 counts.
-    pub(super) fn in_counts_of(self, axis: Axis, ratio: CountsRatio) -> Result<f64, String> {
+    pub(super) fn nonzero_along(self, axis: Axis, ratio: CountsRatio) -> Result<f64, String> {
         let distance = self.along(axis)?;
         let per_unit = if axis == Axis::Rotation { 360.0 } else { 1.0 };
         match ratio.nearest_count(self.value / per_unit) {
@@ -121,13 +122,13 @@ mod tests {
     #[test]
     fn what_moves_no_count_is_refused_with_the_smallest_step() {
         let ratio = CountsRatio::new(4646, 1).unwrap();
-        assert_eq!(distance(-0.0002, MM).in_counts_of(MM, ratio), Ok(-0.0002));
+        assert_eq!(distance(-0.0002, MM).nonzero_along(MM, ratio), Ok(-0.0002));
         assert_eq!(
-            distance(0.00001, MM).in_counts_of(MM, ratio).unwrap_err(),
+            distance(0.00001, MM).nonzero_along(MM, ratio).unwrap_err(),
             "the insertion axis would not move: --by is under half of its smallest step, 2.15e-4mm"
         );
         assert_eq!(
-            distance(0.0, DEG).in_counts_of(DEG, ratio).unwrap_err(),
+            distance(0.0, DEG).nonzero_along(DEG, ratio).unwrap_err(),
             "the rotation axis would not move: --by is under half of its smallest step, 7.75e-2deg"
         );
     }

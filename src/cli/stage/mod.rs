@@ -1,4 +1,4 @@
-//! `needle-bench stage`: what the stage does without a needle to steer.
+//! `needle-bench stage`: reads and moves the stage without a needle to steer.
 
 mod distance;
 mod motion;
@@ -27,7 +27,7 @@ use std::path::PathBuf;
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     #[command(flatten)]
-    named: Named,
+    before: StageArguments,
     /// Move the emulated stage of bench-config/virtual.toml, in memory and in virtual time.
     #[arg(long = "virtual", global = true)]
     emulated: bool,
@@ -47,10 +47,10 @@ pub(super) struct Arguments {
     operation: Operation,
 }
 
-/// The stage, named before or after the operation. `global = true` would not do: of options on both
-/// sides clap drops those before.
+/// The stage, if it is named before the operation. `global = true` would not do: if an option is given on both
+/// sides of the operation, clap drops the one before it.
 #[derive(Debug, Args)]
-pub(super) struct Named {
+pub(super) struct StageArguments {
     /// Configuration, which names the bus and the drives.
     #[arg(long)]
     config: Option<PathBuf>,
@@ -59,9 +59,9 @@ pub(super) struct Named {
     set: Vec<String>,
 }
 
-impl Named {
-    /// What this names and then `after`, in the order of the command line.
-    fn and(&self, after: &Configured) -> Result<Configured, Failure> {
+impl StageArguments {
+    /// Joins these arguments and those `after` the operation, in the order of the command line.
+    fn joined(&self, after: &Configured) -> Result<Configured, Failure> {
         if let (Some(config), Some(again)) = (&self.config, after.path()) {
             return Err(Failure::configuration(format_args!(
                 "--config is given twice, {} and {}: nothing was done, give one",
@@ -169,7 +169,7 @@ impl Motion {
         }
     }
 
-    /// Its name in the record.
+    /// The motion's name in the record.
     pub(super) fn name(&self) -> &'static str {
         match self {
             Motion::Home { .. } => "home",
@@ -180,7 +180,7 @@ impl Motion {
         }
     }
 
-    /// What followed it on its command line, as far as it says what was to be done.
+    /// The options of its command line that say what to do, for the record.
     pub(super) fn arguments(&self) -> Vec<String> {
         let (axis, by, to, speed) = match self {
             Motion::Home { axis, .. } => (*axis, None, None, None),
@@ -199,9 +199,8 @@ impl Motion {
         given.flatten().collect()
     }
 
-    /// The words after `stage withdraw` that finish a withdrawal which went as far as `done`, and no farther
-    /// than `min_mm`. `None` where nothing is left to withdraw or the rest would be refused, and of another
-    /// operation.
+    /// The options of the `stage withdraw` that finishes this withdrawal after it went as far as `done`. `None` if
+    /// nothing remains, if the limit `min_mm` would refuse the remainder, and for another motion.
     fn remaining(&self, done: &[Done], min_mm: f64) -> Option<String> {
         let Motion::Withdraw { by, .. } = self else { return None };
         let Some(by_mm) = by.and_then(|by| by.along(Axis::Insertion).ok()) else {
@@ -209,26 +208,26 @@ impl Motion {
         };
         let moved = done.iter().find_map(|done| Some((done.from?, done.to)));
         let (from_mm, to_mm) = moved.unwrap_or_default();
-        // Down to a tenth: rounded up, the rest might pass the limit.
-        let left_mm = (10.0 * (by_mm - (from_mm - to_mm)) + 1e-6).floor() / 10.0;
+        // Rounded down to a tenth: rounded up, the remainder might pass the limit.
+        let remaining_mm = (10.0 * (by_mm - (from_mm - to_mm)) + 1e-6).floor() / 10.0;
         let is_allowed = moved.is_none() || from_mm - by_mm >= min_mm;
-        (left_mm >= 0.05 && is_allowed).then(|| format!(" --by {left_mm:.1}mm"))
+        (remaining_mm >= 0.05 && is_allowed).then(|| format!(" --by {remaining_mm:.1}mm"))
     }
 
-    /// The key that an emulated stage needs besides, for this motion to show anything.
-    fn emulated(&self, config: &Config) -> Option<String> {
+    /// The configuration key that an emulated stage also needs for this motion to have an effect.
+    fn emulator_key(&self, config: &Config) -> Option<String> {
         let emulator = &config.emulator;
-        let is_out = emulator.rehearse && emulator.insertion_start_mm == 0.0;
+        let is_needle_out = emulator.rehearse && emulator.insertion_start_mm == 0.0;
         match self {
             Motion::Prove { handedness: true, .. } => sensor_off_axis(config),
-            Motion::Withdraw { .. } if is_out => {
+            Motion::Withdraw { .. } if is_needle_out => {
                 Some(format!("emulator.insertion_start_mm={:?}", config.insertion.depth_mm))
             }
             _ => None,
         }
     }
 
-    /// The operation that this asks of the stage of `config`.
+    /// The operation that this motion asks of the stage of `config`.
     fn plan(&self, config: &Config) -> Result<OperationConfig, Failure> {
         let stage = config.stage.to_stage(&config.can)?;
         let operation = match self {
@@ -249,19 +248,19 @@ impl Motion {
                 Task::Move(with_speed(withdraw(config, &stage, *by)?, *speed, &stage)?)
             }
             Motion::Prove { handedness: false, .. } => Task::Prove,
-            Motion::Prove { handedness: true, .. } => answer(config)?,
+            Motion::Prove { handedness: true, .. } => handedness_check(config)?,
         };
         Ok(OperationConfig { stage, operation })
     }
 }
 
-/// The motion that `manifest` tells of, on the stage of `config`; `None` of an insertion.
+/// The motion that `manifest` records, on the stage of `config`; `None` for an insertion.
 pub(super) fn recorded(
     manifest: &Manifest,
     config: &Config,
 ) -> Result<Option<OperationConfig>, Failure> {
     let Some(name) = &manifest.operation else { return Ok(None) };
-    // `prove-handedness` is `prove --handedness`.
+    // The record says `prove-handedness` for `prove --handedness`.
     let command = name.split('-').next().unwrap_or_default();
     let motion = Motion::of(&format!("{command} {}", manifest.arguments.join(" ")));
     let motion = motion.map_err(|_| {
@@ -289,7 +288,7 @@ pub(super) fn stage(arguments: &Arguments) -> Result<(), Failure> {
         | Operation::Reset(configured)
         | Operation::Stop(configured) => configured,
     };
-    let configured = arguments.named.and(configured)?;
+    let configured = arguments.before.joined(configured)?;
     if let Operation::Stop(_) = operation {
         if !emulated && !rehearse {
             return stop(&configured, json);
@@ -303,11 +302,11 @@ pub(super) fn stage(arguments: &Arguments) -> Result<(), Failure> {
         realtime.refuse_if_given("`stage status` and `reset` have no SYNC thread")?;
     }
     let configured = configured.rehearsed(rehearse);
-    let key = |config: &Config| match operation {
-        Operation::Motion(motion) => motion.emulated(config),
+    let emulator_key = |config: &Config| match operation {
+        Operation::Motion(motion) => motion.emulator_key(config),
         _ => None,
     };
-    let (config, configured) = load_stage(configured, emulated || rehearse, key)?;
+    let (config, configured) = load_stage(configured, emulated || rehearse, emulator_key)?;
     match operation {
         Operation::Motion(motion) => {
             motion::operate(&config, configured.whole_path(), motion, arguments)
@@ -318,15 +317,15 @@ pub(super) fn stage(arguments: &Arguments) -> Result<(), Failure> {
     }
 }
 
-/// The configuration of a stage to move, with the key that an emulated one needs besides.
+/// Loads the configuration of a stage to move, with the `emulator_key` that an emulated stage also needs.
 pub(super) fn load_stage(
     mut configured: Configured,
     emulated: bool,
-    key: impl Fn(&Config) -> Option<String>,
+    emulator_key: impl Fn(&Config) -> Option<String>,
 ) -> Result<(Config, Configured), Failure> {
     let mut config = configured.load(None)?;
     check_bus(config.bus(), emulated)?;
-    if let Some(key) = key(&config) {
+    if let Some(key) = emulator_key(&config) {
         print_stderr(format_args!("emulated    {key}"));
         configured.set.push(key);
         config = configured.load(None)?;
@@ -337,7 +336,8 @@ pub(super) fn load_stage(
 /// Refuses the emulated stage in memory without `--virtual` or a rehearsal: an operator who forgot to name the
 /// rig must not take it for the rig.
 fn check_bus(interface: &CanInterface, emulated: bool) -> Result<(), Failure> {
-    match (interface == &CanInterface::Memory, emulated) {
+    let is_memory = interface == &CanInterface::Memory;
+    match (is_memory, emulated) {
         (true, true) | (false, false) => Ok(()),
         (false, true) => Err(Failure::configuration(format_args!(
             "--virtual moves the emulated stage in memory, but can.interface is \"{interface}\": \
@@ -351,30 +351,30 @@ fn check_bus(interface: &CanInterface, emulated: bool) -> Result<(), Failure> {
     }
 }
 
-/// Distance from its goal at which a rotation has arrived.
+/// A rotation has arrived at this distance from its goal.
 const ROTATION_ARRIVAL_DEG: f64 = 0.1;
 
-/// Turn of the base by which a sensor shows its handedness, made twice.
-const ANSWER_TURN_DEG: f64 = 45.0;
+/// Turn of the base that shows the handedness of the tracked sensor, made twice.
+const HANDEDNESS_TURN_DEG: f64 = 45.0;
 
-/// An emulated sensor that sits on the axis is moved so far off it, to show its handedness.
+/// Distance by which an emulated sensor on the axis is moved off it, to show its handedness.
 const SENSOR_OFF_AXIS_MM: f64 = 5.0;
 
-/// The key that an emulated sensor needs to show how the base turns.
+/// The configuration key that an emulated sensor on the axis needs to show how the base turns.
 pub(super) fn sensor_off_axis(config: &Config) -> Option<String> {
     let is_on_axis = config.emulator.sensor.to_pose().translation.xy().norm() == 0.0;
     (config.is_emulated() && is_on_axis)
         .then(|| format!("emulator.sensor.x_mm={SENSOR_OFF_AXIS_MM}"))
 }
 
-fn answer(config: &Config) -> Result<Task, Failure> {
+fn handedness_check(config: &Config) -> Result<Task, Failure> {
     let gate = config.tracker.to_gate()?;
-    // Where the sensor is, not the tip: that is on the axis.
+    // The sensor's own position: the tip is on the axis.
     let registration = Registration::new(*gate.registration.x_wt());
     Ok(Task::Answer(Box::new(AnswerSettings {
         gate: Gate { registration, workspace: None, ..gate },
         axis: config.plane.to_pose().rotation * Vector3::z(),
-        turn: jog_move(config, Axis::Rotation, Goal::By(ANSWER_TURN_DEG.to_radians())),
+        turn: jog_move(config, Axis::Rotation, Goal::By(HANDEDNESS_TURN_DEG.to_radians())),
     })))
 }
 
@@ -387,7 +387,7 @@ fn goal(
 ) -> Result<Goal, Failure> {
     match (by, to) {
         (Some(by), _) => by
-            .in_counts_of(axis, stage.axis(axis).ratio)
+            .nonzero_along(axis, stage.axis(axis).ratio)
             .map(Goal::By)
             .map_err(Failure::configuration),
         (None, Some(_)) if stage.axis(axis).zero.is_none() => {
@@ -410,7 +410,7 @@ fn with_speed(jog: Move, speed: Option<Distance>, stage: &StageConfig) -> Result
         return Ok(Move { speed, ..jog });
     }
     let (max, unit) = jog.axis.in_unit(max);
-    // As it was configured, not as radians make it.
+    // Undo the rounding of the conversion to radians and back.
     let max = (max * 1e9).round() / 1e9;
     Err(Failure::configuration(format_args!(
         "--speed is {asked}/s, allowed: over 0, up to {max}{unit}/s"
@@ -434,7 +434,7 @@ fn jog_move(config: &Config, axis: Axis, goal: Goal) -> Move {
 /// The move that withdraws the needle: by a distance, or to depth 0, which only an axis with a configured zero has.
 fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Result<Move, Failure> {
     let insertion = &config.stage.insertion;
-    let along = |by: Distance| by.in_counts_of(Axis::Insertion, stage.insertion.ratio);
+    let along = |by: Distance| by.nonzero_along(Axis::Insertion, stage.insertion.ratio);
     let goal = match by.map(along).transpose().map_err(Failure::configuration)? {
         Some(mm) if mm > 0.0 => Goal::By(-mm),
         Some(mm) => {

@@ -1,4 +1,4 @@
-//! `home`, `jog`, `withdraw` and `prove`: a run without a needle's steering, and its record.
+//! `home`, `jog`, `withdraw` and `prove`: runs without a needle to steer, and their records.
 
 use super::{Arguments, Motion};
 use crate::archive::{file, proof};
@@ -12,8 +12,7 @@ use crate::session::Done;
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// Runs the `motion` of `arguments` and prints its result. `path` is the file of `config`, where no key was set
-/// over it.
+/// Runs the `motion` of `arguments` and prints its result. `path` is the file of `config` if no key overrides it.
 pub(super) fn operate(
     config: &Config,
     path: Option<&Path>,
@@ -37,7 +36,7 @@ pub(super) fn operate(
     finish_with(status(config, &report))
 }
 
-/// Runs the motion in `line`, written as on the command line of `stage`, and returns the report and the summary.
+/// Runs the motion that `line` describes as on the command line of `stage`; returns the report and the summary.
 pub(in crate::cli) fn perform(
     config: &Config,
     line: &str,
@@ -92,9 +91,9 @@ fn summary(
             None => format!("{axis:<11} home, at {to:.3} {unit}"),
         }
     };
-    let rest = motion.remaining(done, config.stage.insertion.limits.min);
-    let left = after_operation(config, path, rest.as_deref(), report);
+    let remaining = motion.remaining(done, config.stage.insertion.limits.min);
+    let next = after_operation(config, path, remaining.as_deref(), report);
     let lines: Vec<String> =
-        done.iter().map(line).chain(left).chain([ending(config, report)]).collect();
+        done.iter().map(line).chain(next).chain([ending(config, report)]).collect();
     lines.join("\n")
 }

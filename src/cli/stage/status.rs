@@ -1,4 +1,4 @@
-//! `status`: what the drives say of themselves.
+//! `status` and `reset`: what the drives report about themselves.
 
 use crate::cli::output::{has_no_reader, print_stderr, print_stdout, print_wrapped};
 use crate::cli::perform::open_bus;
@@ -15,12 +15,12 @@ use std::time::{Duration, Instant};
 
 /// Interval between two readings of `--watch`.
 const WATCH_PERIOD: Duration = Duration::from_secs(1);
-/// What the lowest bits of the digital inputs mean (CiA 402, 60FD).
+/// Meaning of the lowest bits of the digital inputs (CiA 402, 0x60FD).
 const SWITCHES: [&str; 3] = ["negative_limit", "positive_limit", "home_switch"];
-/// How often `--watch` looks at Ctrl-C.
-const LOOK_PERIOD: Duration = Duration::from_millis(50);
+/// Interval at which `--watch` checks for Ctrl-C.
+const SIGNAL_POLL: Duration = Duration::from_millis(50);
 
-/// Holds `dialogue` with the drives of `config` to its end.
+/// Runs `dialogue` with the drives of `config` to its end.
 fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<(), Failure> {
     if config.is_emulated() {
         let mut stage = VirtualStage::new(config.virtual_stage()?, Time::ZERO);
@@ -31,7 +31,7 @@ fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<(), Failure> {
     talk_live(dialogue, bus.as_mut(), Clock::start()).map_err(Failure::environment)
 }
 
-/// Resets the faults of both drives, then says how they are.
+/// Resets the faults of both drives, then prints their status.
 pub(super) fn reset(config: &Config, as_json: bool) -> Result<(), Failure> {
     let stage = config.stage.to_stage(&config.can)?;
     let mut reset = Reset::new(&stage, Time::ZERO);
@@ -44,12 +44,12 @@ pub(super) fn reset(config: &Config, as_json: bool) -> Result<(), Failure> {
     }
 }
 
-/// Prints the status each second, until Ctrl-C or until the pipe it goes to is closed.
+/// Prints the status each second, until Ctrl-C or until stdout is closed.
 pub(super) fn watch(config: &Config, as_json: bool) -> Result<(), Failure> {
     let interrupt = Interrupt::listen()?;
     loop {
         let read = status(config, as_json);
-        // A drive that does not answer now may answer the next time; without a bus none does.
+        // A drive that does not answer now may answer the next time; a bus that cannot be opened ends the watch.
         if read.as_ref().is_err_and(|failure| failure.message.is_some()) || has_no_reader(&stdout())
         {
             return read;
@@ -59,12 +59,12 @@ pub(super) fn watch(config: &Config, as_json: bool) -> Result<(), Failure> {
             if interrupt.is_raised() {
                 return read;
             }
-            thread::sleep(LOOK_PERIOD);
+            thread::sleep(SIGNAL_POLL);
         }
     }
 }
 
-/// Reads what both drives say.
+/// Reads the status of both drives.
 pub(in crate::cli) fn read_status(config: &Config) -> Result<StatusReader, Failure> {
     let stage = config.stage.to_stage(&config.can)?;
     let mut reader = StatusReader::new(&stage, Time::ZERO);
@@ -93,7 +93,7 @@ pub(super) fn status(config: &Config, as_json: bool) -> Result<(), Failure> {
     finish_with(if errors.is_empty() { 0 } else { ENVIRONMENT_FAILED })
 }
 
-/// A drive as it describes itself.
+/// A drive's status for programs.
 pub(in crate::cli) fn drive_json(axis: Axis, status: &AxisStatus) -> Value {
     let position = status.position.map(|position| axis.in_unit(position).0);
     let unit = axis.unit();
@@ -122,7 +122,7 @@ pub(in crate::cli) fn drive_json(axis: Axis, status: &AxisStatus) -> Value {
     object
 }
 
-/// One line for the terminal.
+/// A drive's status in one line for the terminal.
 fn line(axis: Axis, status: &AxisStatus) -> String {
     let AxisStatus { node, identity, statusword, .. } = status;
     let mut parts = vec![format!("{axis:<11} node {node}, {identity}; {statusword}")];
