@@ -1,4 +1,4 @@
-//! What the bench does at every millimetre, every frame and every message, and a whole run.
+//! Times the work of the bench at each millimetre, frame and message, and a whole run.
 //!
 //! `cargo bench --profile dev` prints criterion's figures, and before them the quantiles of single
 //! steps. (Without the profile, all dependencies are built anew as for a release.)
@@ -24,10 +24,10 @@ use needle_bench::units::Time;
 use std::hint::black_box;
 use std::time::{Duration, Instant};
 
-/// Increments of one millimetre at 2 mm/s and 10 ms SYNC.
+/// Increments per millimetre at 2 mm/s and a SYNC period of 10 ms.
 const INCREMENTS_PER_MM: u32 = 50;
 
-/// Every observer and every law, each with the default of the other.
+/// Each observer with the default law, and each other law with the default observer.
 const STEERINGS: [(&str, &str); 4] = [
     ("observer", "invariant"),
     ("observer", "coupled"),
@@ -41,7 +41,7 @@ fn session(part: &str, kind: &str) -> SessionConfig {
     config.session().expect("valid")
 }
 
-/// A needle that is steered, a millimetre at a time.
+/// A needle that is steered one millimetre at a time.
 struct Insertion {
     steering: Steering,
     needle: Needle,
@@ -57,9 +57,9 @@ impl Insertion {
         Insertion { steering, needle: session.needle, tip, rotation_rad_per_mm: 0.0 }
     }
 
-    /// One millimetre, and what all of a step's work on it took: carried along the stage's path,
-    /// corrected, decided.
-    fn millimetre(&mut self, noise: Vector3<f64>) -> Duration {
+    /// Inserts one millimetre. Returns the time that the step's work took: predicting along the stage's path,
+    /// correcting, deciding.
+    fn insert_mm(&mut self, noise: Vector3<f64>) -> Duration {
         let part = 1.0 / f64::from(INCREMENTS_PER_MM);
         let increment = Increment::new(part, self.rotation_rad_per_mm * part).expect("finite");
         for _ in 0..INCREMENTS_PER_MM {
@@ -78,7 +78,7 @@ impl Insertion {
     }
 }
 
-/// Quantiles of a step's work over whole insertions from all around the circle.
+/// Quantiles of the time of a step over whole insertions, from start rolls all around the circle.
 fn steps(_: &mut Criterion) {
     for (part, kind) in STEERINGS {
         let session = session(part, kind);
@@ -86,22 +86,26 @@ fn steps(_: &mut Criterion) {
             .flat_map(|start| {
                 let mut insertion = Insertion::new(&session, 0.157 * f64::from(start));
                 let noise = Noise::Uniform(1.0);
-                (0..300)
-                    .map(move |mm| insertion.millimetre(noise.draw(start.into(), mm)).as_nanos())
+                (0..300).map(move |mm| insertion.insert_mm(noise.draw(start.into(), mm)).as_nanos())
             })
             .collect();
-        print(kind, ns);
+        print_quantiles(kind, ns);
     }
 }
 
-fn print(name: &str, mut ns: Vec<u128>) {
+fn print_quantiles(name: &str, mut ns: Vec<u128>) {
     ns.sort_unstable();
-    let at = |per_cent: usize| ns[(ns.len() - 1) * per_cent / 100];
-    println!("step, {name}: p50 {} ns, p99 {} ns, max {} ns", at(50), at(99), at(100));
+    let quantile = |per_cent: usize| ns[(ns.len() - 1) * per_cent / 100];
+    println!(
+        "step, {name}: p50 {} ns, p99 {} ns, max {} ns",
+        quantile(50),
+        quantile(99),
+        quantile(100)
+    );
 }
 
-/// Quantiles of a step on the way to targets among five spheres: twenty corrections, the plan, and the emulated
-/// needle.
+/// Quantiles of the time of a step on the way to targets among five spheres. A step has twenty corrections, the
+/// plan, and the emulated needle.
 fn steps_to_targets(_: &mut Criterion) {
     let text = include_str!("../bench-config/target-study.toml");
     let sets = ["study.obstacles=5", "study.target_share=[0,0.6]", "goal.curvature_margin=0.1"];
@@ -130,17 +134,17 @@ fn steps_to_targets(_: &mut Criterion) {
         };
         insert(&session, &stage, &timetable, take).expect("a trial");
     }
-    print("to a target among five spheres", ns);
+    print_quantiles("to a target among five spheres", ns);
 }
 
-/// One command of each law.
+/// The time of one command of each law.
 fn commands(c: &mut Criterion) {
     let mut group = c.benchmark_group("command");
     for kind in ["nested-saturation", "feedback-linearization"] {
         let session = session("control", kind);
         let mut insertion = Insertion::new(&session, 0.0);
         for mm in 0..100 {
-            insertion.millimetre(Noise::Uniform(0.1).draw(1, mm));
+            insertion.insert_mm(Noise::Uniform(0.1).draw(1, mm));
         }
         let estimate = insertion.steering.decide(&[], true).estimate.expect("an estimate");
         let mut law = session.control.build(session.needle);
@@ -149,7 +153,7 @@ fn commands(c: &mut Criterion) {
     group.finish();
 }
 
-/// Trials of 300 mm of the default study, by threads: inserted mm a second.
+/// Trials of 300 mm of the default study, by the number of threads: inserted mm a second.
 fn study(c: &mut Criterion) {
     let sets = ["insertion.depth_mm=300", "observer.shadows=[]"].map(str::to_owned);
     let config = Config::from_sources(&[], &sets).expect("the defaults");
@@ -176,7 +180,7 @@ fn study(c: &mut Criterion) {
     group.finish();
 }
 
-/// An SDO upload of the identity: the bench's client and the emulated drive's server.
+/// An SDO upload of the identity, between the bench's client and the emulated drive's server.
 fn sdo(c: &mut Criterion) {
     let node = NodeId::new(1).expect("a node");
     let mut drive = Drive::new(DriveConfig::new(node, 1, 2));
@@ -197,7 +201,7 @@ fn sdo(c: &mut Criterion) {
     });
 }
 
-/// From the bytes of a tracker's connection to samples, a hundred messages a read.
+/// Decodes the bytes of a tracker's connection into samples, a hundred messages a read.
 fn decoder(c: &mut Criterion) {
     const MESSAGES: u64 = 100;
     let turned = [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 2.0, 3.0];
@@ -253,18 +257,18 @@ fn whole_run(config: &Config) -> usize {
     let mut stage = VirtualStage::new(config.virtual_stage().expect("valid"), Time::ZERO);
     let (mut now, mut records) = (Time::ZERO, 0);
     while session.outcome().is_none() {
-        let mut quiet = false;
-        while !quiet {
-            quiet = true;
+        let mut is_idle = false;
+        while !is_idle {
+            is_idle = true;
             while let Some(output) = session.poll() {
-                quiet = false;
+                is_idle = false;
                 match output {
                     Output::Transmit { frame, .. } => stage.handle_frame(now, &frame),
                     Output::Record(_) => records += 1,
                 }
             }
             while let Some(output) = stage.poll() {
-                quiet = false;
+                is_idle = false;
                 session.handle(
                     now,
                     match output {

@@ -1,8 +1,8 @@
-//! Instructions of a step of each observer and law: the same on every run of the same program, which
-//! times on a busy machine are not.
+//! Counts the instructions of a step of each observer and law. Unlike times on a busy machine, the count is the
+//! same on every run of the same program.
 //!
 //! `cargo bench --profile dev --bench instructions`, with valgrind installed. The program runs
-//! itself under callgrind with two numbers of insertions; their difference is the steps' alone.
+//! itself under callgrind with two numbers of insertions; the difference is that of the steps alone.
 
 use nalgebra::Vector3;
 use needle_bench::config::Config;
@@ -12,7 +12,7 @@ use needle_bench::needle::{Increment, TipPosition};
 use needle_bench::session::{SessionConfig, Steering};
 use std::process::{Command, ExitCode};
 
-/// One increment a step, as in a study; the stage's own rate has 50.
+/// Steps of an insertion, one increment each, as in a study; a run has 50 increments a step.
 const STEPS: u64 = 100;
 const KINDS: [(&str, &str); 4] = [
     ("observer", "invariant"),
@@ -32,8 +32,8 @@ fn main() -> ExitCode {
         return ExitCode::SUCCESS;
     }
     for (part, kind) in KINDS {
-        let counted = |insertions| instructions(part, kind, insertions);
-        let (Some(few), Some(many)) = (counted(2), counted(6)) else {
+        let count = |insertions| instructions(part, kind, insertions);
+        let (Some(few), Some(many)) = (count(2), count(6)) else {
             println!("no count: is valgrind installed?");
             return ExitCode::SUCCESS;
         };
@@ -42,7 +42,7 @@ fn main() -> ExitCode {
     ExitCode::SUCCESS
 }
 
-/// Instructions of this program making so many insertions.
+/// Counts the instructions of this program while it makes this number of insertions.
 fn instructions(part: &str, kind: &str, insertions: u32) -> Option<u64> {
     let program = std::env::current_exe().ok()?;
     let output = Command::new("valgrind")
@@ -51,12 +51,12 @@ fn instructions(part: &str, kind: &str, insertions: u32) -> Option<u64> {
         .args([part, kind, &insertions.to_string()])
         .output()
         .ok()?;
-    let said = String::from_utf8(output.stderr).ok()?;
-    let (_, count) = said.split_once("Collected : ")?;
+    let stderr = String::from_utf8(output.stderr).ok()?;
+    let (_, count) = stderr.split_once("Collected : ")?;
     count.split_whitespace().next()?.parse().ok()
 }
 
-/// The steps of one insertion; the true needle takes a small and equal part of the count.
+/// Makes the steps of one insertion. The true needle is a small part of the count, the same for every kind.
 fn insert(session: &SessionConfig, start: u32) {
     let mut steering = Steering::new(session).expect("valid");
     let roll = f64::from(start);

@@ -105,7 +105,7 @@ fn what_if(text: &str, sets: &[String]) -> Result<Option<ObserverConfig>, Failur
         let key = set.split('=').next().unwrap_or_default().trim();
         if key == "observer.shadows" {
             return Err(Failure::configuration(format_args!(
-                "--set {key}: a replay shows one other observer; name it by observer.kind"
+                "--set {key}: a replay tries one other observer; name the observer by observer.kind"
             )));
         }
         if !key.starts_with("observer.") {
