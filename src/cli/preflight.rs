@@ -140,7 +140,7 @@ pub(super) fn before_run(config: &Config, yes: bool, as_json: bool) -> Result<Ve
     let preflight = Preflight::inspect(config, config, LISTEN);
     print_stderr(to_text(&preflight.checks));
     let is_confirmed = || yes || ask(config, &interrupt);
-    let refusal = refusal(&preflight.checks, || interrupt.is_raised(), is_confirmed);
+    let refusal = why_refused(&preflight.checks, || interrupt.is_raised(), is_confirmed);
     let Some((reason, status)) = refusal else {
         return Ok(preflight.checks);
     };
@@ -153,7 +153,7 @@ pub(super) fn before_run(config: &Config, yes: bool, as_json: bool) -> Result<Ve
 
 /// Why the run does not start, and the exit status for it; `None` if it starts. Calls `ask` only if no check
 /// failed.
-fn refusal(
+fn why_refused(
     checks: &[Check],
     is_interrupted: impl Fn() -> bool,
     ask: impl FnOnce() -> bool,
@@ -263,7 +263,7 @@ mod tests {
     fn an_interrupted_preflight_is_a_stop_whatever_its_checks_found() {
         let failed = [Check::new("disk", "9 MB", "100 MB").with(Verdict::Fail, "make room")];
         let status_of = |checks: &[Check], is_interrupted: bool, answer: bool| {
-            refusal(checks, || is_interrupted, || answer).map(|(_, status)| status)
+            why_refused(checks, || is_interrupted, || answer).map(|(_, status)| status)
         };
         assert_eq!(status_of(&failed, true, true), Some(STOPPED));
         assert_eq!(status_of(&failed, false, true), Some(ENVIRONMENT_FAILED));

@@ -41,7 +41,7 @@ fn ago(days: Option<f64>) -> String {
     }
 }
 
-/// The registration, the tip and the needle: their quality and age. On hardware a value that was typed in
+/// Checks the quality and age of the registration, the tip and the needle. On hardware a value that was typed in
 /// does not pass: nothing shows when and how it was measured.
 pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
     let (tracker, is_emulated) = (&config.tracker, !config.stage.hardware);
@@ -51,11 +51,11 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
             let days = fit.map(|fit| age_days(&fit.date_utc, now_unix_us));
             let age = days.map_or_else(|| "typed in, no date".to_owned(), ago);
             let found = if found.is_empty() { age } else { format!("{found}, {age}") };
-            let is_recent = days.is_none_or(|days| is_recent(days, days_max));
+            let is_in_date = days.is_none_or(|days| is_recent(days, days_max));
             let undated = format!("nothing shows when and how it was measured: {next}");
             Check::new(name, found, limit)
                 .unless(fit.is_some() || is_emulated, Warn, undated)
-                .unless(is_recent, Warn, format!("measure it again: {next}"))
+                .unless(is_in_date, Warn, format!("measure it again: {next}"))
         };
     let register = "needle-bench calibrate registration";
     let collect = format!("{register} --collect");

@@ -40,7 +40,7 @@ pub struct BusFacts {
     pub errors: Option<[u16; 2]>,
 }
 
-/// The bus of `config`, from the `facts` of the system; `None` if the interface does not exist.
+/// Checks the bus of `config` by the `facts` of the system; `Ok(None)` if the interface does not exist.
 pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Check> {
     const UP: &str = "up, error active";
     const BRING_UP: &str = "bitrate 1000000 restart-ms 0";
@@ -107,7 +107,7 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
     vec![bus, rate, restart, counters.unless(is_quiet, Warn, CABLE)]
 }
 
-/// The drive of `axis`, as it describes itself.
+/// Checks the drive of `axis` by the status that it reports.
 pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) -> Vec<Check> {
     const POWERED: &str = "it has power: is another program moving it? Stop it: needle-bench stop";
     const HISTORY: &str = "needle-bench stage reset clears it once it is understood";
@@ -186,13 +186,13 @@ fn room(axis: Axis, position: f64, travel: f64, drive: &AxisConfig) -> Check {
         false => format!("from {} to {}", axis.shown(position), axis.shown(goal)),
     };
     let limit = format!("{} to {}", axis.shown(min), axis.shown(max));
-    let next = "withdraw, insert less deep, or set the limits of this axis";
+    let next = "withdraw, lower insertion.depth_mm, or set the limits of this axis";
     let check = Check::new(format!("{axis} room"), found, limit);
     let is_inside = on_grid(position) >= on_grid(min) && on_grid(goal) <= on_grid(max);
     check.unless(is_inside, Fail, next)
 }
 
-/// The tracker, from a report about the tool at rest.
+/// Checks the tracker by a report about the tool at rest.
 pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     let tool = &config.tracker.tool;
     let TrackerReport { accepted, refused, rate_hz, .. } = report;
@@ -210,14 +210,14 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
         .max(hold.after.as_secs_f64().recip());
     let limit = format!("at least {rate_min_hz:.1}");
     let rate = Check::new("tracker rate", format!("{rate_hz:.1} Hz"), limit);
-    let faster = "insert slower, or raise the tracker's rate";
+    let faster = "lower insertion.speed_mm_per_s, or raise the tracker's rate";
     let rate = rate.unless(*rate_hz >= rate_min_hz, Warn, faster);
 
     let is_within = |value: Option<f64>, limit: f64| value.is_none_or(|value| value.abs() <= limit);
     let noise_mm = report.noise_sd_mm;
     let noise_max_mm = NOISE_MAX * config.tracker.to_track().noise_sd_mm;
     let found = noise_mm.map_or_else(|| "not measured".to_owned(), |mm| format!("{mm:.3} mm"));
-    let limit = format!("up to {noise_max_mm:.3}, {NOISE_MAX} of tracker.gates.noise_sd_mm");
+    let limit = format!("up to {noise_max_mm:.3}, {NOISE_MAX} times tracker.gates.noise_sd_mm");
     let longer =
         format!("listen for at least {POSITIONS_MIN} positions: check --connect --listen 10");
     let measure = "measure it: needle-bench tracker rest";
