@@ -357,7 +357,7 @@ mod tests {
         StageAtEnd { had_power: true, unknown: None, drives, position: Some(position) }
     }
 
-    /// The rotation's drive is in Fault besides.
+    /// As [`stood`], with the rotation drive in Fault.
     fn in_fault() -> StageAtEnd {
         let mut stage = stood();
         stage.drives.rotation =

@@ -117,7 +117,7 @@ fn reason(error: &NiftiError) -> String {
 /// The largest part of a voxel's side that may point along another axis.
 const TILT_MAX: f32 = 1e-3;
 
-/// Whether the header neither turns nor mirrors the voxels: the pose alone places them.
+/// True if the header neither turns nor mirrors the voxels, so that only the configured pose places them.
 fn is_upright(header: &NiftiHeader) -> bool {
     let [qfac, sides @ ..] = header.pixdim;
     if header.sform_code > 0 {

@@ -84,7 +84,7 @@ enum Command {
 /// Why a command did not succeed.
 #[derive(Debug)]
 struct Failure {
-    /// `None` where the command has printed it already.
+    /// `None` if the command has printed it already.
     message: Option<String>,
     /// The exit status of the command.
     status: u8,
@@ -112,7 +112,7 @@ impl Failure {
     }
 }
 
-/// The message; empty where it was printed already.
+/// The message; empty if it was printed already.
 impl Display for Failure {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         f.write_str(self.message.as_deref().unwrap_or_default())

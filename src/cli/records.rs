@@ -92,7 +92,7 @@ pub(super) fn open(path: &Path) -> Result<(RunFolder, Config), Failure> {
     Ok((folder, Config::from_sources(&[source], &[])?))
 }
 
-/// A function that tells `make_recording` what it needs to know of a run of `config` beside the record.
+/// The plan, scene and configuration of a run of `config`, which `make_recording` needs beside the record.
 pub(super) fn describe(config: Config) -> Describe {
     Box::new(move |manifest| {
         let plan = recorded_plan(manifest, &config).map_err(|failure| failure.to_string())?;
@@ -102,7 +102,7 @@ pub(super) fn describe(config: Config) -> Describe {
 
 /// The plan of the run of `manifest`, from its configuration and arguments.
 pub(super) fn recorded_plan(manifest: &Manifest, config: &Config) -> Result<Plan, Failure> {
-    Ok(match stage::recorded(manifest, config)? {
+    Ok(match stage::recorded_operation(manifest, config)? {
         Some(operation) => Plan::from(operation),
         None => Plan::from(config.session_reading(&mask_reader(None))?),
     })

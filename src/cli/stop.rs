@@ -1,4 +1,4 @@
-//! `needle-bench stop`: quick stop of both drives, whichever program moves them.
+//! `needle-bench stop`: quick stop of both drives, whatever program moves them.
 
 use super::arguments::Configured;
 use super::output::{print_stderr, print_stdout};

@@ -46,7 +46,7 @@ pub struct Check {
 }
 
 impl Check {
-    /// A check that passes so far: what was `found`, and what is allowed.
+    /// A check that passes, of what was `found` and what is allowed.
     pub fn new(
         name: impl Into<String>,
         found: impl Into<String>,

@@ -22,7 +22,7 @@ const RATE_WINDOW: Duration = Duration::from_secs(1);
 const INNOVATIONS: usize = 20;
 /// Events kept.
 const EVENTS: usize = 40;
-/// Bits of a CAN frame besides its data, without stuffing.
+/// Bits of a CAN frame without its data and without stuffing.
 const FRAME_BITS: u64 = 47;
 
 /// What the screen needs to know of the configuration.

@@ -15,7 +15,7 @@ use super::records::last_run_on_a_bus;
 use super::stop::stop;
 use crate::archive::Manifest;
 use crate::config::{CanInterface, Config};
-use crate::operation::{AnswerSettings, Goal, Move, Operation as Task, OperationConfig};
+use crate::operation::{AnswerSettings, Goal, Move, Operation, OperationConfig};
 use crate::session::Done;
 use crate::stage::{Axis, StageConfig};
 use crate::tracker::{Gate, Registration};
@@ -44,7 +44,7 @@ pub(super) struct Arguments {
     #[command(flatten)]
     realtime: RealTimeArguments,
     #[command(subcommand)]
-    operation: Operation,
+    command: StageCommand,
 }
 
 /// The stage, if it is named before the operation. `global = true` would not do: if an option is given on both
@@ -75,7 +75,7 @@ impl StageArguments {
 }
 
 #[derive(Debug, Subcommand)]
-enum Operation {
+enum StageCommand {
     /// Read identity, state, position and error history of both drives; nothing is written.
     Status {
         /// Read again each second, until Ctrl-C.
@@ -231,8 +231,8 @@ impl Motion {
     fn plan(&self, config: &Config) -> Result<OperationConfig, Failure> {
         let stage = config.stage.to_stage(&config.can)?;
         let operation = match self {
-            Motion::Home { axis, .. } => match Task::home(&stage, *axis) {
-                Task::Home(axes) if axes.all(|chosen| !chosen) => {
+            Motion::Home { axis, .. } => match Operation::home(&stage, *axis) {
+                Operation::Home(axes) if axes.all(|chosen| !chosen) => {
                     return Err(Failure::configuration(
                         "no axis can be homed: neither [stage.insertion.homing] nor \
                          [stage.rotation.homing] is configured",
@@ -241,21 +241,21 @@ impl Motion {
                 homing => homing,
             },
             Motion::Jog { axis, by, to, speed, .. } => {
-                let goal = goal(&stage, *axis, *by, *to)?;
-                Task::Move(with_speed(jog_move(config, *axis, goal), *speed, &stage)?)
+                let goal = jog_goal(&stage, *axis, *by, *to)?;
+                Operation::Move(with_speed(jog_move(config, *axis, goal), *speed, &stage)?)
             }
             Motion::Withdraw { by, speed, .. } => {
-                Task::Move(with_speed(withdraw(config, &stage, *by)?, *speed, &stage)?)
+                Operation::Move(with_speed(withdrawal_move(config, &stage, *by)?, *speed, &stage)?)
             }
-            Motion::Prove { handedness: false, .. } => Task::Prove,
+            Motion::Prove { handedness: false, .. } => Operation::Prove,
             Motion::Prove { handedness: true, .. } => handedness_check(config)?,
         };
         Ok(OperationConfig { stage, operation })
     }
 }
 
-/// The motion that `manifest` records, on the stage of `config`; `None` for an insertion.
-pub(super) fn recorded(
+/// The operation that `manifest` records, on the stage of `config`; `None` for an insertion.
+pub(super) fn recorded_operation(
     manifest: &Manifest,
     config: &Config,
 ) -> Result<Option<OperationConfig>, Failure> {
@@ -281,15 +281,15 @@ fn axis() -> impl TypedValueParser<Value = Axis> {
 }
 
 pub(super) fn stage(arguments: &Arguments) -> Result<(), Failure> {
-    let Arguments { emulated, rehearse, json, realtime, ref operation, .. } = *arguments;
-    let configured = match operation {
-        Operation::Motion(motion) => &motion.common().configured,
-        Operation::Status { configured, .. }
-        | Operation::Reset(configured)
-        | Operation::Stop(configured) => configured,
+    let Arguments { emulated, rehearse, json, realtime, ref command, .. } = *arguments;
+    let configured = match command {
+        StageCommand::Motion(motion) => &motion.common().configured,
+        StageCommand::Status { configured, .. }
+        | StageCommand::Reset(configured)
+        | StageCommand::Stop(configured) => configured,
     };
     let configured = arguments.before.joined(configured)?;
-    if let Operation::Stop(_) = operation {
+    if let StageCommand::Stop(_) = command {
         if !emulated && !rehearse {
             return stop(&configured, json);
         }
@@ -298,21 +298,21 @@ pub(super) fn stage(arguments: &Arguments) -> Result<(), Failure> {
             "{flag}: the emulated stage does not move by itself: there is nothing to stop"
         )));
     }
-    if !matches!(operation, Operation::Motion(_)) {
+    if !matches!(command, StageCommand::Motion(_)) {
         realtime.refuse_if_given("`stage status` and `reset` have no SYNC thread")?;
     }
     let configured = configured.rehearsed(rehearse);
-    let emulator_key = |config: &Config| match operation {
-        Operation::Motion(motion) => motion.emulator_key(config),
+    let emulator_key = |config: &Config| match command {
+        StageCommand::Motion(motion) => motion.emulator_key(config),
         _ => None,
     };
     let (config, configured) = load_stage(configured, emulated || rehearse, emulator_key)?;
-    match operation {
-        Operation::Motion(motion) => {
+    match command {
+        StageCommand::Motion(motion) => {
             motion::operate(&config, configured.whole_path(), motion, arguments)
         }
-        Operation::Reset(_) => status::reset(&config, json),
-        Operation::Status { watch: true, .. } => status::watch(&config, json),
+        StageCommand::Reset(_) => status::reset(&config, json),
+        StageCommand::Status { watch: true, .. } => status::watch(&config, json),
         _ => status::status(&config, json),
     }
 }
@@ -367,19 +367,19 @@ pub(super) fn sensor_off_axis(config: &Config) -> Option<String> {
         .then(|| format!("emulator.sensor.x_mm={SENSOR_OFF_AXIS_MM}"))
 }
 
-fn handedness_check(config: &Config) -> Result<Task, Failure> {
+fn handedness_check(config: &Config) -> Result<Operation, Failure> {
     let gate = config.tracker.to_gate()?;
     // The sensor's own position: the tip is on the axis.
     let registration = Registration::new(*gate.registration.x_wt());
-    Ok(Task::Answer(Box::new(AnswerSettings {
+    Ok(Operation::Answer(Box::new(AnswerSettings {
         gate: Gate { registration, workspace: None, ..gate },
         axis: config.plane.to_pose().rotation * Vector3::z(),
         turn: jog_move(config, Axis::Rotation, Goal::By(HANDEDNESS_TURN_DEG.to_radians())),
     })))
 }
 
-/// Where a jog ends.
-fn goal(
+/// The goal of a jog.
+fn jog_goal(
     stage: &StageConfig,
     axis: Axis,
     by: Option<Distance>,
@@ -432,7 +432,11 @@ fn jog_move(config: &Config, axis: Axis, goal: Goal) -> Move {
 }
 
 /// The move that withdraws the needle: by a distance, or to depth 0, which only an axis with a configured zero has.
-fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Result<Move, Failure> {
+fn withdrawal_move(
+    config: &Config,
+    stage: &StageConfig,
+    by: Option<Distance>,
+) -> Result<Move, Failure> {
     let insertion = &config.stage.insertion;
     let along = |by: Distance| by.nonzero_along(Axis::Insertion, stage.insertion.ratio);
     let goal = match by.map(along).transpose().map_err(Failure::configuration)? {

@@ -196,7 +196,7 @@ struct Watch {
 }
 
 impl Watch {
-    /// Positions are on the bench where the tracker is registered, else in the tracker's own frame.
+    /// Positions are in the bench frame if the tracker is registered, else in the tracker's own frame.
     fn new(tracker: &TrackerConfig) -> Self {
         let registered = tracker.to_gate().ok();
         let frame = if registered.is_some() { "bench" } else { "tracker, not registered" };

@@ -100,7 +100,7 @@ const ANY_STAGE: (&str, &str) =
     ("no configuration", "can.interface = \"vcan0\"\ntracker.source = \"openigtlink\"\n");
 const NO_TRACKER: &str = "give --config my-rig.toml, or --set 'tracker.address=\"HOST:PORT\"'";
 
-/// An open stream, and what came over it.
+/// An open stream of a tracker, without a run.
 pub(super) struct Listener {
     pub(super) config: Config,
     clock: Clock,
