@@ -104,7 +104,7 @@ pub(super) fn after_insertion(
         return report.outcome.stop_reason().map(|_| next_review(report));
     }
     let inserted_mm = report.figures.report().insertion_mm;
-    let next = match (required(config, &report.stage_at_end), withdrawal(config, report)) {
+    let next = match (required(config, &report.stage_at_end), possible_withdrawal(config, report)) {
         (Some(required), _) => next_stage(required.operation(), path, report),
         (None, Err(_)) => next_review(report),
         (None, Ok(withdrawal)) => next_stage("withdraw", path, report) + &withdrawal.options(),
@@ -262,7 +262,10 @@ impl fmt::Display for Withdrawal {
 ///
 /// # Errors
 /// Why the needle is not withdrawn, in a few words.
-pub(super) fn withdrawal(config: &Config, report: &RunReport) -> Result<Withdrawal, String> {
+pub(super) fn possible_withdrawal(
+    config: &Config,
+    report: &RunReport,
+) -> Result<Withdrawal, String> {
     let inserted_mm = report.figures.report().insertion_mm;
     if inserted_mm <= config.insertion.arrival_mm {
         return Err(format!("the needle is out, at {inserted_mm:.2} mm"));
@@ -369,10 +372,10 @@ mod tests {
     fn a_needle_is_withdrawn_after_a_stop_as_after_a_completed_run() {
         let real = config(&[]);
         assert_eq!(
-            withdrawal(&real, &stopped(5.0, stood())),
+            possible_withdrawal(&real, &stopped(5.0, stood())),
             Ok(Withdrawal::from_depth(&real, 5.0))
         );
-        let out = withdrawal(&real, &stopped(0.01, stood()));
+        let out = possible_withdrawal(&real, &stopped(0.01, stood()));
         assert_eq!(out.unwrap_err(), "the needle is out, at 0.01 mm");
         let said = after_insertion(&real, Some(Path::new(RIG)), &stopped(5.0, stood())).unwrap();
         assert!(
@@ -389,7 +392,7 @@ mod tests {
         let real = config(&[]);
         let unknown = Some("the axes were not seen to stand");
         let stopped = stopped(5.0, StageAtEnd { unknown, ..in_fault() });
-        let why = withdrawal(&real, &stopped).unwrap_err();
+        let why = possible_withdrawal(&real, &stopped).unwrap_err();
         assert_eq!(why, "the drives are not known to stand; look at the stage");
         let path = Some(Path::new(RIG));
         for said in [
@@ -411,7 +414,7 @@ mod tests {
              heartbeat or life guard lost)\n\
              next        needle-bench stage reset rig.toml"
         );
-        let why = withdrawal(&real, &stopped).unwrap_err();
+        let why = possible_withdrawal(&real, &stopped).unwrap_err();
         assert_eq!(why, "a drive is in fault: find why, then stage reset");
         let resets = config(&["stage.fault_reset_on_start=true"]);
         let said = after_insertion(&resets, Some(Path::new(RIG)), &stopped).unwrap();

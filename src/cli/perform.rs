@@ -2,7 +2,7 @@
 
 use super::arguments::{About, RealTimeArguments};
 use super::console::Console;
-use super::ending::{record_error, withdrawal};
+use super::ending::{possible_withdrawal, record_error};
 use super::mask::mask_reader;
 use super::operator::Terminal;
 use super::output::print_stderr;
@@ -86,10 +86,11 @@ impl Job<'_> {
         let performed = if self.options.console {
             let mut console = Console::open(self.config, interrupt.clone())?;
             let performed = self.run_and_complete(&mut console, &runtime, &interrupt);
-            let withdrawal = performed.as_ref().map(|Performed { report, .. }| {
-                withdrawal(self.config, report).map(|withdrawal| withdrawal.to_string())
+            let withdrawal = performed.as_ref().ok().map(|performed| {
+                let possible = possible_withdrawal(self.config, &performed.report);
+                possible.map(|withdrawal| withdrawal.to_string())
             });
-            let wants_withdrawal = console.finish(withdrawal.ok());
+            let wants_withdrawal = console.finish(withdrawal);
             performed.map(|performed| Performed { wants_withdrawal, ..performed })
         } else {
             let quiet = self.options.quiet;
@@ -132,7 +133,7 @@ impl Job<'_> {
             let stage = VirtualStage::new(config.virtual_stage()?, Time::ZERO);
             let (tool, target) = (config.tracker.tool.clone(), config.goal.tool.clone());
             let emulated = TipSource::Emulated { tool, target };
-            let tips = match self.records_tracker() {
+            let tips = match self.receives_tracker() {
                 true => Some(
                     load_replay(&config.tracker, Time::ZERO)?.map_or(emulated, TipSource::Recorded),
                 ),
@@ -167,9 +168,9 @@ impl Job<'_> {
         }
     }
 
-    /// Whether the session receives the tracker's stream. An operation that does not need it receives a live
-    /// stream all the same, for the record.
-    fn records_tracker(&self) -> bool {
+    /// True if the session receives the tracker's stream. An operation that does not need the tracker still
+    /// receives a live stream, for the record.
+    fn receives_tracker(&self) -> bool {
         let tracker = &self.config.tracker;
         self.needs_tracker() || (tracker.file.is_none() && !tracker.is_standard_input())
     }
@@ -177,7 +178,7 @@ impl Job<'_> {
     /// The stream of the tracker's tool, if the session receives one.
     fn open_tracker(&self, runtime: &Runtime, clock: Clock) -> Result<Option<Link>, Failure> {
         let is_emulated = self.config.tip_source() == TrackerSource::Emulated;
-        if !self.records_tracker() || (is_emulated && !self.needs_tracker()) {
+        if !self.receives_tracker() || (is_emulated && !self.needs_tracker()) {
             return Ok(None);
         }
         match open_tracker(self.config, runtime, clock) {

@@ -2,7 +2,9 @@
 
 use super::arguments::{About, Configured, RealTimeArguments, parse_seed};
 use super::console::Console;
-use super::ending::{after_insertion, ending, plan_status, plane_missed_by_mm, status, withdrawal};
+use super::ending::{
+    after_insertion, ending, plan_status, plane_missed_by_mm, possible_withdrawal, status,
+};
 use super::mask::{file_crc32, mask_reader};
 use super::output::{merged, print_result, print_stderr};
 use super::perform::{Job, LIVE_ADDRESS, Options, Performed, end_json};
@@ -101,7 +103,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), Failure> {
     let more = screen_values(&config, configured.whole_path(), &report);
     print_result(arguments.json, &object, || screen(include_str!("run.txt"), &object, more))?;
     let mut worst = status(&config, &report);
-    if wants_withdrawal && let Ok(withdrawal) = withdrawal(&config, &report) {
+    if wants_withdrawal && let Ok(withdrawal) = possible_withdrawal(&config, &report) {
         let config = withdrawal.configuration(config, &report);
         let command = format!("withdraw{}", withdrawal.by_option());
         let (report, summary) = stage::perform(&config, &command, withdrawal_options)?;
