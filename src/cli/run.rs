@@ -62,7 +62,8 @@ pub(super) struct Arguments {
 
 pub(super) fn run(arguments: &Arguments) -> Result<(), Failure> {
     if arguments.console {
-        Console::keys()?;
+        // Refused before anything is checked.
+        Console::open_keys()?;
     }
     let configured = arguments.configured.clone().rehearsed(arguments.rehearse);
     let (mut config, _) = configured.load_with_warnings()?;

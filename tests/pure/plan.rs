@@ -82,7 +82,8 @@ fn the_reserve_of_a_run_is_said() {
     let (_, json) = plan(&scratch, BALL, &[]);
     assert_eq!((&json["run_reserve_mm"], &json["run_refusal"]), (&2.0.into(), &Value::Null));
     let said = needle_bench(&scratch, &["plan", "goal.toml"]);
-    let begins = "\nrun         begins with a path that keeps 2.00 mm more than goal.clearance_mm\n";
+    let begins =
+        "\nrun         begins with a path that keeps 2.00 mm more than goal.clearance_mm\n";
     assert!(said.stdout.contains(begins), "{}", said.stdout);
     // No needle keeps 40 mm from a ball on its axis.
     let reserve = ["--set", "goal.reserve_mm=40"];

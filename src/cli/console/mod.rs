@@ -79,10 +79,13 @@ struct Shared {
     /// The operator has asked for a hold. A hold overtakes every other command.
     hold: AtomicBool,
     dropped: AtomicU64,
+    /// The run has ended.
     is_over: AtomicBool,
+    /// The operator leaves the screen, which stays after the run.
     is_leaving: AtomicBool,
     /// The operator has asked for the withdrawal of the needle.
     wants_withdrawal: AtomicBool,
+    /// The console's threads must end.
     is_closing: AtomicBool,
     interrupt: Interrupt,
 }
@@ -114,7 +117,7 @@ impl Console {
     ///
     /// # Errors
     /// There is no terminal.
-    pub(super) fn keys() -> Result<File, Failure> {
+    pub(super) fn open_keys() -> Result<File, Failure> {
         let keys = File::open("/dev/tty").ok().filter(|_| stderr().is_terminal());
         keys.ok_or_else(|| {
             Failure::configuration(
@@ -125,7 +128,7 @@ impl Console {
 
     /// Takes the terminal for a run of `config`. Ctrl-C and q raise `interrupt`.
     pub(super) fn open(config: &Config, interrupt: Interrupt) -> Result<Self, Failure> {
-        let keys = Console::keys()?;
+        let keys = Console::open_keys()?;
         let shared = Arc::new(Shared::new(Setup::of(config), interrupt));
         let terminal = take_terminal()?;
         let (messages, mut queue) = RingBuffer::new(QUEUE);
