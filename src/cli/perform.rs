@@ -21,7 +21,7 @@ use crate::runtime::{
     Clock, DriveOutcome, EmulationReport, Interrupt, Moment, Operator, Pace, RealTime, RunReport,
     Sink, TipSource, complete_record, run_live, run_virtual,
 };
-use crate::session::Done;
+use crate::session::AxisMove;
 use crate::telemetry::{Backpressure, Recorder, Scene, check_room, utc_text};
 use crate::transport::can::CanBus;
 use crate::transport::link::Link;
@@ -65,7 +65,7 @@ pub(super) struct Options {
 pub(super) struct Performed {
     pub(super) report: RunReport,
     /// How far the axes of an operation went.
-    pub(super) done: Vec<Done>,
+    pub(super) done: Vec<AxisMove>,
     /// The operator has asked for the withdrawal of the needle.
     pub(super) wants_withdrawal: bool,
 }
@@ -122,7 +122,7 @@ impl Job<'_> {
         operator: &mut dyn Operator,
         runtime: &Runtime,
         interrupt: &Interrupt,
-    ) -> Result<(RunReport, Vec<Done>), Failure> {
+    ) -> Result<(RunReport, Vec<AxisMove>), Failure> {
         let config = self.config;
         let stops_on_record_failure = config.record.on_failure == OnFailure::Stop;
         let begin = |now| self.plan.clone().begin(now).map_err(Failure::configuration);
@@ -144,7 +144,7 @@ impl Job<'_> {
             let mut session = begin(Time::ZERO)?;
             let pace = paced.then(Pace::begin);
             let report = run_virtual(&mut session, stage, tips, pace, sink);
-            return Ok((report, session.done().to_vec()));
+            return Ok((report, session.moves().to_vec()));
         }
         realtime.check_permission()?;
         let mut bus = open_stage_bus(config)?;
@@ -158,7 +158,7 @@ impl Job<'_> {
         let (bus, tips) = (bus.as_mut(), tracker.as_mut());
         let report = run_live(&mut session, bus, tips, clock, realtime, sink);
         drop(tracker);
-        Ok((report, session.done().to_vec()))
+        Ok((report, session.moves().to_vec()))
     }
 
     fn needs_tracker(&self) -> bool {

@@ -1,6 +1,6 @@
 //! The drives find their home, one axis after the other.
 
-use crate::session::{Done, Record, Shell, State, Task};
+use crate::session::{AxisMove, Record, Shell, State, Task};
 use crate::stage::{Axis, AxisLimits, PerAxis, StageConfig, StageEvent};
 use std::collections::VecDeque;
 
@@ -10,7 +10,7 @@ pub(super) struct Homing {
     limits: PerAxis<AxisLimits>,
     /// The axes still to be homed, the one that is being homed first.
     left: VecDeque<Axis>,
-    done: Vec<Done>,
+    moves: Vec<AxisMove>,
 }
 
 impl Homing {
@@ -18,7 +18,7 @@ impl Homing {
         Homing {
             limits: PerAxis::from_fn(|axis| config.axis(axis).limits),
             left: Axis::BOTH.into_iter().filter(|axis| axes[*axis]).collect(),
-            done: Vec::new(),
+            moves: Vec::new(),
         }
     }
 
@@ -54,7 +54,7 @@ impl Task for Homing {
                 self.home_next(shell)
             }
             StageEvent::Homed { axis, position } => {
-                self.done.push(Done { axis, from: None, to: position });
+                self.moves.push(AxisMove { axis, from: None, to: position });
                 self.check_home(axis, position)?;
                 self.left.pop_front();
                 self.home_next(shell)
@@ -67,7 +67,7 @@ impl Task for Homing {
         }
     }
 
-    fn done(&self) -> &[Done] {
-        &self.done
+    fn moves(&self) -> &[AxisMove] {
+        &self.moves
     }
 }

@@ -1,6 +1,6 @@
 //! One axis on its way, the other held.
 
-use crate::session::{Done, Profile, Record, Shell, State, Task};
+use crate::session::{AxisMove, Profile, Record, Shell, State, Task};
 use crate::stage::{Axis, Feedback, SetPoint, StageConfig, StageEvent};
 use crate::units::Time;
 use std::time::Duration;
@@ -128,12 +128,12 @@ pub(super) struct MoveOneAxis {
     way: Move,
     sync_period: Duration,
     moving: Option<Moving>,
-    done: Vec<Done>,
+    moves: Vec<AxisMove>,
 }
 
 impl MoveOneAxis {
     pub(super) fn new(config: &StageConfig, way: Move) -> Self {
-        MoveOneAxis { way, sync_period: config.bus.sync_period(), moving: None, done: Vec::new() }
+        MoveOneAxis { way, sync_period: config.bus.sync_period(), moving: None, moves: Vec::new() }
     }
 
     /// The move from `at`; a goal out of the limits is refused.
@@ -150,7 +150,7 @@ impl MoveOneAxis {
             None => {
                 let moving = self.from(shell, feedback.commanded)?;
                 let (axis, from) = (self.way.axis, feedback.commanded.along(self.way.axis));
-                self.done.push(Done { axis, from: Some(from), to: from });
+                self.moves.push(AxisMove { axis, from: Some(from), to: from });
                 shell.state(State::Moving);
                 moving
             }
@@ -172,8 +172,8 @@ impl Task for MoveOneAxis {
             StageEvent::Located(at) => self.from(shell, *at).map(drop),
             StageEvent::Feedback(feedback) => {
                 shell.record(Record::Stage(*feedback));
-                if let Some(done) = self.done.last_mut() {
-                    done.to = feedback.measured.along(done.axis);
+                if let Some(moved) = self.moves.last_mut() {
+                    moved.to = feedback.measured.along(moved.axis);
                 }
                 match shell.is_running() {
                     true => self.go_on(shell, feedback),
@@ -184,7 +184,7 @@ impl Task for MoveOneAxis {
         }
     }
 
-    fn done(&self) -> &[Done] {
-        &self.done
+    fn moves(&self) -> &[AxisMove] {
+        &self.moves
     }
 }

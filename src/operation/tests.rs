@@ -165,9 +165,9 @@ fn a_jog_moves_its_axis_and_no_other() {
         let (insertion_mm, rotation_rad) = bench.travel();
         assert!((insertion_mm - expected.0).abs() < 2e-4, "{insertion_mm}");
         assert!((rotation_rad - expected.1).abs() < 2e-4, "{rotation_rad}");
-        let [done] = bench.operation.done() else { panic!("one move") };
-        let moved = done.to - done.from.expect("it began somewhere");
-        assert!((moved - distance).abs() < 2e-4, "{done:?}");
+        let [moved] = bench.operation.moves() else { panic!("one move") };
+        let distance_moved = moved.to - moved.from.expect("it began somewhere");
+        assert!((distance_moved - distance).abs() < 2e-4, "{moved:?}");
     }
 }
 
@@ -290,9 +290,10 @@ fn homing_finds_the_switch_and_ends_without_power() {
     let (insertion_mm, rotation_rad) = bench.travel();
     assert!((insertion_mm + 1.8).abs() < 1e-3, "{insertion_mm}");
     assert_eq!(rotation_rad, 0.0);
-    let done: Vec<_> = bench.operation.done().iter().map(|done| (done.axis, done.from)).collect();
-    assert_eq!(done, [(Axis::Insertion, None), (Axis::Rotation, None)]);
-    assert_eq!(bench.operation.done()[0].to, 0.0);
+    let moves: Vec<_> =
+        bench.operation.moves().iter().map(|moved| (moved.axis, moved.from)).collect();
+    assert_eq!(moves, [(Axis::Insertion, None), (Axis::Rotation, None)]);
+    assert_eq!(bench.operation.moves()[0].to, 0.0);
 
     // Homed, it may be moved by who asks for that; the drive itself remembers.
     let needs_home =

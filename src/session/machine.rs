@@ -99,14 +99,14 @@ pub struct Progress {
     pub syncs_skipped: u64,
 }
 
-/// What an axis has done in an operation.
+/// The move of one axis in an operation.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Done {
+pub struct AxisMove {
     /// Which axis.
     pub axis: Axis,
-    /// Where it began, mm or rad; `None` before it was homed.
+    /// Position at the start, mm or rad; `None` if the axis was not homed.
     pub from: Option<f64>,
-    /// Where it stood last, mm or rad.
+    /// Last position, mm or rad.
     pub to: f64,
 }
 
@@ -188,9 +188,9 @@ impl Session {
         session
     }
 
-    /// Where the axes went, of an operation.
-    pub fn done(&self) -> &[Done] {
-        self.task.done()
+    /// The moves of an operation, one for each axis that moved.
+    pub fn moves(&self) -> &[AxisMove] {
+        self.task.moves()
     }
 
     fn permit_power(&mut self) {

@@ -1,7 +1,7 @@
 //! What a run is for: the part of it that differs from task to task.
 
 use super::shell::Shell;
-use super::{Done, Lane, OperatorCommand, Progress, Record, SampleRecord, tracker_news};
+use super::{AxisMove, Lane, OperatorCommand, Progress, Record, SampleRecord, tracker_news};
 use crate::canopen::Frame;
 use crate::stage::StageEvent;
 use crate::tracker::{Event, GateCounts};
@@ -89,8 +89,8 @@ pub(crate) trait Task {
         GateCounts::default()
     }
 
-    /// Where the axes went, of a task that moves one after the other.
-    fn done(&self) -> &[Done] {
+    /// The moves so far, of a task that moves one axis after the other.
+    fn moves(&self) -> &[AxisMove] {
         &[]
     }
 }

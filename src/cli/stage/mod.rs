@@ -16,7 +16,7 @@ use super::stop::stop;
 use crate::archive::Manifest;
 use crate::config::{CanInterface, Config};
 use crate::operation::{AnswerSettings, Goal, Move, Operation, OperationConfig};
-use crate::session::Done;
+use crate::session::AxisMove;
 use crate::stage::{Axis, StageConfig};
 use crate::tracker::{Gate, Registration};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
@@ -201,7 +201,7 @@ impl Motion {
 
     /// The options of the `stage withdraw` that finishes this withdrawal after it went as far as `done`. `None` if
     /// nothing remains, if the limit `min_mm` would refuse the remainder, and for another motion.
-    fn remaining(&self, done: &[Done], min_mm: f64) -> Option<String> {
+    fn remaining(&self, done: &[AxisMove], min_mm: f64) -> Option<String> {
         let Motion::Withdraw { by, .. } = self else { return None };
         let Some(by_mm) = by.and_then(|by| by.along(Axis::Insertion).ok()) else {
             return Some(String::new());
@@ -478,7 +478,7 @@ mod tests {
     #[test]
     fn the_rest_of_a_withdrawal_is_what_was_asked_for_and_not_done() {
         let rest = |line: &str, to: f64| {
-            let done = Done { axis: Axis::Insertion, from: Some(30.0), to };
+            let done = AxisMove { axis: Axis::Insertion, from: Some(30.0), to };
             Motion::of(line).unwrap().remaining(&[done], -1.0)
         };
         assert_eq!(rest("withdraw --by 20mm", 24.5).as_deref(), Some(" --by 14.5mm"));

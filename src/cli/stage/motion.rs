@@ -8,7 +8,7 @@ use crate::cli::perform::{Job, Options, Performed, end_json};
 use crate::cli::{Failure, finish_with};
 use crate::config::Config;
 use crate::runtime::RunReport;
-use crate::session::Done;
+use crate::session::AxisMove;
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -53,8 +53,8 @@ fn job<'a>(config: &'a Config, motion: &'a Motion, options: Options) -> Result<J
     Ok(Job { config, plan, motion: Some(motion), options })
 }
 
-fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
-    let axis = |done: &Done| {
+fn to_json(name: &str, done: &[AxisMove], report: &RunReport) -> Value {
+    let axis = |done: &AxisMove| {
         let (to, unit) = done.axis.in_unit(done.to);
         let from = done.from.map(|from| done.axis.in_unit(from).0);
         let mut object = json!({ "axis": done.axis.to_string() });
@@ -80,10 +80,10 @@ fn summary(
     config: &Config,
     path: Option<&Path>,
     motion: &Motion,
-    done: &[Done],
+    done: &[AxisMove],
     report: &RunReport,
 ) -> String {
-    let line = |done: &Done| {
+    let line = |done: &AxisMove| {
         let (to, unit) = done.axis.in_unit(done.to);
         let axis = done.axis;
         match done.from.map(|from| axis.in_unit(from).0) {
