@@ -174,7 +174,7 @@ impl Answering {
         let back = Moving::new(Move { goal, ..turn }, feedback.commanded)?;
         self.leg = Leg::Returning(Box::new(back));
         match verdict {
-            Ok(text) => shell.event(Lane::Session, Severity::Info, text),
+            Ok(text) => shell.report(Lane::Session, Severity::Info, text),
             Err(reason) => self.failed = Some(reason),
         }
         Ok(())
@@ -245,7 +245,7 @@ impl Task for Answering {
             // Before the axes have power.
             StageEvent::Located(at) => shell.check_goal(self.settings.farthest(*at)),
             StageEvent::Ready => {
-                shell.state(State::TurningInAir);
+                shell.enter(State::TurningInAir);
                 Ok(())
             }
             StageEvent::Feedback(feedback) => {
@@ -261,7 +261,7 @@ impl Task for Answering {
 
     fn take_tracker_event(&mut self, shell: &mut Shell, event: Event) {
         if let Some((severity, text)) = tracker_news(&event) {
-            shell.event(Lane::Tracker, severity, text);
+            shell.report(Lane::Tracker, severity, text);
         }
         if let Event::Sample(sample) = event {
             self.take_sample(shell, sample);

@@ -50,7 +50,7 @@ impl Task for Homing {
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
         match *event {
             StageEvent::Ready => {
-                shell.state(State::Homing);
+                shell.enter(State::Homing);
                 self.home_next(shell)
             }
             StageEvent::Homed { axis, position } => {

@@ -151,7 +151,7 @@ impl MoveOneAxis {
                 let moving = self.from(shell, feedback.commanded)?;
                 let (axis, from) = (self.way.axis, feedback.commanded.along(self.way.axis));
                 self.moves.push(AxisMove { axis, from: Some(from), to: from });
-                shell.state(State::Moving);
+                shell.enter(State::Moving);
                 moving
             }
         };

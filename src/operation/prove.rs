@@ -99,7 +99,7 @@ impl Task for Prove {
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
         match event {
             StageEvent::Ready => {
-                shell.state(State::Silent);
+                shell.enter(State::Silent);
                 shell.fall_silent();
                 self.silence = Some(Silence::new(&self.config, shell.now));
             }
@@ -108,7 +108,7 @@ impl Task for Prove {
                     let after = shell.now.since(silence.since);
                     let after_ms = silence.noticed_after[*axis].get_or_insert(after).as_millis();
                     let text = format!("{axis}: noticed the bench's silence after {after_ms} ms");
-                    shell.event(Lane::Session, Severity::Info, text);
+                    shell.report(Lane::Session, Severity::Info, text);
                 }
             }
             StageEvent::Feedback(feedback) => shell.record(Record::Stage(*feedback)),
@@ -138,7 +138,7 @@ impl Task for Prove {
             None => Ok(()),
             Some(Err(reason)) => Err(reason),
             Some(Ok(proof)) => {
-                shell.event(Lane::Session, Severity::Info, proof);
+                shell.report(Lane::Session, Severity::Info, proof);
                 shell.complete_by_quick_stop();
                 Ok(())
             }

@@ -181,7 +181,7 @@ impl Session {
     pub(crate) fn begin(stage: Stage, config: StageConfig, task: Box<dyn Task>, now: Time) -> Self {
         let mut session = Session { shell: Shell::new(stage, config, now), task };
         session.shell.record(Record::Begun { time: now });
-        session.shell.state(State::Preparing);
+        session.shell.enter(State::Preparing);
         session.task.begin(&mut session.shell);
         session.permit_power();
         session.drain_stage();
@@ -230,7 +230,7 @@ impl Session {
             Ok(text) => (Severity::Info, format!("operator: {text}")),
             Err(why) => (Severity::Warning, format!("operator: {command} refused: {why}")),
         };
-        self.shell.event(Lane::Session, severity, text);
+        self.shell.report(Lane::Session, severity, text);
     }
 
     fn finish(&mut self, outcome: Outcome) {
@@ -262,7 +262,7 @@ impl Machine for Session {
                 self.task.take_frame(&self.shell, &frame);
             }
             Input::BusFault(reason) => self.shell.stop(format!("can: {reason}")),
-            Input::BusWarning(text) => self.shell.event(Lane::Stage, Severity::Warning, text),
+            Input::BusWarning(text) => self.shell.report(Lane::Stage, Severity::Warning, text),
             Input::Tracker(event) => self.task.take_tracker_event(&mut self.shell, event),
             Input::Stop(reason) => self.shell.stop(reason),
             Input::Operator(command) => self.take_operator(command),

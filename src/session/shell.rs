@@ -83,13 +83,13 @@ impl Shell {
         self.outputs.push_back(Output::Record(record));
     }
 
-    /// Records that a part of the bench is in `state`, unless it was before.
-    pub(crate) fn state(&mut self, state: State) {
-        self.state_at(self.now, state);
+    /// Records that a part of the bench enters `state`, unless it is in that state already.
+    pub(crate) fn enter(&mut self, state: State) {
+        self.enter_at(self.now, state);
     }
 
-    /// The same, of an earlier moment.
-    pub(crate) fn state_at(&mut self, time: Time, state: State) {
+    /// As [`Shell::enter`], at `time`.
+    pub(crate) fn enter_at(&mut self, time: Time, state: State) {
         if self.states.insert(state.lane(), state) != Some(state) {
             self.record(Record::State { time, state });
         }
@@ -100,12 +100,13 @@ impl Shell {
         self.states.get(&Lane::Session).copied().unwrap_or_default()
     }
 
-    pub(crate) fn event(&mut self, lane: Lane, severity: Severity, text: String) {
-        self.event_at(self.now, lane, severity, text);
+    /// Records an event, which the operator sees.
+    pub(crate) fn report(&mut self, lane: Lane, severity: Severity, text: String) {
+        self.report_at(self.now, lane, severity, text);
     }
 
-    /// The same, of an earlier moment.
-    pub(crate) fn event_at(&mut self, time: Time, lane: Lane, severity: Severity, text: String) {
+    /// As [`Shell::report`], at `time`.
+    pub(crate) fn report_at(&mut self, time: Time, lane: Lane, severity: Severity, text: String) {
         self.record(Record::Event { time, lane, severity, text });
     }
 
@@ -184,14 +185,14 @@ impl Shell {
             return;
         }
         if let Some((severity, text)) = news(event) {
-            self.event(Lane::Stage, severity, text);
+            self.report(Lane::Stage, severity, text);
         }
         match event {
             StageEvent::Progress(Progress::Enabling) => self.power = Power::ComingOn,
             StageEvent::Located(_) => self.power = Power::Awaited(self.now),
             StageEvent::Ready => {
                 self.power = Power::On(self.now);
-                self.state(State::Enabled);
+                self.enter(State::Enabled);
             }
             StageEvent::Identity(axis, identity) => {
                 let (axis, identity) = (*axis, *identity);
@@ -214,12 +215,12 @@ impl Shell {
             Phase::Over(_) | Phase::Stopping { outcome: Outcome::Stopped(_), .. } => {
                 // A bus that is down reports it at every frame.
                 if self.then.len() < THEN_MAX && !self.then.contains(&reason) {
-                    self.event(Lane::Session, Severity::Warning, format!("then: {reason}"));
+                    self.report(Lane::Session, Severity::Warning, format!("then: {reason}"));
                     self.then.push(reason);
                 }
             }
             Phase::Running | Phase::Stopping { outcome: Outcome::Completed, .. } => {
-                self.event(Lane::Session, Severity::Fault, reason.clone());
+                self.report(Lane::Session, Severity::Fault, reason.clone());
                 self.stage.quick_stop(self.now);
                 self.begin_stopping(Outcome::Stopped(reason));
             }
@@ -248,7 +249,7 @@ impl Shell {
     fn begin_stopping(&mut self, outcome: Outcome) {
         self.stopped_with_power |= self.had_power();
         self.phase = Phase::Stopping { outcome, since: self.now };
-        self.state(State::Stopping);
+        self.enter(State::Stopping);
     }
 
     /// The longest a stop may take by the stage's own timeouts, and a margin.
@@ -270,7 +271,7 @@ impl Shell {
     /// The outcome once the stage has done what it can to take power off. A run whose drives may still
     /// have power is not completed.
     pub(super) fn outcome_of_stop(&mut self, standing: bool, off: bool) -> Outcome {
-        self.state(State::PowerOff);
+        self.enter(State::PowerOff);
         let unknown = self.tell_left_unknown(standing, off);
         match (&self.phase, unknown) {
             (Phase::Stopping { outcome: Outcome::Completed, .. }, Some(text)) if !off => {
@@ -284,7 +285,7 @@ impl Shell {
     /// Reports what a stop has left unknown of drives that had power.
     fn tell_left_unknown(&mut self, standing: bool, off: bool) -> Option<&'static str> {
         let unknown = left_unknown(standing, off).filter(|_| self.had_power())?;
-        self.event(Lane::Stage, Severity::Warning, unknown.to_owned());
+        self.report(Lane::Stage, Severity::Warning, unknown.to_owned());
         self.left_unknown = Some(unknown);
         Some(unknown)
     }
@@ -330,7 +331,7 @@ impl Shell {
             Outcome::Completed => State::Completed,
             Outcome::Stopped(_) => State::Stopped,
         };
-        self.state(state);
+        self.enter(state);
         self.phase = Phase::Over(outcome);
     }
 

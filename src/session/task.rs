@@ -33,7 +33,7 @@ pub(crate) trait Task {
             return;
         }
         if let Some((severity, text)) = tracker_news(&event) {
-            shell.event(Lane::Tracker, severity, text);
+            shell.report(Lane::Tracker, severity, text);
         }
         if let Event::Sample(sample) = event {
             shell.record(Record::Sample(SampleRecord::received(sample)));

@@ -78,8 +78,8 @@ impl Insert {
                     ended.lasted.saturating_sub(now.since(ended.at))
                 });
                 self.hold = Some(Hold { since: now, before, by });
-                shell.state_at(now, State::Holding);
-                shell.event_at(now, Lane::Tracker, Severity::Warning, text);
+                shell.enter_at(now, State::Holding);
+                shell.report_at(now, Lane::Tracker, Severity::Warning, text);
             } else if insertion.profile.has_stepped() {
                 self.hold_after_step(shell, now, insertion);
             }
@@ -103,8 +103,8 @@ impl Insert {
             self.ended_hold = Some(EndedHold { at: now, lasted: held + hold.before });
             insertion.profile.release(None);
             self.hold = None;
-            shell.state_at(now, State::Inserting);
-            shell.event_at(now, Lane::Tracker, Severity::Info, text);
+            shell.enter_at(now, State::Inserting);
+            shell.report_at(now, Lane::Tracker, Severity::Info, text);
             return Ok(());
         }
         let began = (cause.clone(), why.clone());
@@ -127,9 +127,9 @@ impl Insert {
     fn hold_after_step(&mut self, shell: &mut Shell, now: Time, insertion: &mut Insertion) {
         insertion.profile.hold(self.config.tracker.hold.braking_mm_per_s2);
         self.hold = Some(Hold { since: now, before: Duration::ZERO, by: HeldBy::Step });
-        shell.state_at(now, State::HeldAfterStep);
+        shell.enter_at(now, State::HeldAfterStep);
         let text = format!("the step ends; held, {:.2} mm left", insertion.left_mm());
-        shell.event_at(now, Lane::Session, Severity::Info, text);
+        shell.report_at(now, Lane::Session, Severity::Info, text);
     }
 
     /// Holds the insertion; one that has not begun will begin held.
@@ -146,7 +146,7 @@ impl Insert {
             return Ok("hold: the insertion will begin held".to_owned());
         };
         insertion.profile.hold(self.config.tracker.hold.braking_mm_per_s2);
-        shell.state(State::HeldByOperator);
+        shell.enter(State::HeldByOperator);
         Ok(format!("hold at {:.2} mm", self.progress.insertion_meas_mm))
     }
 
@@ -201,7 +201,7 @@ impl Insert {
         if let Some(insertion) = &mut self.insertion {
             insertion.profile.release(step_mm);
         }
-        shell.state(if step_mm.is_some() { State::Stepping } else { State::Inserting });
+        shell.enter(if step_mm.is_some() { State::Stepping } else { State::Inserting });
         let what = step_mm.map_or("resume".to_owned(), |mm| format!("step of {mm} mm"));
         Ok(format!("{what} at {insertion_mm:.2} mm, held for {held_s:.2} s"))
     }

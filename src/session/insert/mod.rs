@@ -88,7 +88,7 @@ impl Insert {
     /// Everything the tracking has to record, and its state.
     fn drain_tracking(&mut self, shell: &mut Shell) {
         self.tracking.records.drain(..).for_each(|record| shell.record(record));
-        shell.state(self.tracking.state(shell.now));
+        shell.enter(self.tracking.state(shell.now));
     }
 
     /// Refuses an insertion that would run into a soft limit, before the axes have power.
@@ -143,7 +143,7 @@ impl Insert {
         let Err(why) = check_reach(&self.config, tip_mm) else { return Ok(()) };
         match self.config.insertion.plane_out_of_reach {
             PlaneOutOfReach::Insert => {
-                shell.event(Lane::Session, Severity::Warning, why);
+                shell.report(Lane::Session, Severity::Warning, why);
                 Ok(())
             }
             PlaneOutOfReach::Refuse => {
@@ -161,10 +161,10 @@ impl Insert {
         let (measured, held) = (feedback.measured, feedback.commanded);
         let mut insertion = Insertion::new(self.config.insertion, measured, held);
         match &self.hold {
-            None => shell.state(State::Inserting),
+            None => shell.enter(State::Inserting),
             Some(_) => {
                 insertion.profile.hold(self.config.tracker.hold.braking_mm_per_s2);
-                shell.state(State::HeldByOperator);
+                shell.enter(State::HeldByOperator);
             }
         }
         self.insertion = Some(insertion);
@@ -235,12 +235,12 @@ impl Insert {
             Some(estimate) if !estimate.is_roll_known() => State::RollUnknown,
             Some(_) => State::Estimating,
         };
-        shell.state_at(time, observer);
+        shell.enter_at(time, observer);
         self.progress.x_mm = estimate.map(|estimate| estimate.x_pb.translation.x);
         let rolled = estimate.filter(Estimate::is_roll_known);
         self.progress.roll_rad = rolled.map(|estimate| coordinates(&estimate.x_pb)[5]);
         let control = if command_saturated { State::Saturated } else { State::Steering };
-        shell.state_at(time, control);
+        shell.enter_at(time, control);
         shell.record(Record::Step(Box::new(StepRecord {
             step: due.step,
             time,
@@ -318,7 +318,7 @@ impl Task for Insert {
     }
 
     fn begin(&mut self, shell: &mut Shell) {
-        shell.state(State::AwaitingTip);
+        shell.enter(State::AwaitingTip);
     }
 
     /// The axes get power only while the tip is believed, from a start from which the plane can be
@@ -383,7 +383,7 @@ impl Task for Insert {
         }
         self.drain_tracking(shell);
         if let Some((severity, text)) = text {
-            shell.event(Lane::Tracker, severity, text);
+            shell.report(Lane::Tracker, severity, text);
         }
     }
 
