@@ -2,7 +2,7 @@
 
 use super::recorded::{Entries, Logged, Recorded};
 use crate::archive::{Inputs, RecordedInput, file, unix_us};
-use crate::session::{Direction, HELD_UP, Input};
+use crate::session::{Direction, Input, STALLED};
 use crate::tracker::ndjson;
 use crate::tracker::{Event, Sample};
 use crate::units::Time;
@@ -101,7 +101,7 @@ pub(super) fn unsent_unix_us(recorded: &Recorded<'_>) -> Result<Vec<i64>, String
         let (time, given) = input?;
         let is_fault = match given {
             RecordedInput::Input(Input::BusFault(_)) => true,
-            RecordedInput::Input(Input::Stop(reason)) => reason.starts_with(HELD_UP),
+            RecordedInput::Input(Input::Stop(reason)) => reason.starts_with(STALLED),
             _ => false,
         };
         unsent.extend(is_fault.then(|| unix_us(started_unix_us, time)));

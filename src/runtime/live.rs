@@ -5,7 +5,7 @@ use super::realtime::{RealTime, wake_in_time};
 use super::sink::{RunReport, Sink};
 use super::timing::{Clock, TimingFigures, TimingReport};
 use crate::canopen::{Frame, cob};
-use crate::session::{HELD_UP, Input, Machine, Record};
+use crate::session::{Input, Machine, Record, STALLED};
 use crate::transport::can::{BusEvent, CanBus, CanError};
 use crate::transport::link::Link;
 use crate::units::Time;
@@ -71,14 +71,14 @@ impl<'a, W: Witness> Live<'a, W> {
         }
     }
 
-    /// Gives `input`, which came at `at`, to the session. After a gap longer than [`Machine::silence_max`] the
+    /// Gives `input`, which came at `at`, to the session. After a gap longer than [`Machine::stall_max`] the
     /// session is told to stop first, so that it computes no set-point from the input.
     fn give_at(&mut self, at: Time, input: Input) {
         self.check_gap(self.session.deadline());
         self.handle(at.max(self.last), input);
     }
 
-    /// Tells the session to stop if [`Machine::silence_max`] has passed since `since`. Frames that it made before
+    /// Tells the session to stop if [`Machine::stall_max`] has passed since `since`. Frames that it made before
     /// and that were not sent yet are stale.
     fn check_gap(&mut self, since: Time) {
         let now = self.clock.now();
@@ -101,13 +101,13 @@ impl<'a, W: Witness> Live<'a, W> {
 
     /// Why a run ends after a `gap` in which the bench did nothing; `None` if it is short enough.
     fn held_up(&self, gap: Duration) -> Option<String> {
-        let max = self.session.silence_max().filter(|max| gap >= *max)?;
+        let max = self.session.stall_max().filter(|max| gap >= *max)?;
         let messages = self.tracker.as_ref().map_or(0, |link| link.messages() - self.counted);
         let cause = flood(messages, self.clock.now().since(self.looked)).unwrap_or_else(|| {
             "was the program suspended, or the machine busy? See --realtime".to_owned()
         });
         Some(format!(
-            "{HELD_UP}{} ms (limit {}, the drives' heartbeat time or tracker.hold_after_s), {cause}",
+            "{STALLED}{} ms (limit {}, the drives' heartbeat time or tracker.hold_after_s), {cause}",
             gap.as_millis(),
             max.as_millis()
         ))
@@ -195,7 +195,7 @@ impl<W: Witness> World for Live<'_, W> {
         self.give_at(self.clock.now(), input);
     }
 
-    /// A frame that was made before a gap longer than [`Machine::silence_max`] is never sent.
+    /// A frame that was made before a gap longer than [`Machine::stall_max`] is never sent.
     fn send(&mut self, made: Time, frame: &Frame) -> Result<bool, CanError> {
         self.check_gap(made);
         if self.stale_before.is_some_and(|before| made < before) {

@@ -14,9 +14,9 @@ use crate::units::Time;
 use derive_more::Display;
 use std::time::Duration;
 
-/// The reason begins with this if the runtime stops a run because the bench itself stalled for longer than
-/// [`Machine::silence_max`]. Frames that were made before the stall and not sent are never sent.
-pub const HELD_UP: &str = "bench: was held up for ";
+/// The stop reason begins with this if the bench itself stalled for longer than [`Machine::stall_max`]. The
+/// runtime then discards the frames that were made before the stall.
+pub const STALLED: &str = "bench: was held up for ";
 
 /// Something that reaches the session from outside.
 #[derive(Debug, Clone, PartialEq)]
@@ -134,10 +134,10 @@ pub trait Machine {
     /// Counts of what went wrong on the stage's bus without harm.
     fn stage_counters(&self) -> Counters;
 
-    /// The longest that the bench may stall, for whatever reason: the drives' heartbeat timeout, or during an
-    /// insertion the maximum age of the tip, if that is less; `None` before the drives are enabled and once
-    /// they are being stopped.
-    fn silence_max(&self) -> Option<Duration>;
+    /// The longest stall of the bench that a run survives: the drives' heartbeat timeout, or during an
+    /// insertion the maximum age of the tip position, if that is less. `None` before the drives are enabled
+    /// and while they are being stopped.
+    fn stall_max(&self) -> Option<Duration>;
 
     /// The state in which the run leaves the stage.
     fn stage_at_end(&self) -> StageAtEnd {
@@ -278,7 +278,7 @@ impl Machine for Session {
         let done = self.task.handle_timeout(&mut self.shell);
         self.shell.stop_on_error(done);
         self.drain_stage();
-        if let Some(outcome) = self.shell.outcome_of_silence() {
+        if let Some(outcome) = self.shell.outcome_of_timeout() {
             self.finish(outcome);
         }
     }
@@ -313,9 +313,9 @@ impl Machine for Session {
         self.shell.stage_at_end()
     }
 
-    fn silence_max(&self) -> Option<Duration> {
-        let max = self.shell.silence_max()?;
-        Some(self.task.blind_max().map_or(max, |blind| max.min(blind)))
+    fn stall_max(&self) -> Option<Duration> {
+        let max = self.shell.stall_max()?;
+        Some(self.task.tip_age_max().map_or(max, |tip_age_max| max.min(tip_age_max)))
     }
 
     fn gate_counts(&self) -> GateCounts {

@@ -31,7 +31,7 @@ pub use config::{
     TrackerConfig,
 };
 pub use goal::{Approach, Goal};
-pub use machine::{AxisMove, HELD_UP, Input, Machine, OperatorCommand, Output, Progress, Session};
+pub use machine::{AxisMove, Input, Machine, OperatorCommand, Output, Progress, STALLED, Session};
 pub use outcome::{Outcome, StageAtEnd};
 pub use peak::{PROFILE_PEAK, rotation_peak};
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StepRecord};

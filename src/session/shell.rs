@@ -165,11 +165,11 @@ impl Shell {
         self.stage.fall_silent();
     }
 
-    /// The drives' heartbeat timeout; `None` before they are enabled, once they are being stopped, and
-    /// while the bench is silent on purpose.
-    pub(super) fn silence_max(&self) -> Option<Duration> {
-        let is_missed = matches!(self.power, Power::On(_)) && self.is_running() && !self.is_silent;
-        is_missed.then_some(self.config.bus.heartbeat_timeout())
+    /// The drives' heartbeat timeout; `None` while they would not notice a stall: before they are enabled,
+    /// while they are being stopped, and while the bench is silent on purpose.
+    pub(super) fn stall_max(&self) -> Option<Duration> {
+        let is_noticed = matches!(self.power, Power::On(_)) && self.is_running() && !self.is_silent;
+        is_noticed.then_some(self.config.bus.heartbeat_timeout())
     }
 
     /// Records an event of the stage.
@@ -309,7 +309,7 @@ impl Shell {
     }
 
     /// The outcome if the stage has reported nothing for longer than a stop may take.
-    pub(super) fn outcome_of_silence(&mut self) -> Option<Outcome> {
+    pub(super) fn outcome_of_timeout(&mut self) -> Option<Outcome> {
         let timeout = self.stop_timeout();
         let Phase::Stopping { outcome, since } = &self.phase else { return None };
         if self.now < *since + timeout {

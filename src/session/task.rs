@@ -40,8 +40,8 @@ pub(crate) trait Task {
         }
     }
 
-    /// The longest that the task may go on without a new tip position; `None` if it needs none.
-    fn blind_max(&self) -> Option<Duration> {
+    /// The maximum age of the tip position during the task; `None` if the task needs no tip position.
+    fn tip_age_max(&self) -> Option<Duration> {
         None
     }
 

@@ -73,7 +73,7 @@ impl Machine for Late {
     fn stage_counters(&self) -> Counters {
         Counters::default()
     }
-    fn silence_max(&self) -> Option<Duration> {
+    fn stall_max(&self) -> Option<Duration> {
         self.0.is_none().then_some(Duration::from_millis(100))
     }
 }
@@ -122,7 +122,7 @@ fn nothing_is_given_to_a_session_before_it_was_made() {
         fn stage_counters(&self) -> Counters {
             Counters::default()
         }
-        fn silence_max(&self) -> Option<Duration> {
+        fn stall_max(&self) -> Option<Duration> {
             None
         }
     }
@@ -237,7 +237,7 @@ impl Machine for Answering {
     fn stage_counters(&self) -> Counters {
         Counters::default()
     }
-    fn silence_max(&self) -> Option<Duration> {
+    fn stall_max(&self) -> Option<Duration> {
         (self.outcome.is_none() && self.due_after == usize::MAX)
             .then_some(Duration::from_millis(50))
     }

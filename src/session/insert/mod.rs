@@ -313,7 +313,7 @@ impl Insert {
 }
 
 impl Task for Insert {
-    fn blind_max(&self) -> Option<Duration> {
+    fn tip_age_max(&self) -> Option<Duration> {
         Some(self.config.tracker.hold.after)
     }
 

@@ -179,7 +179,7 @@ fn a_bench_held_up_for_longer_than_a_tip_is_fresh_only_stops() {
         let timeout = format!("can.heartbeat_timeout_ms={timeout_ms}");
         let mut bench = Bench::new(configured(&["insertion.depth_mm=30", &timeout]));
         bench.run_to_mm(10.0);
-        assert_eq!(bench.session.silence_max(), Some(Duration::from_millis(max_ms)));
+        assert_eq!(bench.session.stall_max(), Some(Duration::from_millis(max_ms)));
     }
 }
 
