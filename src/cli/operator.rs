@@ -144,7 +144,8 @@ fn print(queue: &mut Consumer<String>, latest: &Latest, bar: &ProgressBar) {
 
 /// For example `inserting  123.4/250.0 mm  x -0.12 mm  roll 12°  tip 0.03 s  1:03 to go`.
 fn line(progress: &Progress) -> String {
-    let Progress { insertion_meas_mm, depth_mm, x_mm, roll_rad, tip_age_s, to_go_s, .. } = progress;
+    let Progress { insertion_meas_mm, depth_mm, x_mm, roll_rad, tip_age_s, remaining_s, .. } =
+        progress;
     let state = match progress.state {
         State::Holding => "held by tracker",
         state => state.as_str(),
@@ -153,7 +154,7 @@ fn line(progress: &Progress) -> String {
     let x = known(x_mm.map(|mm| format!("{mm:.2} mm")));
     let roll = known(roll_rad.map(|rad| format!("{:.0}°", rad.to_degrees())));
     let age = known(tip_age_s.map(|age_s| format!("{age_s:.2} s")));
-    let to_go = known(to_go_s.map(minutes));
+    let to_go = known(remaining_s.map(minutes));
     format!(
         "{state}  {insertion_meas_mm:.1}/{depth_mm:.1} mm  x {x}  roll {roll}  tip {age}  {to_go} to go"
     )
@@ -172,7 +173,7 @@ mod tests {
             x_mm: Some(-0.123),
             roll_rad: Some(0.2),
             tip_age_s: Some(0.031),
-            to_go_s: Some(63.2),
+            remaining_s: Some(63.2),
             ..Progress::default()
         };
         let shown = "inserting  123.4/250.0 mm  x -0.12 mm  roll 11°  tip 0.03 s  1:03 to go";

@@ -25,7 +25,7 @@ pub struct SessionConfig {
     pub needle_torsion: Torsion,
     /// The observer that steers.
     pub observer: ObserverConfig,
-    /// Settings of the watch over the stream's handedness.
+    /// Settings of the handedness watch.
     pub handedness: InvariantConfig,
     /// Observers that run alongside on the same measurements and never steer.
     pub shadows: Vec<ObserverConfig>,
@@ -40,7 +40,7 @@ pub struct SessionConfig {
 }
 
 impl SessionConfig {
-    /// Checks what [`Session::new`](super::Session::new) would refuse, before a run folder is made.
+    /// Checks the configuration as [`Session::new`](super::Session::new) does, before a run folder is made.
     ///
     /// # Errors
     /// As [`Session::new`](super::Session::new).
@@ -52,8 +52,8 @@ impl SessionConfig {
         self.stage.validate().map_err(|error| format!("stage: {error}"))
     }
 
-    /// Whether the depth suffices to reach the plane from a tip at `tip_mm` in the plane frame, and a path
-    /// leads from there to the target.
+    /// Checks that the depth suffices to reach the plane from a tip at `tip_mm`, plane frame, and that a path leads
+    /// from there to the target, if there is one.
     ///
     /// # Errors
     /// Why not, with its numbers.
@@ -127,15 +127,15 @@ choice! {
 /// The tracker stream.
 #[derive(Debug, Clone)]
 pub struct TrackerConfig {
-    /// What a sample must pass by itself; registration and tool name are in it.
+    /// The gate that judges a sample by itself. It holds the registration and the tool's name.
     pub gate: Gate,
-    /// A stream that as a whole contradicts the insertion ends the run.
+    /// The run ends if the stream as a whole contradicts the insertion.
     pub judges_stream: bool,
-    /// Dates samples.
+    /// Determines the acquisition time of samples.
     pub clock: AcquisitionClock,
-    /// What a position must pass against the others and the model.
+    /// Settings of the track, which judges a position against the others and the model.
     pub track: TrackSettings,
-    /// The noise of the positions, where it is known.
+    /// The noise of the positions, if it is known.
     pub noise: Option<PositionNoise>,
     /// How long to wait for the tool before giving up.
     pub timeout: Duration,

@@ -1,4 +1,4 @@
-//! One insertion under way: which step is next, and where the set-point is.
+//! The state of an insertion: which step is next, and where the set-point is.
 
 use super::config::{InsertionConfig, InsertionMode, Samples};
 use super::estimation::Measurement;
@@ -9,16 +9,16 @@ use crate::units::Time;
 use nalgebra::Vector3;
 use std::time::Duration;
 
-/// A step is due when the measured depth is this near to its depth, mm: an encoder has whole counts.
+/// A step is due when the measured depth is within this distance of its depth, mm: encoder counts are discrete.
 const DUE_TOLERANCE_MM: f64 = 1e-3;
 /// Time after the last set-point from which a position within `insertion.arrival_mm` counts as arrived.
 const ARRIVAL_PATIENCE: Duration = Duration::from_millis(300);
 /// Time after the last set-point by which the axis must be within its arrival tolerance.
 const ARRIVAL_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Where a stepwise insertion is within its step.
+/// The phase of a step of a stepwise insertion.
 #[derive(Debug, Clone)]
-enum Pause {
+enum StepPhase {
     Moving,
     Settling { since: Time },
     Sampling { from: Time, sum_mm: Vector3<f64>, count: u32 },
@@ -32,25 +32,25 @@ pub(crate) struct Insertion {
     config: InsertionConfig,
     origin_meas: SetPoint,
     origin_cmd: SetPoint,
-    /// The commanded depth; a hold brakes it, and rotation stands with it.
+    /// The commanded depth. A hold brakes it, and the rotation stops with it.
     pub(super) profile: Profile,
     /// Set-point at which the present rotation rate was commanded.
     anchor: SetPoint,
     rotation_cmd_rad_per_mm: f64,
     next_step: u32,
     last_step: u32,
-    /// The insertion never ends deeper.
+    /// The configured depth. A target may end the insertion sooner, never deeper.
     depth_max_mm: f64,
-    pause: Pause,
-    /// The newest position, to be taken at the next step.
+    step_phase: StepPhase,
+    /// The newest position, which the next step uses.
     newest: Option<Measurement>,
     /// The tip was seen since the insertion began.
     is_seen: bool,
-    /// Since when the set-points have been at their end while the measured depth has not.
+    /// Since when the set-points have been at their end while the measured depth is still short of it.
     short_since: Option<Time>,
 }
 
-/// A step that is due, with the measurement that it takes.
+/// A step that is due, with the measurement that it uses.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct DueStep {
     pub(crate) step: u32,
@@ -59,7 +59,7 @@ pub(crate) struct DueStep {
 }
 
 impl Insertion {
-    /// An insertion from the stage's `measured` position, while it is `held` at its target.
+    /// An insertion that starts at the stage's `measured` position, where the stage is `held` at its target.
     pub(crate) fn new(config: InsertionConfig, measured: SetPoint, held: SetPoint) -> Self {
         Insertion {
             config,
@@ -71,7 +71,7 @@ impl Insertion {
             next_step: 0,
             last_step: last_step(&config),
             depth_max_mm: config.depth_mm,
-            pause: Pause::Moving,
+            step_phase: StepPhase::Moving,
             newest: None,
             is_seen: false,
             short_since: None,
@@ -89,15 +89,15 @@ impl Insertion {
     }
 
     /// Depth of step `step`, mm.
-    fn depth_of(&self, step: u32) -> f64 {
+    fn step_depth_mm(&self, step: u32) -> f64 {
         (f64::from(step) * self.config.step_mm).min(self.config.depth_mm)
     }
 
-    /// Takes a measurement that is paired with the stage's depth. Gives it back if it is to correct the
-    /// observers at once.
-    pub(crate) fn measure(&mut self, measurement: Measurement) -> Option<Measurement> {
+    /// Takes a measurement that is paired with the stage's depth. Returns it if it must correct the observers
+    /// at once.
+    pub(crate) fn take_measurement(&mut self, measurement: Measurement) -> Option<Measurement> {
         self.is_seen = true;
-        match (self.config.mode, &mut self.pause) {
+        match (self.config.mode, &mut self.step_phase) {
             (InsertionMode::Continuous, _) if self.config.corrected_by == Samples::All => {
                 return Some(measurement);
             }
@@ -106,7 +106,7 @@ impl Insertion {
                     self.newest = Some(measurement);
                 }
             }
-            (InsertionMode::Stepwise, Pause::Sampling { from, sum_mm, count })
+            (InsertionMode::Stepwise, StepPhase::Sampling { from, sum_mm, count })
                 if measurement.acquisition_time >= *from && *count < self.config.samples =>
             {
                 *sum_mm += measurement.tip_meas.mm();
@@ -118,16 +118,16 @@ impl Insertion {
         None
     }
 
-    /// Depth that is left to insert, mm.
-    pub(crate) fn left_mm(&self) -> f64 {
+    /// Depth that remains to be commanded, mm.
+    pub(crate) fn remaining_mm(&self) -> f64 {
         self.config.depth_mm - self.profile.position_mm()
     }
 
     /// Inserts at this speed from now on, mm/s.
     ///
     /// # Errors
-    /// Where it is not within the limits. The configured speed is the highest: everything else was checked
-    /// for it.
+    /// If the speed is not within the limits. The configured speed is the highest, because the other settings
+    /// were checked against it.
     pub(crate) fn set_speed(&mut self, speed_mm_per_s: f64) -> Result<(), String> {
         let max = self.config.speed_mm_per_s;
         if !(speed_mm_per_s > 0.0 && speed_mm_per_s <= max) {
@@ -137,14 +137,15 @@ impl Insertion {
         Ok(())
     }
 
-    /// Time that is left at this speed, s: stepwise with the pauses, but without their samples.
-    pub(crate) fn to_go_s(&self) -> f64 {
-        let pauses = match self.config.mode {
+    /// Remaining time at this speed, s. A stepwise insertion adds the time to settle at each step, but not the
+    /// time to take samples.
+    pub(crate) fn remaining_s(&self) -> f64 {
+        let stops = match self.config.mode {
             InsertionMode::Continuous => 0,
             InsertionMode::Stepwise => (self.last_step + 1).saturating_sub(self.next_step),
         };
-        self.left_mm() / self.profile.speed_max_mm_per_s
-            + f64::from(pauses) * self.config.settle.as_secs_f64()
+        self.remaining_mm() / self.profile.speed_max_mm_per_s
+            + f64::from(stops) * self.config.settle.as_secs_f64()
     }
 
     /// True when the needle stands where a hold has brought its set-points to rest.
@@ -154,7 +155,7 @@ impl Insertion {
     }
 
     /// Checks that the needle arrives where its set-points end; otherwise the run would wait there for
-    /// ever. An error is the reason to stop for.
+    /// ever. An error is the reason to stop the run.
     pub(crate) fn check_arrival(
         &mut self,
         time: Time,
@@ -184,20 +185,22 @@ impl Insertion {
         ))
     }
 
-    /// The step that is due at the measured depth, if one is.
-    pub(crate) fn due(&mut self, time: Time, insertion_meas_mm: f64) -> Option<DueStep> {
-        let goal_mm = self.depth_of(self.next_step);
+    /// The step that is due at the measured depth, if any. It is then no longer due.
+    pub(crate) fn take_due_step(&mut self, time: Time, insertion_meas_mm: f64) -> Option<DueStep> {
+        let goal_mm = self.step_depth_mm(self.next_step);
         let measurement = match self.config.mode {
             InsertionMode::Continuous => {
                 // Step 0 is taken at rest, with the first measurement.
                 let waiting = self.next_step == 0 && !self.is_seen;
-                let near_enough = self.has_arrived_near(time, insertion_meas_mm);
+                let near_enough = self.has_nearly_arrived(time, insertion_meas_mm);
                 if waiting || insertion_meas_mm < goal_mm - DUE_TOLERANCE_MM && !near_enough {
                     return None;
                 }
                 self.newest.take()
             }
-            InsertionMode::Stepwise => Some(self.settled(time, insertion_meas_mm, goal_mm)?),
+            InsertionMode::Stepwise => {
+                Some(self.take_settled_sample(time, insertion_meas_mm, goal_mm)?)
+            }
         };
         let step = self.next_step;
         self.next_step += 1;
@@ -209,30 +212,36 @@ impl Insertion {
         stage_insertion_meas_mm - self.origin_meas.insertion_mm
     }
 
-    /// True when the set-points have ended a while ago and the needle stands as near to their end
-    /// as the configuration asks for: a real drive may hold a few counts short.
-    fn has_arrived_near(&self, time: Time, insertion_meas_mm: f64) -> bool {
+    /// True when the set-points ended a while ago and the needle stands within `insertion.arrival_mm` of
+    /// their end: a real drive may hold its target a few counts off.
+    fn has_nearly_arrived(&self, time: Time, insertion_meas_mm: f64) -> bool {
         (self.profile.goal_mm() - insertion_meas_mm).abs() <= self.config.arrival_mm
             && self.short_since.is_some_and(|since| time.since(since) >= ARRIVAL_PATIENCE)
     }
 
-    /// The mean of the step's samples, once the needle has stood still and they are complete.
-    fn settled(&mut self, time: Time, insertion_meas_mm: f64, goal_mm: f64) -> Option<Measurement> {
+    /// The mean of the step's samples, once the needle has settled and the samples are complete.
+    fn take_settled_sample(
+        &mut self,
+        time: Time,
+        insertion_meas_mm: f64,
+        goal_mm: f64,
+    ) -> Option<Measurement> {
         let standing = self.profile.position_mm() == goal_mm
             && (insertion_meas_mm - goal_mm).abs() <= self.config.arrival_mm;
-        match self.pause.clone() {
-            // The needle has moved: the samples are not of one place.
-            Pause::Settling { .. } | Pause::Sampling { .. } if !standing => {
-                self.pause = Pause::Moving;
+        match self.step_phase.clone() {
+            // The needle has moved, so the samples are from different places.
+            StepPhase::Settling { .. } | StepPhase::Sampling { .. } if !standing => {
+                self.step_phase = StepPhase::Moving;
             }
-            Pause::Moving if standing => self.pause = Pause::Settling { since: time },
-            Pause::Settling { since } if time.since(since) >= self.config.settle => {
-                self.pause = Pause::Sampling { from: time, sum_mm: Vector3::zeros(), count: 0 };
+            StepPhase::Moving if standing => self.step_phase = StepPhase::Settling { since: time },
+            StepPhase::Settling { since } if time.since(since) >= self.config.settle => {
+                self.step_phase =
+                    StepPhase::Sampling { from: time, sum_mm: Vector3::zeros(), count: 0 };
             }
-            Pause::Sampling { sum_mm, count, .. } if count >= self.config.samples => {
+            StepPhase::Sampling { sum_mm, count, .. } if count >= self.config.samples => {
                 let newest = self.newest.take()?;
                 let tip_meas = TipPosition::new(sum_mm / f64::from(count))?;
-                self.pause = Pause::Moving;
+                self.step_phase = StepPhase::Moving;
                 return Some(Measurement { tip_meas, positions: count, ..newest });
             }
             _ => {}
@@ -240,7 +249,8 @@ impl Insertion {
         None
     }
 
-    /// Ends the insertion at `depth_mm`, or where the needle can be stopped; gives the depth of that, mm.
+    /// Sets the depth at which the insertion ends to `depth_mm`, or to the nearest depth at which the needle
+    /// can still be stopped. Returns that depth, mm.
     pub(crate) fn end_at(&mut self, depth_mm: f64) -> f64 {
         self.config.depth_mm = depth_mm.max(self.profile.stops_at_mm()).min(self.depth_max_mm);
         self.last_step = last_step(&self.config);
@@ -254,11 +264,11 @@ impl Insertion {
         self.rotation_cmd_rad_per_mm = rotation_rad_per_mm;
         self.profile.go_to(match self.config.mode {
             InsertionMode::Continuous => self.config.depth_mm,
-            InsertionMode::Stepwise => self.depth_of(self.next_step),
+            InsertionMode::Stepwise => self.step_depth_mm(self.next_step),
         });
     }
 
-    /// The set-point of now: rotation is locked to depth.
+    /// The present set-point: rotation is locked to depth.
     fn set_point(&self) -> SetPoint {
         let insertion_mm = self.profile.position_mm();
         let turned_rad = self.rotation_cmd_rad_per_mm * (insertion_mm - self.anchor.insertion_mm);
@@ -276,7 +286,7 @@ impl Insertion {
     }
 }
 
-/// The number of the last step.
+/// The number of the last step, which may be shorter than the others.
 fn last_step(config: &InsertionConfig) -> u32 {
     (config.depth_mm / config.step_mm - 1e-9).ceil() as u32
 }

@@ -1,7 +1,7 @@
 //! The run machine.
 
 use super::SessionConfig;
-use super::insert::Insert;
+use super::insert::InsertTask;
 use super::outcome::{Outcome, StageAtEnd};
 use super::record::{Direction, Lane, Record, Severity};
 use super::shell::{Power, Shell};
@@ -43,19 +43,19 @@ pub enum OperatorCommand {
     /// Brake the insertion to a standstill; both axes stay enabled.
     #[display("hold")]
     Hold,
-    /// Let a held insertion go on.
+    /// Resume a held insertion.
     #[display("resume")]
     Resume,
-    /// Insert so many millimetres of a held insertion, and hold it again.
+    /// Insert a held needle by this much, then hold again.
     #[display("step of {mm} mm")]
     Step {
-        /// How far.
+        /// Length of the step, mm.
         mm: f64,
     },
-    /// Insert at another speed.
+    /// Change the speed of the insertion.
     #[display("speed {mm_per_s:.3} mm/s")]
     Speed {
-        /// Which, up to `insertion.speed_mm_per_s`.
+        /// The new speed, mm/s; at most `insertion.speed_mm_per_s`.
         mm_per_s: f64,
     },
 }
@@ -63,7 +63,7 @@ pub enum OperatorCommand {
 /// Something that leaves the session.
 #[derive(Debug, Clone)]
 pub enum Output {
-    /// A frame for the bus. Whoever sends it records it as sent, with this time.
+    /// A frame for the bus. The runtime sends it and records it as sent, with this time.
     Transmit {
         /// When it was made.
         time: Time,
@@ -77,18 +77,18 @@ pub enum Output {
 /// The progress of a run.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Progress {
-    /// When.
+    /// Time of the last input.
     pub time: Time,
     /// The state of the run.
     pub state: State,
     /// Measured depth from the start, mm.
     pub insertion_meas_mm: f64,
-    /// Depth to reach, mm; 0 of a run without one.
+    /// Depth to reach, mm; 0 if the run has none.
     pub depth_mm: f64,
     /// Speed of the insertion while nothing holds it, mm/s; 0 before it begins.
     pub speed_mm_per_s: f64,
-    /// Time that is left at this speed, s; `None` before the insertion and while it is held.
-    pub to_go_s: Option<f64>,
+    /// Remaining time at this speed, s; `None` before the insertion and while it is held.
+    pub remaining_s: Option<f64>,
     /// Distance of the tip from the plane as estimated at the last step, mm.
     pub x_mm: Option<f64>,
     /// Roll of the tip as estimated at the last step, rad; `None` while it is not known.
@@ -122,16 +122,16 @@ pub trait Machine {
     /// The next frame or record to leave the machine; `None` when there is no more for now.
     fn poll(&mut self) -> Option<Output>;
 
-    /// When to call [`handle`](Self::handle) with [`Input::Tick`] if nothing comes before.
+    /// When to call [`handle`](Self::handle) with [`Input::Tick`] if no input comes first.
     fn deadline(&self) -> Time;
 
-    /// How the run ended; `None` while it goes on.
+    /// How the run ended; `None` until it has.
     fn outcome(&self) -> Option<&Outcome>;
 
-    /// How far the run is.
+    /// The progress of the run.
     fn progress(&self) -> Progress;
 
-    /// Counts of what went wrong on the stage's bus without harm.
+    /// Counts of harmless errors on the stage's bus.
     fn stage_counters(&self) -> Counters;
 
     /// The longest stall of the bench that a run survives: the drives' heartbeat timeout, or during an
@@ -157,8 +157,7 @@ pub trait Machine {
 /// same run.
 ///
 /// Motion follows from feedback alone: a set-point is computed only when both drives have answered a
-/// SYNC, from that answer. Every fault ends in both axes stopped; nothing in here starts again after
-/// one.
+/// SYNC, from that answer. Every fault stops both axes, and the session never starts them again.
 pub struct Session {
     shell: Shell,
     task: Box<dyn Task>,
@@ -168,10 +167,10 @@ impl Session {
     /// An insertion that begins at `now`.
     ///
     /// # Errors
-    /// Where an observer or the stage refuses its configuration.
+    /// If an observer or the stage refuses its configuration.
     pub fn new(config: SessionConfig, now: Time) -> Result<Self, String> {
         let stage_config = config.stage.clone();
-        let task = Insert::new(config, now).map_err(|error| format!("observer: {error}"))?;
+        let task = InsertTask::new(config, now).map_err(|error| format!("observer: {error}"))?;
         let stage = Stage::new(stage_config.clone(), now);
         let stage = stage.map_err(|error| format!("stage: {error}"))?;
         Ok(Session::begin(stage, stage_config, Box::new(task), now))
@@ -194,8 +193,8 @@ impl Session {
     }
 
     fn permit_power(&mut self) {
-        let is_asked = matches!(self.shell.power(), Power::Off | Power::Awaited(_));
-        if !is_asked || !self.shell.is_running() {
+        let may_ask = matches!(self.shell.power(), Power::Off | Power::Awaited(_));
+        if !may_ask || !self.shell.is_running() {
             return;
         }
         match self.task.permits_power(&mut self.shell) {
@@ -245,7 +244,7 @@ impl Machine for Session {
     fn handle(&mut self, now: Time, input: Input) {
         self.shell.now = now;
         if self.outcome().is_some() {
-            // The bus may refuse the last frame. A replay needs to know.
+            // The bus may refuse the last frame. A replay needs this input.
             if matches!(input, Input::BusFault(_)) {
                 self.shell.record(Record::Input { time: now, input });
             }
@@ -275,8 +274,8 @@ impl Machine for Session {
             self.shell.stage.handle_timeout(now);
             self.drain_stage();
         }
-        let done = self.task.handle_timeout(&mut self.shell);
-        self.shell.stop_on_error(done);
+        let handled = self.task.handle_timeout(&mut self.shell);
+        self.shell.stop_on_error(handled);
         self.drain_stage();
         if let Some(outcome) = self.shell.outcome_of_timeout() {
             self.finish(outcome);

@@ -39,12 +39,12 @@ pub use state::State;
 pub use steering::{Decision, Steering};
 pub use target::{MovingMean, TargetTool};
 
-pub(crate) use news::{news, tracker_news};
+pub(crate) use news::{stage_news, tracker_news};
 pub(crate) use profile::Profile;
 pub(crate) use shell::Shell;
 pub(crate) use task::Task;
 
-/// How the event begins that says what an operation has proved.
+/// Prefix of the event that reports what an operation has proved.
 pub const PROVED: &str = "proved: ";
 
-use news::left_unknown;
+use news::unconfirmed_stop;

@@ -4,8 +4,8 @@ use super::Severity;
 use crate::stage::StageEvent;
 use crate::tracker::Event;
 
-/// The news in `event`, with how much it matters; `None` for what has a record of its own.
-pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
+/// The text for the operator about `event`, with its severity; `None` if `event` has a record of its own.
+pub(crate) fn stage_news(event: &StageEvent) -> Option<(Severity, String)> {
     let warning = match event {
         StageEvent::Progress(progress) => return Some((Severity::Info, progress.to_string())),
         StageEvent::Homed { axis, position } => {
@@ -18,15 +18,15 @@ pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
              current limits those of this rig?"
         ),
         StageEvent::NotShown(axis, flag) => format!(
-            "{axis}: the enabled drive has not set statusword {flag}: its loss could not be noticed; \
-             see its manual"
+            "{axis}: the enabled drive has not set statusword {flag}, so the bench could not notice the \
+             loss of that bit; see the drive's manual"
         ),
         StageEvent::Warns { axis, statusword, count } => format!(
             "{axis}: the drive warns (statusword {statusword}, bit 7), {count} so far; see its manual \
              and its display for why"
         ),
         StageEvent::Flood(frames) => {
-            format!("a flood on the bus: {frames} frames beside the cycle within 100 ms")
+            format!("a flood on the bus: {frames} frames outside the SYNC cycle within 100 ms")
         }
         StageEvent::Ignored { why, count, frame } => {
             format!("{why}, {count} so far, the newest {frame}")
@@ -44,7 +44,8 @@ pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
     Some((Severity::Warning, warning))
 }
 
-/// The news in what the tracker's link says; `None` for what has a record of its own, or is counted.
+/// The text for the operator about `event` of the tracker's link, with its severity; `None` if `event` has a
+/// record of its own, or is only counted.
 pub(crate) fn tracker_news(event: &Event) -> Option<(Severity, String)> {
     Some(match event {
         Event::Connected { peer } => (Severity::Info, format!("connected to {peer}")),
@@ -63,9 +64,8 @@ pub(crate) fn tracker_news(event: &Event) -> Option<(Severity, String)> {
     })
 }
 
-/// What is not known of a stage that was told to stop; `None` where it was seen to stand without
-/// power.
-pub(crate) fn left_unknown(standing: bool, off: bool) -> Option<&'static str> {
+/// The part of a stop that the stage did not confirm; `None` if it was seen to stand without power.
+pub(crate) fn unconfirmed_stop(standing: bool, off: bool) -> Option<&'static str> {
     match (standing, off) {
         (true, true) => None,
         (false, true) => Some("the axes were not seen to stand before power was taken off"),
@@ -74,7 +74,7 @@ pub(crate) fn left_unknown(standing: bool, off: bool) -> Option<&'static str> {
              look at the stage",
         ),
         (false, false) => Some(
-            "neither were the axes seen to stand nor have the drives confirmed that their power is \
+            "the axes were not seen to stand, and the drives have not confirmed that their power is \
              off: press the emergency stop, then look at the stage",
         ),
     }

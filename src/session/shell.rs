@@ -3,7 +3,7 @@
 use super::outcome::{Outcome, StageAtEnd};
 use super::record::{Lane, Record, Severity};
 use super::state::State;
-use super::{Output, left_unknown, news};
+use super::{Output, stage_news, unconfirmed_stop};
 use crate::canopen::{Frame, cob};
 use crate::stage::{self, Axis, Progress, SetPoint, Stage, StageConfig, StageEvent};
 use crate::units::Time;
@@ -15,16 +15,16 @@ use std::time::Duration;
 const STOP_MARGIN: Duration = Duration::from_secs(1);
 
 /// Maximum number of follow-up reasons that are reported.
-const THEN_MAX: usize = 8;
+const FOLLOW_UPS_MAX: usize = 8;
 
-/// Where the run is.
+/// The phase of a run.
 #[derive(Debug, Clone)]
 enum Phase {
-    /// The stage is brought up, or the task goes on.
+    /// The stage is being brought up, or the task is under way.
     Running,
     /// The drives are being stopped, in order or after a fault; the run will end as `outcome`.
     Stopping { outcome: Outcome, since: Time },
-    /// Over; nothing is sent any more.
+    /// Over; nothing more is sent.
     Over(Outcome),
 }
 
@@ -33,15 +33,15 @@ enum Phase {
 pub(crate) enum Power {
     /// The drives are being brought up.
     Off,
-    /// They have been ready for power since then.
+    /// The drives have been ready for power since this time.
     Awaited(Time),
-    /// They are being enabled.
+    /// The drives are being enabled.
     ComingOn,
-    /// They have been enabled since then.
+    /// The drives have been enabled since this time.
     On(Time),
 }
 
-/// The stage and the record of a run, in the hands of its [`Task`](super::Task).
+/// The stage and the record of a run. Its [`Task`](super::Task) acts through this.
 #[derive(Debug)]
 pub(crate) struct Shell {
     pub(super) stage: Stage,
@@ -52,12 +52,13 @@ pub(crate) struct Shell {
     power: Power,
     /// The bench has stopped sending its heartbeat on purpose.
     is_silent: bool,
-    /// The state each part is in.
+    /// The state of each part of the bench.
     states: BTreeMap<Lane, State>,
     /// The follow-up reasons reported since the stop began.
-    then: Vec<String>,
-    left_unknown: Option<&'static str>,
-    /// A drive had power when the stop began, whoever gave it.
+    follow_ups: Vec<String>,
+    /// The part of the stop that the drives did not confirm.
+    unconfirmed: Option<&'static str>,
+    /// A drive had power when the stop began, even if this bench did not switch it on.
     stopped_with_power: bool,
     outputs: VecDeque<Output>,
 }
@@ -72,8 +73,8 @@ impl Shell {
             power: Power::Off,
             is_silent: false,
             states: BTreeMap::new(),
-            then: Vec::new(),
-            left_unknown: None,
+            follow_ups: Vec::new(),
+            unconfirmed: None,
             stopped_with_power: false,
             outputs: VecDeque::new(),
         }
@@ -123,7 +124,7 @@ impl Shell {
         self.power
     }
 
-    /// Neither stopping nor over.
+    /// True until the run is being stopped.
     pub(crate) fn is_running(&self) -> bool {
         matches!(self.phase, Phase::Running)
     }
@@ -143,7 +144,7 @@ impl Shell {
         self.stage.command(set_point).map_err(|error| format!("stage: {error}"))
     }
 
-    /// Whether both axes may be sent to `goal` in time.
+    /// Checks that both axes may be sent to `goal` later.
     ///
     /// # Errors
     /// As [`Stage::check_goal`].
@@ -177,14 +178,14 @@ impl Shell {
         let is_expected = match event {
             // The task refused the position in the event before: the axes stay without power.
             StageEvent::Progress(Progress::Enabling) => !self.is_running(),
-            // An answer to the task, which reads the drives while the bench is silent.
+            // The reply to an SDO request of the task, which reads the drives while the bench is silent.
             StageEvent::Ignored { frame, .. } => self.is_silent && self.is_sdo_answer(frame),
             _ => false,
         };
         if is_expected {
             return;
         }
-        if let Some((severity, text)) = news(event) {
+        if let Some((severity, text)) = stage_news(event) {
             self.report(Lane::Stage, severity, text);
         }
         match event {
@@ -209,14 +210,14 @@ impl Shell {
         frame.cob_id().is_some_and(|cob_id| answers.contains(&cob_id))
     }
 
-    /// Ends the run for `reason`: both axes are quick-stopped. The first reason stands.
+    /// Stops the run for `reason`, with a quick stop of both axes. The outcome keeps the first reason.
     pub(crate) fn stop(&mut self, reason: String) {
         match &self.phase {
             Phase::Over(_) | Phase::Stopping { outcome: Outcome::Stopped(_), .. } => {
-                // A bus that is down reports it at every frame.
-                if self.then.len() < THEN_MAX && !self.then.contains(&reason) {
+                // A bus that is down reports the same reason for every frame.
+                if self.follow_ups.len() < FOLLOW_UPS_MAX && !self.follow_ups.contains(&reason) {
                     self.report(Lane::Session, Severity::Warning, format!("then: {reason}"));
-                    self.then.push(reason);
+                    self.follow_ups.push(reason);
                 }
             }
             Phase::Running | Phase::Stopping { outcome: Outcome::Completed, .. } => {
@@ -227,7 +228,7 @@ impl Shell {
         }
     }
 
-    /// As [`Shell::stop`], for the reason that `result` gives, if it gives one.
+    /// As [`Shell::stop`], for the error of `result`, if it is one.
     pub(super) fn stop_on_error(&mut self, result: Result<(), String>) {
         if let Err(reason) = result {
             self.stop(reason);
@@ -240,7 +241,7 @@ impl Shell {
         self.begin_stopping(Outcome::Completed);
     }
 
-    /// The task is done, and the drives have stopped by themselves, so an orderly end is not possible.
+    /// The task is done, and the drives have stopped by themselves, so an orderly shutdown is not possible.
     pub(crate) fn complete_by_quick_stop(&mut self) {
         self.stage.quick_stop(self.now);
         self.begin_stopping(Outcome::Completed);
@@ -252,12 +253,12 @@ impl Shell {
         self.enter(State::Stopping);
     }
 
-    /// The longest a stop may take by the stage's own timeouts, and a margin.
+    /// The longest that a stop may take: the stage's own timeouts, plus a margin.
     fn stop_timeout(&self) -> Duration {
         self.config.power.stop_timeout * 2 + STOP_MARGIN
     }
 
-    /// When the shell itself, or else its stage, has something to do.
+    /// When the shell or its stage next has something to do.
     pub(super) fn deadline(&self) -> Time {
         match &self.phase {
             Phase::Running => self.stage.deadline(),
@@ -268,11 +269,11 @@ impl Shell {
         }
     }
 
-    /// The outcome once the stage has done what it can to take power off. A run whose drives may still
-    /// have power is not completed.
+    /// The outcome once the stage has reported the end of the stop. A run whose drives may still have power
+    /// does not count as completed.
     pub(super) fn outcome_of_stop(&mut self, standing: bool, off: bool) -> Outcome {
         self.enter(State::PowerOff);
-        let unknown = self.tell_left_unknown(standing, off);
+        let unknown = self.report_unconfirmed(standing, off);
         match (&self.phase, unknown) {
             (Phase::Stopping { outcome: Outcome::Completed, .. }, Some(text)) if !off => {
                 Outcome::Stopped(format!("stage: {text}"))
@@ -282,15 +283,15 @@ impl Shell {
         }
     }
 
-    /// Reports what a stop has left unknown of drives that had power.
-    fn tell_left_unknown(&mut self, standing: bool, off: bool) -> Option<&'static str> {
-        let unknown = left_unknown(standing, off).filter(|_| self.had_power())?;
+    /// Reports what drives with power did not confirm of the stop.
+    fn report_unconfirmed(&mut self, standing: bool, off: bool) -> Option<&'static str> {
+        let unknown = unconfirmed_stop(standing, off).filter(|_| self.had_power())?;
         self.report(Lane::Stage, Severity::Warning, unknown.to_owned());
-        self.left_unknown = Some(unknown);
+        self.unconfirmed = Some(unknown);
         Some(unknown)
     }
 
-    /// The bench gave the drives power, or something else did.
+    /// True if the drives had power, from this bench or from elsewhere.
     fn had_power(&self) -> bool {
         let reports = self.stage.drive_reports();
         self.stopped_with_power
@@ -302,13 +303,13 @@ impl Shell {
     pub(super) fn stage_at_end(&self) -> StageAtEnd {
         StageAtEnd {
             had_power: self.had_power(),
-            unknown: self.left_unknown,
+            unknown: self.unconfirmed,
             drives: self.stage.drive_reports(),
             position: self.stage.position(),
         }
     }
 
-    /// The outcome if the stage has reported nothing for longer than a stop may take.
+    /// The outcome if the stage has not reported the end of the stop in time.
     pub(super) fn outcome_of_timeout(&mut self) -> Option<Outcome> {
         let timeout = self.stop_timeout();
         let Phase::Stopping { outcome, since } = &self.phase else { return None };
@@ -322,7 +323,7 @@ impl Shell {
             )),
             Outcome::Stopped(_) => outcome.clone(),
         };
-        self.tell_left_unknown(false, false);
+        self.report_unconfirmed(false, false);
         Some(outcome)
     }
 
@@ -335,7 +336,7 @@ impl Shell {
         self.phase = Phase::Over(outcome);
     }
 
-    /// The next event of the stage; the frames before it are sent.
+    /// The next event of the stage. Frames that come before it are queued to be sent.
     pub(super) fn poll_stage(&mut self) -> Option<StageEvent> {
         loop {
             match self.stage.poll()? {

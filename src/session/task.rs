@@ -1,4 +1,4 @@
-//! What a run is for: the part of it that differs from task to task.
+//! The part of a run that differs from task to task.
 
 use super::shell::Shell;
 use super::{AxisMove, Lane, OperatorCommand, Progress, Record, SampleRecord, tracker_news};
@@ -11,23 +11,22 @@ use std::time::Duration;
 /// A task: an insertion, or an operation of the stage alone.
 ///
 /// The [`Session`](super::Session) around it brings the stage up, supervises it, stops it and takes
-/// power off. A task decides what to do between [`StageEvent::Ready`] and the stop. An error of a
-/// method is the reason to stop for, except where it says otherwise.
+/// power off. A task decides what to do between [`StageEvent::Ready`] and the stop. If a method returns an
+/// error, the run stops for that reason, unless the method says otherwise.
 pub(crate) trait Task {
     /// The run begins.
     fn begin(&mut self, _shell: &mut Shell) {}
 
-    /// Whether the axes may be given power now; asked after every input until they are.
+    /// Whether the axes may be given power now. The session asks after every input until they have power.
     fn permits_power(&mut self, _shell: &mut Shell) -> Result<bool, String> {
         Ok(true)
     }
 
-    /// Takes an event of the stage. Feedback comes while the axes are stopped, too; everything else
-    /// comes before.
+    /// Takes an event of the stage. While the run is being stopped, only feedback is passed on.
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String>;
 
-    /// Takes an event of the tracker's link. A task that does not use the tracker records the events, and
-    /// ignores that no connection can be made.
+    /// Takes an event of the tracker's link. By default, for a task that does not use the tracker, the events
+    /// are recorded, and a failure to connect is ignored.
     fn take_tracker_event(&mut self, shell: &mut Shell, event: Event) {
         if let Event::Unreachable { .. } = event {
             return;
@@ -45,11 +44,11 @@ pub(crate) trait Task {
         None
     }
 
-    /// Takes any frame of the bus, which the stage has taken already.
+    /// Takes a frame of the bus, after the stage has taken it.
     fn take_frame(&mut self, _shell: &Shell, _frame: &Frame) {}
 
-    /// Does what the last input left to do, once the frames that answer it may have left; called before
-    /// the next one. Until then [`deadline`](Self::deadline) is past.
+    /// Does the work that the last input left over, so that the frames in response to it are sent first.
+    /// Called before the next input. While there is such work, [`deadline`](Self::deadline) is in the past.
     fn catch_up(&mut self) -> Result<(), String> {
         Ok(())
     }
@@ -59,18 +58,19 @@ pub(crate) trait Task {
         Ok(())
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) has something to do, while nothing is stopped.
+    /// When [`handle_timeout`](Self::handle_timeout) or [`catch_up`](Self::catch_up) next has something to
+    /// do, unless the run is being stopped.
     fn deadline(&self, _shell: &Shell) -> Time {
         Time::NEVER
     }
 
-    /// The run is over: the last records of the task.
+    /// Called once when the run is over, for the last records of the task.
     fn end(&mut self, _shell: &mut Shell) {}
 
-    /// Takes a command of the operator, and says what comes of it.
+    /// Takes a command of the operator, and returns its effect as text.
     ///
     /// # Errors
-    /// Why it is refused; the task goes on as before.
+    /// Why the command is refused; the task goes on as before.
     fn take_operator(
         &mut self,
         _shell: &mut Shell,
@@ -79,7 +79,7 @@ pub(crate) trait Task {
         Err("only an insertion can be held; stop the operation".to_owned())
     }
 
-    /// How far the task is.
+    /// The progress of the task.
     fn progress(&self, _now: Time) -> Progress {
         Progress::default()
     }

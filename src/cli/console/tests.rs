@@ -14,7 +14,7 @@ use crate::canopen::emcy::{Emcy, EmcyCode};
 use crate::canopen::{Frame, NodeId};
 use crate::geometry::{FixedAngles, Pose};
 use crate::observer::Estimate;
-use crate::session::news;
+use crate::session::stage_news;
 use crate::session::{Approach, Decision, Direction, SampleRecord, State, StepRecord};
 use crate::stage::{Axis, Feedback, SetPoint, StageEvent};
 use crate::tracker::{GateName, Refusal, Sample, Validity};
@@ -94,7 +94,7 @@ fn inserted() -> Screen {
         insertion_meas_mm: 39.98,
         depth_mm: 100.0,
         speed_mm_per_s: 2.0,
-        to_go_s: Some(30.0),
+        remaining_s: Some(30.0),
         tip_age_s: Some(0.03),
         ..Progress::default()
     };
@@ -109,7 +109,7 @@ fn ask(screen: &mut Screen, s: f64, command: OperatorCommand) {
 fn held() -> Screen {
     let mut screen = inserted();
     screen.progress.state = State::HeldByOperator;
-    screen.progress.to_go_s = None;
+    screen.progress.remaining_s = None;
     ask(&mut screen, 20.0, OperatorCommand::Hold);
     screen.take(&Record::State { time: at(20.0), state: State::HeldByOperator });
     screen.event(at(20.0), Lane::Session, Severity::Info, "operator: hold at 39.98 mm");
@@ -124,7 +124,7 @@ fn stopped() -> Screen {
     let frame = emcy.to_frame(NodeId::new(1).expect("a node"));
     screen.take(&Record::Can { time: at(20.0), direction: Direction::Received, frame });
     let told = StageEvent::Emergency(Axis::Insertion, emcy);
-    let (severity, text) = news(&told).expect("news");
+    let (severity, text) = stage_news(&told).expect("news");
     screen.event(at(20.0), Lane::Stage, severity, &text);
     screen.event(at(20.0), Lane::Session, Severity::Fault, why);
     screen.is_over = true;

@@ -82,7 +82,7 @@ fn render_depth(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
     let part = Some(progress.insertion_meas_mm / progress.depth_mm).filter(|part| part.is_finite());
     let part = part.map_or(0.0, |part| part.clamp(0.0, 1.0));
     let is_over = matches!(progress.state, State::Stopping | State::Stopped | State::Completed);
-    let to_go = progress.to_go_s.filter(|_| !is_over).map_or("-".to_owned(), minutes);
+    let to_go = progress.remaining_s.filter(|_| !is_over).map_or("-".to_owned(), minutes);
     let label = format!(
         "{:.1} of {:.1} mm  {:.2} mm/s  {to_go} to go{}",
         progress.insertion_meas_mm, progress.depth_mm, progress.speed_mm_per_s, screen.target

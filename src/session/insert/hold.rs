@@ -1,7 +1,7 @@
-//! The insertion is held while the tip is not seen, in seconds and in millimetres, and as soon as the
-//! stream contradicts the model; and as long as the operator wants it, or after a single step.
+//! Holds of the insertion: while the tip is not seen (limits in seconds and in millimetres), when the stream
+//! contradicts the model, when the operator asks for it, and after a single step.
 
-use super::Insert;
+use super::InsertTask;
 use crate::session::config::Resume;
 use crate::session::insertion::Insertion;
 use crate::session::shell::Shell;
@@ -12,25 +12,26 @@ use std::time::Duration;
 
 /// A message about a tip that is not seen has at most this many characters.
 pub(super) const MESSAGE_MAX: usize = 200;
-/// What to look at when the stream contradicts the model.
+/// What the operator should check when the stream contradicts the model.
 const JUMP_ADVICE: &str = "check the tracker, and needle.radius_mm";
-/// Why a command comes too soon.
+/// Why a command is refused before the insertion.
 pub(super) const NOT_BEGUN: &str = "the insertion has not begun";
-/// Why the operator can neither keep nor end a hold by the tracker.
-const ENDS: &str = "the tracker holds it, and the run ends once the needle stands (tracker.resume)";
+/// Why the operator can neither prolong nor end a hold by the tracker with `tracker.resume = "stop"`.
+const RUN_WILL_END: &str =
+    "the tracker holds it, and the run ends once the needle stands (tracker.resume)";
 
-/// An insertion that is held: set-points brake to a standstill, and both axes stay enabled.
+/// A hold of the insertion: set-points brake to a standstill, and both axes stay enabled.
 #[derive(Debug, Clone)]
 pub(super) struct Hold {
     since: Time,
-    /// How long holds by the tracker shortly before it lasted.
+    /// The time that earlier holds by the tracker have already used of `tracker.hold_timeout_s`.
     before: Duration,
     by: HeldBy,
 }
 
-/// A hold by the tracker that has ended by itself, with those before it. The next one shares its time
-/// limit, less the time for which the insertion went on between them: a stream that is held for longer
-/// than it is believed ends the run.
+/// A hold by the tracker that has ended by itself, together with those before it. The next hold has that much
+/// less time before it ends the run, but gets back the time for which the insertion went on in between. So
+/// the run ends when the stream causes holds for longer than it is believed.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct EndedHold {
     at: Time,
@@ -41,23 +42,23 @@ pub(super) struct EndedHold {
 #[derive(Debug, Clone)]
 enum HeldBy {
     Tracker {
-        /// How long and how far it had gone on blind, or how the stream contradicts the model.
+        /// How long and how far the insertion went on blind, or how the stream contradicts the model.
         cause: String,
-        /// Why the tip was not seen, or what to look at.
+        /// Why the tip was not seen, or what the operator should check.
         why: String,
-        /// It interrupted a single step, which never goes on by itself.
+        /// The hold interrupted a single step, which never goes on by itself.
         in_step: bool,
     },
     Operator,
     Step,
 }
 
-impl Insert {
-    /// Holds the insertion when the tip has not been seen lately, and decides what becomes of a
-    /// hold: with [`Resume::Automatic`] the insertion goes on once the tip is found again.
+impl InsertTask {
+    /// Holds the insertion when the tip has not been seen lately, and ends a hold by the tracker:
+    /// with [`Resume::Automatic`] the insertion goes on once the tip is found again.
     ///
     /// # Errors
-    /// The reason to stop for: with [`Resume::Stop`] as soon as the needle stands, and else after
+    /// The reason to stop the run: with [`Resume::Stop`] as soon as the needle stands, otherwise after
     /// `tracker.hold_timeout_s`.
     pub(super) fn watch_tip(
         &mut self,
@@ -66,7 +67,7 @@ impl Insert {
         insertion_meas_mm: f64,
         insertion: &mut Insertion,
     ) -> Result<(), String> {
-        let found = self.cause(now, insertion_meas_mm, insertion);
+        let found = self.hold_cause(now, insertion_meas_mm, insertion);
         let Some(hold) = &self.hold else {
             if let Some((cause, why)) = found {
                 let text = format!("{cause}; insertion held; {why}");
@@ -113,9 +114,9 @@ impl Insert {
         } else if now.since(hold.since) + hold.before >= tracker.hold.timeout {
             let in_a_row = if hold.before.is_zero() { "" } else { " in a row" };
             let timeout_s = tracker.hold.timeout.as_secs_f64();
-            // What held it first may be over, and something else hold it now.
-            let last = found.unwrap_or(began);
-            (format!("held for {timeout_s:.1} s{in_a_row} and stopped"), last)
+            // The first cause may be over and another may hold the insertion now.
+            let latest = found.unwrap_or(began);
+            (format!("held for {timeout_s:.1} s{in_a_row} and stopped"), latest)
         } else {
             return Ok(());
         };
@@ -123,21 +124,21 @@ impl Insert {
         Err(clipped(&text, MESSAGE_MAX).into_owned())
     }
 
-    /// Holds the insertion after a single step, done or interrupted.
+    /// Holds the insertion after a single step, whether it was completed or interrupted.
     fn hold_after_step(&mut self, shell: &mut Shell, now: Time, insertion: &mut Insertion) {
         insertion.profile.hold(self.config.tracker.hold.braking_mm_per_s2);
         self.hold = Some(Hold { since: now, before: Duration::ZERO, by: HeldBy::Step });
         shell.enter_at(now, State::HeldAfterStep);
-        let text = format!("the step ends; held, {:.2} mm left", insertion.left_mm());
+        let text = format!("the step ends; held, {:.2} mm left", insertion.remaining_mm());
         shell.report_at(now, Lane::Session, Severity::Info, text);
     }
 
-    /// Holds the insertion; one that has not begun will begin held.
+    /// Holds the insertion. If it has not begun, it will begin held.
     pub(super) fn hold_for_operator(&mut self, shell: &mut Shell) -> Result<String, String> {
         match self.hold.as_ref().map(|hold| &hold.by) {
             Some(HeldBy::Operator) => return Ok("hold: it is held already".to_owned()),
             Some(HeldBy::Tracker { .. }) if self.config.tracker.hold.resume == Resume::Stop => {
-                return Err(ENDS.to_owned());
+                return Err(RUN_WILL_END.to_owned());
             }
             _ => {}
         }
@@ -150,16 +151,16 @@ impl Insert {
         Ok(format!("hold at {:.2} mm", self.progress.insertion_meas_mm))
     }
 
-    /// Ends a hold on purpose: the insertion goes on, by a single step where one is asked for. It needs
-    /// a standing needle and a tip that would not be held for again at once.
-    pub(super) fn go_on(
+    /// Ends a hold at the operator's command: the insertion goes on, or makes a single step of `step_mm`.
+    /// Refused unless the needle stands and nothing would cause another hold at once.
+    pub(super) fn resume(
         &mut self,
         shell: &mut Shell,
         step_mm: Option<f64>,
     ) -> Result<String, String> {
         let hold = self.hold.as_ref().ok_or("the insertion is not held; hold it first")?;
         match (&hold.by, self.config.tracker.hold.resume) {
-            (HeldBy::Tracker { .. }, Resume::Stop) => return Err(ENDS.to_owned()),
+            (HeldBy::Tracker { .. }, Resume::Stop) => return Err(RUN_WILL_END.to_owned()),
             (HeldBy::Tracker { .. }, Resume::Automatic) => {
                 return Err("the tracker holds it, until the tip is seen again".to_owned());
             }
@@ -187,15 +188,15 @@ impl Insert {
         };
         let insertion_mm = self.progress.insertion_meas_mm;
         if !insertion.is_standing(insertion_mm) {
-            return Err("the needle still brakes; ask again once it stands".to_owned());
+            return Err("the needle is still braking; try again once it stands".to_owned());
         }
-        if let Some((cause, why)) = self.cause(shell.now, insertion_mm, insertion) {
+        if let Some((cause, why)) = self.hold_cause(shell.now, insertion_mm, insertion) {
             return Err(clipped(&format!("{cause}; {why}"), MESSAGE_MAX).into_owned());
         }
-        let left_mm = insertion.left_mm();
-        // Many steps add up their rounding; the insertion ends at its depth all the same.
-        if let Some(mm) = step_mm.filter(|mm| !(*mm > 0.0 && *mm <= left_mm + 5e-4)) {
-            return Err(format!("{mm} mm is not over 0 and up to the {left_mm:.3} mm left"));
+        let remaining_mm = insertion.remaining_mm();
+        // Many steps accumulate rounding errors; the insertion still ends exactly at its depth.
+        if step_mm.is_some_and(|mm| !(mm > 0.0 && mm <= remaining_mm + 5e-4)) {
+            return Err(format!("allowed: over 0 and up to the {remaining_mm:.3} mm left"));
         }
         self.hold = None;
         if let Some(insertion) = &mut self.insertion {
@@ -206,8 +207,8 @@ impl Insert {
         Ok(format!("{what} at {insertion_mm:.2} mm, held for {held_s:.2} s"))
     }
 
-    /// What calls for a hold, and why it came to that or what to look at.
-    fn cause(
+    /// Why the insertion must be held, and what led to that or what the operator should check.
+    fn hold_cause(
         &self,
         now: Time,
         insertion_meas_mm: f64,
@@ -222,8 +223,8 @@ impl Insert {
         self.target.as_ref()?.trouble(now)
     }
 
-    /// How long and how far the insertion has gone on blind, where that calls for a hold: by age,
-    /// or because the needle would otherwise not stand before the limit.
+    /// How long and how far the insertion has gone on blind, if it must be held for that: the tip is too old,
+    /// or the needle would otherwise pass the limit in millimetres before it stands.
     fn blindness(
         &self,
         now: Time,

@@ -1,4 +1,4 @@
-//! The task of steering: one insertion, from the first tip seen to the depth.
+//! The task that steers: one insertion, from the first tip seen to the full depth.
 
 mod hold;
 #[cfg(test)]
@@ -26,46 +26,46 @@ use crate::units::Time;
 use nalgebra::Vector3;
 use std::time::Duration;
 
-/// The stage's positions are kept for longer by this than a measurement can be old.
+/// The stage's positions are kept this much longer than a measurement can be old.
 const HISTORY_MARGIN: Duration = Duration::from_secs(1);
-/// A start is refused by the mean of the positions over this time: a single one may be off by its noise.
+/// A start is refused only by the mean of the positions over this time, because of their noise.
 const START_AVERAGE: Duration = Duration::from_millis(500);
 
-/// An insertion and what it is steered by.
+/// An insertion, with the tracking and the estimation that steer it.
 ///
 /// A set-point is computed only while the newest believed tip position is young enough.
-pub(super) struct Insert {
+pub(super) struct InsertTask {
     config: SessionConfig,
     begun: Time,
-    /// The tip was believed when the last input had been taken.
-    tip_believed: bool,
+    /// At the last input the tip was seen, and the start from there was good.
+    is_start_accepted: bool,
     /// Since when the start is in doubt, and the mean of the positions since then.
     start_in_doubt: Option<(Time, MovingMean)>,
     tracking: Tracking,
     /// The track of the target, if the target is a tool of its own.
     target: Option<TargetTracking>,
-    /// Measured stage positions, depth never receding: what the needle has cut.
+    /// Measured stage positions, with a depth that never decreases: the path that the needle has cut.
     history: StageHistory,
     estimation: Estimation,
-    /// None while the stage is brought up and the first tip position awaited.
+    /// `None` until the stage is brought up and the first tip position has come.
     insertion: Option<Insertion>,
     hold: Option<Hold>,
     /// The last hold by the tracker that ended by itself.
     ended_hold: Option<EndedHold>,
-    /// Measurements that the observers have not been told.
+    /// Measurements that have not corrected the observers yet.
     untold: Vec<Measurement>,
-    /// The time of the feedback after which the observers are to be told.
-    catches_up: Option<Time>,
+    /// The time of the feedback after which the observers still must be corrected.
+    catch_up_to: Option<Time>,
     progress: Progress,
 }
 
-impl Insert {
+impl InsertTask {
     /// # Errors
-    /// Where an observer refuses its configuration.
+    /// If an observer refuses its configuration.
     pub(super) fn new(config: SessionConfig, now: Time) -> Result<Self, ObserverError> {
-        Ok(Insert {
+        Ok(InsertTask {
             begun: now,
-            tip_believed: false,
+            is_start_accepted: false,
             start_in_doubt: None,
             tracking: Tracking::new(&config),
             target: config
@@ -79,13 +79,13 @@ impl Insert {
             hold: None,
             ended_hold: None,
             untold: Vec::new(),
-            catches_up: None,
+            catch_up_to: None,
             progress: Progress { depth_mm: config.insertion.depth_mm, ..Progress::default() },
             config,
         })
     }
 
-    /// Everything the tracking has to record, and its state.
+    /// Records what the tracking has to report, and its state.
     fn drain_tracking(&mut self, shell: &mut Shell) {
         self.tracking.records.drain(..).for_each(|record| shell.record(record));
         shell.enter(self.tracking.state(shell.now));
@@ -126,7 +126,7 @@ impl Insert {
         if shell.is_running() {
             measurements.into_iter().for_each(|measurement| {
                 self.estimation.gather(&measurement);
-                self.untold.extend(insertion.measure(measurement));
+                self.untold.extend(insertion.take_measurement(measurement));
             });
             inserted = self.insert(shell, feedback, at, &mut insertion);
         }
@@ -134,7 +134,8 @@ impl Insert {
         inserted
     }
 
-    fn check_reach(&mut self, shell: &mut Shell, tip_mm: &Vector3<f64>) -> Result<(), String> {
+    /// Checks that the plane, and the target if there is one, can be reached from a tip at `tip_mm`.
+    fn check_start(&mut self, shell: &mut Shell, tip_mm: &Vector3<f64>) -> Result<(), String> {
         let target_mm = self.target.as_ref().and_then(TargetTracking::position_mm);
         if let Some(goal) = &mut self.config.goal {
             target_mm.into_iter().for_each(|target_mm| goal.set_target(target_mm));
@@ -183,7 +184,7 @@ impl Insert {
     }
 
     /// One SYNC of the insertion: checks, the step that is due, the next set-point. An error is
-    /// the reason to stop for.
+    /// the reason to stop the run.
     fn insert(
         &mut self,
         shell: &mut Shell,
@@ -191,13 +192,13 @@ impl Insert {
         at: SetPoint,
         insertion: &mut Insertion,
     ) -> Result<(), String> {
-        self.catches_up = Some(feedback.time);
+        self.catch_up_to = Some(feedback.time);
         if self.config.tracker.judges_stream {
             self.tracking.travel.check().map_err(|error| format!("tracker: {error}"))?;
         }
         self.watch_tip(shell, feedback.time, at.insertion_mm, insertion)?;
         insertion.check_arrival(feedback.time, at.insertion_mm)?;
-        if let Some(due) = insertion.due(feedback.time, at.insertion_mm) {
+        if let Some(due) = insertion.take_due_step(feedback.time, at.insertion_mm) {
             self.correct(feedback.time)?;
             self.step(shell, feedback.time, at, insertion, &due)?;
         }
@@ -207,8 +208,8 @@ impl Insert {
         }
     }
 
-    /// Takes one step: observe, decide, record, and steer on. After the last the insertion is complete.
-    /// An error is the reason to stop for.
+    /// Takes one step: observe, decide, record, and steer on. After the last step the insertion is complete.
+    /// An error is the reason to stop the run.
     fn step(
         &mut self,
         shell: &mut Shell,
@@ -267,30 +268,30 @@ impl Insert {
         Ok(())
     }
 
-    /// True while the tip is believed, and the target where that is a tool of its own.
+    /// True while the tip is seen, and the target if that is a tool of its own.
     fn is_seen(&self, now: Time) -> bool {
-        let has_target = self.target.as_ref().is_none_or(|target| target.trouble(now).is_none());
-        self.tracking.is_seen(now) && has_target
+        let sees_target = self.target.as_ref().is_none_or(|target| target.trouble(now).is_none());
+        self.tracking.is_seen(now) && sees_target
     }
 
-    /// When the run gives up waiting for a tip to begin with: some time after the last was seen; once
-    /// nothing but the tip is awaited, some time after that, whatever is seen. A start in doubt is decided
-    /// first.
+    /// When the run gives up waiting for a tip to start from: `tracker.timeout_s` after the last position of tip
+    /// and target, or, once the run waits for nothing else, that long after this wait began, even if positions
+    /// are still seen. A start in doubt is decided first.
     fn tip_due(&self, power: Power) -> Time {
         let tip = self.tracking.last_acquisition();
         let target = self.target.as_ref().map_or(tip, TargetTracking::last_acquisition);
-        let heard = tip.min(target).unwrap_or(self.begun).max(self.begun);
-        let since = match power {
-            Power::Off | Power::ComingOn => heard,
-            // Decided; power comes on at the next SYNC.
-            Power::Awaited(_) if self.tip_believed => heard,
-            Power::Awaited(since) | Power::On(since) => since.min(heard),
+        let last_seen = tip.min(target).unwrap_or(self.begun).max(self.begun);
+        let waiting_since = match power {
+            Power::Off | Power::ComingOn => last_seen,
+            // The start is accepted; power comes on at the next SYNC.
+            Power::Awaited(_) if self.is_start_accepted => last_seen,
+            Power::Awaited(since) | Power::On(since) => since.min(last_seen),
         };
-        let due = since + self.config.tracker.timeout;
+        let due = waiting_since + self.config.tracker.timeout;
         self.start_in_doubt.as_ref().map_or(due, |(doubted, _)| due.max(*doubted + START_AVERAGE))
     }
 
-    /// Why there is no tip to begin with.
+    /// Why there is no tip to start from.
     fn explain_no_tip(&self, now: Time) -> String {
         let limit_s = self.config.tracker.timeout.as_secs_f64();
         let target = self.target.as_ref().filter(|_| self.tracking.is_seen(now));
@@ -312,7 +313,7 @@ impl Insert {
     }
 }
 
-impl Task for Insert {
+impl Task for InsertTask {
     fn tip_age_max(&self) -> Option<Duration> {
         Some(self.config.tracker.hold.after)
     }
@@ -321,15 +322,15 @@ impl Task for Insert {
         shell.enter(State::AwaitingTip);
     }
 
-    /// The axes get power only while the tip is believed, from a start from which the plane can be
+    /// The axes get power only while the tip is seen at a start from which the plane, or the target, can be
     /// reached.
     fn permits_power(&mut self, shell: &mut Shell) -> Result<bool, String> {
         let newest = self.tracking.track.last().copied().filter(|_| self.is_seen(shell.now));
         let Some(newest) = newest else {
-            (self.tip_believed, self.start_in_doubt) = (false, None);
+            (self.is_start_accepted, self.start_in_doubt) = (false, None);
             return Ok(false);
         };
-        if self.tip_believed {
+        if self.is_start_accepted {
             return Ok(true);
         }
         if let Some((since, mean)) = &mut self.start_in_doubt {
@@ -338,19 +339,19 @@ impl Task for Insert {
                 return Ok(false);
             }
             let tip_mm = mean.mean_mm().unwrap_or(newest.position_mm);
-            self.check_reach(shell, &tip_mm)?;
-        } else if self.check_reach(shell, &newest.position_mm).is_err() {
+            self.check_start(shell, &tip_mm)?;
+        } else if self.check_start(shell, &newest.position_mm).is_err() {
             self.start_in_doubt = Some((shell.now, MovingMean::new(START_AVERAGE)));
             return Ok(false);
         }
-        self.tip_believed = true;
+        self.is_start_accepted = true;
         Ok(true)
     }
 
-    /// A set-point between two steps does not depend on what the observers make of the positions, and
-    /// leaves first: that takes far longer.
+    /// A set-point between two steps does not depend on the observers. It is sent first, because correcting
+    /// the observers takes far longer.
     fn catch_up(&mut self) -> Result<(), String> {
-        let Some(time) = self.catches_up.take() else { return Ok(()) };
+        let Some(time) = self.catch_up_to.take() else { return Ok(()) };
         self.correct(time)?;
         let after = self.config.tracker.hold.after;
         self.estimation.watch(time - after / 2, time - after, &self.history)
@@ -400,7 +401,7 @@ impl Task for Insert {
     fn deadline(&self, shell: &Shell) -> Time {
         match self.insertion {
             None => self.tip_due(shell.power()),
-            Some(_) => self.catches_up.unwrap_or(Time::NEVER),
+            Some(_) => self.catch_up_to.unwrap_or(Time::NEVER),
         }
     }
 
@@ -416,13 +417,13 @@ impl Task for Insert {
     ) -> Result<String, String> {
         match command {
             OperatorCommand::Hold => self.hold_for_operator(shell),
-            OperatorCommand::Resume => self.go_on(shell, None),
-            OperatorCommand::Step { mm } => self.go_on(shell, Some(mm)),
+            OperatorCommand::Resume => self.resume(shell, None),
+            OperatorCommand::Step { mm } => self.resume(shell, Some(mm)),
             OperatorCommand::Speed { mm_per_s } => {
                 let insertion = self.insertion.as_mut().ok_or(hold::NOT_BEGUN)?;
-                let was = insertion.profile.speed_max_mm_per_s;
+                let before = insertion.profile.speed_max_mm_per_s;
                 insertion.set_speed(mm_per_s)?;
-                Ok(format!("{command}, was {was:.3}"))
+                Ok(format!("{command}, was {before:.3}"))
             }
         }
     }
@@ -431,7 +432,7 @@ impl Task for Insert {
         let (insertion, is_held) = (self.insertion.as_ref(), self.hold.is_some());
         Progress {
             speed_mm_per_s: insertion.map_or(0.0, |insertion| insertion.profile.speed_max_mm_per_s),
-            to_go_s: insertion.filter(|_| !is_held).map(Insertion::to_go_s),
+            remaining_s: insertion.filter(|_| !is_held).map(Insertion::remaining_s),
             tip_age_s: self.tracking.age_s(now),
             ..self.progress
         }
@@ -442,9 +443,9 @@ impl Task for Insert {
     }
 }
 
-/// How many SYNCs the history holds: those that a measurement can come from, and a margin.
+/// How many SYNCs the history holds: those to which a measurement may refer, and a margin.
 fn history_points(config: &SessionConfig) -> usize {
-    // Positions are gathered for half as long before the watch over the stream takes their mean.
+    // The check of handedness averages the positions of half of `hold_after` before it uses their mean.
     let span = config.tracker.hold.after * 2 + HISTORY_MARGIN;
     (span.as_nanos() / config.stage.bus.sync_period().as_nanos().max(1)) as usize + 2
 }

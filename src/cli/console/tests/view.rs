@@ -65,7 +65,7 @@ proptest! {
         for mut screen in [inserted(), stopped()] {
             screen.progress.insertion_meas_mm = number;
             screen.progress.depth_mm = number;
-            screen.progress.to_go_s = Some(number);
+            screen.progress.remaining_s = Some(number);
             screen.path.push([number; 4]);
             screen.pose = Some(([number; 6], Some([number; 6])));
             screen.has_help = true;
