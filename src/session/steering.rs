@@ -9,42 +9,42 @@ use nalgebra::Vector3;
 
 /// The observers of a run and its control law.
 ///
-/// Carry it along the measured path with [`Steering::predict`], correct it at a measurement, and
-/// ask it once a step what to do. A session does so at what the stage and the tracker send; a study
-/// at what they would have sent.
+/// The caller carries it along the measured path with [`Steering::predict`], corrects it with each
+/// measurement, and calls [`Steering::decide`] once a step. A session does so with what the stage and the
+/// tracker send, a study with what they would have sent.
 pub struct Steering {
     observer: Box<dyn Observer>,
     shadows: Vec<(String, Box<dyn Observer>)>,
     control: Box<dyn Controller>,
     pursuit: Option<Pursuit>,
-    /// Depth at which the observers stand, from where they began, mm.
+    /// Depth of the observers' states, from where they began, mm.
     depth_mm: f64,
     handedness: HandednessWatch,
     samples: Samples,
     whiteness: Whiteness,
-    is_noise_told: bool,
+    is_noise_configured: bool,
     step_mm: f64,
 }
 
-/// With one correction a step, the correlation of the positions between two steps is not known: at most
-/// every second one counts as independent.
-const UNSEEN_INFLATION: f64 = 2.0;
+/// With one correction a step, the correlation of the positions between two steps is not known. Every second
+/// position counts as independent.
+const UNKNOWN_INFLATION: f64 = 2.0;
 
 /// The result of a step.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Decision {
     /// The estimate that steers; `None` while its observer has none.
     pub estimate: Option<Estimate>,
-    /// The shadows', by name.
+    /// The estimates of the shadows, by name.
     pub shadows: Vec<(String, Option<Estimate>)>,
-    /// Rotation of the base for the next step, rad/mm; `None` after the last step, and where the
+    /// Rotation of the base for the next step, rad/mm; `None` after the last step, and if the
     /// law refuses.
     pub rotation_cmd_rad_per_mm: Option<f64>,
-    /// The law asked for more than its own limits let through.
+    /// The law demanded more than its own limits allow.
     pub command_saturated: bool,
-    /// What is known of the target; `None` without one, and without an estimate.
+    /// What is known of the target; `None` without a target or without an estimate.
     pub approach: Option<Approach>,
-    /// Why there is no command: the run is to be stopped.
+    /// Why there is no command: the run must be stopped for this reason.
     pub refused: Option<String>,
 }
 
@@ -52,7 +52,7 @@ impl Steering {
     /// The observers and the law that `config` names.
     ///
     /// # Errors
-    /// [`ObserverError`] where an observer refuses what it is told.
+    /// [`ObserverError`] if an observer refuses its parameters.
     pub fn new(config: &SessionConfig) -> Result<Self, ObserverError> {
         let shadows = config
             .shadows
@@ -81,20 +81,20 @@ impl Steering {
             samples: config.insertion.corrected_by,
             whiteness: Whiteness::new(position_sd_mm)
                 .with_told(config.tracker.noise, observer_sd_mm),
-            is_noise_told: config.tracker.noise.is_some(),
+            is_noise_configured: config.tracker.noise.is_some(),
             step_mm: config.insertion.step_mm,
         })
     }
 
-    /// Carries every observer on by one measured increment.
+    /// Advances every observer by one measured increment.
     pub fn predict(&mut self, increment: Increment) {
         self.depth_mm += increment.insertion_mm();
         self.observers().for_each(|observer| observer.predict(increment));
     }
 
-    /// Corrects every observer with the mean of `positions` positions measured where they stand,
-    /// each `spacing_s` after the one before; infinite for the first of all. Gives the innovation of
-    /// the one that steers, mm; `None` where it had no estimate yet.
+    /// Corrects every observer with the mean of `positions` positions measured at the depth of their states,
+    /// each `spacing_s` after the one before (infinite for the first position of a run). Returns the
+    /// innovation of the observer that steers, mm; `None` if it had no estimate yet.
     pub fn correct(
         &mut self,
         tip_meas: &TipPosition,
@@ -102,7 +102,7 @@ impl Steering {
         spacing_s: f64,
     ) -> Option<Vector3<f64>> {
         let predicted_mm = self.observer.position_mm();
-        let independent = match (self.samples, self.is_noise_told) {
+        let independent = match (self.samples, self.is_noise_configured) {
             (Samples::OnePerStep, false) => 1.0,
             _ => f64::from(positions) / self.whiteness.inflation(spacing_s),
         };
@@ -112,41 +112,41 @@ impl Steering {
         Some(innovation_mm)
     }
 
-    /// The watch over the stream's handedness, which goes along the measured path at its own pace.
+    /// The handedness watch. The caller carries it along the measured path, independently of the observers.
     pub fn handedness(&mut self) -> &mut HandednessWatch {
         &mut self.handedness
     }
 
-    /// Tells that watch the mean of `positions` positions, `spacing_s` apart, measured on average
-    /// where it stands.
-    pub fn watch(&mut self, tip_meas: &TipPosition, positions: u32, spacing_s: f64) {
-        let inflation = match (self.samples, self.is_noise_told) {
-            (Samples::OnePerStep, false) => UNSEEN_INFLATION,
+    /// Corrects the handedness watch with the mean of `positions` positions, `spacing_s` apart, whose mean
+    /// depth is that of the watch.
+    pub fn correct_handedness(&mut self, tip_meas: &TipPosition, positions: u32, spacing_s: f64) {
+        let inflation = match (self.samples, self.is_noise_configured) {
+            (Samples::OnePerStep, false) => UNKNOWN_INFLATION,
             _ => self.whiteness.inflation(spacing_s),
         };
         self.handedness.correct(tip_meas, f64::from(positions) / inflation);
     }
 
-    /// Sets where the target is, if there is one, plane frame, mm.
+    /// Sets the position of the target, plane frame, mm. Does nothing without a target.
     pub fn set_target(&mut self, target_mm: Vector3<f64>) {
         if let Some(pursuit) = &mut self.pursuit {
             pursuit.set_target(target_mm);
         }
     }
 
-    /// The estimate that steers, where the observers stand; `None` while there is none.
+    /// The estimate that steers, at the depth of the observers' states; `None` while there is none.
     pub fn estimate(&self) -> Option<Estimate> {
         self.observer.estimate()
     }
 
-    /// Decides on the next step, from the estimates carried `ahead` of where the observers stand.
-    /// Without an estimate the needle goes on unturned.
+    /// Decides on the next step, from the estimates predicted over the increments `ahead` of the observers'
+    /// states. Without an estimate the needle goes on unturned.
     pub fn decide(&mut self, ahead: &[Increment], is_last: bool) -> Decision {
         let estimate = self.observer.estimate_after(ahead);
         let shadows = self.shadows.iter();
         let shadows =
             shadows.map(|(name, shadow)| (name.clone(), shadow.estimate_after(ahead))).collect();
-        // A lost observer has no estimate either: it is asked before anything else.
+        // A lost observer has no estimate either, so it is checked first.
         let unturned = Command { rotation_rad_per_mm: 0.0, saturated: false };
         let ahead_mm: f64 = ahead.iter().map(|increment| increment.insertion_mm()).sum();
         let (approach, command) = match (self.check(), &estimate) {
@@ -168,14 +168,14 @@ impl Steering {
         }
     }
 
-    /// A lost observer and a stream of the wrong handedness end a run. The stream comes first: it may be
-    /// the cause of the other.
+    /// A stream of the wrong handedness and a lost observer end a run. The stream is checked first, since it
+    /// may have caused the loss.
     fn check(&self) -> Result<(), String> {
         self.handedness.check().map_err(|error| format!("tracker: {error}"))?;
         self.observer.check().map_err(|error| format!("observer: {error}"))
     }
 
-    /// What the step knows of the target, and the command; none where the insertion ends.
+    /// What is known of the target at this step, and the command; no command if the insertion ends here.
     fn command(
         &mut self,
         estimate: &Estimate,

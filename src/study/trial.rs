@@ -59,7 +59,7 @@ pub fn insert(
             let path = needle.base.between(watched_mm, mean.insertion_meas_mm);
             path.into_iter().for_each(|increment| watch.predict(increment));
             watched_mm = watched_mm.max(mean.insertion_meas_mm);
-            steering.watch(&tip_meas, mean.positions(), interval_s);
+            steering.correct_handedness(&tip_meas, mean.positions(), interval_s);
         }
         if let Some(tool) = target_tool {
             needle.see_target(tool, &due.samples);
