@@ -1,4 +1,4 @@
-//! Steering to a target: the path planned anew each step, and the law that follows it.
+//! Steering to a target: the path is planned anew each step, and a control law follows it.
 
 use super::target::TargetTool;
 use crate::control::{Bend, BendLaw, Command, ControlConfig, ControlKind};
@@ -12,20 +12,20 @@ use nalgebra::Vector3;
 pub struct Goal {
     /// The obstacles.
     pub world: World,
-    /// The target, and what a path may be; the expansions are those of each step.
+    /// The target, and the limits of a path; `expansions_max` is the budget of each step.
     pub problem: Problem,
-    /// The part of the needle's curvature that a path leaves unused.
+    /// The share of the needle's curvature that a path leaves unused.
     pub curvature_margin: f64,
     /// The path planned before the run.
     pub path: Path,
-    /// The tool that is the target, where the tracker sees it.
+    /// The target's tool, if the tracker sees the target.
     pub tool: Option<TargetTool>,
 }
 
 impl Goal {
-    /// Plans the path with which the run begins by `problem.expansions_max` expansions. It keeps at least
-    /// `reserve_mm` more from the obstacles than the clearance. Each step of the run may spend
-    /// `step_expansions_max`.
+    /// Plans the path with which the run begins, with at most `problem.expansions_max` expansions. The path
+    /// stays at least `reserve_mm` farther from the obstacles than the clearance. Each step of the run may spend
+    /// `step_expansions_max` expansions.
     ///
     /// # Errors
     /// Why no path is found, and the reachable point that is nearest to the target.
@@ -40,8 +40,8 @@ impl Goal {
         let roomy = plan_with_reserve(&world, &problem, reserve_mm, &shortest);
         let RoomyPath { path, .. } = roomy.map_err(|reason| {
             let nearest = shortest.nearest_mm.filter(|_| shortest.path.is_none()).map(|at| {
-                let (at, off_mm) = (text(&at), (at - target_mm).norm());
-                format!("; nearest is {at}, {off_mm:.1} mm from it")
+                let (at, off_mm) = (shown(&at), (at - target_mm).norm());
+                format!("; the nearest reachable point is {at}, {off_mm:.1} mm from the target")
             });
             format!("goal: {reason}{}", nearest.unwrap_or_default())
         })?;
@@ -50,14 +50,14 @@ impl Goal {
         Ok(Goal { world, problem, curvature_margin, path, tool: None })
     }
 
-    /// Sets where the target is, plane frame, mm. A path in the plane leads to the point of the plane that is
-    /// nearest to it.
+    /// Sets the position of the target, plane frame, mm. A path in the plane leads to the point of the plane that
+    /// is nearest to it.
     pub(super) fn set_target(&mut self, target_mm: Vector3<f64>) {
         let x_mm = if self.problem.in_plane { 0.0 } else { target_mm.x };
         self.problem.target_mm = Vector3::new(x_mm, target_mm.y, target_mm.z);
     }
 
-    /// Refuses a tip that is seen where no path to the target begins, with the heading as assumed.
+    /// Checks that a path leads to the target from a tip that is seen at `tip_mm`, with the assumed heading.
     ///
     /// # Errors
     /// The reason, in words.
@@ -71,11 +71,11 @@ impl Goal {
         let Problem { start, clearance_mm, .. } = problem;
         let (world, path) = (self.world.clone(), Some(self.path.clone()));
         let mut replanner = Replanner::new(world, problem, self.curvature_margin, path);
-        let seen = text(tip_mm);
+        let seen = shown(tip_mm);
         replanner.check_start(start).map_err(|reason| {
             format!("no path to the target from {seen}, where the tip is seen: {reason}")
         })?;
-        // The path begins in the plane, where the tip may not be.
+        // The path begins in the plane, but the tip may be off the plane.
         if self.world.slack_mm(tip_mm, clearance_mm) < 0.0 {
             return Err(format!(
                 "the tip is seen at {seen}, off the plane, and nearer to an obstacle than \
@@ -86,18 +86,18 @@ impl Goal {
     }
 }
 
-fn text(at_mm: &Vector3<f64>) -> String {
+fn shown(at_mm: &Vector3<f64>) -> String {
     format!("[{:.1}, {:.1}, {:.1}]", at_mm.x, at_mm.y, at_mm.z)
 }
 
-/// What a step knows of the target.
+/// What is known of the target at a step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Approach {
     /// The target, plane frame, mm.
     pub target_mm: Vector3<f64>,
-    /// From the estimated tip to the target, mm.
+    /// Distance of the estimated tip from the target, mm.
     pub distance_mm: f64,
-    /// From the estimated tip to the nearest obstacle, mm; infinite without obstacles.
+    /// Distance of the estimated tip from the nearest obstacle, mm; infinite without obstacles.
     pub clearance_mm: f64,
     /// Distance from the target at the end of the path, mm.
     pub error_mm: f64,
@@ -110,16 +110,16 @@ pub(super) struct Pursuit {
     replanner: Replanner,
     law: BendLaw,
     goal: Goal,
-    /// Where the target is, plane frame, mm; it may be off the plane.
+    /// Position of the target, plane frame, mm; it may be off the plane.
     target_mm: Vector3<f64>,
-    /// Depth up to which the replanner knows of the insertion, mm.
+    /// Depth at the replanner's last step, mm.
     planned_at_mm: f64,
     /// The needle's curvature as configured, per mm.
     curvature_per_mm: f64,
 }
 
 impl Pursuit {
-    /// `None` if the control law is not one that can follow a path.
+    /// `None` if the control law cannot follow a path.
     pub(super) fn new(goal: Goal, needle: Needle, control: &ControlConfig) -> Option<Self> {
         if control.kind != ControlKind::NestedSaturation {
             return None;
@@ -135,35 +135,35 @@ impl Pursuit {
         })
     }
 
-    /// Sets where the target is, plane frame, mm.
+    /// Sets the position of the target, plane frame, mm.
     pub(super) fn set_target(&mut self, target_mm: Vector3<f64>) {
         self.target_mm = target_mm;
         self.goal.set_target(target_mm);
         self.replanner.set_target(self.goal.problem.target_mm);
     }
 
-    /// Refuses a target that has moved where no path may end.
+    /// Checks that the target has not moved to where no path may end.
     fn check_target(&self) -> Result<(), String> {
         let Problem { target_mm, tolerance_mm, clearance_mm, .. } = self.goal.problem;
         let off_mm = (self.target_mm - target_mm).norm();
         if off_mm > tolerance_mm {
             return Err(format!(
-                "goal: the target is {off_mm:.1} mm off the plane, allowed is goal.tolerance_mm, \
-                 {tolerance_mm}"
+                "goal: the target is {off_mm:.1} mm off the plane (limit goal.tolerance_mm, \
+                 {tolerance_mm})"
             ));
         }
         let slack_mm = self.goal.world.slack_mm(&target_mm, clearance_mm) + tolerance_mm;
         if slack_mm < 0.0 {
             return Err(format!(
-                "goal: the target has moved {:.1} mm too far: out of goal.workspace_mm, or to an \
-                 obstacle",
+                "goal: the target has moved {:.1} mm too far: out of goal.workspace_mm, or into the \
+                 clearance of an obstacle",
                 -slack_mm
             ));
         }
         Ok(())
     }
 
-    /// How far the tip is from the target where the insertion has ended.
+    /// The approach at the end of the insertion, without a path.
     pub(super) fn end(&self, estimate: &Estimate) -> Approach {
         let (target_mm, tip_mm) = (self.target_mm, estimate.x_pb.translation);
         let distance_mm = (tip_mm - target_mm).norm();
@@ -179,13 +179,13 @@ impl Pursuit {
         step_mm: f64,
     ) -> (Approach, Result<Option<Command>, String>) {
         let heading = estimate.x_pb.rotation * Vector3::z();
-        let told_per_mm = self.curvature_per_mm;
+        let nominal_per_mm = self.curvature_per_mm;
         let curvature_per_mm =
-            estimate.belief.map_or(told_per_mm, |belief| belief.curvature_per_mm);
+            estimate.belief.map_or(nominal_per_mm, |belief| belief.curvature_per_mm);
         let known = plan::Estimate {
             tip: Tip { position_mm: estimate.x_pb.translation, heading },
-            // A needle that bends by more than it was told to may do so by chance.
-            curvature_per_mm: curvature_per_mm.clamp(0.1 * told_per_mm, told_per_mm),
+            // An estimate above the configured curvature may be chance.
+            curvature_per_mm: curvature_per_mm.clamp(0.1 * nominal_per_mm, nominal_per_mm),
             position_sd_mm: estimate.sd.map_or(0.0, |[x, y, z, ..]| x.max(y).max(z)),
             heading_sd_rad: estimate.sd.map_or(0.0, |[.., yaw, pitch, _]| yaw.max(pitch)),
         };

@@ -252,7 +252,8 @@ impl Insertion {
     /// Sets the depth at which the insertion ends to `depth_mm`, or to the nearest depth at which the needle
     /// can still be stopped. Returns that depth, mm.
     pub(crate) fn end_at(&mut self, depth_mm: f64) -> f64 {
-        self.config.depth_mm = depth_mm.max(self.profile.stops_at_mm()).min(self.depth_max_mm);
+        self.config.depth_mm =
+            depth_mm.max(self.profile.stopping_depth_mm()).min(self.depth_max_mm);
         self.last_step = last_step(&self.config);
         self.config.depth_mm
     }

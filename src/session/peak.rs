@@ -1,18 +1,17 @@
-//! The highest accelerations that set-points command: limits of the axes must allow them.
+//! The highest accelerations that set-points can command. The limits of the axes must allow them.
 
 use std::time::Duration;
 
-/// The highest acceleration of an axis that is led to a goal by an acceleration of 1, where set-points
-/// are one SYNC apart.
+/// The highest acceleration in the set-points of a profile, relative to the configured acceleration. It
+/// exceeds 1 because set-points are one SYNC apart and the last of them is cut to end at the goal.
 ///
-/// The axis brakes by 1 from SYNC to SYNC until less is left to the goal than it would go. Where it
-/// would go at the speed u by then, in units of acceleration times period, u(u + 1)/2 is left, and
-/// 1 + u is the speed before: the difference is 1 + u/2 - u²/2, at most 9/8.
+/// Take speeds in units of acceleration times period. The speed falls by 1 each period until the distance to
+/// the goal is shorter than the next step. If the next speed were u, the distance is u(u + 1)/2, and the speed
+/// before was 1 + u. The difference is 1 + u/2 - u²/2, at most 9/8.
 pub const PROFILE_PEAK: f64 = 1.125;
 
-/// The highest acceleration of the rotation, in units of `rate_max` times `speed` per second: the law
-/// may turn the needle by `rate_max` per mm one way until one SYNC and the other way from it on,
-/// inserted at `speed` mm/s.
+/// The highest acceleration of the rotation, in the unit of `rate_max` times mm per s². At one SYNC the law may
+/// change from `rate_max` per mm in one direction to as much in the other, inserting at `speed_mm_per_s`.
 pub fn rotation_peak(rate_max: f64, speed_mm_per_s: f64, sync_period: Duration) -> f64 {
     2.0 * rate_max * speed_mm_per_s / sync_period.as_secs_f64()
 }

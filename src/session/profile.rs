@@ -1,11 +1,11 @@
-//! The commanded depth over time: one axis, accelerated and braked evenly.
+//! The commanded depth over time: one axis, with constant acceleration and braking.
 
 use std::time::Duration;
 
-/// A trapezoid of speed towards a goal, sampled once a SYNC.
+/// A trapezoidal speed profile towards a goal, sampled once a SYNC.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Profile {
-    /// Speed to go on with, mm/s; a faster one is braked evenly.
+    /// Speed limit, mm/s; a higher present speed is braked down to it.
     pub(super) speed_max_mm_per_s: f64,
     acceleration_mm_per_s2: f64,
     position_mm: f64,
@@ -14,61 +14,61 @@ pub(crate) struct Profile {
     /// Depth at which a single step ends, short of the goal, mm.
     step_end_mm: Option<f64>,
     /// Braking while the insertion is held, mm/s².
-    held_mm_per_s2: Option<f64>,
+    hold_braking_mm_per_s2: Option<f64>,
 }
 
 impl Profile {
-    /// At rest at 0 mm, with 0 mm for a goal.
+    /// At rest at 0 mm, with the goal at 0 mm.
     pub(crate) fn new(speed_max_mm_per_s: f64, acceleration_mm_per_s2: f64) -> Self {
         Profile { speed_max_mm_per_s, acceleration_mm_per_s2, ..Profile::default() }
     }
 
-    /// Sets the depth to stop at; it is never less than where the present speed can be braked.
+    /// Sets the depth to stop at, or the stopping depth if that is deeper.
     pub(crate) fn go_to(&mut self, goal_mm: f64) {
-        self.goal_mm = goal_mm.max(self.stops_at_mm());
+        self.goal_mm = goal_mm.max(self.stopping_depth_mm());
     }
 
-    /// The least depth to stop at by even braking, mm.
-    pub(crate) fn stops_at_mm(&self) -> f64 {
+    /// The depth at which braking from now on would end, mm, at most the goal.
+    pub(crate) fn stopping_depth_mm(&self) -> f64 {
         let braking_mm =
             0.5 * self.speed_mm_per_s * self.speed_mm_per_s / self.acceleration_mm_per_s2;
         (self.position_mm + braking_mm).min(self.goal_mm)
     }
 
-    /// Brakes to a standstill short of the goal, by `braking_mm_per_s2`, until released.
+    /// Brakes to a standstill short of the goal, at `braking_mm_per_s2`, until [`Profile::release`].
     pub(crate) fn hold(&mut self, braking_mm_per_s2: f64) {
-        self.held_mm_per_s2 = Some(braking_mm_per_s2);
+        self.hold_braking_mm_per_s2 = Some(braking_mm_per_s2);
     }
 
     /// Goes on after a hold: to the goal, or by a single step of `step_mm`.
     pub(crate) fn release(&mut self, step_mm: Option<f64>) {
-        self.held_mm_per_s2 = None;
+        self.hold_braking_mm_per_s2 = None;
         self.step_end_mm = step_mm.map(|mm| self.position_mm + mm);
     }
 
-    /// True from the begin of a single step until the next hold ends.
+    /// True from the start of a single step until the next release.
     pub(crate) fn is_stepping(&self) -> bool {
         self.step_end_mm.is_some()
     }
 
-    /// True when a single step has come to its end.
-    pub(crate) fn has_stepped(&self) -> bool {
+    /// True when a single step has reached its end.
+    pub(crate) fn has_finished_step(&self) -> bool {
         self.step_end_mm.is_some_and(|end_mm| self.position_mm >= end_mm)
     }
 
-    /// Depth at which the way ends for now, mm.
+    /// Depth at which the present motion ends, mm: the goal, or the end of a single step.
     fn end_mm(&self) -> f64 {
         self.step_end_mm.map_or(self.goal_mm, |end_mm| end_mm.min(self.goal_mm))
     }
 
-    /// True when a hold has brought the commanded depth to rest.
+    /// True while the commanded depth does not change.
     pub(crate) fn is_at_rest(&self) -> bool {
         self.speed_mm_per_s == 0.0
     }
 
-    /// The depth at which the commanded depth would be at rest, mm, if it were held one `period`
-    /// from now; braking in whole periods stays within the `v² / 2a` of braking evenly.
-    pub(crate) fn held_at_mm(&self, braking_mm_per_s2: f64, period: Duration) -> f64 {
+    /// The depth at which a hold that starts one `period` from now would end, mm, at most. Braking once a
+    /// period takes no more than the `v² / 2a` of continuous braking.
+    pub(crate) fn hold_depth_mm(&self, braking_mm_per_s2: f64, period: Duration) -> f64 {
         let next = (self.speed_mm_per_s + self.acceleration_mm_per_s2 * period.as_secs_f64())
             .min(self.speed_max_mm_per_s.max(self.speed_mm_per_s));
         let braking_mm = 0.5 * next * next / braking_mm_per_s2;
@@ -91,11 +91,13 @@ impl Profile {
         let end_mm = self.end_mm();
         let remaining_mm = end_mm - self.position_mm;
         let a = self.acceleration_mm_per_s2;
-        // The speed from which braking in whole periods still ends at the goal.
+        // The speed from which braking once a period still ends at the goal.
         let half = 0.5 * a * dt;
         let braking = (half * half + 2.0 * a * remaining_mm).sqrt() - half;
-        let speed_mm_per_s = match self.held_mm_per_s2 {
-            Some(held_mm_per_s2) => (self.speed_mm_per_s - held_mm_per_s2 * dt).max(0.0),
+        let speed_mm_per_s = match self.hold_braking_mm_per_s2 {
+            Some(hold_braking_mm_per_s2) => {
+                (self.speed_mm_per_s - hold_braking_mm_per_s2 * dt).max(0.0)
+            }
             None if self.speed_mm_per_s > self.speed_max_mm_per_s => {
                 (self.speed_mm_per_s - a * dt).max(self.speed_max_mm_per_s)
             }
@@ -148,7 +150,7 @@ mod tests {
             let mut profile = Profile::new(speed, 10.0);
             profile.go_to(100.0);
             (0..after).for_each(|_| { profile.advance(period); });
-            let held_at_mm = profile.held_at_mm(braking, period);
+            let hold_depth_mm = profile.hold_depth_mm(braking, period);
             profile.advance(period);
             profile.hold(braking);
             let mut periods = 0;
@@ -158,7 +160,7 @@ mod tests {
                 periods += 1;
                 prop_assert!(periods <= 1001);
             }
-            let spare_mm = held_at_mm - profile.position_mm();
+            let spare_mm = hold_depth_mm - profile.position_mm();
             prop_assert!((-1e-9..=1.01 * speed * 0.01).contains(&spare_mm), "{spare_mm} mm");
             prop_assert_eq!(profile.advance(period), profile.position_mm());
             profile.release(None);

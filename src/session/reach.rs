@@ -4,18 +4,18 @@ use super::config::SessionConfig;
 use crate::needle::{Reduced, approach_max_mm, shortest_into_plane_mm};
 use nalgebra::Vector3;
 
-/// Standard deviations of the position and of the heading that are allowed in the run's favour.
-const SDS: f64 = 3.0;
-/// A shorter insertion is a trial, which need not reach the plane, mm.
+/// Number of standard deviations of position and heading that may count in the favour of a start.
+const SD_FACTOR: f64 = 3.0;
+/// A shorter insertion is a trial, mm. It is judged as if it were this deep.
 const TRIAL_MM: f64 = 60.0;
-/// Intervals between the positions and headings that are tried, over what the standard deviations allow.
-const POSITIONS: u32 = 8;
-const HEADINGS: u32 = 48;
+/// Numbers of intervals into which the ranges of position and heading are divided to try their values.
+const POSITION_INTERVALS: u32 = 8;
+const HEADING_INTERVALS: u32 = 48;
 
-/// Refuses a start from which no way into the plane is as short as the depth (60 mm for a shorter insertion),
-/// even from the most favourable position and heading within three standard deviations.
-/// On the way to a target in the plane the tip need only come as near to the plane as the target's tolerance. A
-/// target in space does not need the plane.
+/// Refuses a start from which the shortest way into the plane is longer than the depth (60 mm for a shorter
+/// insertion), even from the most favourable position and heading within three standard deviations. On the way
+/// to a target in the plane, the tip need only come within the target's tolerance of the plane. A target in
+/// space does not need the plane.
 ///
 /// # Errors
 /// The reason, with its numbers.
@@ -26,26 +26,26 @@ pub(super) fn check_reach(config: &SessionConfig, tip_mm: &Vector3<f64>) -> Resu
     let tracker = &config.tracker;
     let variance_mm2 =
         tracker.track.noise_sd_mm.powi(2) + config.handedness.registration_sd_mm.powi(2);
-    let margin_mm = SDS * variance_mm2.sqrt();
+    let margin_mm = SD_FACTOR * variance_mm2.sqrt();
     let (pitch_rad, pitch_sd_rad) =
         (config.handedness.start.pitch, config.handedness.start_sd.pitch);
     if let Some(goal) = &config.goal {
         let (off_mm, length_mm) = (tip_mm.x.abs(), goal.path.length_mm());
-        let toward_rad = SDS * pitch_sd_rad - tip_mm.x.signum() * pitch_rad;
-        let mended_mm = approach_max_mm(&config.needle, toward_rad, length_mm);
-        let left_mm = off_mm - margin_mm - mended_mm;
+        let toward_rad = SD_FACTOR * pitch_sd_rad - tip_mm.x.signum() * pitch_rad;
+        let correctable_mm = approach_max_mm(&config.needle, toward_rad, length_mm);
+        let remaining_mm = off_mm - margin_mm - correctable_mm;
         let tolerance_mm = goal.problem.tolerance_mm;
-        return match left_mm <= tolerance_mm {
+        return match remaining_mm <= tolerance_mm {
             true => Ok(()),
             false => Err(format!(
                 "the target is out of reach: the tip is {off_mm:.1} mm off the plane, and the path to the \
-                 target, {length_mm:.1} mm, corrects {mended_mm:.1} at most (plus {margin_mm:.1} for noise); \
+                 target, {length_mm:.1} mm, corrects {correctable_mm:.1} at most (plus {margin_mm:.1} for noise); \
                  goal.tolerance_mm is {tolerance_mm}"
             )),
         };
     }
-    let states = spread(tip_mm.x, margin_mm, POSITIONS).flat_map(|x_mm| {
-        let headings = spread(pitch_rad, SDS * pitch_sd_rad, HEADINGS);
+    let states = spread(tip_mm.x, margin_mm, POSITION_INTERVALS).flat_map(|x_mm| {
+        let headings = spread(pitch_rad, SD_FACTOR * pitch_sd_rad, HEADING_INTERVALS);
         headings.map(move |pitch_rad| Reduced { x_mm, pitch_rad, roll_rad: 0.0 })
     });
     let needed_mm = states
@@ -64,11 +64,11 @@ pub(super) fn check_reach(config: &SessionConfig, tip_mm: &Vector3<f64>) -> Resu
          it {needs}, insertion.depth_mm is {depth_mm:.0}",
         tip_mm.x,
         pitch_rad.to_degrees(),
-        SDS * pitch_sd_rad.to_degrees(),
+        SD_FACTOR * pitch_sd_rad.to_degrees(),
     ))
 }
 
-/// Gives `parts + 1` values from `middle - reach` to `middle + reach`, and the one in that range nearest to zero.
+/// `parts + 1` values from `middle - reach` to `middle + reach`, and the value in that range nearest to zero.
 fn spread(middle: f64, reach: f64, parts: u32) -> impl Iterator<Item = f64> {
     let nearest = middle - middle.clamp(-reach, reach);
     let part = move |part| middle + reach * (2.0 * f64::from(part) / f64::from(parts) - 1.0);
@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_depth_can_mend_is_let_pass() {
+    fn what_the_depth_can_correct_is_accepted() {
         assert_eq!(reach(&[], 8.0), Ok(()));
         assert_eq!(reach(&["insertion.depth_mm=1"], 1.0), Ok(()), "within the noise");
         assert_eq!(reach(&["insertion.depth_mm=30"], -5.0), Ok(()));

@@ -1,4 +1,4 @@
-//! What a session reports for its record. It never reads it back.
+//! What a session writes to its record. A session never reads its record.
 
 use super::machine::Input;
 use super::state::State;
@@ -10,7 +10,7 @@ use crate::units::Time;
 use derive_more::Display;
 use nalgebra::Vector3;
 
-/// Which way a frame went, seen from the bench.
+/// Direction of a frame, from the bench's point of view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Direction {
     /// Taken from the bus.
@@ -46,20 +46,20 @@ impl Lane {
 pub enum Severity {
     /// Worth knowing.
     Info,
-    /// Something is not as it should be; the run goes on.
+    /// Something is wrong, but the run goes on.
     Warning,
     /// The run is stopped.
     Fault,
 }
 
-/// One tip position as received, and what became of it.
+/// One position as received, and whether it was accepted.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SampleRecord {
     /// As received.
     pub received: Sample,
-    /// Position in plane frame P, mm, where the sample was accepted.
+    /// Position in plane frame P, mm, if the sample was accepted.
     pub position_plane_mm: Option<Vector3<f64>>,
-    /// When the tip was there: the stamp less the latency, where the sample was accepted.
+    /// When the tip was there: the stamp less the latency, if the sample was accepted.
     pub acquisition_time: Option<Time>,
     /// Why the sample was refused; `None` when it was accepted.
     pub refused: Option<Refusal>,
@@ -90,7 +90,7 @@ pub struct StepRecord {
     pub rotation_meas_rad: f64,
     /// Tracked positions that corrected the observers since the step before.
     pub tip_positions: u32,
-    /// The newest of them, or the mean of a standstill, plane frame, mm.
+    /// The newest of them, or in a stepwise insertion their mean, plane frame, mm.
     pub tip_meas_mm: Option<Vector3<f64>>,
     /// Measured depth at which that position was acquired, mm.
     pub tip_meas_insertion_mm: Option<f64>,
@@ -115,7 +115,7 @@ pub enum Record {
     Input {
         /// The time it was given at.
         time: Time,
-        /// What.
+        /// The input.
         input: Input,
     },
     /// A CAN frame.
@@ -129,21 +129,21 @@ pub enum Record {
     },
     /// A tip position, accepted or not.
     Sample(SampleRecord),
-    /// A position of the target, where that is a tool of its own, accepted or not.
+    /// A position of the target, if that is a tool of its own, accepted or not.
     Target(SampleRecord),
     /// The stage at one SYNC; depth and rotation of an insertion count from where it began.
     Stage(Feedback),
-    /// One millimetre.
+    /// One step of the insertion.
     Step(Box<StepRecord>),
-    /// A drive said who it is.
+    /// A drive reported its identity.
     Drive {
         /// When.
         time: Time,
-        /// Whose drive.
+        /// The axis of the drive.
         axis: Axis,
         /// Its node number.
         node: NodeId,
-        /// What it said.
+        /// The identity.
         identity: Identity,
     },
     /// A part of the bench entered a new state.

@@ -2,7 +2,7 @@
 
 use super::record::Lane;
 
-/// The state that a part of the bench is in. Each belongs to one part, its [lane](State::lane).
+/// The state of a part of the bench. Each state belongs to one part, its [lane](State::lane).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, derive_more::Display)]
 #[display("{}", self.as_str())]
 pub enum State {
@@ -21,9 +21,9 @@ pub enum State {
     HeldAfterStep,
     /// The run: an axis finds its home.
     Homing,
-    /// The run: an axis moves to where it was sent.
+    /// The run: an axis moves to its commanded position.
     Moving,
-    /// The run: the bench sends no heartbeat, to see whether the drives notice.
+    /// The run: the bench sends no heartbeat, to test whether the drives notice.
     Silent,
     /// The run: the base turns in air.
     TurningInAir,
@@ -93,7 +93,9 @@ impl State {
     /// The state of `lane` that has this name in `events.log`.
     pub fn named(lane: Lane, name: &str) -> Option<Self> {
         let mut states = State::TABLE.into_iter();
-        states.find(|(_, of, known)| *of == lane && *known == name).map(|(state, ..)| state)
+        states
+            .find(|&(_, its_lane, its_name)| (its_lane, its_name) == (lane, name))
+            .map(|(state, ..)| state)
     }
 
     /// True while the insertion is held, for whatever reason.

@@ -1,4 +1,4 @@
-//! The target as a tool of its own on the tracker's stream.
+//! A target that the tracker sees as a tool of its own.
 
 use super::config::TrackerConfig;
 use super::record::SampleRecord;
@@ -16,17 +16,17 @@ use std::time::Duration;
 /// The tool that is the target.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TargetTool {
-    /// What a sample must pass by itself; the tool's name and the registration are in it.
+    /// The gate that judges a sample by itself. It holds the tool's name and the registration.
     pub gate: Gate,
-    /// Where the target is expected, plane frame, mm: the path before the run leads there.
+    /// Where the target is expected, plane frame, mm: the end of the path planned before the run.
     pub expected_mm: Vector3<f64>,
     /// How far from there it may be, mm.
     pub range_mm: f64,
-    /// Its position is the mean over this long.
+    /// Time over which its position is averaged.
     pub average: Duration,
 }
 
-/// The mean of the newest positions: a target moves by less than its noise.
+/// The mean of the newest positions. It suits a target, which moves by less than the noise of its positions.
 #[derive(Debug, Clone)]
 pub struct MovingMean {
     over: Duration,
@@ -83,7 +83,7 @@ impl TargetTracking {
         }
     }
 
-    /// True for a sample of the target.
+    /// True if `sample` is of the target.
     pub(super) fn is_own(&self, sample: &Sample) -> bool {
         is_tool(&sample.tool, &self.tool.gate.tool)
     }
@@ -105,7 +105,7 @@ impl TargetTracking {
                 self.last_refusal = None;
             }
             Err(refusal) => {
-                // Before the insertion a target may be anywhere, and is looked for anew.
+                // Before the insertion the target may have been moved, so it is searched for anew.
                 if insertion_mm.is_none() && refusal.gate == GateName::Step {
                     self.mean = MovingMean::new(self.tool.average);
                 }
@@ -137,7 +137,8 @@ impl TargetTracking {
         Ok((acquisition_time, position_mm))
     }
 
-    /// What a sample must pass by itself, and when it was acquired.
+    /// Applies the gates that judge a sample by itself. Returns its acquisition time and position, plane
+    /// frame, mm.
     fn admit(&mut self, sample: &Sample) -> Result<(Time, Vector3<f64>), Refusal> {
         let position_mm = self.x_pw.transform(&self.tool.gate.admit(sample)?);
         let TargetTool { expected_mm, range_mm: limit_mm, .. } = self.tool;
@@ -156,7 +157,7 @@ impl TargetTracking {
         }
     }
 
-    /// Where the target is expected to be seen next: where it was.
+    /// Where the target is expected to be seen next: at the mean of its last positions.
     fn prediction(&self) -> Option<Prediction> {
         let position_mm = self.mean.mean_mm()?;
         let variance_mm2 = self.noise_sd_mm.powi(2) / self.mean.newest.len() as f64;
@@ -173,12 +174,13 @@ impl TargetTracking {
         self.mean.mean_mm().filter(|_| self.track.is_held())
     }
 
-    /// When its newest believed position was acquired.
+    /// When its newest accepted position was acquired.
     pub(super) fn last_acquisition(&self) -> Option<Time> {
         self.track.last().map(|fix| fix.acquisition_time)
     }
 
-    /// Why the needle cannot be steered to it at `now`, and what was last refused; `None` while it can.
+    /// Why the needle cannot be steered to the target at `now`, with the last refusal or what the operator should
+    /// check; `None` while it can.
     pub(super) fn trouble(&self, now: Time) -> Option<(String, String)> {
         let limit_s = self.hold_after.as_secs_f64();
         let trouble = match self.last_acquisition().map(|last| now.seconds_after(last)) {

@@ -1,4 +1,4 @@
-//! The tracker stream as the session believes it: gated, registered, dated, paired and judged.
+//! The tracker stream of a session: each sample is gated, registered, dated, paired and judged.
 
 use super::config::{SessionConfig, TrackerConfig};
 use super::estimation::{Estimation, Measurement};
@@ -18,9 +18,9 @@ use std::time::Duration;
 
 /// Maximum number of samples that wait for the stage's next feedback; the oldest position is then refused.
 const PENDING_MAX: usize = 256;
-/// Once a run is being stopped, a position waits no longer than this, or two SYNC periods, for the
-/// stage's feedback, so that samples are recorded as they come until the end.
-const UNPAIRED_MAX: Duration = Duration::from_millis(100);
+/// Once a run is being stopped, a position waits for the stage's feedback no longer than this or two SYNC
+/// periods, whichever is longer, so that samples are recorded until the end.
+const UNPAIRED_AGE_MAX: Duration = Duration::from_millis(100);
 /// Why a position that still waits at the end is refused.
 const NEVER_PAIRED: &str = "the stage gave no position at its acquisition before the run ended";
 /// Why the oldest of too many positions that wait is refused.
@@ -41,27 +41,29 @@ pub(crate) struct Tracking {
     /// What the gates did with the samples so far.
     pub(super) counts: GateCounts,
     census: Census,
-    unpaired_max: Duration,
-    /// Samples in order of receipt, from the first that is not decided yet.
+    unpaired_age_max: Duration,
+    /// Samples in order of receipt, from the first that is not judged yet.
     waiting: VecDeque<Waiting>,
-    /// What has happened and is not recorded yet.
+    /// Records that the session has not taken yet.
     pub(super) records: VecDeque<Record>,
-    was: TrackState,
+    reported_state: TrackState,
     last_refusal: Option<String>,
-    /// The refusal by which the mean of the last positions contradicted the model, until one is believed.
+    /// The refusal by which the mean of the last positions contradicted the model, until a position is accepted.
     pub(super) jump: Option<String>,
     link_trouble: Option<String>,
-    /// Why the last message that could not be read was refused, until a position is believed.
+    /// The error of the last malformed message, until a position is accepted.
     malformed: Option<String>,
-    /// The server said last that all is well, after the last position believed.
+    /// The last STATUS of the server was OK and came after the last accepted position.
     status_is_ok: bool,
     /// Samples of the tool that the link dropped.
     dropped: u64,
-    /// Positions in a row that a model refused, and how often there were two.
-    off_model: (u32, u32),
+    /// Positions in a row that the model refused.
+    off_model_in_a_row: u32,
+    /// How often there were two in a row.
+    off_model_pairs: u32,
 }
 
-/// A sample on its way; the position is there while it waits to be judged.
+/// A sample that is not recorded yet. `position` is `Some` while it waits to be judged.
 struct Waiting {
     record: SampleRecord,
     is_target: bool,
@@ -78,22 +80,23 @@ impl Tracking {
             travel: TravelCheck::new(tracker.track.noise_sd_mm, config.needle.curvature_per_mm()),
             counts: GateCounts::default(),
             census: Census::default(),
-            unpaired_max: UNPAIRED_MAX.max(2 * config.stage.bus.sync_period()),
+            unpaired_age_max: UNPAIRED_AGE_MAX.max(2 * config.stage.bus.sync_period()),
             config: tracker,
             waiting: VecDeque::new(),
             records: VecDeque::new(),
-            was: TrackState::Waiting,
+            reported_state: TrackState::Waiting,
             last_refusal: None,
             jump: None,
             link_trouble: None,
             malformed: None,
             status_is_ok: false,
             dropped: 0,
-            off_model: (0, 0),
+            off_model_in_a_row: 0,
+            off_model_pairs: 0,
         }
     }
 
-    /// Notes what happened on the link. A sample is counted only: [`Tracking::take`] judges it.
+    /// Notes an event of the link. A sample is only counted here: [`Tracking::take`] judges it.
     pub(crate) fn note(&mut self, now: Time, event: &Event) {
         self.census.note(event);
         match event {
@@ -148,28 +151,29 @@ impl Tracking {
                     position = Some((acquisition_time, tip_meas));
                 } else {
                     let judged = self.track.seek(fix(&record, acquisition_time, &tip_meas, None));
-                    self.decide(now, &mut record, judged.err());
+                    self.settle(now, &mut record, judged.err());
                 }
             }
             Err(refusal) => {
                 self.track.refuse(&refusal);
-                self.decide(now, &mut record, Some(refusal));
+                self.settle(now, &mut record, Some(refusal));
             }
         }
         self.waiting.push_back(Waiting { record, is_target: false, position });
         if self.waiting.len() > PENDING_MAX {
             self.refuse_oldest(now, 1, TOO_MANY_WAIT);
         }
-        self.release();
+        self.release_records();
     }
 
-    /// Records a sample of the target, which was judged elsewhere, in the order of receipt.
-    pub(crate) fn pass(&mut self, record: SampleRecord) {
+    /// Records a sample of the target, which [`TargetTracking`](super::target::TargetTracking) has judged, in
+    /// the order of receipt.
+    pub(crate) fn record_target(&mut self, record: SampleRecord) {
         self.waiting.push_back(Waiting { record, is_target: true, position: None });
-        self.release();
+        self.release_records();
     }
 
-    /// What a sample must pass by itself, and when it was acquired.
+    /// Applies the gates that judge a sample by itself. Returns its acquisition time and tip position.
     fn admit(&mut self, sample: &Sample) -> Result<(Time, TipPosition), Refusal> {
         let position_bench_mm = self.config.gate.admit(sample)?;
         let position_plane_mm = self.x_pw.transform(&position_bench_mm);
@@ -178,8 +182,8 @@ impl Tracking {
         Ok((self.clock.acquisition_time(sample)?, tip_meas))
     }
 
-    /// Judges the positions whose acquisition the stage's history now covers, oldest first, and
-    /// gives those that are believed.
+    /// Judges the positions whose acquisition the stage's history now covers, in the order of receipt.
+    /// Returns those that are accepted.
     pub(crate) fn judge(
         &mut self,
         now: Time,
@@ -206,14 +210,14 @@ impl Tracking {
                     positions: 1,
                 });
             }
-            self.decide(now, &mut sample.record, judged.err());
+            self.settle(now, &mut sample.record, judged.err());
         }
         self.waiting = waiting;
-        self.release();
+        self.release_records();
         believed
     }
 
-    /// The stage's depth at the position's acquisition, where the position is believed.
+    /// The stage's depth at the position's acquisition, if the position is accepted.
     fn judge_one(
         &mut self,
         record: &SampleRecord,
@@ -232,12 +236,12 @@ impl Tracking {
         Ok(insertion_mm)
     }
 
-    /// Notes what became of a sample.
-    fn decide(&mut self, now: Time, record: &mut SampleRecord, refusal: Option<Refusal>) {
+    /// Notes whether a sample was accepted, in its record and for the messages.
+    fn settle(&mut self, now: Time, record: &mut SampleRecord, refusal: Option<Refusal>) {
         self.counts.count(refusal.as_ref());
         match refusal {
             None => {
-                self.off_model.0 = 0;
+                self.off_model_in_a_row = 0;
                 self.last_refusal = None;
                 self.jump = None;
                 self.malformed = None;
@@ -260,16 +264,19 @@ impl Tracking {
         self.report_track(now);
     }
 
-    /// Warns of a second position in a row that the model refuses. The observer may come to believe a jump
-    /// that is too small, or of too slow a stream, to lose the track. Said at the first pair, and at each
-    /// doubling of their count.
+    /// Warns when the model refuses a second position in a row. Such a jump may be too small, or the stream too
+    /// slow, to lose the track; the observer then may come to accept it. The warning comes at the first pair and
+    /// at each doubling of their number.
     fn warn_of_jump(&mut self, time: Time, refusal: &Refusal) {
-        let (in_a_row, pairs) = &mut self.off_model;
-        *in_a_row += 1;
-        *pairs += u32::from(*in_a_row == 2);
-        if *in_a_row == 2 && pairs.is_power_of_two() && self.track.is_held() {
+        self.off_model_in_a_row += 1;
+        if self.off_model_in_a_row != 2 {
+            return;
+        }
+        self.off_model_pairs += 1;
+        if self.off_model_pairs.is_power_of_two() && self.track.is_held() {
             let text = format!(
-                "two positions in a row do not fit the model (pair {pairs} of this run): {refusal}"
+                "two positions in a row do not fit the model (pair {} of this run): {refusal}",
+                self.off_model_pairs
             );
             self.warn(time, text);
         }
@@ -278,7 +285,7 @@ impl Tracking {
     /// Records that the track was lost or found again.
     fn report_track(&mut self, time: Time) {
         let state = self.track.state(time);
-        let was = std::mem::replace(&mut self.was, state);
+        let was = std::mem::replace(&mut self.reported_state, state);
         let (severity, text) = match (was, state) {
             (TrackState::Lost, TrackState::Lost) => return,
             (_, TrackState::Lost) => {
@@ -286,7 +293,7 @@ impl Tracking {
                 let refused = self.track.refused_in_a_row();
                 (Severity::Warning, format!("lost, {refused} refused in a row; the last: {last}"))
             }
-            // Before an insertion it is looked for anew, without a model.
+            // Before an insertion the tip is searched for anew, without a model.
             (TrackState::Lost, TrackState::Waiting) => return,
             (TrackState::Lost, _) => {
                 (Severity::Info, "found again: it agrees with the model".to_owned())
@@ -296,36 +303,35 @@ impl Tracking {
         self.records.push_back(Record::Event { time, lane: Lane::Tracker, severity, text });
     }
 
-    /// Decides that the `count` oldest samples are never judged, where they still wait.
+    /// Refuses those of the `count` oldest samples that still wait to be judged.
     fn refuse_oldest(&mut self, now: Time, count: usize, why: &str) {
         let mut waiting = std::mem::take(&mut self.waiting);
         for sample in waiting.iter_mut().take(count) {
             if sample.position.take().is_some() {
                 let refusal = Refusal::new(GateName::Pairing, why);
-                self.decide(now, &mut sample.record, Some(refusal));
+                self.settle(now, &mut sample.record, Some(refusal));
             }
         }
         self.waiting = waiting;
     }
 
-    /// Refuses the samples that wait for a feedback that does not come, now that the run is being
-    /// stopped.
+    /// While the run is being stopped: refuses the samples that have waited too long for the stage's feedback.
     pub(crate) fn refuse_unpaired(&mut self, now: Time) {
-        let oldest = now - self.unpaired_max;
+        let oldest = now - self.unpaired_age_max;
         let is_late = |sample: &&Waiting| sample.record.received.receive_time < oldest;
         let late = self.waiting.iter().take_while(is_late).count();
         self.refuse_oldest(now, late, NEVER_PAIRED);
-        self.release();
+        self.release_records();
     }
 
     /// The run is over: positions that still wait are refused, and all samples recorded.
     pub(crate) fn close(&mut self, now: Time) {
         self.refuse_oldest(now, usize::MAX, NEVER_PAIRED);
-        self.release();
+        self.release_records();
     }
 
-    /// Releases the records up to the first sample that is not decided.
-    fn release(&mut self) {
+    /// Releases the records up to the first sample that still waits to be judged.
+    fn release_records(&mut self) {
         while let Some(decided) = self.waiting.pop_front_if(|sample| sample.position.is_none()) {
             self.records.push_back(match decided.is_target {
                 true => Record::Target(decided.record),
@@ -345,7 +351,7 @@ impl Tracking {
         }
     }
 
-    /// Seconds since the newest believed position was acquired; `None` before the first.
+    /// Seconds since the newest accepted position was acquired; `None` before the first.
     pub(crate) fn age_s(&self, now: Time) -> Option<f64> {
         self.last_acquisition().map(|acquired| now.seconds_after(acquired))
     }
@@ -355,12 +361,12 @@ impl Tracking {
         self.track.is_held() && self.is_fresh(now)
     }
 
-    /// True while the newest believed position is young enough to steer by.
+    /// True while the newest accepted position is recent enough to steer by.
     pub(crate) fn is_fresh(&self, now: Time) -> bool {
         self.age_s(now).is_some_and(|age_s| age_s <= self.config.hold.after.as_secs_f64())
     }
 
-    /// When the newest believed position was acquired.
+    /// When the newest accepted position was acquired.
     pub(crate) fn last_acquisition(&self) -> Option<Time> {
         self.track.last().map(|fix| fix.acquisition_time)
     }
@@ -373,7 +379,7 @@ impl Tracking {
         match &self.last_refusal {
             Some(refusal) if self.census.has(&self.config.gate.tool) => refusal.to_string(),
             _ if let Some(error) = self.malformed.as_ref().filter(|_| self.counts.accepted > 0) => {
-                format!("what comes cannot be read: {error}")
+                format!("the tracker's messages cannot be read: {error}")
             }
             _ if self.counts.accepted > 0 && self.status_is_ok => {
                 "the server still sends STATUS OK: the tool is out of view, not the network"

@@ -81,7 +81,7 @@ impl InsertTask {
                 self.hold = Some(Hold { since: now, before, by });
                 shell.enter_at(now, State::Holding);
                 shell.report_at(now, Lane::Tracker, Severity::Warning, text);
-            } else if insertion.profile.has_stepped() {
+            } else if insertion.profile.has_finished_step() {
                 self.hold_after_step(shell, now, insertion);
             }
             return Ok(());
@@ -236,7 +236,7 @@ impl InsertTask {
         let seen_at_mm = seen_at_mm.map_or(0.0, |mm| insertion.depth_mm(mm).max(0.0));
         let stands_at_mm = insertion
             .profile
-            .held_at_mm(tracker.hold.braking_mm_per_s2, self.config.stage.bus.sync_period());
+            .hold_depth_mm(tracker.hold.braking_mm_per_s2, self.config.stage.bus.sync_period());
         let (age_s, limit_s) =
             (self.tracking.age_s(now).unwrap_or(f64::INFINITY), tracker.hold.after.as_secs_f64());
         let (blind_mm, braking_mm) =

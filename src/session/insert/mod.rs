@@ -373,7 +373,7 @@ impl Task for InsertTask {
                 Some(target) if target.is_own(&sample) => {
                     let inserted = self.insertion.as_ref();
                     let insertion_mm = inserted.map(|_| self.progress.insertion_meas_mm);
-                    self.tracking.pass(target.take(sample, insertion_mm));
+                    self.tracking.record_target(target.take(sample, insertion_mm));
                 }
                 _ => self.tracking.take(shell.now, sample, self.insertion.is_some()),
             },

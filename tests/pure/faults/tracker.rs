@@ -56,7 +56,7 @@ fn messages_that_cannot_be_read() {
     });
     let reason = stops[0].bench.reason();
     held(&stops, "messages_that_cannot_be_read", 510.0, &reason);
-    let why = "; what comes cannot be read: ndjson: line 7: x is not a number";
+    let why = "; the tracker's messages cannot be read: ndjson: line 7: x is not a number";
     assert!(reason.ends_with(why), "{reason}");
 }
 
