@@ -62,8 +62,8 @@ impl Increment {
         Increment { insertion_mm: self.insertion_mm * part, rotation_rad }
     }
 
-    /// The same insertion with the base turned the other way.
-    pub fn turned_back(&self) -> Increment {
+    /// The same insertion, with the base turned in the opposite direction.
+    pub fn with_rotation_reversed(&self) -> Increment {
         Increment { rotation_rad: -self.rotation_rad, ..*self }
     }
 

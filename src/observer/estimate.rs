@@ -5,7 +5,7 @@ use crate::math;
 use nalgebra::{Matrix3, Matrix6};
 
 /// A roll with a larger standard deviation than this, rad, counts as unknown: too often half of the
-/// bend would go in a wrong direction.
+/// bend would point in a wrong direction.
 const ROLL_KNOWN_SD_RAD: f64 = 30.0 / 180.0 * std::f64::consts::PI;
 
 /// An estimated tip pose, with its uncertainty.
@@ -41,7 +41,7 @@ pub struct Belief {
     pub shaft: Shaft,
 }
 
-/// How a turn of the base reaches the tip, as estimated.
+/// The estimated transmission from a turn of the base to the tip.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shaft {
     /// Base rotation in the positive direction before the tip starts to turn.
@@ -86,14 +86,14 @@ impl Estimate {
     }
 
     /// Covariance of the estimated position, plane frame, mm², to first order in the error ε:
-    /// `R P_vv Rᵀ`; `None` for observers that carry none.
+    /// `R P_vv Rᵀ`; `None` for observers that carry no covariance.
     pub fn position_covariance_mm2(&self) -> Option<Matrix3<f64>> {
         let belief = self.belief.as_ref()?;
         Some(position_covariance(&self.x_pb, &belief.covariance))
     }
 
-    /// The part of a turn that a law may command: less by up to `caution` while the hypotheses do not
-    /// agree on the roll. All of it if the observer states no uncertainty.
+    /// The share of a turn that a law may command: 1 if the hypotheses agree on the roll, down to
+    /// `1 - caution` if they do not agree at all. It is 1 if the observer states no uncertainty.
     pub fn demand_gain(&self, caution: f64) -> f64 {
         self.belief.map_or(1.0, |belief| 1.0 - caution * (1.0 - belief.roll_agreement))
     }

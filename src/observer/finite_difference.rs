@@ -17,8 +17,8 @@ section! {
     }
 }
 
-/// So many positions at most are kept of a baseline.
-const KEPT_PER_BASELINE: f64 = 1000.0;
+/// At most about this many positions are kept per baseline.
+const POSITIONS_PER_BASELINE: f64 = 1000.0;
 
 /// The baseline is not a finite distance over 0.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
@@ -29,30 +29,30 @@ pub struct BaselineError(pub f64);
 /// with the powers of v that the print drops).
 ///
 /// The derivatives are those of the parabola through three positions a baseline apart, at the
-/// middle one. The measured increments then predict the frame at the present depth, so that turns
-/// made since then count. The columns are made orthonormal starting from the tangent, the most
-/// accurate of the three; κ drops out. The position is the last measured one.
+/// middle one. The measured increments then predict the frame at the present depth, so turns
+/// made in between are included. The columns are made orthonormal starting from the tangent, the most
+/// accurate of the three; κ cancels out. The position is the last measured one.
 ///
-/// Noise of standard deviation σ turns the roll by about `2.4 σ / (κ b²)` rad at baseline b. The
-/// observer is there for comparison, not for steering.
+/// Position noise of standard deviation σ causes a roll error of about `2.4 σ / (κ b²)` rad at baseline b.
+/// The observer is meant for comparison, not for steering.
 #[derive(Debug, Clone)]
 pub struct FiniteDifference {
     needle: Needle,
     baseline_mm: f64,
     depth_mm: f64,
-    /// A tip that started as the identity and was carried along every increment.
+    /// The pose of a tip that started at the identity and made every increment.
     carried: Pose,
     /// Oldest first.
-    positions: VecDeque<Passed>,
+    positions: VecDeque<Measured>,
     tip: Option<Pose>,
 }
 
 /// A measured position.
 #[derive(Debug, Clone, Copy)]
-struct Passed {
+struct Measured {
     depth_mm: f64,
     position_mm: Vector3<f64>,
-    /// Of the tip that is carried along, there.
+    /// The rotation of [`FiniteDifference::carried`] at that depth.
     carried: Rotation3<f64>,
 }
 
@@ -75,18 +75,18 @@ impl FiniteDifference {
         })
     }
 
-    /// The newest position at least `distance_mm` before `depth_mm`, by index.
-    fn before(&self, depth_mm: f64, distance_mm: f64) -> Option<usize> {
-        let at = depth_mm - distance_mm + 1e-6 * self.baseline_mm;
-        self.positions.partition_point(|passed| passed.depth_mm <= at).checked_sub(1)
+    /// The index of the newest position at least `distance_mm` before `depth_mm`.
+    fn index_before(&self, depth_mm: f64, distance_mm: f64) -> Option<usize> {
+        let limit_mm = depth_mm - distance_mm + 1e-6 * self.baseline_mm;
+        self.positions.partition_point(|measured| measured.depth_mm <= limit_mm).checked_sub(1)
     }
 
-    /// The frame at the newest of three positions. The kinematics are left-invariant: the increments since
-    /// the middle one turn its frame as they turned the tip that is carried along.
+    /// The frame at the newest of three positions. The kinematics are left-invariant, so the increments since
+    /// the middle position turn its frame exactly as they turned the carried tip.
     fn frame(&self) -> Option<Rotation3<f64>> {
         let newest = self.positions.back()?;
-        let middle = self.positions.get(self.before(newest.depth_mm, self.baseline_mm)?)?;
-        let oldest = self.positions.get(self.before(middle.depth_mm, self.baseline_mm)?)?;
+        let middle = self.positions.get(self.index_before(newest.depth_mm, self.baseline_mm)?)?;
+        let oldest = self.positions.get(self.index_before(middle.depth_mm, self.baseline_mm)?)?;
         let (a, b) = (middle.depth_mm - oldest.depth_mm, newest.depth_mm - middle.depth_mm);
         let back = (middle.position_mm - oldest.position_mm) / a;
         let ahead = (newest.position_mm - middle.position_mm) / b;
@@ -99,14 +99,14 @@ impl FiniteDifference {
         Some(Rotation3::from_matrix_unchecked(columns) * since)
     }
 
-    /// The least depth from one position that is kept to the next, mm.
+    /// Minimum distance between two positions that are kept, mm.
     fn spacing_mm(&self) -> f64 {
-        self.baseline_mm / KEPT_PER_BASELINE
+        self.baseline_mm / POSITIONS_PER_BASELINE
     }
 
     /// Drops positions that no later difference can use.
     fn prune(&mut self) {
-        if let Some(oldest) = self.before(self.depth_mm, 3.0 * self.baseline_mm) {
+        if let Some(oldest) = self.index_before(self.depth_mm, 3.0 * self.baseline_mm) {
             self.positions.drain(..oldest);
         }
     }
@@ -120,18 +120,18 @@ impl Observer for FiniteDifference {
     }
 
     fn correct(&mut self, tip_meas: &TipPosition, _: f64) {
-        if self.positions.back().is_some_and(|passed| passed.depth_mm >= self.depth_mm) {
+        if self.positions.back().is_some_and(|measured| measured.depth_mm >= self.depth_mm) {
             return;
         }
         let position_mm = tip_meas.mm();
         let carried = self.carried.rotation;
-        // Of a slow needle every one counts while it is the newest, and few are kept.
-        let mut newest = self.positions.iter().rev().map(|passed| passed.depth_mm);
+        // A slow needle has very dense positions. Each is used while it is the newest, but few are kept.
+        let mut newest = self.positions.iter().rev().map(|measured| measured.depth_mm);
         let last = newest.next().zip(newest.next());
         if last.is_some_and(|(last, before)| last - before < self.spacing_mm()) {
             self.positions.pop_back();
         }
-        self.positions.push_back(Passed { depth_mm: self.depth_mm, position_mm, carried });
+        self.positions.push_back(Measured { depth_mm: self.depth_mm, position_mm, carried });
         let rotation = self.frame().or(self.tip.map(|tip| tip.rotation));
         self.tip = rotation.map(|rotation| Pose { rotation, translation: position_mm });
         self.prune();

@@ -3,9 +3,10 @@
 //! The kinematics are left-invariant (paper Eq. 1). A rotated or shifted registration gives the
 //! path of a needle that started elsewhere: positions reveal it only where the configured start
 //! does not allow for that. They do reveal a mirrored tracker axis, or a stage that turns against its
-//! configured sign: the mirrored path is that of a needle whose base turns the other way. So
-//! invariant filters follow the same positions, one of them with the base's rotation negated, one
-//! that does not know the heading at the start, and their likelihoods are compared.
+//! configured sign: the mirrored path is that of a needle whose base turns the other way. So several
+//! invariant filters follow the same positions, and their likelihoods are compared: the configured one, one
+//! with the base's rotation negated, one that does not know the heading at the start, and one that does not
+//! know the roll there.
 //!
 //! Under the configured model the likelihood ratio of any alternative is a martingale of mean 1.
 //! The probability that it ever exceeds `e^L` is at most `e^-L` (Ville's inequality). This holds
@@ -30,10 +31,10 @@ const INDEPENDENT_PER_MM: f64 = 20.0;
 const SEARCH_SHARE: f64 = 0.5;
 /// Standard deviation of yaw and pitch of a heading that is not known at the start.
 const HEADING_UNKNOWN_RAD: f64 = FRAC_PI_4;
-/// The roll at the start is judged where it is known to so much, rad.
-pub const ROLL_KNOWN_RAD: f64 = FRAC_PI_2;
-/// The first positions show the heading at the start. It is not judged any more after this depth.
-const HEADING_SHOWN_MM: f64 = 30.0;
+/// The roll at the start is judged if its configured standard deviation is at most this, rad.
+pub const ROLL_JUDGED_SD_MAX_RAD: f64 = FRAC_PI_2;
+/// The first positions show the heading at the start. It is no longer judged after this depth.
+const HEADING_JUDGED_MM: f64 = 30.0;
 
 /// The positions fit an alternative much better than the configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
@@ -43,7 +44,7 @@ const HEADING_SHOWN_MM: f64 = 30.0;
     .alternative.question()
 )]
 pub struct StreamContradiction {
-    /// What they fit.
+    /// The alternative that they fit.
     alternative: Alternative,
     /// Logarithm of the likelihood ratio.
     log_odds: f64,
@@ -65,7 +66,7 @@ enum Alternative {
 }
 
 impl Alternative {
-    /// What the operator is to check.
+    /// What the operator should check.
     fn question(self) -> &'static str {
         match self {
             Alternative::Mirrored => {
@@ -99,16 +100,16 @@ impl HandednessWatch {
         let configured = Invariant::new(needle, torsion, config);
         let mut alternatives = vec![(Alternative::Mirrored, configured.clone())];
         let start_sd = config.start_sd;
-        let mut unknown = |alternative, start_sd| {
+        let mut add_alternative = |alternative, start_sd| {
             let model = Invariant::new(needle, torsion, InvariantConfig { start_sd, ..config });
             alternatives.push((alternative, model));
         };
         if start_sd.yaw.max(start_sd.pitch) < HEADING_UNKNOWN_RAD {
             let [yaw, pitch] = [HEADING_UNKNOWN_RAD; 2];
-            unknown(Alternative::Tilted, FixedAngles { yaw, pitch, ..start_sd });
+            add_alternative(Alternative::Tilted, FixedAngles { yaw, pitch, ..start_sd });
         }
-        if start_sd.roll <= ROLL_KNOWN_RAD {
-            unknown(Alternative::Turned, FixedAngles { roll: PI, ..start_sd });
+        if start_sd.roll <= ROLL_JUDGED_SD_MAX_RAD {
+            add_alternative(Alternative::Turned, FixedAngles { roll: PI, ..start_sd });
         }
         HandednessWatch {
             configured,
@@ -129,15 +130,15 @@ impl HandednessWatch {
         self.configured.predict(increment);
         for (alternative, model) in &mut self.alternatives {
             model.predict(match alternative {
-                Alternative::Mirrored => increment.turned_back(),
+                Alternative::Mirrored => increment.with_rotation_reversed(),
                 Alternative::Tilted | Alternative::Turned => increment,
             });
         }
     }
 
-    /// Compares every model with a position, plane frame, measured at the depth of the models. It
-    /// may be a mean; it counts as `independent` positions. An alternative that is `e^7` times less
-    /// likely than the configured model is dropped for good: handedness and mounting do not change
+    /// Compares every model with a position, plane frame, measured at the depth of the models. The position
+    /// may be a mean; it counts as `independent` positions. An alternative that is less likely than the
+    /// configured model by a factor of `e^7` is dropped for good: handedness and mounting do not change
     /// during an insertion.
     pub fn correct(&mut self, tip_meas: &TipPosition, independent: f64) {
         if self.is_decided() {
@@ -163,8 +164,8 @@ impl HandednessWatch {
                     depth_mm,
                 });
             }
-            let is_shown = *alternative == Alternative::Tilted && depth_mm > HEADING_SHOWN_MM;
-            !model.is_lost() && log_odds > -LOG_ODDS_MAX && !is_shown
+            let is_too_deep = *alternative == Alternative::Tilted && depth_mm > HEADING_JUDGED_MM;
+            !model.is_lost() && log_odds > -LOG_ODDS_MAX && !is_too_deep
         });
         // Without the configured model there is nothing to compare with.
         if self.configured.is_lost() {

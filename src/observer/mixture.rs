@@ -14,13 +14,13 @@ pub(super) const ALIKE_SD: f64 = 0.5;
 pub(super) trait Hypothesis {
     /// Logarithm of the weight, up to a constant common to the mixture.
     fn log_weight(&self) -> f64;
-    /// The same, to be changed.
+    /// The log weight, mutable.
     fn log_weight_mut(&mut self) -> &mut f64;
     /// The tip's pose, plane frame.
     fn x_pb(&self) -> &Pose;
     /// Covariance of the pose's left-invariant error.
     fn covariance(&self) -> Matrix6<f64>;
-    /// True if the two say the same.
+    /// True if the two agree well enough to be merged.
     fn is_alike(&self, other: &Self) -> bool;
 }
 
@@ -60,9 +60,9 @@ pub(super) fn position_mm<H: Hypothesis>(mixture: &[H]) -> Option<Vector3<f64>> 
     (!mixture.is_empty()).then(|| weighted.map(|(h, w)| h.x_pb().translation * w).sum())
 }
 
-/// Mean heading, bevel direction and position, and the covariance about them, which uses each
-/// weight to the power `doubt`. `None` for an empty mixture.
-pub(super) fn mean<H: Hypothesis>(mixture: &[H], doubt: f64) -> Option<Mean> {
+/// Mean heading, bevel direction and position, and the covariance about them. The covariance raises each
+/// weight to the power `covariance_power`. `None` for an empty mixture.
+pub(super) fn mean<H: Hypothesis>(mixture: &[H], covariance_power: f64) -> Option<Mean> {
     let likeliest = likeliest(mixture)?;
     let weights_1 = weights(mixture, 1.0);
     let direction = |axis: usize| -> Vector3<f64> {
@@ -83,7 +83,7 @@ pub(super) fn mean<H: Hypothesis>(mixture: &[H], doubt: f64) -> Option<Mean> {
     let x_pb = Pose { rotation, translation };
     let inverse = x_pb.inverse();
     let mut covariance = Matrix6::zeros();
-    for (h, w) in mixture.iter().zip(weights(mixture, doubt)) {
+    for (h, w) in mixture.iter().zip(weights(mixture, covariance_power)) {
         covariance += h.covariance() * w;
         if mixture.len() > 1 {
             let apart = (inverse * *h.x_pb()).log().to_vector();
@@ -102,11 +102,12 @@ pub(super) fn reduce<H: Hypothesis>(mixture: &mut Vec<H>, weight_min: f64) {
     mixture.retain(|h| h.log_weight() > math::ln(weight_min));
     let mut kept = 1;
     while kept < mixture.len() {
-        let (likelier, rest) = mixture.split_at_mut(kept);
-        match likelier.iter_mut().find(|likelier| likelier.is_alike(&rest[0])) {
+        let (likelier, others) = mixture.split_at_mut(kept);
+        let next = &others[0];
+        match likelier.iter_mut().find(|likelier| likelier.is_alike(next)) {
             Some(likelier) => {
-                let behind = rest[0].log_weight() - likelier.log_weight();
-                *likelier.log_weight_mut() += math::ln_1p(math::exp(behind));
+                let log_ratio = next.log_weight() - likelier.log_weight();
+                *likelier.log_weight_mut() += math::ln_1p(math::exp(log_ratio));
                 mixture.remove(kept);
             }
             None => kept += 1,

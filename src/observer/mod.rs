@@ -20,7 +20,7 @@ mod whiteness;
 pub use coupled::{Coupled, CoupledConfig, CoupledError, Gains};
 pub use estimate::{Belief, Estimate, Shaft, Slack, standard_deviations};
 pub use finite_difference::{BaselineError, FiniteDifference, FiniteDifferenceConfig};
-pub use handedness::{HandednessWatch, ROLL_KNOWN_RAD, StreamContradiction};
+pub use handedness::{HandednessWatch, ROLL_JUDGED_SD_MAX_RAD, StreamContradiction};
 pub use invariant::{Invariant, InvariantConfig, NoiseConfig};
 pub use whiteness::{PositionNoise, Whiteness};
 
@@ -41,9 +41,9 @@ pub enum Divergence {
         /// Insertion since the first measurement, mm.
         depth_mm: f64,
     },
-    /// The measurements contradict the model.
+    /// The measurements contradict the model of the invariant observer. The other observers do not check this.
     #[error(
-        "the last {samples} tip positions are {times:.1} times as far from their prediction as \
+        "the last {samples} tip positions are {times:.1} times as far from their predictions as \
          observer.invariant.position_sd_mm explains (limit {limit:.1}); check the registration and \
          the needle that is configured"
     )]
@@ -68,14 +68,15 @@ pub enum ObserverError {
     FiniteDifference(#[from] BaselineError),
 }
 
-/// What every observer does.
+/// An observer of the tip's pose. It has no estimate before the first [`correct`](Self::correct), since it takes
+/// its start position from there; some need more positions.
 pub trait Observer: Send {
     /// Advances the state by one measured increment.
     fn predict(&mut self, increment: Increment);
 
-    /// Corrects the state with a position measured at the state's depth, in the plane frame. The
-    /// position counts as `independent` positions with independent noise: more than 1 for a mean,
-    /// less than 1 if its noise is correlated with that of others.
+    /// Corrects the state with a position measured at the state's depth, in the plane frame. It carries as much
+    /// information as `independent` positions with independent noise: more than 1 for a mean, less than 1 if
+    /// its noise is correlated with that of others.
     fn correct(&mut self, tip_meas: &TipPosition, independent: f64);
 
     /// The estimate as it would be after `increments`; `None` while the observer has none.

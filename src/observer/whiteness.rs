@@ -10,8 +10,9 @@ use std::time::Duration;
 const LAGS: usize = 32;
 /// Memory of the fading sums, in positions: half an insertion of 100 mm at 2 mm/s and 40 Hz.
 const MEMORY: f64 = 1000.0;
-/// Inflation assumed at first, and the number of innovations that has the same weight.
+/// Inflation assumed at first.
 const PRIOR_INFLATION: f64 = 2.0;
+/// Number of innovations that have the same weight as this assumption.
 const PRIOR_WEIGHT: f64 = 100.0;
 
 /// A standard deviation, mm.
@@ -67,14 +68,14 @@ pub struct Whiteness {
     last: VecDeque<Vector3<f64>>,
     /// Sums of products at each lag, from 0; old products fade.
     products_mm2: [f64; LAGS + 1],
-    /// Innovations in the sums.
+    /// Number of innovations in the sums; old ones fade.
     count: f64,
-    /// The configured noise, and the variance that the observer assumes, mm².
-    told: Option<(PositionNoise, f64)>,
+    /// The configured noise of the positions, and the variance that the observer assumes, mm².
+    noise: Option<(PositionNoise, f64)>,
 }
 
 impl Whiteness {
-    /// No innovations yet; `position_sd_mm` is the configured standard deviation of each
+    /// Starts without innovations; `position_sd_mm` is the configured standard deviation of each
     /// coordinate.
     pub fn new(position_sd_mm: f64) -> Self {
         Whiteness {
@@ -82,15 +83,15 @@ impl Whiteness {
             last: VecDeque::with_capacity(LAGS + 1),
             products_mm2: [0.0; LAGS + 1],
             count: 0.0,
-            told: None,
+            noise: None,
         }
     }
 
-    /// The same, with the noise of the positions if it is configured. `observer_sd_mm` is the standard
-    /// deviation that the observer assumes of each coordinate.
+    /// Sets the noise of the positions, if it is configured. `observer_sd_mm` is the standard
+    /// deviation that the observer assumes for each coordinate.
     #[must_use]
-    pub fn with_told(self, noise: Option<PositionNoise>, observer_sd_mm: f64) -> Self {
-        Whiteness { told: noise.map(|noise| (noise, observer_sd_mm.powi(2))), ..self }
+    pub fn with_noise(self, noise: Option<PositionNoise>, observer_sd_mm: f64) -> Self {
+        Whiteness { noise: noise.map(|noise| (noise, observer_sd_mm.powi(2))), ..self }
     }
 
     /// Adds the next innovation, mm. An innovation that is not finite comes from a lost estimate
@@ -108,19 +109,19 @@ impl Whiteness {
         }
     }
 
-    /// How many positions, `spacing_s` apart, carry as much information as one with white noise as
-    /// configured; at least 1, and at least what the configured correlation leaves.
+    /// The variance inflation f: how many positions, `spacing_s` apart, carry as much information as one
+    /// position with the configured white noise. It is at least 1, and at least the f of the configured noise.
     pub fn inflation(&self, spacing_s: f64) -> f64 {
-        // Bartlett's weights: the sum is the variance of a mean, so it is never negative.
-        let part = |lag: usize| 1.0 - lag as f64 / (LAGS + 1) as f64;
-        let [alone, lagged @ ..] = &self.products_mm2;
-        let correlated: f64 = (1..).zip(lagged).map(|(lag, product)| part(lag) * product).sum();
-        let seen = (alone + 2.0 * correlated) / (3.0 * self.variance_mm2);
-        let told = self.told.map(|(noise, variance_mm2)| {
+        // With Bartlett's weights the sum is the variance of a mean, so it is never negative.
+        let weight = |lag: usize| 1.0 - lag as f64 / (LAGS + 1) as f64;
+        let [squares, lagged @ ..] = &self.products_mm2;
+        let correlated: f64 = (1..).zip(lagged).map(|(lag, product)| weight(lag) * product).sum();
+        let measured = (squares + 2.0 * correlated) / (3.0 * self.variance_mm2);
+        let configured = self.noise.map(|(noise, variance_mm2)| {
             (noise.long_mean_variance_mm2(spacing_s) / variance_mm2).max(1.0)
         });
-        let sum = PRIOR_WEIGHT * told.unwrap_or(PRIOR_INFLATION) + seen;
-        (sum / (PRIOR_WEIGHT + self.count)).max(told.unwrap_or(1.0))
+        let sum = PRIOR_WEIGHT * configured.unwrap_or(PRIOR_INFLATION) + measured;
+        (sum / (PRIOR_WEIGHT + self.count)).max(configured.unwrap_or(1.0))
     }
 }
 
@@ -221,7 +222,7 @@ mod tests {
             correlation_time: Duration::from_millis(200),
         };
         assert!((noise.sd_mm() - 1.0).abs() < 1e-12);
-        let mut whiteness = Whiteness::new(1.0).with_told(Some(noise), 1.0);
+        let mut whiteness = Whiteness::new(1.0).with_noise(Some(noise), 1.0);
         let expected = 0.5 + 0.5 / (0.025f64 / 0.4).tanh();
         let close = |seen: f64, expected: f64| (seen / expected - 1.0).abs() < 1e-9;
         assert!(close(whiteness.inflation(0.025), expected), "{expected}");
@@ -229,13 +230,16 @@ mod tests {
         assert!(close(whiteness.inflation(f64::INFINITY), 1.0), "the first is a whole one");
         assert!(whiteness.inflation(0.0).is_finite());
         (0..4000).for_each(|_| whiteness.take(Vector3::zeros()));
-        assert!(close(whiteness.inflation(0.025), expected), "never more confidence than told");
+        assert!(
+            close(whiteness.inflation(0.025), expected),
+            "never more confidence than configured"
+        );
         let white = PositionNoise { correlation_time: Duration::ZERO, ..noise };
-        let whiteness = Whiteness::new(1.0).with_told(Some(white), 0.5);
+        let whiteness = Whiteness::new(1.0).with_noise(Some(white), 0.5);
         assert!(close(whiteness.inflation(0.025), 4.0), "the observer assumes a quarter");
     }
 
-    /// What is measured counts where it is more than what is told.
+    /// What is measured counts where it is more than what is configured.
     #[test]
     fn noise_over_what_is_told_counts() {
         let mut rng = Pcg64::seed_from_u64(5);
@@ -244,7 +248,7 @@ mod tests {
             correlated_sd_mm: 0.0,
             correlation_time: Duration::ZERO,
         };
-        let mut whiteness = Whiteness::new((1.0f64 / 3.0).sqrt()).with_told(Some(white), 0.577);
+        let mut whiteness = Whiteness::new((1.0f64 / 3.0).sqrt()).with_noise(Some(white), 0.577);
         assert_eq!(whiteness.inflation(SPACING_S), 1.0);
         (0..4000).for_each(|_| whiteness.take(draw(&mut rng) * 2.0));
         assert!(whiteness.inflation(SPACING_S) > 3.2);

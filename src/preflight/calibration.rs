@@ -5,7 +5,7 @@ use super::Verdict::{Fail, Warn};
 use crate::archive::unix_us_of;
 use crate::calibration::Provenance;
 use crate::config::{Config, RegistrationConfig};
-use crate::observer::ROLL_KNOWN_RAD;
+use crate::observer::ROLL_JUDGED_SD_MAX_RAD;
 
 const DAY_US: f64 = 86_400e6;
 /// A date may be ahead of this machine's clock by an hour; a later one is wrong.
@@ -110,11 +110,11 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
 /// about the needle. `None` for an emulated rig.
 pub fn start_roll(config: &Config) -> Option<Check> {
     let sd_deg = config.observer.invariant.start_sd.roll.to_degrees();
-    let limit = format!("up to {:.0} deg", ROLL_KNOWN_RAD.to_degrees());
+    let limit = format!("up to {:.0} deg", ROLL_JUDGED_SD_MAX_RAD.to_degrees());
     let next = "a registration turned about the needle would go unnoticed: compare tracker watch with a tool \
                 moved along each axis, or set observer.start.roll_deg and observer.invariant.start_sd";
     let check = Check::new("start roll", format!("known to {sd_deg:.0} deg"), limit);
-    let is_known = sd_deg <= ROLL_KNOWN_RAD.to_degrees();
+    let is_known = sd_deg <= ROLL_JUDGED_SD_MAX_RAD.to_degrees();
     config.stage.hardware.then(|| check.unless(is_known, Warn, next))
 }
 

@@ -80,7 +80,7 @@ impl Steering {
             handedness,
             samples: config.insertion.corrected_by,
             whiteness: Whiteness::new(position_sd_mm)
-                .with_told(config.tracker.noise, observer_sd_mm),
+                .with_noise(config.tracker.noise, observer_sd_mm),
             is_noise_configured: config.tracker.noise.is_some(),
             step_mm: config.insertion.step_mm,
         })

@@ -1,5 +1,5 @@
-//! The coupled observer from every start: copies of it around the circle of rolls, judged by their
-//! innovations, until one is left.
+//! The coupled observer for any roll at the start: a bank of copies, spread over all rolls and weighted by
+//! their innovations, until one is left.
 
 use super::CoupledConfig;
 use crate::geometry::{FixedAngles, Pose, so3};
@@ -11,30 +11,29 @@ use nalgebra::{Matrix3, Matrix6, Matrix6x3, Vector3};
 
 /// Copies below this fraction of the largest weight are dropped.
 const WEIGHT_MIN: f64 = 1e-5;
-/// x shows the sine of the roll, so near ±90° it does not correct the roll.
+/// x depends on the sine of the roll, so near ±90° it does not correct the roll.
 const ROLL_SEEN_RAD: f64 = 80.0 / 180.0 * std::f64::consts::PI;
-/// Of an error in the plane frame, a displacement and then a turn: what moves the reduced state,
-/// which is x and the plane's normal seen from the tip (S² × ℝ, paper Section 4)…
+/// Indices into an error (displacement; turn) in the plane frame. These components change the reduced state:
+/// x and the plane's normal as seen from the tip (S² × ℝ, paper Section 4).
 const REDUCED: [usize; 3] = [0, 4, 5];
-/// … and what moves the fibre, SE(2): y, z and the yaw.
+/// These components change the fibre, SE(2): y, z and the yaw.
 const FIBRE: [usize; 3] = [1, 2, 3];
 
 /// The paper's coupled observer (Fig. 2) without its local coordinates, with fading memory.
 ///
 /// The structure is the paper's: x alone corrects the reduced state, which does not depend on the
-/// fibre; its estimate moves the fibre, which y and z correct. The paper's coordinates (Eq. 5) end
+/// fibre. The reduced estimate drives the fibre, which y and z correct. The paper's coordinates (Eq. 5) end
 /// at γ = ±90° and do not distinguish γ from π − γ. Here the state of a copy is the pose itself,
 /// and its error is that of the pose on SE(3). In the plane frame a turn about the plane's normal
 /// changes the fibre only, and turns about y and z the reduced state.
 ///
-/// The exact kinematics predict; the error propagates by `Ad(Exp(−ξ))`. The gains are the best ones
-/// of this structure if an old position counts less than a new one by `exp(−depth / memory_mm)`.
-/// Near the plane they settle to those that place all poles of the paper's observer at a modulus of
+/// The exact kinematics predict; the error propagates by `Ad(Exp(−ξ))`. The gains are the best that this
+/// structure allows if a position measured d before the present depth has the weight `exp(−d / memory_mm)`.
+/// Near the plane they converge to the gains that place all poles of the paper's observer at a modulus of
 /// `exp(−Δℓ / memory_mm)`.
 ///
-/// Copies start around the circle. Their weights are the likelihoods of all three coordinates of
-/// the innovations, and fade like everything else. Unlikely copies are dropped, and those that
-/// agree are merged.
+/// Copies start at rolls around the circle. Their weights are the likelihoods of the innovations in all three
+/// coordinates, and fade in the same way. Unlikely copies are dropped, and those that agree are merged.
 ///
 /// The stated covariance is the one that the gains follow from. It counts old positions for less than they
 /// contribute, so it is larger than the error's: NEES is about 2.3 (`docs/steering.md`).
@@ -46,7 +45,7 @@ pub(super) struct CoupledBank {
     /// The tip's motion since the last correction, in its frame then, and its depth.
     motion: Pose,
     motion_mm: f64,
-    /// Normalised square of the last innovation of the likeliest copy.
+    /// Normalised innovation squared (NIS) of the likeliest copy at the last correction.
     nis: Option<f64>,
 }
 
@@ -54,7 +53,7 @@ pub(super) struct CoupledBank {
 #[derive(Debug, Clone)]
 struct RollHypothesis {
     x_pb: Pose,
-    /// Of the left-invariant error.
+    /// Covariance of the left-invariant error.
     covariance: Matrix6<f64>,
     log_weight: f64,
 }
@@ -94,29 +93,30 @@ fn turned(covariance: &Matrix6<f64>, r: &Matrix3<f64>) -> Matrix6<f64> {
 
 /// The gains of the reduced state from x, and of the fibre from y and z.
 fn gain(p: &Matrix6<f64>, s: &Matrix3<f64>) -> Option<Matrix6x3<f64>> {
-    let by_yz = s.fixed_view::<2, 2>(1, 1).into_owned().try_inverse()?;
+    let s_yz_inverse = s.fixed_view::<2, 2>(1, 1).into_owned().try_inverse()?;
     let mut gain = Matrix6x3::zeros();
     for state in REDUCED {
         gain[(state, 0)] = p[(state, 0)] / s[(0, 0)];
     }
     for state in FIBRE {
-        let row = p.fixed_view::<1, 2>(state, 1) * by_yz;
+        let row = p.fixed_view::<1, 2>(state, 1) * s_yz_inverse;
         gain.fixed_view_mut::<1, 2>(state, 1).copy_from(&row);
     }
     Some(gain)
 }
 
 impl RollHypothesis {
-    /// Carries the copy over a motion of the tip, over which what is known fades by `forgetting`.
-    fn carry(&mut self, motion: &Pose, forgetting: f64) {
+    /// Propagates the copy over a motion of the tip. Old knowledge fades: the covariance grows by the factor
+    /// `forgetting`, and the log weight shrinks by it.
+    fn propagate(&mut self, motion: &Pose, forgetting: f64) {
         self.x_pb = (self.x_pb * *motion).renormalized();
         let ad = motion.inverse().adjoint();
         self.covariance = ad * self.covariance * ad.transpose() * forgetting;
         self.log_weight /= forgetting;
     }
 
-    /// Corrects with a measured position. Returns the normalised square of the innovation, or `None`
-    /// if its covariance is not positive.
+    /// Corrects with a measured position. Returns the normalised innovation squared (NIS), or `None`
+    /// if the innovation's covariance is not positive.
     fn correct(&mut self, tip_meas: &TipPosition, variance_mm2: f64) -> Option<f64> {
         let p = turned(&self.covariance, self.x_pb.rotation.matrix());
         let innovation = tip_meas.mm() - self.x_pb.translation;
@@ -124,18 +124,19 @@ impl RollHypothesis {
         let square = innovation.dot(&s.cholesky()?.solve(&innovation));
         self.log_weight -= 0.5 * (square + math::ln(s.determinant()));
         let gain = gain(&p, &s)?;
-        let by = gain * innovation;
-        let tilted = so3::exp(&Vector3::new(0.0, by[4], by[5])) * self.x_pb.rotation;
+        let correction = gain * innovation;
+        let tilted =
+            so3::exp(&Vector3::new(0.0, correction[4], correction[5])) * self.x_pb.rotation;
         let mut kept = Matrix6::<f64>::identity();
         let mut of_position = kept.fixed_view_mut::<6, 3>(0, 0);
         of_position -= gain;
         let p = kept * p * kept.transpose() + gain * gain.transpose() * variance_mm2;
-        // The turn of the fibre comes last and takes the error along: the reduced state and its
-        // covariance do not depend on it.
+        // The turn of the fibre is applied last and turns the error with it: neither the reduced state nor its
+        // covariance depends on this turn.
         self.covariance = turned(&p, &tilted.matrix().transpose());
         self.x_pb = Pose {
-            rotation: so3::exp(&Vector3::new(by[3], 0.0, 0.0)) * tilted,
-            translation: self.x_pb.translation + by.fixed_rows::<3>(0),
+            rotation: so3::exp(&Vector3::new(correction[3], 0.0, 0.0)) * tilted,
+            translation: self.x_pb.translation + correction.fixed_rows::<3>(0),
         };
         Some(square)
     }
@@ -159,8 +160,8 @@ impl CoupledBank {
         }
     }
 
-    /// The copies at the first position.
-    fn started(&self, tip_meas: &TipPosition) -> Vec<RollHypothesis> {
+    /// The copies with which the bank starts, at the first position.
+    fn initial_bank(&self, tip_meas: &TipPosition) -> Vec<RollHypothesis> {
         let CoupledConfig { start, start_sd, position_sd_mm, .. } = self.config;
         let rolls = start::rolls(start.roll, start_sd.roll, WEIGHT_MIN).into_iter();
         rolls
@@ -180,17 +181,17 @@ impl CoupledBank {
         math::exp(depth_mm / self.config.memory_mm)
     }
 
-    fn moved(&self, motion: Pose, increment: Increment) -> Pose {
+    fn motion_after(&self, motion: Pose, increment: Increment) -> Pose {
         motion * Pose::exp(&self.needle.twist(increment))
     }
 
-    /// The copies at the present depth and after `increments`.
-    fn ahead(&self, increments: &[Increment]) -> Vec<RollHypothesis> {
-        let motion = increments.iter().fold(self.motion, |motion, &i| self.moved(motion, i));
+    /// The copies at the present depth, or after `increments` from there.
+    fn bank_after(&self, increments: &[Increment]) -> Vec<RollHypothesis> {
+        let motion = increments.iter().fold(self.motion, |motion, &i| self.motion_after(motion, i));
         let ahead_mm: f64 = increments.iter().map(Increment::insertion_mm).sum();
         let forgetting = self.forgetting(self.motion_mm + ahead_mm);
         let mut ahead = self.bank.clone();
-        ahead.iter_mut().for_each(|copy| copy.carry(&motion, forgetting));
+        ahead.iter_mut().for_each(|copy| copy.propagate(&motion, forgetting));
         ahead
     }
 }
@@ -205,13 +206,13 @@ impl CoupledBank {
 
 impl Observer for CoupledBank {
     fn predict(&mut self, increment: Increment) {
-        self.motion = self.moved(self.motion, increment);
+        self.motion = self.motion_after(self.motion, increment);
         self.motion_mm += increment.insertion_mm();
     }
 
     fn correct(&mut self, tip_meas: &TipPosition, independent: f64) {
         let variance_mm2 = self.config.position_sd_mm.powi(2) / independent;
-        let mut bank = self.ahead(&[]);
+        let mut bank = self.bank_after(&[]);
         (self.motion, self.motion_mm) = (Pose::identity(), 0.0);
         let mut likeliest = (f64::NEG_INFINITY, None);
         bank.retain_mut(|copy| {
@@ -222,21 +223,21 @@ impl Observer for CoupledBank {
             square.is_some() && copy.is_sound()
         });
         self.nis = likeliest.1;
-        // At the first position, and if no copy can explain it, the bank starts there.
+        // The bank starts at the first position, and starts again if no copy can explain a position.
         if bank.is_empty() {
-            bank = self.started(tip_meas);
+            bank = self.initial_bank(tip_meas);
         }
         mixture::reduce(&mut bank, WEIGHT_MIN);
         self.bank = bank;
     }
 
     fn position_mm(&self) -> Option<Vector3<f64>> {
-        mixture::position_mm(&self.ahead(&[]))
+        mixture::position_mm(&self.bank_after(&[]))
     }
 
     fn estimate_after(&self, increments: &[Increment]) -> Option<Estimate> {
         let mixture::Mean { x_pb, covariance, roll_agreement } =
-            mixture::mean(&self.ahead(increments), 1.0)?;
+            mixture::mean(&self.bank_after(increments), 1.0)?;
         let belief = Belief {
             covariance,
             roll_agreement,

@@ -1,4 +1,4 @@
-//! The paper's coupled observer (Section 5.4): as the paper has it ([`Coupled`]), and from every start
+//! The paper's coupled observer (Section 5.4): as in the paper ([`Coupled`]), and for any roll at the start
 //! ([`CoupledBank`]).
 
 mod bank;
@@ -82,7 +82,7 @@ impl CoupledConfig {
     /// Builds the observer.
     ///
     /// # Errors
-    /// [`CoupledError`] as of [`Coupled::new`].
+    /// As [`Coupled::new`].
     pub fn build(self, needle: Needle) -> Result<Box<dyn Observer>, CoupledError> {
         let placed = Coupled::new(needle, self)?;
         Ok(match self.gains {

@@ -24,7 +24,7 @@ const SINE_LIMIT: f64 = 0.999;
 ///
 /// - reduced: `s = (x, sin β, κ cos β sin γ)` (Eq. 5), error `e⁺ = (I − L C) Φ e`, Φ the
 ///   transition of `s₁′ = s₂, s₂′ = s₃, s₃′ = −κ² s₂` (Eq. 6 and 7 with its constant part);
-/// - fibre: Eq. 10 as two complex numbers, `q = z − i y` and `c = cos α + i sin α`. Eq. 15, with
+/// - fibre: Eq. 10 in two complex numbers, `q = z − i y` and `c = cos α + i sin α`. Eq. 15, with
 ///   `T A_h` in place of the printed `A_h T`, is `q′ = cos β c`, `c′ = i κ (cos γ / cos β) c`. It
 ///   is linear over C, so the exact transition over a step is `(q, c) → (q + w c, E c)`; the exact
 ///   step of the reduced pose gives w and E. Two complex gains place both poles exactly.
@@ -69,7 +69,7 @@ impl Transition {
 }
 
 impl State {
-    /// The exact step of the reduced state, and the transition it gives the fibre.
+    /// The exact step of the reduced state, and the transition of the fibre that follows from it.
     fn step(&self, needle: &Needle, increment: Increment) -> (State, Transition) {
         let tip = needle.step(&self.reduced.join(&Fibre::default()), increment);
         let (reduced, moved) = Reduced::split(&tip);
@@ -128,15 +128,16 @@ impl Coupled {
         );
         let first = RowVector3::new(1.0, 0.0, 0.0) * phi;
         let observability = Matrix3::from_rows(&[first, first * phi, first * phi * phi]);
-        let mut wanted = Matrix3::<f64>::identity();
+        // The desired characteristic polynomial, evaluated at Φ.
+        let mut polynomial = Matrix3::<f64>::identity();
         for rate in self.config.reduced_poles_per_mm {
-            wanted *= phi - Matrix3::identity() * math::exp(-rate * depth_mm);
+            polynomial *= phi - Matrix3::identity() * math::exp(-rate * depth_mm);
         }
-        Some(wanted * observability.try_inverse()? * Vector3::z())
+        Some(polynomial * observability.try_inverse()? * Vector3::z())
     }
 
-    /// The gains (l₁, l₂) that give the transition `(q, c) → (q + w c, E c)`, followed by the
-    /// correction, the configured poles p₁, p₂: `l₁ = 1 − p₁p₂/E`,
+    /// The gains (l₁, l₂) with which the transition `(q, c) → (q + w c, E c)` and the following
+    /// correction have the configured poles p₁, p₂: `l₁ = 1 − p₁p₂/E`,
     /// `l₂ = (1 − l₁ + E − p₁ − p₂) / w`.
     fn fibre_gain(&self, over: &Transition) -> (Complex<f64>, Complex<f64>) {
         let [p1, p2] = self.config.fibre_poles_per_mm.map(|rate| math::exp(-rate * over.depth_mm));
@@ -146,7 +147,7 @@ impl Coupled {
     }
 
     /// The reduced state corrected by `change` (gain times innovation) in the coordinates of Eq. 5.
-    /// It stays inside those coordinates and on its side of γ = ±90°.
+    /// The result stays within those coordinates and on the same side of γ = ±90°.
     fn corrected(&self, reduced: &Reduced, change: Vector3<f64>) -> Reduced {
         let k = self.needle.curvature_per_mm();
         let (sin_b, cos_b) = math::sin_cos(reduced.pitch_rad);

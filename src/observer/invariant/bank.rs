@@ -1,4 +1,4 @@
-//! The bank as one estimate, and when two of its hypotheses agree.
+//! Combines the bank into one estimate, and decides whether two of its hypotheses agree.
 
 use super::error_state::{CURVATURE, GROWTH, LAG, LOWER, ROLL, UPPER};
 use super::hypothesis::Hypothesis;
@@ -9,14 +9,14 @@ use nalgebra::Matrix6;
 use std::f64::consts::PI;
 
 /// Two hypotheses are merged if they agree and the variances of their parameters differ by less
-/// than this factor: the more confident one may be wrong where the other is right.
+/// than this factor: otherwise the more confident one may be wrong where the other is right.
 const ALIKE_VARIANCE: f64 = 1.5;
 
 /// The covariance uses each weight to this power. Positions hardly distinguish a shaft that twists
 /// a little from a rigid one. The rigid hypothesis has fewer unknowns, so it is soon a thousand
 /// times as likely, even if it is wrong. It then dominates the mean, but the other one still widens
 /// the covariance.
-const DOUBT_POWER: f64 = 0.2;
+const COVARIANCE_POWER: f64 = 0.2;
 
 impl mixture::Hypothesis for Hypothesis {
     fn log_weight(&self) -> f64 {
@@ -40,7 +40,7 @@ impl mixture::Hypothesis for Hypothesis {
         let least = |state: usize| p.at(state, state).min(q.at(state, state));
         let near =
             |state: usize, apart: f64| apart * apart <= ALIKE_SD * ALIKE_SD * least(state) + 1e-18;
-        let as_sure = |state: usize| {
+        let is_as_certain = |state: usize| {
             let most = p.at(state, state).max(q.at(state, state));
             most <= ALIKE_VARIANCE * least(state) + 1e-12
         };
@@ -62,7 +62,7 @@ impl mixture::Hypothesis for Hypothesis {
         };
         p.extent() == q.extent()
             && 1.0 - bevels <= ALIKE_SD * ALIKE_SD * (least(4) + least(ROLL)) + 1e-12
-            && [CURVATURE, LOWER, UPPER, GROWTH].into_iter().all(as_sure)
+            && [CURVATURE, LOWER, UPPER, GROWTH].into_iter().all(is_as_certain)
             && parameters().into_iter().all(|(state, apart)| near(state, apart))
             && poses()
     }
@@ -72,7 +72,7 @@ impl mixture::Hypothesis for Hypothesis {
 /// them, to which unlikely hypotheses add more than their weight. `None` for an empty bank.
 pub(super) fn estimate(bank: &[Hypothesis]) -> Option<Estimate> {
     let likeliest = mixture::likeliest(bank)?;
-    let mixture::Mean { x_pb, covariance, roll_agreement } = mixture::mean(bank, DOUBT_POWER)?;
+    let mixture::Mean { x_pb, covariance, roll_agreement } = mixture::mean(bank, COVARIANCE_POWER)?;
     let weights = mixture::weights(bank, 1.0);
     let weighted = || bank.iter().zip(weights.iter().copied());
     let mean = |of: &dyn Fn(&Hypothesis) -> f64| weighted().map(|(h, w)| of(h) * w).sum::<f64>();

@@ -12,11 +12,11 @@ use crate::observer::start;
 const TORSION_SD_TIGHT: f64 = 0.04;
 /// … and in the other half, which takes over if the first is wrong.
 const TORSION_SD_LOOSE: f64 = 0.22;
-/// If no torsion is configured, these growths of the band are tried, with these standard
-/// deviations, both as fractions of the search range. They are finer near 0: a growth that was once
-/// taken for none is not searched for again…
+/// If no torsion is configured, these growths of the band are tried, with these standard deviations, both as
+/// fractions of the search range. They are finer near 0, because a growth that was once mistaken for none is
+/// not searched for again.
 const SEARCH: [(f64, f64); 4] = [(0.06, 0.05), (0.2, 0.08), (0.5, 0.12), (0.85, 0.12)];
-/// … Together they have this share of the bank; the rigid shaft has the rest.
+/// The share of the bank that these growths have together; the rigid shaft has the rest.
 const SEARCH_SHARE: f64 = 0.02;
 
 /// A relative uncertainty: over 0.5 a needle could as well be straight.
@@ -125,7 +125,7 @@ impl InvariantConfig {
 
     fn priors(&self, configured: TorsionConfig) -> Vec<TorsionPrior> {
         let TorsionConfig { half_width_rad, half_width_rad_per_mm, .. } = configured;
-        let of = |part: f64, share: f64| TorsionPrior {
+        let prior = |part: f64, share: f64| TorsionPrior {
             band: configured,
             half_width_sd_rad: part * half_width_rad,
             offset_sd_rad: self.torsion_offset_sd * half_width_rad,
@@ -133,9 +133,9 @@ impl InvariantConfig {
             share,
         };
         if half_width_rad > 0.0 || half_width_rad_per_mm > 0.0 {
-            return vec![of(TORSION_SD_TIGHT, 0.5), of(TORSION_SD_LOOSE, 0.5)];
+            return vec![prior(TORSION_SD_TIGHT, 0.5), prior(TORSION_SD_LOOSE, 0.5)];
         }
-        let mut priors = vec![of(0.0, 0.5)];
+        let mut priors = vec![prior(0.0, 0.5)];
         priors[0].offset_sd_rad = self.torsion_offset_sd_rad;
         if self.torsion_search_rad_per_mm > 0.0 && configured.creep_mm == 0.0 {
             let range = self.torsion_search_rad_per_mm;
@@ -144,7 +144,7 @@ impl InvariantConfig {
                 band: TorsionConfig { half_width_rad_per_mm: growth * range, ..configured },
                 growth_sd_rad_per_mm: sd * range,
                 share: self.search_share / SEARCH.len() as f64,
-                ..of(0.0, 0.0)
+                ..prior(0.0, 0.0)
             }));
         }
         priors
@@ -180,8 +180,8 @@ impl InvariantConfig {
             p.set(LOWER, UPPER, offset_variance - width_variance);
             p.set(GROWTH, GROWTH, prior.growth_sd_rad_per_mm.powi(2));
         } else if extent == Extent::Creeping && !banded {
-            // The lag starts at the middle of the band, and the tip still has to creep there: the
-            // uncertainty of the offset is one of the backlog.
+            // The lag starts at the middle of the band, and the tip still has to creep there, so the
+            // uncertainty of the offset is that of the backlog.
             p.set(BACKLOG, BACKLOG, offset_variance);
         }
         let band = Band {

@@ -1,6 +1,6 @@
 //! The error state of a hypothesis, its covariance, and how predict and correct change it.
 //!
-//! The words of the torsion model ([`crate::needle::Torsion`]):
+//! The terms of the torsion model ([`crate::needle::Torsion`]):
 //! - lag λ: rotation that the play has passed on to the tip, less the base's rotation;
 //! - band: the play keeps λ between a lower and an upper edge; their distance grows with depth;
 //! - push: rotation that the play passes on to the tip while an edge of the band holds λ;
@@ -193,15 +193,15 @@ impl Covariance {
     }
 
     /// Propagates the covariance: `P ← F P Fᵀ`, plus the variance of the push.
-    pub(super) fn carry(&mut self, t: &Transition) {
+    pub(super) fn propagate(&mut self, t: &Transition) {
         match self.extent {
-            Extent::Rigid => self.carry_states::<{ CURVATURE + 1 }>(t),
-            Extent::Creeping => self.carry_states::<{ BACKLOG + 1 }>(t),
-            Extent::Banded => self.carry_states::<STATES>(t),
+            Extent::Rigid => self.propagate_states::<{ CURVATURE + 1 }>(t),
+            Extent::Creeping => self.propagate_states::<{ BACKLOG + 1 }>(t),
+            Extent::Banded => self.propagate_states::<STATES>(t),
         }
     }
 
-    fn carry_states<const N: usize>(&mut self, t: &Transition) {
+    fn propagate_states<const N: usize>(&mut self, t: &Transition) {
         // Each pass replaces P by F Pᵀ; two passes give F P Fᵀ.
         for _ in 0..2 {
             let mut carried = [[0.0; STATES]; STATES];
@@ -277,7 +277,7 @@ impl Transition {
         }
     }
 
-    /// F times an error vector; only the first N states count.
+    /// F times an error vector, for its first N states.
     fn apply<const N: usize>(&self, error: &ErrorState) -> ErrorState {
         let pose: [f64; 6] = std::array::from_fn(|i| error[i]);
         let mut pose = adjoint_inverse(&self.motion, &pose);

@@ -17,9 +17,10 @@ use crate::needle::{Increment, Needle, TipPosition};
 use crate::observer::Slack;
 use nalgebra::{Matrix3, Vector3};
 
-/// A turn against the stroke starts a new stroke if it may come this near to the other edge, rad,
-/// plus this many standard deviations of the distance.
+/// A turn against the stroke starts a new stroke if it comes within a margin of the other edge: this angle,
+/// rad …
 const REVERSAL_MARGIN_RAD: f64 = 0.05;
+/// … plus this many standard deviations of the distance to the edge.
 const REVERSAL_MARGIN_SD: f64 = 5.0;
 
 /// Process noise, as variances per mm of insertion.
@@ -202,15 +203,15 @@ impl Hypothesis {
 
     /// Starts a stroke in the other direction, with the present lag as its anchor.
     fn reverse(&mut self) {
-        self.carry_covariance(None);
+        self.propagate_covariance(None);
         self.anchor_rad = self.lag_rad;
         self.covariance.copy_state(LAG, ANCHOR);
         let farthest = (0.0, self.insertion_mm);
         self.stroke = Stroke { sign: -self.stroke.sign, turned_rad: 0.0, farthest };
     }
 
-    /// The fractions that are still backlog after `increment_mm`: of a push spread evenly over it,
-    /// and of the backlog at its start.
+    /// The fractions that are still backlog after `increment_mm`: first of a push that is spread evenly over
+    /// it, then of the backlog at its start.
     fn creep(&self, increment_mm: f64) -> (f64, f64) {
         let Band { creep_mm, creep_mm_per_mm, .. } = self.band;
         let length_mm = creep_mm + creep_mm_per_mm * (self.insertion_mm + 0.5 * increment_mm);
@@ -269,7 +270,7 @@ impl Hypothesis {
     }
 
     /// True while the covariance has not been propagated to the depth of the mean.
-    pub(super) fn is_carried_behind(&self) -> bool {
+    pub(super) fn is_covariance_behind(&self) -> bool {
         self.pending_mm > 0.0 || self.pending.motion != Pose::identity()
     }
 
@@ -279,10 +280,10 @@ impl Hypothesis {
     }
 
     /// Propagates the covariance over the pending transition, and adds `noise` for the depth of it.
-    pub(super) fn carry_covariance(&mut self, noise: Option<&ProcessNoise>) {
+    pub(super) fn propagate_covariance(&mut self, noise: Option<&ProcessNoise>) {
         let transition = self.transition();
         self.pending = Transition::none();
-        self.covariance.carry(&transition);
+        self.covariance.propagate(&transition);
         if let Some(noise) = noise {
             let depth_mm = std::mem::take(&mut self.pending_mm);
             for across in [0, 1] {
@@ -292,8 +293,8 @@ impl Hypothesis {
             self.covariance.add_variance(2, noise.axial_mm2_per_mm * depth_mm);
             self.covariance.add_roll_variance(noise.roll_rad2_per_mm * depth_mm);
             self.covariance.add_variance(CURVATURE, noise.curvature_per_mm3 * depth_mm);
-            // Without an uncertain band the tip creeps toward its middle, so the random walk of the edges
-            // is one of the backlog.
+            // Without an uncertain band the tip creeps toward the band's middle, so the random walk of the
+            // edges acts on the backlog.
             let edges: &[usize] = match self.covariance.extent() {
                 Extent::Rigid => &[],
                 Extent::Creeping => &[BACKLOG],
@@ -306,8 +307,8 @@ impl Hypothesis {
     }
 
     /// Corrects with a measured position. Returns the normalised innovation squared (NIS), χ² with three
-    /// degrees of freedom, or `None` if its covariance is not positive. The covariance must
-    /// have been propagated.
+    /// degrees of freedom, or `None` if the innovation's covariance is not positive. The hypothesis'
+    /// covariance must have been propagated.
     pub(super) fn correct(&mut self, tip_meas: &TipPosition, variance_mm2: f64) -> Option<f64> {
         let off_mm = tip_meas.mm() - self.x_pb.translation;
         let innovation = self.x_pb.rotation.inverse_transform_vector(&off_mm);

@@ -35,12 +35,12 @@ pub struct Invariant {
     torsion: Torsion,
     config: InvariantConfig,
     bank: Vec<Hypothesis>,
-    /// Normalised squares of the likeliest hypothesis' last innovations: χ² with three degrees of
-    /// freedom.
+    /// Normalised innovations squared (NIS) of the likeliest hypothesis, the last ones: χ² with three degrees
+    /// of freedom.
     innovations: VecDeque<f64>,
     insertion_mm: f64,
     log_evidence: f64,
-    /// No hypothesis was left.
+    /// No hypothesis is left.
     is_lost: bool,
 }
 
@@ -60,7 +60,7 @@ impl Invariant {
     }
 
     /// Logarithm of the likelihood of all positions so far under this model, up to a constant that
-    /// depends on their number only. It serves to compare two observers of the same positions.
+    /// depends only on their number. It serves to compare two observers of the same positions.
     pub fn log_evidence(&self) -> f64 {
         self.log_evidence
     }
@@ -90,7 +90,7 @@ impl Invariant {
         let mut likeliest = (f64::NEG_INFINITY, f64::INFINITY);
         let log_weight_before = mixture::log_weight(&self.bank);
         self.bank.retain_mut(|h| {
-            h.carry_covariance(Some(&noise));
+            h.propagate_covariance(Some(&noise));
             let Some(square) = h.correct(tip_meas, variance_mm2) else { return false };
             if h.log_weight > likeliest.0 {
                 likeliest = (h.log_weight, square);
@@ -140,18 +140,18 @@ impl Observer for Invariant {
     }
 
     fn estimate_after(&self, increments: &[Increment]) -> Option<Estimate> {
-        let estimate = if increments.is_empty() && self.bank.iter().all(|h| !h.is_carried_behind())
-        {
-            bank::estimate(&self.bank)?
-        } else {
-            let noise = self.config.process_noise(&self.needle);
-            let mut ahead = self.bank.clone();
-            for h in &mut ahead {
-                increments.iter().for_each(|&increment| h.predict(increment));
-                h.carry_covariance(Some(&noise));
-            }
-            bank::estimate(&ahead)?
-        };
+        let estimate =
+            if increments.is_empty() && self.bank.iter().all(|h| !h.is_covariance_behind()) {
+                bank::estimate(&self.bank)?
+            } else {
+                let noise = self.config.process_noise(&self.needle);
+                let mut ahead = self.bank.clone();
+                for h in &mut ahead {
+                    increments.iter().for_each(|&increment| h.predict(increment));
+                    h.propagate_covariance(Some(&noise));
+                }
+                bank::estimate(&ahead)?
+            };
         let mut belief = estimate.belief?;
         belief.nis = self.innovations.back().copied();
         for coordinate in 0..3 {

@@ -283,7 +283,7 @@ proptest! {
         let moved = |nudge: f64| {
             let mut h = bank[0].clone();
             h.predict(path[0]);
-            h.carry_covariance(None);
+            h.propagate_covariance(None);
             let mut delta: error_state::ErrorState = [0.0; error_state::STATES];
             delta[nudged] = nudge;
             h.nudge(&delta);

@@ -129,7 +129,10 @@ fn a_target_that_is_seen_where_no_path_leads() {
 #[test]
 fn a_target_that_moves_where_no_path_may_end() {
     let cases = [
-        ("emulator.target_drift_mm_per_mm=[0.1, 0.0, 0.0]", "mm off the plane (limit goal.tolerance_mm"),
+        (
+            "emulator.target_drift_mm_per_mm=[0.1, 0.0, 0.0]",
+            "mm off the plane (limit goal.tolerance_mm",
+        ),
         ("emulator.target_drift_mm_per_mm=[0.0, 0.15, 0.0]", "the target has moved 0."),
     ];
     let near = "goal.workspace_mm={ min=[-50, -75, 0], max=[50, 6, 150] }";
