@@ -9,43 +9,44 @@ use crate::units::wrap_angle;
 use nalgebra::Vector3;
 use std::f64::consts::{PI, TAU};
 
-/// The part of the bend that may always hold the plane, whatever the path asks for.
-const ASIDE_MIN: f64 = 0.25;
+/// The share of the needle's bend that is always available to hold the plane, whatever the path demands.
+const TOWARD_PLANE_MIN: f64 = 0.25;
 
-/// A smaller part of the bend has no direction worth aiming at: whole turns are made.
+/// A wanted bend below this share has no direction worth aiming at; the base then makes whole turns.
 const SHARE_MIN: f64 = 0.05;
-/// When less than this many whole turns are left, past bends are forgotten entirely.
-const FORGETTING: f64 = 2.0;
+/// The excess fades towards the end of the path, and is zero within this many whole turns of it.
+const FADE_TURNS: f64 = 2.0;
 
 /// The bend wanted over the next step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bend {
     /// The path bends toward this unit vector across the heading, plane frame.
     pub toward: Vector3<f64>,
-    /// By this mean curvature, per mm; negative where the path soon bends to the other side.
+    /// Its mean curvature, per mm; negative if the path soon bends to the other side.
     pub curvature_per_mm: f64,
-    /// How far the path still is, mm.
-    pub left_mm: f64,
+    /// Remaining length of the path, mm.
+    pub remaining_mm: f64,
     /// The path can still be followed after a whole turn of the base.
     pub may_turn: bool,
     /// The law holds the plane x = 0 as well.
     pub in_plane: bool,
 }
 
-/// Bends the needle by less than its full curvature: it holds the roll that bends the needle along the
-/// path, and once it has bent by so much more than wanted that half of a whole turn would make up for it,
-/// and the path can be followed after that turn, it turns the base once around, over which the bends cancel.
+/// Bends the needle by less than its full curvature. The law holds the roll that bends the needle along the
+/// path, so the needle bends by more than wanted. Once half of a whole turn would make up for this excess, and
+/// if the path can still be followed afterwards, the law turns the base once around, over which the bends
+/// cancel.
 ///
-/// Each whole turn goes the other way than the one before, so the turns do not add up. In the plane
+/// Each whole turn goes in the direction opposite to the one before, so the turns do not add up. In the plane,
 /// [`NestedSaturation`], which holds the plane, gives the sine of the roll, and the path gives its cosine.
 #[derive(Debug, Clone)]
 pub struct BendLaw {
     plane: NestedSaturation,
     /// By how much the needle has bent more than wanted, in mm of full curvature, plane frame.
     excess_mm: Vector3<f64>,
-    /// What is left of a whole turn, rad; 0 while the roll is held.
-    left_rad: f64,
-    /// By how much that may become longer, rad.
+    /// The rest of a whole turn that is under way, rad; 0 while the roll is held.
+    remaining_rad: f64,
+    /// By how much that may still become longer, rad.
     spare_rad: f64,
     /// The direction of that turn, 1 or -1.
     side: f64,
@@ -57,7 +58,7 @@ impl BendLaw {
         BendLaw {
             plane: NestedSaturation::new(needle, config),
             excess_mm: Vector3::zeros(),
-            left_rad: 0.0,
+            remaining_rad: 0.0,
             spare_rad: 0.0,
             side: -1.0,
         }
@@ -79,7 +80,7 @@ impl BendLaw {
         step_mm: f64,
     ) -> Result<Command, ControlError> {
         let rotation = &estimate.x_pb.rotation;
-        let wanted = self.wanted(estimate, bend, step_mm);
+        let wanted = self.wanted_bend(estimate, bend, step_mm);
         let share = wanted.norm();
         // An unturned tip bends toward its own -y.
         let seen = rotation.inverse() * wanted;
@@ -89,36 +90,36 @@ impl BendLaw {
         }
         let transmission = self.plane.transmission(estimate, step_mm);
         let limit_rad_per_mm = self.plane.rotation_max_rad_per_mm();
-        let most_rad = limit_rad_per_mm * step_mm;
+        let step_max_rad = limit_rad_per_mm * step_mm;
         let turn_mm = self.turn_mm();
-        // Near the end nothing makes up for what lies back, but what the path asks for.
-        self.excess_mm *= 1.0 - (FORGETTING * turn_mm / bend.left_mm).min(1.0);
+        // Near the end only the path counts: it leads to the target whatever the past bends were.
+        self.excess_mm *= 1.0 - (FADE_TURNS * turn_mm / bend.remaining_mm).min(1.0);
         self.excess_mm += (rotation * -Vector3::y() - wanted / share.max(1.0)) * step_mm;
         let has_aim = share > SHARE_MIN;
-        let has_bent = self.excess_mm.dot(&wanted) >= 0.5 * share * share * turn_mm;
-        let is_due = bend.may_turn && (has_bent || !has_aim);
-        let is_turning = self.left_rad > 0.0;
+        let has_excess = self.excess_mm.dot(&wanted) >= 0.5 * share * share * turn_mm;
+        let is_due = bend.may_turn && (has_excess || !has_aim);
+        let is_turning = self.remaining_rad > 0.0;
         if !estimate.is_roll_known() {
-            (self.excess_mm, self.left_rad) = (Vector3::zeros(), 0.0);
+            (self.excess_mm, self.remaining_rad) = (Vector3::zeros(), 0.0);
         } else if is_turning || is_due {
             if !is_turning {
-                (self.side, self.left_rad, self.spare_rad) = (-self.side, TAU, PI);
+                (self.side, self.remaining_rad, self.spare_rad) = (-self.side, TAU, PI);
             }
-            // The wanted roll may have changed meanwhile. A turn without aim crosses the play all the same.
+            // The wanted roll may have changed meanwhile. A turn without an aim must cross the play as well.
             if has_aim || !is_turning {
                 let aim_rad = if has_aim { off_rad } else { 0.0 };
-                let to_rad = self.side * transmission.base_for(aim_rad, self.side);
-                let longer_rad = wrap_angle(to_rad - self.left_rad).min(self.spare_rad);
-                self.spare_rad -= longer_rad.max(0.0);
-                self.left_rad += longer_rad;
+                let to_rad = self.side * transmission.base_turn_for(aim_rad, self.side);
+                let added_rad = wrap_angle(to_rad - self.remaining_rad).min(self.spare_rad);
+                self.spare_rad -= added_rad.max(0.0);
+                self.remaining_rad += added_rad;
             }
         }
-        let turn_rad = if self.left_rad > 0.0 {
-            let turn_rad = self.left_rad.min(most_rad);
-            self.left_rad -= turn_rad;
+        let turn_rad = if self.remaining_rad > 0.0 {
+            let turn_rad = self.remaining_rad.min(step_max_rad);
+            self.remaining_rad -= turn_rad;
             turn_rad * self.side
         } else {
-            self.left_rad = 0.0;
+            self.remaining_rad = 0.0;
             self.plane.base_turn([off_rad; 2], 0.0, &transmission)
         };
         let wanted_rad_per_mm = turn_rad / step_mm;
@@ -129,8 +130,8 @@ impl BendLaw {
         Ok(Command { rotation_rad_per_mm, saturated: share > 1.0 })
     }
 
-    /// The bend wanted as a vector, in parts of the needle's curvature.
-    fn wanted(&self, estimate: &Estimate, bend: &Bend, step_mm: f64) -> Vector3<f64> {
+    /// The wanted bend as a vector, relative to the needle's curvature.
+    fn wanted_bend(&self, estimate: &Estimate, bend: &Bend, step_mm: f64) -> Vector3<f64> {
         let curvature_per_mm = self.plane.curvature_per_mm(estimate);
         let share = bend.curvature_per_mm / curvature_per_mm;
         let along = bend.toward * share;
@@ -138,11 +139,11 @@ impl BendLaw {
             return along;
         }
         let (state, _) = Reduced::split(&estimate.x_pb);
-        let most = (1.0 - share * share).max(0.0).sqrt().max(ASIDE_MIN);
-        let aside = self.plane.demand(&state, curvature_per_mm, step_mm).clamp(-most, most);
+        let most = (1.0 - share * share).max(0.0).sqrt().max(TOWARD_PLANE_MIN);
+        let toward_plane = self.plane.demand(&state, curvature_per_mm, step_mm).clamp(-most, most);
         let heading = estimate.x_pb.rotation * Vector3::z();
         let across = Vector3::x() - heading * heading.x;
-        along + across.try_normalize(1e-9).unwrap_or_default() * aside
+        along + across.try_normalize(1e-9).unwrap_or_default() * toward_plane
     }
 }
 
@@ -221,7 +222,7 @@ mod tests {
             let bend = Bend {
                 toward: (toward - heading * toward.dot(&heading)).normalize(),
                 curvature_per_mm: share * CURVATURE_PER_MM,
-                left_mm: 1e6,
+                remaining_mm: 1e6,
                 may_turn: true,
                 in_plane,
             };
@@ -252,7 +253,7 @@ mod tests {
                 let bend = Bend {
                     toward: across.try_normalize(1e-9).unwrap_or_default(),
                     curvature_per_mm: 2.0 * across.norm() / way.norm_squared(),
-                    left_mm: way.norm(),
+                    remaining_mm: way.norm(),
                     may_turn: true,
                     in_plane: false,
                 };
@@ -276,7 +277,7 @@ mod tests {
             let bend = Bend {
                 toward: -Vector3::y(),
                 curvature_per_mm: 0.3 * CURVATURE_PER_MM,
-                left_mm: 1e6,
+                remaining_mm: 1e6,
                 may_turn,
                 in_plane: false,
             };

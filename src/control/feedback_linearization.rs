@@ -10,8 +10,8 @@ use std::f64::consts::TAU;
 
 /// Pitch limit of the law, rad: beyond it the demanded bend is always saturated.
 const PITCH_LIMIT_RAD: f64 = 60.0 / 180.0 * std::f64::consts::PI;
-/// Distance of the roll from the nearer of 0 and π, rad, beyond which the divisor cos γ keeps its
-/// value at this distance.
+/// Beyond this distance of the roll from the nearer of 0 and π, rad, the divisor |cos γ| is no longer
+/// decreased.
 const ROLL_GUARD_RAD: f64 = 80.0 / 180.0 * std::f64::consts::PI;
 /// Insertion allowed with the roll estimate beyond the guard, mm.
 const ROLL_GUARD_DEPTH_MM: f64 = 30.0;
@@ -36,8 +36,8 @@ section! {
 ///
 /// Written as a roll loop, `u = −k₃ (s₃ − s₃,demand)` with `s₃,demand = −(k₁s₁ + k₂s₂)/k₃`, the
 /// demand is limited to `κ cos β sin(roll_demand_max)`: the needle cannot bend harder than κ. Both
-/// equilibria, γ = 0 and γ = π, are valid; the sign of cos γ selects the nearer. While the observer
-/// does not know the roll, a part of each turn is withheld.
+/// equilibria, γ = 0 and γ = π, are valid; the sign of cos γ selects the nearer one. While the observer
+/// does not know the roll, the law commands only a part of each turn.
 #[derive(Debug, Clone)]
 pub struct FeedbackLinearization {
     needle: Needle,
@@ -53,6 +53,7 @@ impl FeedbackLinearization {
         FeedbackLinearization { needle, config, past_guard_mm: 0.0, spin: SpinGuard::default() }
     }
 
+    /// Checks that the roll estimate has not been beyond the guard for too long.
     fn check_roll(&mut self, state: &Reduced, step_mm: f64) -> Result<(), ControlError> {
         let past = math::cos(state.roll_rad).abs() < math::cos(ROLL_GUARD_RAD);
         self.past_guard_mm = if past { self.past_guard_mm + step_mm } else { 0.0 };

@@ -16,7 +16,7 @@ use thiserror::Error;
 
 /// The effect of a pole faster than 1 per mm decays within a sample.
 const RATE: Rule = over(0.0, 1.0);
-/// More than a whole turn per mm acts like the remainder.
+/// A rotation by more than a whole turn per mm acts like the rest after whole turns.
 const ROTATION: Rule = over(0.0, 360.0);
 
 /// A controller's command for the next step.
@@ -71,7 +71,7 @@ pub enum ControlError {
     },
 }
 
-/// The reduced state of `estimate`, which must be finite and within the pitch that a law holds for.
+/// The reduced state of `estimate`, which must be finite, with a pitch of at most `limit_rad`.
 fn state_within(
     estimate: &Estimate,
     step_mm: f64,

@@ -14,8 +14,8 @@ use std::f64::consts::PI;
 const PITCH_LIMIT_RAD: f64 = 80.0 / 180.0 * PI;
 /// A distance to the other edge of the band below this base rotation, rad, counts as zero.
 const SLACK_MIN_RAD: f64 = 0.02;
-/// At least this part of the outstanding turn is expected within a step. Inverting a slower creep would
-/// amplify noise.
+/// The tip is assumed to make at least this share of the outstanding turn within a step. Inverting a slower creep
+/// would amplify noise.
 const FOLLOWED_MIN: f64 = 0.5;
 
 section! {
@@ -49,11 +49,12 @@ section! {
 ///   shortest path ([`shortest_into_plane_mm`](crate::needle::shortest_into_plane_mm)).
 /// * The demanded roll has `κ sin γ` equal to the decay of the pitch error plus the rate of the demand
 ///   along the path (`x′ = sin β`, paper Eq. 3), limited to ±κ. The law takes the nearer of γ and π − γ.
-/// * The turn is the difference to that roll plus the feed-forward `κ cos γ tan β` that holds it (Eq. 3).
+/// * The demanded turn is the difference to that roll, plus the feed-forward `κ cos γ tan β` that holds it
+///   (Eq. 3).
 ///
-/// The inverse of the play converts the turn of the tip into a turn of the base, which first moves to the
-/// edge of the band. A crossing adds the uncertainty of the band's width to the roll, so small demands do
-/// not cross. The law uses the observer's curvature and torsion if the observer estimates them.
+/// The inverse of the play converts the turn of the tip into a turn of the base: the base first turns to the
+/// edge of the band. Crossing the band adds the uncertainty of its width to the roll, so small demands do
+/// not cross it. The law uses the observer's curvature and torsion if the observer estimates them.
 #[derive(Debug, Clone)]
 pub struct NestedSaturation {
     needle: Needle,
@@ -69,7 +70,7 @@ impl NestedSaturation {
         NestedSaturation { needle, config, crossing: None, spin: SpinGuard::default() }
     }
 
-    /// The curvature that the law counts on, per mm.
+    /// The curvature that the law assumes, per mm.
     pub(super) fn curvature_per_mm(&self, estimate: &Estimate) -> f64 {
         let believed = self.needle.curvature_per_mm();
         let estimated = estimate.belief.map_or(believed, |belief| belief.curvature_per_mm);
@@ -120,8 +121,8 @@ impl NestedSaturation {
         pitch_rate / curvature_per_mm
     }
 
-    /// The turn of the base over the next step that turns the tip by the nearer one of `to`, rad,
-    /// with `hold_rad` of feed-forward.
+    /// The turn of the base over the next step that turns the tip by the smaller of the two turns `to`, rad,
+    /// plus the feed-forward `hold_rad`.
     pub(super) fn base_turn(
         &mut self,
         to: [f64; 2],
@@ -129,8 +130,9 @@ impl NestedSaturation {
         transmission: &Transmission,
     ) -> f64 {
         let nearest = if to[0].abs() <= to[1].abs() { to[0] } else { to[1] };
-        let push = |turn: f64| transmission.push(turn * transmission.demand_gain + hold_rad);
-        let wanted = push(nearest);
+        let excess =
+            |turn_rad: f64| transmission.excess_for(turn_rad * transmission.demand_gain + hold_rad);
+        let wanted = excess(nearest);
         let Slack { mean_rad, sd_rad } = transmission.slack(wanted);
         if mean_rad <= SLACK_MIN_RAD {
             self.crossing = None;
@@ -140,37 +142,37 @@ impl NestedSaturation {
             self.crossing = None;
             return 0.0;
         }
-        // Crossing the band takes more than one step, and the tip bends further meanwhile, so the other
-        // roll with the same sine may become the nearer one. A law that turned back each time would
-        // never arrive.
-        let under_way =
+        // Crossing the band takes more than one step. Meanwhile the tip bends further, so the other roll
+        // with the same sine may become the nearer one. If the law turned back each time, it would never
+        // finish the crossing.
+        let ongoing =
             self.crossing.filter(|&sign| transmission.slack(sign).mean_rad > SLACK_MIN_RAD);
-        let sign = under_way.unwrap_or(wanted.signum());
+        let sign = ongoing.unwrap_or(wanted.signum());
         self.crossing = Some(sign);
-        let onward = to.map(push).into_iter().filter(|push| push * sign > 0.0);
-        let push = onward.min_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(wanted);
-        push + transmission.slack(push).mean_rad.max(0.0).copysign(push)
+        let onward = to.map(excess).into_iter().filter(|excess_rad| excess_rad * sign > 0.0);
+        let chosen = onward.min_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(wanted);
+        chosen + transmission.slack(chosen).mean_rad.max(0.0).copysign(chosen)
     }
 }
 
 /// The transmission from the base's rotation to the tip's roll.
 pub(super) struct Transmission {
     shaft: Shaft,
-    /// Part of the outstanding turn that the tip makes within a step.
+    /// Share of the outstanding turn that the tip makes within a step.
     followed: f64,
-    /// Part of each demanded turn that is commanded; less than 1 while the roll is uncertain.
+    /// Share of each demanded turn that is commanded; less than 1 while the roll is uncertain.
     demand_gain: f64,
 }
 
 impl Transmission {
-    /// The excess over the band that turns the tip by `turn_rad` within the step, rad.
-    fn push(&self, turn_rad: f64) -> f64 {
+    /// The excess over the band that makes the tip turn by `turn_rad` within the step, rad.
+    fn excess_for(&self, turn_rad: f64) -> f64 {
         turn_rad / self.followed - self.shaft.backlog_rad
     }
 
-    /// Turn of the base that leaves the tip turned by `turn_rad` once it stands, in the direction of
-    /// `direction`, rad.
-    pub(super) fn base_for(&self, turn_rad: f64, direction: f64) -> f64 {
+    /// Turn of the base in `direction`, rad, after which the tip has turned by `turn_rad` once it has stopped
+    /// creeping.
+    pub(super) fn base_turn_for(&self, turn_rad: f64, direction: f64) -> f64 {
         let slack_rad = self.slack(direction).mean_rad.max(0.0);
         turn_rad - self.shaft.backlog_rad + slack_rad.copysign(direction)
     }

@@ -7,8 +7,8 @@ use std::f64::consts::TAU;
 /// Depth over which the net rotation is limited, mm.
 const WINDOW_MM: f64 = 50.0;
 
-/// Net rotation allowed in the window to a law whose observer may not know the roll yet, rad. The
-/// law then tries several rolls, and each may be most of a turn away.
+/// Net rotation allowed in the window if the observer may not know the roll yet, rad. The law then
+/// tries several rolls, and each may be most of a turn away.
 pub(super) const SEARCHING_SPIN_RAD: f64 = 3.0 * TAU;
 
 /// The rotation commanded over the last part of the insertion.
@@ -19,7 +19,7 @@ pub(super) struct SpinGuard {
 }
 
 impl SpinGuard {
-    /// The command to turn the base by `wanted_rad_per_mm`, limited to ± `limit_rad_per_mm`.
+    /// The command to turn the base at `wanted_rad_per_mm`, limited to ± `limit_rad_per_mm`.
     ///
     /// # Errors
     /// [`ControlError::NotFinite`], and [`ControlError::Spinning`] if the net rotation over the window

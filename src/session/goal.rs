@@ -200,7 +200,7 @@ impl Pursuit {
                 let bend = Bend {
                     toward: steer.bend,
                     curvature_per_mm: steer.curvature_per_mm,
-                    left_mm: steer.left_mm,
+                    remaining_mm: steer.left_mm,
                     may_turn: self.replanner.may_turn(&known, self.law.turn_mm()),
                     in_plane: self.goal.problem.in_plane,
                 };
