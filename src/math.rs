@@ -2,8 +2,8 @@
 //!
 //! `f64::sin` and similar methods call the system's C library, whose results differ in the last bit or
 //! two between libraries, versions and processors. This module uses the `libm` crate, which computes
-//! them by sums and products in Rust. Square root, rounding, remainder and products are exact by
-//! IEEE 754 and stay methods; `powi(2)` is one product. See `docs/decisions/0015`.
+//! them by sums and products in Rust. Square root, rounding, remainder and products are exactly defined by
+//! IEEE 754, so their methods are used; `powi(2)` is one product. See `docs/decisions/0015`.
 
 pub use libm::{acos, asin, atan2, cos, erfc, exp, expm1 as exp_m1, hypot, log as ln, log10};
 pub use libm::{log1p as ln_1p, sin, sincos as sin_cos, tan};

@@ -3,10 +3,10 @@
 use crate::geometry::{Pose, Twist};
 use nalgebra::Vector3;
 
-/// The least depth from one pose that is kept to the next, mm.
+/// Minimum distance between two poses that are kept, mm.
 const SPACING_MM: f64 = 0.005;
 
-/// A place on the path: the tip as it cut there.
+/// The tip as it was when it cut one place of the path.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Cut {
     /// Pose of the tip.
@@ -16,8 +16,8 @@ pub struct Cut {
 }
 
 impl Cut {
-    /// The tip that is back here after it has rolled to `roll_rad`: the channel holds its place and its
-    /// heading, and not its roll.
+    /// The pose of a tip that is back at this place after it has rolled to `roll_rad`: the channel constrains
+    /// position and heading, but not the roll.
     pub fn tip_rolled_to(&self, roll_rad: f64) -> Pose {
         let w = Vector3::new(0.0, 0.0, roll_rad - self.roll_rad);
         self.tip * Pose::exp(&Twist { v: Vector3::zeros(), w })
@@ -36,7 +36,7 @@ impl InsertedPath {
     /// tissue is already cut.
     pub fn advance(&mut self, depth_mm: f64, cut: Cut) {
         if depth_mm.is_finite() && self.points.last().is_none_or(|&(last, _)| depth_mm > last) {
-            // The deepest pose is kept, and few of a slow needle.
+            // A slow needle has very dense poses. The deepest is kept, but few of the others.
             if let [.., (before, _), (last, _)] = self.points[..]
                 && last - before < SPACING_MM
             {
@@ -51,8 +51,8 @@ impl InsertedPath {
         self.points.last().map(|&(depth, _)| depth)
     }
 
-    /// What was cut at `depth_mm`: on the screw between the two recorded poses around that depth. `None`
-    /// outside the recorded depths.
+    /// The tip as it was at `depth_mm`, interpolated on the screw motion between the two recorded poses around
+    /// that depth. `None` outside the recorded depths.
     pub fn at(&self, depth_mm: f64) -> Option<Cut> {
         let after = self.points.partition_point(|&(depth, _)| depth < depth_mm);
         let &(deep, far) = self.points.get(after)?;

@@ -5,7 +5,7 @@ use super::kinematics::{NeedleError, bounded};
 use crate::keys::{Rule, section, within};
 use crate::math;
 
-/// Below this ratio of inserted depth to creep length the creep is linear to rounding.
+/// Below this ratio of insertion to creep length the creep is linear, up to rounding.
 const CREEP_RATIO_MIN: f64 = 1e-9;
 /// Rounding tolerance of the band's edges, relative to 1 rad and the half-width.
 const EDGE_TOLERANCE: f64 = 1e-12;
@@ -125,25 +125,25 @@ impl Play {
         base: Increment,
     ) -> impl Iterator<Item = Increment> + use<> {
         let mut pieces = [None; 3];
-        let mut left = 1.0;
+        let mut remaining = 1.0;
         // Outside the band, through it and outside again: there is no fourth piece.
         for piece in &mut pieces {
-            if left > 0.0 {
-                let (part, lag_rad) = self.piece(torsion, base, left);
+            if remaining > 0.0 {
+                let (part, lag_rad) = self.piece(torsion, base, remaining);
                 let roll_rad = base.rotation_rad() * part + (lag_rad - self.lag_rad);
                 let increment = base.part(part, roll_rad);
                 self.insertion_mm += increment.insertion_mm();
                 self.lag_rad = lag_rad;
-                left -= part;
+                remaining -= part;
                 *piece = Some(increment);
             }
         }
         pieces.into_iter().flatten()
     }
 
-    /// The next piece, outside or inside the band: the part of `base` that it takes, at most `left`, and
+    /// The next piece, outside or inside the band: the part of `base` that it takes, at most `remaining`, and
     /// the lag at its end. All rates are per whole `base`.
-    fn piece(&self, torsion: &Torsion, base: Increment, left: f64) -> (f64, f64) {
+    fn piece(&self, torsion: &Torsion, base: Increment, remaining: f64) -> (f64, f64) {
         let TorsionConfig { half_width_rad_per_mm, offset_rad, .. } = torsion.config;
         let half_width_rad = torsion.half_width_rad(self.insertion_mm);
         let widening = half_width_rad_per_mm * base.insertion_mm();
@@ -155,8 +155,8 @@ impl Play {
         let outward = side * drift - widening;
         if excess <= edge {
             let gap = half_width_rad - side * from_middle;
-            if outward <= 0.0 || gap >= outward * left {
-                return (left, self.lag_rad + drift * left);
+            if outward <= 0.0 || gap >= outward * remaining {
+                return (remaining, self.lag_rad + drift * remaining);
             }
             if gap > edge {
                 let part = gap / outward;
@@ -165,9 +165,9 @@ impl Play {
         }
         let creep = Creep::of(torsion, self.insertion_mm, base.insertion_mm());
         let excess = excess.max(0.0);
-        let inside_after = if outward < 0.0 { creep.back_inside(excess, outward) } else { 1.0 };
-        let part = left.min(inside_after);
-        let excess = if part < left { 0.0 } else { creep.excess(excess, outward, part) };
+        let inside_after = if outward < 0.0 { creep.part_to_edge(excess, outward) } else { 1.0 };
+        let part = remaining.min(inside_after);
+        let excess = if part < remaining { 0.0 } else { creep.excess(excess, outward, part) };
         (part, offset_rad + side * (half_width_rad + widening * part + excess))
     }
 }
@@ -206,8 +206,8 @@ impl Creep {
         excess * math::exp(-exponent) + outward * part * mean
     }
 
-    /// The part after which the excess is back at 0, for a negative outward rate.
-    fn back_inside(&self, excess: f64, outward: f64) -> f64 {
+    /// The part of the increment after which the excess is 0, for a negative outward rate.
+    fn part_to_edge(&self, excess: f64, outward: f64) -> f64 {
         let (ratio, growth) = (self.ratio, self.growth);
         if ratio == f64::INFINITY {
             return 0.0;

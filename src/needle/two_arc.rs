@@ -11,12 +11,13 @@ const TOLERANCE: f64 = 1e-12;
 /// may be turned at will: two arcs of the needle's curvature κ.
 ///
 /// With s = ±1 the first arc bends the pitch by β′ = sκ to β_m = s|β_m| and the second bends it
-/// back to 0. Integrating x′ = sin β along both gives `cos β_m = (κ s x + cos β + 1) / 2` and the
-/// length `(s (β_m − β) + |β_m|) / κ`; the shorter of the two signs counts. Where that cosine is
-/// negative (without pitch: beyond 2/κ), the arcs turn to 90° and back, and what is left of x, `−2 cos β_m / κ`,
-/// is a straight between them.
+/// back to 0. Integrating x′ = sin β along both arcs gives `cos β_m = (κ s x + cos β + 1) / 2` and the
+/// length `(s (β_m − β) + |β_m|) / κ`; the sign with the shorter length counts. If that cosine is
+/// negative (without pitch: for |x| over 2/κ), the arcs turn to 90° and back, and a straight of length
+/// `−2 cos β_m / κ` between them covers the rest of x.
 ///
-/// x is that of the point that moves along the shaft's axis. In the plane without pitch the tip is there too.
+/// x belongs to the point that moves along the shaft's axis. In the plane and without pitch, the tip is in the
+/// plane as well.
 ///
 /// `None` if the needle is straight and not already in the plane, or |β| is over π/2.
 pub fn shortest_into_plane_mm(needle: &Needle, state: &Reduced) -> Option<f64> {
@@ -36,15 +37,16 @@ pub fn shortest_into_plane_mm(needle: &Needle, state: &Reduced) -> Option<f64> {
             let turn_rad = math::acos(cos_turn.clamp(0.0, 1.0));
             let straight_rad = -2.0 * cos_turn.min(0.0);
             let first_rad = turn_rad - s * pitch_rad;
-            let is_way = cos_turn <= 1.0 + TOLERANCE && first_rad >= -TOLERANCE;
-            is_way.then(|| (first_rad.max(0.0) + straight_rad + turn_rad) / curvature)
+            let exists = cos_turn <= 1.0 + TOLERANCE && first_rad >= -TOLERANCE;
+            exists.then(|| (first_rad.max(0.0) + straight_rad + turn_rad) / curvature)
         })
         .min_by(f64::total_cmp)
 }
 
-/// An upper bound of how much nearer to the plane a tip comes over `length_mm`, mm, that heads for the plane at
-/// `toward_rad`: the needle bends toward it all the way, and `sin(β + κ s) ≤ sin β + κ s`. A tip that is ahead of
-/// the point that moves along the shaft's axis comes nearer by its share of that turn, too.
+/// An upper bound, mm, of how much nearer to the plane the tip comes over `length_mm` if it heads for the plane at
+/// `toward_rad`. The bound assumes that the needle bends toward the plane all the way, with
+/// `sin(β + κ s) ≤ sin β + κ s`. A tip that is ahead of the point that moves along the shaft's axis also comes
+/// nearer by the turn of the heading times that distance.
 pub fn approach_max_mm(needle: &Needle, toward_rad: f64, length_mm: f64) -> f64 {
     let curvature = needle.curvature_per_mm();
     length_mm * math::sin(toward_rad.min(FRAC_PI_2))
