@@ -42,7 +42,7 @@ fn read_mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obsta
     check_voxel_size(&header)?;
     let [_, x, y, z, ..] = header.pixdim.map(f64::from);
     let spacing_mm = Vector3::new(x, y, z);
-    let voxels = Mask::check(size, &spacing_mm)?;
+    let voxels = Mask::voxel_count(size, &spacing_mm)?;
     check_length(path, &header, voxels)?;
     let image = ReaderOptions::new().read_file(path).map_err(|error| reason(&error))?;
     let image = image.into_volume();

@@ -1,4 +1,4 @@
-//! Where the tip goes on arcs, and how long the shortest way to a point is with nothing in the way.
+//! The motion of the tip on arcs, and the shortest way to a point without obstacles.
 
 use crate::math;
 use nalgebra::Vector3;
@@ -7,7 +7,7 @@ use std::f64::consts::{PI, TAU};
 /// Distance from the tip's axis under which a point counts as straight ahead, mm.
 const STRAIGHT_MM: f64 = 1e-9;
 
-/// Position and heading of the needle's tip. Its roll may be chosen, so it is not part of a plan.
+/// Position and heading of the needle's tip. The roll can be chosen freely, so it is not part of a plan.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tip {
     /// Position, plane frame, mm.
@@ -28,13 +28,13 @@ pub struct Arc {
 }
 
 impl Arc {
-    /// The first `length_mm` of the same arc, or more of it.
+    /// The same arc with another length.
     pub fn with_length(self, length_mm: f64) -> Self {
         Arc { length_mm, ..self }
     }
 }
 
-/// Where a bent arc ends, seen from its start: forward and aside, mm; sine and cosine of its turn.
+/// The end of a bent arc relative to its start: distances ahead and aside, mm; sine and cosine of its turn.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Chord {
     ahead_mm: f64,
@@ -44,7 +44,7 @@ pub(super) struct Chord {
 }
 
 impl Chord {
-    /// Of an arc of this curvature, over 0, and length.
+    /// The chord of an arc with this curvature, over 0, and length.
     pub(super) fn of(curvature_per_mm: f64, length_mm: f64) -> Self {
         let angle_rad = curvature_per_mm * length_mm;
         let (sin, cos) = math::sin_cos(angle_rad);
@@ -54,8 +54,8 @@ impl Chord {
     }
 }
 
-/// A point as the tip sees it.
-pub(super) struct Seen {
+/// A point relative to the tip.
+pub(super) struct RelativePoint {
     /// Distance from the tip's axis, ρ, mm.
     pub(super) off_axis_mm: f64,
     /// Distance along the tip's axis, mm; negative behind the tip.
@@ -83,14 +83,14 @@ impl Tip {
         }
     }
 
-    /// Unit vectors across the heading: perpendicular to each other, the same for the same heading.
+    /// Two perpendicular unit vectors across the heading. They depend only on the heading.
     pub fn across(&self) -> [Vector3<f64>; 2] {
         let axis = Vector3::ith(self.heading.iamin(), 1.0);
         let first = self.heading.cross(&axis).normalize();
         [first, self.heading.cross(&first)]
     }
 
-    pub(super) fn sees(&self, point_mm: &Vector3<f64>) -> Seen {
+    pub(super) fn relative(&self, point_mm: &Vector3<f64>) -> RelativePoint {
         let to_point = point_mm - self.position_mm;
         let ahead_mm = to_point.dot(&self.heading);
         let across = to_point - self.heading * ahead_mm;
@@ -99,13 +99,13 @@ impl Tip {
             true => across / off_axis_mm,
             false => self.across()[0],
         };
-        Seen { off_axis_mm, ahead_mm, bend }
+        RelativePoint { off_axis_mm, ahead_mm, bend }
     }
 
-    /// The one arc to `point_mm`: curvature `κ = 2ρ / (ρ² + z²)` and length `2 atan2(ρ, z) / κ` for a
+    /// The single arc to `point_mm`: curvature `κ = 2ρ / (ρ² + z²)` and length `2 atan2(ρ, z) / κ` for a
     /// point ρ off the axis and z ahead. `None` for a point behind the tip or at it.
     pub fn arc_to(&self, point_mm: &Vector3<f64>) -> Option<Arc> {
-        let Seen { off_axis_mm, ahead_mm, bend } = self.sees(point_mm);
+        let RelativePoint { off_axis_mm, ahead_mm, bend } = self.relative(point_mm);
         if ahead_mm < 0.0 || off_axis_mm + ahead_mm <= STRAIGHT_MM {
             return None;
         }
@@ -121,35 +121,37 @@ impl Tip {
     /// The shortest way to `point_mm` with a curvature of at most `curvature_per_mm` > 0: an arc of that
     /// curvature, then straight. With r = 1/κ, a point ρ off the axis and z ahead, d² = (ρ − r)² + z² and
     /// t² = d² − r², the arc turns by `atan2(z r − (r − ρ) t, (r − ρ) r + z t)` and t is straight.
-    /// `None` for a point inside the turning circle: every way there is longer than [`Tip::shortest_mm`].
+    /// `None` for a point inside the turning circle, for which there is no such way.
     pub fn arc_then_straight_to(
         &self,
         point_mm: &Vector3<f64>,
         curvature_per_mm: f64,
     ) -> Option<[Arc; 2]> {
-        let seen = self.sees(point_mm);
-        let (turn_rad, straight_mm) = seen.turn_then_straight(curvature_per_mm)?;
-        let arc = Arc { bend: seen.bend, curvature_per_mm, length_mm: turn_rad / curvature_per_mm };
+        let relative = self.relative(point_mm);
+        let (turn_rad, straight_mm) = relative.turn_then_straight(curvature_per_mm)?;
+        let arc =
+            Arc { bend: relative.bend, curvature_per_mm, length_mm: turn_rad / curvature_per_mm };
         let (sin, cos) = math::sin_cos(turn_rad);
-        let bend = seen.bend * cos - self.heading * sin;
+        let bend = relative.bend * cos - self.heading * sin;
         Some([arc, Arc { bend, curvature_per_mm: 0.0, length_mm: straight_mm }])
     }
 
-    /// A lower bound of length plus distance left, mm, of any way that ends within `tolerance_mm` of
-    /// `point_mm`, with nothing in the way. It is the length of [`Tip::arc_then_straight_to`] outside the
-    /// turning circle. Points further inside than the tolerance take half a circle at least (Schur: a
-    /// curve of curvature at most 1/r that touches a ball of radius r enters it only after π r).
+    /// A lower bound of the length plus the remaining distance, mm, of any way that ends within `tolerance_mm`
+    /// of `point_mm`, without obstacles. Outside the turning circle it is the length of
+    /// [`Tip::arc_then_straight_to`]. A way to a point that is inside by more than the tolerance takes at least
+    /// half a circle (Schur: a curve of curvature at most 1/r that touches a ball of radius r enters it only
+    /// after π r).
     pub fn shortest_mm(
         &self,
         point_mm: &Vector3<f64>,
         curvature_per_mm: f64,
         tolerance_mm: f64,
     ) -> f64 {
-        let seen = self.sees(point_mm);
-        if let Some((turn_rad, straight_mm)) = seen.turn_then_straight(curvature_per_mm) {
+        let relative = self.relative(point_mm);
+        if let Some((turn_rad, straight_mm)) = relative.turn_then_straight(curvature_per_mm) {
             return turn_rad / curvature_per_mm + straight_mm;
         }
-        let Seen { off_axis_mm, ahead_mm, .. } = seen;
+        let RelativePoint { off_axis_mm, ahead_mm, .. } = relative;
         let radius_mm = curvature_per_mm.recip();
         let from_centre_mm = math::hypot(radius_mm - off_axis_mm, ahead_mm);
         match radius_mm - from_centre_mm <= tolerance_mm {
@@ -159,8 +161,8 @@ impl Tip {
     }
 }
 
-impl Seen {
-    /// The angle of the arc, rad, and the straight rest, mm.
+impl RelativePoint {
+    /// The turn of the arc, rad, and the length of the straight after it, mm; `None` inside the turning circle.
     fn turn_then_straight(&self, curvature_per_mm: f64) -> Option<(f64, f64)> {
         let radius_mm = curvature_per_mm.recip();
         let (from_axis_mm, ahead_mm) = (radius_mm - self.off_axis_mm, self.ahead_mm);

@@ -9,16 +9,17 @@ use std::borrow::Cow;
 /// The shortest step along an arc when it is tested against the obstacles, mm. Between two tests an
 /// obstacle of 1 mm radius may come nearer by 0.0012 mm.
 const TEST_STEP_MM: f64 = 0.1;
-/// An arc longer than this is tested at these parts of it before all along it, mm.
-const FEW_MM: f64 = 5.0;
+/// An arc longer than this, mm, is first tested at a few points, at these fractions of its length.
+const FEW_POINTS_MM: f64 = 5.0;
 const PARTS: [f64; 7] = [0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875];
-/// Above this slack a lower bound of the slack is enough, mm.
+/// If the slack is surely above this, mm, a lower bound of the slack is enough.
 const AMPLE_MM: f64 = 0.5;
-/// Distance between two nodes in the plane and in space, mm, and the most nodes along a coordinate.
+/// Distance between two nodes, mm: in the plane and in space.
 const SPACING_MM: [f64; 2] = [1.0, 4.0];
+/// Maximum number of nodes along a coordinate: in the plane and in space.
 const NODES_MAX: [f64; 2] = [400.0, 60.0];
 
-/// Nodes over the bounds of a workspace: in space, or in the plane x = 0.
+/// A grid of nodes over the bounds of a workspace: in space, or in the plane x = 0.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Grid {
     first_mm: Vector3<f64>,
@@ -35,8 +36,8 @@ impl Grid {
         if in_plane {
             (extent_mm.x, first_mm.x) = (0.0, 0.0);
         }
-        let [which, dimensions] = if in_plane { [0, 2] } else { [1, 3] };
-        let spacing_mm = SPACING_MM[which].max(extent_mm.max() / NODES_MAX[which]);
+        let [index, dimensions] = if in_plane { [0, 2] } else { [1, 3] };
+        let spacing_mm = SPACING_MM[index].max(extent_mm.max() / NODES_MAX[index]);
         let radius_mm = 0.5 * spacing_mm * (dimensions as f64).sqrt();
         let counts = extent_mm.map(|mm| (mm / spacing_mm).ceil() as usize + 1).into();
         Grid { first_mm, spacing_mm, radius_mm, counts }
@@ -55,11 +56,11 @@ impl Grid {
         [node % nx, node / nx % ny, node / nx / ny]
     }
 
-    pub(super) fn place_mm(&self, indices: [usize; 3]) -> Vector3<f64> {
+    pub(super) fn position_mm(&self, indices: [usize; 3]) -> Vector3<f64> {
         self.first_mm + Vector3::from(indices.map(|index| index as f64)) * self.spacing_mm
     }
 
-    /// The node at or below a point of the workspace in each coordinate, not the last one.
+    /// The lower corner of the cell around a point of the workspace.
     pub(super) fn below(&self, point_mm: &Vector3<f64>) -> [usize; 3] {
         std::array::from_fn(|i| {
             let index = ((point_mm[i] - self.first_mm[i]) / self.spacing_mm) as usize;
@@ -75,7 +76,7 @@ impl Grid {
     }
 }
 
-/// Where the tip may be: the obstacles with the clearance around them, in the workspace.
+/// The region in which the tip may be: inside the workspace, with the clearance from the obstacles.
 #[derive(Debug, Clone)]
 pub(super) struct Field<'a> {
     pub(super) world: Cow<'a, World>,
@@ -89,7 +90,7 @@ pub(super) struct Field<'a> {
 }
 
 impl<'a> Field<'a> {
-    /// The field around the obstacles of `world`. One that is `in_plane` judges points of the plane x = 0 only.
+    /// The field around the obstacles of `world`. With `in_plane` it only judges points of the plane x = 0.
     pub(super) fn new(world: Cow<'a, World>, clearance_mm: f64, in_plane: bool) -> Self {
         let grid = Grid::new(&world, in_plane);
         let distances_mm = vec![f32::NAN; grid.nodes()];
@@ -99,14 +100,14 @@ impl<'a> Field<'a> {
     /// The slack of a node, mm.
     pub(super) fn node_slack_mm(&mut self, node: usize) -> f64 {
         if self.distances_mm[node].is_nan() {
-            let place_mm = self.grid.place_mm(self.grid.indices(node));
-            self.distances_mm[node] = self.world.distance_mm(&place_mm) as f32;
+            let position_mm = self.grid.position_mm(self.grid.indices(node));
+            self.distances_mm[node] = self.world.distance_mm(&position_mm) as f32;
         }
         f64::from(self.distances_mm[node]) - self.clearance_mm
     }
 
-    /// How far the tip may go from `point_mm` in any direction, mm, or less if that is far; negative
-    /// where it must not be.
+    /// How far the tip may go from `point_mm` in any direction, mm; if that is far, a lower bound of it. Negative
+    /// if the tip must not be at `point_mm`.
     pub(super) fn slack_mm(&mut self, point_mm: &Vector3<f64>) -> f64 {
         let depth_mm = self.world.workspace.depth_mm(point_mm);
         if depth_mm < 0.0 {
@@ -126,8 +127,7 @@ impl<'a> Field<'a> {
         slack_mm.min(depth_mm)
     }
 
-    /// True if the tip may follow `arc` from `tip`: in the workspace, and nowhere nearer than the
-    /// clearance to an obstacle.
+    /// True if `arc` from `tip` stays in the workspace and keeps the clearance from all obstacles.
     pub(super) fn is_clear(&mut self, tip: &Tip, arc: &Arc) -> bool {
         let mut slack_at_mm = |along_mm| {
             let at = tip.after(&arc.with_length(along_mm)).position_mm;
@@ -135,7 +135,7 @@ impl<'a> Field<'a> {
         };
         let slacks_mm = [0.0, arc.length_mm].map(&mut slack_at_mm);
         // A few points first: most arcs that are not clear fail there.
-        let parts = if arc.length_mm > FEW_MM { PARTS.as_slice() } else { &[] };
+        let parts = if arc.length_mm > FEW_POINTS_MM { PARTS.as_slice() } else { &[] };
         slacks_mm.iter().all(|slack_mm| *slack_mm >= 0.0)
             && !parts.iter().any(|part| slack_at_mm(part * arc.length_mm) < 0.0)
             && self.is_clear_between(tip, arc, slacks_mm)
@@ -159,7 +159,7 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// As [`Field::is_clear`], where the slacks of both ends are known and not negative, mm.
+    /// As [`Field::is_clear`], if the slacks of both ends are known and not negative, mm.
     pub(super) fn is_clear_between(
         &mut self,
         tip: &Tip,

@@ -26,7 +26,8 @@ pub struct Resolution {
     pub heading_rad: f64,
 }
 
-/// Arcs of one length, straight or of one curvature, from each tip; cells of position and heading.
+/// From each tip, arcs of one length lead on: a straight and arcs of one curvature. The places that they reach are
+/// sorted into cells of position and heading.
 #[derive(Debug)]
 pub(super) struct Lattice {
     pub(super) resolution: Resolution,
@@ -36,41 +37,41 @@ pub(super) struct Lattice {
     chord: Chord,
     first_mm: Vector3<f64>,
     counts: [usize; 3],
-    /// In the plane on a circle; in space along an edge of the cube around the directions.
+    /// Number of headings: in the plane around the circle; in space along an edge of a cube of directions.
     headings: usize,
     pub(super) visited: Visited,
 }
 
-/// A set of cells, whose memory serves one search after the other.
+/// A set of cells. Its memory is reused from search to search.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Visited {
     words: Vec<u64>,
-    /// The words that are not 0.
+    /// Indices of the words that are not 0.
     touched: Vec<u32>,
 }
 
 impl Visited {
     /// The empty set, with room for `cells`.
-    fn emptied(mut self, cells: usize) -> Self {
+    fn cleared(mut self, cells: usize) -> Self {
         for word in self.touched.drain(..) {
             self.words[word as usize] = 0;
         }
         let words = cells.div_ceil(64);
         if self.words.len() < words {
-            // New pages are zero already; to lengthen the old ones would copy them.
+            // New pages are zero already; growing the old vector would copy them.
             self.words = vec![0; words];
         }
         self
     }
 
     /// True if the set has this cell.
-    pub(super) fn has(&self, cell: usize) -> bool {
+    pub(super) fn contains(&self, cell: usize) -> bool {
         self.words[cell / 64] & 1 << (cell % 64) != 0
     }
 
     /// Adds a cell; true if it is new.
-    pub(super) fn add(&mut self, cell: usize) -> bool {
-        let is_new = !self.has(cell);
+    pub(super) fn insert(&mut self, cell: usize) -> bool {
+        let is_new = !self.contains(cell);
         let word = &mut self.words[cell / 64];
         if *word == 0 {
             self.touched.push((cell / 64) as u32);
@@ -89,12 +90,12 @@ const BENDS: u8 = 8;
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Place {
     pub(super) tip: Tip,
-    /// In the plane, arcs to the left less arcs to the right.
+    /// In the plane: number of arcs to the left minus number of arcs to the right.
     turns: i32,
 }
 
 impl Lattice {
-    /// In the plane there is one resolution, in space `level` 0 is the coarsest.
+    /// In the plane there is only one resolution; in space, `level` 0 is the coarsest.
     pub(super) fn new(
         workspace: &Workspace,
         curvature_per_mm: f64,
@@ -134,7 +135,7 @@ impl Lattice {
             first_mm,
             counts,
             headings,
-            visited: visited.emptied(cells),
+            visited: visited.cleared(cells),
         }
     }
 
@@ -142,42 +143,57 @@ impl Lattice {
         Place { tip, turns: 0 }
     }
 
-    /// The number of arcs that lead on.
+    /// The number of arcs that lead on from a place.
     pub(super) fn arcs(&self) -> u8 {
         1 + if self.in_plane { 2 } else { BENDS }
     }
 
-    /// Where arc number `by` ends. `before` is the heading at the start of the arc that led here.
-    pub(super) fn next(&self, from: &Place, before: Option<Vector3<f64>>, by: u8) -> Place {
+    /// Where arc number `arc_number` ends. `previous_heading` is the heading at the start of the arc that led here.
+    pub(super) fn next(
+        &self,
+        from: &Place,
+        previous_heading: Option<Vector3<f64>>,
+        arc_number: u8,
+    ) -> Place {
         let Tip { position_mm, heading } = from.tip;
-        if by == STRAIGHT {
+        if arc_number == STRAIGHT {
             let position_mm = position_mm + heading * self.resolution.step_mm;
             return Place { tip: Tip { position_mm, heading }, ..*from };
         }
-        let bend = self.bend(&from.tip, before, by);
+        let bend = self.bend(&from.tip, previous_heading, arc_number);
         let tip = from.tip.at_end_of(&self.chord, &bend);
-        Place { tip, turns: from.turns + if by == 1 { 1 } else { -1 } }
+        Place { tip, turns: from.turns + if arc_number == 1 { 1 } else { -1 } }
     }
 
-    /// Arc number `by` from `tip`.
-    pub(super) fn arc(&self, tip: &Tip, before: Option<Vector3<f64>>, by: u8) -> Arc {
-        let curvature_per_mm = if by == STRAIGHT { 0.0 } else { self.curvature_per_mm };
+    /// Arc number `arc_number` from `tip`.
+    pub(super) fn arc(
+        &self,
+        tip: &Tip,
+        previous_heading: Option<Vector3<f64>>,
+        arc_number: u8,
+    ) -> Arc {
+        let curvature_per_mm = if arc_number == STRAIGHT { 0.0 } else { self.curvature_per_mm };
         let length_mm = self.resolution.step_mm;
-        Arc { bend: self.bend(tip, before, by), curvature_per_mm, length_mm }
+        Arc { bend: self.bend(tip, previous_heading, arc_number), curvature_per_mm, length_mm }
     }
 
-    fn bend(&self, tip: &Tip, before: Option<Vector3<f64>>, by: u8) -> Vector3<f64> {
+    fn bend(
+        &self,
+        tip: &Tip,
+        previous_heading: Option<Vector3<f64>>,
+        arc_number: u8,
+    ) -> Vector3<f64> {
         let heading = tip.heading;
         if self.in_plane {
             // The heading turned by 90 degrees about the plane's normal.
             let left = Vector3::new(0.0, -heading.z, heading.y);
-            return if by == 2 { -left } else { left };
+            return if arc_number == 2 { -left } else { left };
         }
         // The first direction continues the bend of the arc that led here.
-        let first = before.map(|before| heading * self.chord.cos - before);
+        let first = previous_heading.map(|previous| heading * self.chord.cos - previous);
         let first = first.and_then(|bend| bend.try_normalize(1e-6));
         let first = first.unwrap_or_else(|| tip.across()[0]);
-        let (sin, cos) = math::sin_cos(TAU * f64::from(by.max(1) - 1) / f64::from(BENDS));
+        let (sin, cos) = math::sin_cos(TAU * f64::from(arc_number.max(1) - 1) / f64::from(BENDS));
         (first * cos + heading.cross(&first) * sin).normalize()
     }
 
@@ -192,7 +208,7 @@ impl Lattice {
             true => cell * self.headings + place.turns.rem_euclid(self.headings as i32) as usize,
             false => {
                 cell * 6 * self.headings * self.headings
-                    + on_cube(&place.tip.heading, self.headings)
+                    + cube_cell(&place.tip.heading, self.headings)
             }
         }
     }
@@ -202,8 +218,9 @@ impl Lattice {
 /// along an edge of the cube.
 pub(super) const LEVELS: [(f64, f64, usize); 3] = [(12.0, 5.0, 6), (6.0, 3.0, 10), (3.0, 2.0, 16)];
 
-/// The number of a heading among the squares of a cube's faces, each divided so many times.
-fn on_cube(heading: &Vector3<f64>, divisions: usize) -> usize {
+/// The number of the cell of a heading, if each face of a cube of directions is divided into `divisions` ×
+/// `divisions` squares.
+fn cube_cell(heading: &Vector3<f64>, divisions: usize) -> usize {
     let axis = heading.iamax();
     let face = 2 * axis + usize::from(heading[axis] < 0.0);
     let square = |coordinate: f64| {

@@ -6,32 +6,32 @@ use nalgebra::Vector3;
 /// The signed distance field of occupied voxels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Mask {
-    /// From the frame P of the plane to that of the grid, in which voxel (0, 0, 0) has its centre at 0.
+    /// The plane frame P in the frame G of the grid, whose origin is the centre of voxel (0, 0, 0).
     x_gp: Pose,
     size: [usize; 3],
     spacing_mm: Vector3<f64>,
-    /// Of each voxel's centre to the surface, mm, negative inside; the first coordinate runs fastest.
+    /// Distance of each voxel's centre from the surface, mm, negative inside; the first coordinate runs fastest.
     distances_mm: Vec<f32>,
 }
 
 impl Mask {
     /// The most voxels that a mask may have: 256 in each direction.
     pub const VOXELS_MAX: usize = 1 << 24;
-    /// Voxels that are smaller in any direction are not in mm.
+    /// A smaller voxel is not in mm.
     const SPACING_MIN_MM: f64 = 0.01;
 
-    /// The mask of `size` voxels, `spacing_mm` apart, of which those are `occupied` that are true, with
-    /// the first coordinate running fastest. `x_pg` is the pose of its grid in the plane frame.
+    /// The mask of `size` voxels, `spacing_mm` apart. `occupied` tells which voxels are occupied, with the first
+    /// coordinate running fastest. `x_pg` is the pose of the grid in the plane frame.
     ///
     /// # Errors
-    /// Those of [`Mask::check`]; a number of values that is not that of the voxels.
+    /// As [`Mask::voxel_count`]; if `occupied` does not have one value for each voxel.
     pub fn new(
         size: [usize; 3],
         spacing_mm: Vector3<f64>,
         occupied: &[bool],
         x_pg: &Pose,
     ) -> Result<Self, String> {
-        let voxels = Self::check(size, &spacing_mm)?;
+        let voxels = Self::voxel_count(size, &spacing_mm)?;
         if occupied.len() != voxels {
             let [x, y, z] = size;
             let values = occupied.len();
@@ -40,7 +40,7 @@ impl Mask {
         let spacing = spacing_mm.into();
         let to_occupied = distances_mm(size, spacing, |voxel| occupied[voxel]);
         let to_free = distances_mm(size, spacing, |voxel| !occupied[voxel]);
-        // Beyond the grid there is nothing.
+        // Everything beyond the grid is free.
         let to_border = |voxel: usize| {
             let indices = [voxel % size[0], voxel / size[0] % size[1], voxel / size[0] / size[1]];
             let voxels = |i: usize| (indices[i] + 1).min(size[i] - indices[i]) as f64;
@@ -53,11 +53,11 @@ impl Mask {
         Ok(Mask { x_gp: x_pg.inverse(), size, spacing_mm, distances_mm: distances_mm.collect() })
     }
 
-    /// The number of voxels of a mask of this `size` and spacing.
+    /// Checks the `size` and the spacing of a mask, and returns its number of voxels.
     ///
     /// # Errors
-    /// Too many voxels or none; a spacing under 0.01 mm.
-    pub fn check(size: [usize; 3], spacing_mm: &Vector3<f64>) -> Result<usize, String> {
+    /// If there are too many voxels or none, or the spacing is under 0.01 mm.
+    pub fn voxel_count(size: [usize; 3], spacing_mm: &Vector3<f64>) -> Result<usize, String> {
         let voxels = size.iter().try_fold(1usize, |product, count| product.checked_mul(*count));
         let voxels = voxels.unwrap_or(usize::MAX);
         if !(1..=Self::VOXELS_MAX).contains(&voxels) {
@@ -108,7 +108,7 @@ impl Mask {
         let voxel = (z * self.size[1] + y) * self.size[0] + x;
         let bound_mm = f64::from(self.distances_mm[voxel]) - away_mm;
         let bound_mm = match beyond_mm > 0.0 {
-            // From outside, every centre is seen at a right angle to the way in, or more.
+            // For a point outside, the angle between the way to `inside` and any centre is 90° or more.
             true => (beyond_mm.powi(2) + bound_mm.max(0.0).powi(2)).sqrt(),
             false => bound_mm,
         };
@@ -139,16 +139,17 @@ fn distances_mm(size: [usize; 3], spacing_mm: [f64; 3], is_in: impl Fn(usize) ->
     squared_mm2.into_iter().map(f32::sqrt).collect()
 }
 
-/// At each voxel of a line the lowest of the parabolas `line_mm2[k] + (x − x_k)²`, mm².
+/// The lowest of the parabolas `line_mm2[k] + (x − x_k)²` at each voxel of a line, mm².
 fn lowest_mm2(line_mm2: &[f64], spacing_mm: f64) -> Vec<f64> {
-    let place_mm = |voxel: usize| voxel as f64 * spacing_mm;
-    let height = |voxel: usize| line_mm2[voxel] + place_mm(voxel) * place_mm(voxel);
-    // The voxels whose parabolas are in the lower envelope, each with where it begins to be lowest, mm.
+    let position_mm = |voxel: usize| voxel as f64 * spacing_mm;
+    let height = |voxel: usize| line_mm2[voxel] + position_mm(voxel) * position_mm(voxel);
+    // The voxels whose parabolas form the lower envelope, each with the position from which it is the lowest, mm.
     let mut envelope: Vec<(usize, f64)> = Vec::with_capacity(line_mm2.len());
     for voxel in 0..line_mm2.len() {
         let mut begin_mm = f64::NEG_INFINITY;
         while let Some(&(last, last_begin_mm)) = envelope.last() {
-            begin_mm = 0.5 * (height(voxel) - height(last)) / (place_mm(voxel) - place_mm(last));
+            begin_mm =
+                0.5 * (height(voxel) - height(last)) / (position_mm(voxel) - position_mm(last));
             if begin_mm > last_begin_mm {
                 break;
             }
@@ -158,9 +159,9 @@ fn lowest_mm2(line_mm2: &[f64], spacing_mm: f64) -> Vec<f64> {
         envelope.push((voxel, begin_mm));
     }
     let lowest = |voxel: usize| {
-        let begun = envelope.partition_point(|(_, begin_mm)| *begin_mm < place_mm(voxel));
+        let begun = envelope.partition_point(|(_, begin_mm)| *begin_mm < position_mm(voxel));
         let (at, _) = envelope[begun.saturating_sub(1)];
-        line_mm2[at] + (place_mm(voxel) - place_mm(at)).powi(2)
+        line_mm2[at] + (position_mm(voxel) - position_mm(at)).powi(2)
     };
     (0..line_mm2.len()).map(lowest).collect()
 }

@@ -1,7 +1,7 @@
 //! Planning a path of the needle to a target, around obstacles: geometry, distances, search.
 //!
-//! All of it is in the plane frame, in mm, and depends on nothing but its arguments: the budget of a
-//! search is a number of expansions, never a time, so a plan is the same on every machine.
+//! Everything is in the plane frame, in mm, and depends only on its arguments: the budget of a search is a
+//! number of expansions, never a time, so a plan is the same on every machine.
 
 mod arc;
 mod field;
@@ -22,6 +22,6 @@ pub use mask::Mask;
 pub use obstacle::{Obstacle, Workspace, World};
 pub use path::Path;
 pub use reach::{Reach, reach_around};
-pub use replanner::{Estimate, Hold, Replanner, Steer, Step};
+pub use replanner::{Replanner, Steer, Step, StopReason, TipEstimate};
 pub use reserve::{RoomyPath, plan_with_reserve};
 pub use search::{Answer, Problem, Status, plan};

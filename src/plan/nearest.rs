@@ -1,6 +1,6 @@
-//! The reachable point nearest to a target that no path reaches.
+//! Finds the reachable point nearest to a target if no path reaches the target.
 
-use super::arc::{Arc, Seen, Tip};
+use super::arc::{Arc, RelativePoint, Tip};
 use super::field::Field;
 use super::lattice::{LEVELS, Lattice, Place, STRAIGHT};
 use super::path::Path;
@@ -11,34 +11,35 @@ use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 use std::f64::consts::TAU;
 
-/// Nodes that are expanded at most, and no more than the problem allows.
+/// At most this many nodes are expanded, and no more than the problem allows.
 const EXPANSIONS_MAX: u32 = 20_000;
-/// Nodes are ordered by how near they can come, plus this share of how far they are.
+/// Nodes are ordered by how near to the target they can come, plus this share of their distance from it.
 const DISTANCE_SHARE: f64 = 0.1;
-/// The least gain in distance that counts, mm.
+/// A smaller gain in distance does not count, mm.
 const GAIN_MIN_MM: f64 = 0.05;
-/// The largest number of changes of a path.
-const ROUNDS_MAX: u32 = 10;
-/// Points at which an arc may leave a path or end, mm apart, and its largest length, mm.
+/// Maximum number of changes of a path.
+const CHANGES_MAX: u32 = 10;
+/// Distance between the points at which an arc may leave a path or end, mm.
 const LEAVE_MM: f64 = 2.0;
+/// Maximum length of such an arc, mm.
 const ARC_MAX_MM: f64 = 40.0;
-/// Directions in which it bends in space.
+/// Number of directions in which it may bend in space.
 const BENDS: u32 = 8;
 
 #[derive(Clone, Copy)]
 struct Node {
     place: Place,
     /// The heading at the start of the arc that led here; `None` after a straight.
-    before: Option<Vector3<f64>>,
+    previous_heading: Option<Vector3<f64>>,
     length_mm: f64,
     /// The node before, and the arc from it; `None` at the start.
     from: Option<(usize, Arc)>,
 }
 
-/// How near an arc from `tip` can come to the target with nothing in the way, mm: the needle cannot turn
-/// into the circle beside it.
+/// How near an arc from `tip` can come to the target without obstacles, mm: the needle cannot enter its turning
+/// circle.
 fn miss_mm(tip: &Tip, problem: &Problem) -> f64 {
-    let Seen { off_axis_mm, ahead_mm, .. } = tip.sees(&problem.target_mm);
+    let RelativePoint { off_axis_mm, ahead_mm, .. } = tip.relative(&problem.target_mm);
     let radius_mm = problem.curvature_per_mm.recip();
     (radius_mm - math::hypot(radius_mm - off_axis_mm, ahead_mm)).max(0.0)
 }
@@ -46,15 +47,15 @@ fn miss_mm(tip: &Tip, problem: &Problem) -> f64 {
 /// The sharpest arc from `tip` toward the target, at most `length_max_mm` long, up to where it is nearest
 /// to the target.
 pub(super) fn sharpest_arc(tip: &Tip, problem: &Problem, length_max_mm: f64) -> Arc {
-    let Seen { off_axis_mm, ahead_mm, bend } = tip.sees(&problem.target_mm);
+    let RelativePoint { off_axis_mm, ahead_mm, bend } = tip.relative(&problem.target_mm);
     let curvature_per_mm = problem.curvature_per_mm;
     let radius_mm = curvature_per_mm.recip();
     let turn_rad = math::atan2(ahead_mm, radius_mm - off_axis_mm).max(0.0);
     Arc { bend, curvature_per_mm, length_mm: (turn_rad * radius_mm).min(length_max_mm) }
 }
 
-/// The path that ends nearest to the target, as far as a best-first search from the start and then changes
-/// of that path find it.
+/// The path that ends nearest to the target, as found by a best-first search from the start and then by changes
+/// of that path.
 pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path {
     let level = LEVELS.len() - 1;
     let visited = std::mem::take(&mut field.visited);
@@ -63,9 +64,9 @@ pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path 
     let mut lattice = Lattice::new(workspace, curvature_per_mm, in_plane, level, visited);
     let step_mm = lattice.resolution.step_mm;
     let place = lattice.start(problem.start);
-    let mut nodes = vec![Node { place, before: None, length_mm: 0.0, from: None }];
+    let mut nodes = vec![Node { place, previous_heading: None, length_mm: 0.0, from: None }];
     let distance_mm = |tip: &Tip| problem.to_target_mm(&tip.position_mm);
-    // In nm, so that the order is the same everywhere.
+    // Whole nanometres, so that the order is the same on every machine.
     let rank = |tip: &Tip| {
         let mm = miss_mm(tip, problem) + DISTANCE_SHARE * distance_mm(tip);
         Reverse((mm * 1e6) as u64)
@@ -74,10 +75,10 @@ pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path 
     let mut best = (distance_mm(&problem.start), 0, None);
     for _ in 0..EXPANSIONS_MAX.min(problem.expansions_max) {
         let Some((_, from)) = queue.pop() else { break };
-        let Node { place, before, length_mm, .. } = nodes[from];
+        let Node { place, previous_heading, length_mm, .. } = nodes[from];
         let is_hopeless = miss_mm(&place.tip, problem) > best.0 - GAIN_MIN_MM;
-        // A cell is taken by the best that comes to it.
-        if is_hopeless || !lattice.visited.add(lattice.cell(&place)) {
+        // The first node that comes to a cell, which is the best, keeps it.
+        if is_hopeless || !lattice.visited.insert(lattice.cell(&place)) {
             continue;
         }
         let left_mm = length_max_mm - length_mm;
@@ -86,9 +87,9 @@ pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path 
         if end_mm < best.0 {
             best = (end_mm, from, Some(sharpest));
         }
-        for by in (0..lattice.arcs()).filter(|_| step_mm <= left_mm) {
-            let next = lattice.next(&place, before, by);
-            let arc = lattice.arc(&place.tip, before, by);
+        for arc_number in (0..lattice.arcs()).filter(|_| step_mm <= left_mm) {
+            let next = lattice.next(&place, previous_heading, arc_number);
+            let arc = lattice.arc(&place.tip, previous_heading, arc_number);
             if !field.is_clear(&place.tip, &arc) {
                 continue;
             }
@@ -97,9 +98,9 @@ pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path 
                 best = (distance_mm(&next.tip), to, None);
             }
             queue.push((rank(&next.tip), to));
-            let before = (by != STRAIGHT).then_some(place.tip.heading);
+            let previous_heading = (arc_number != STRAIGHT).then_some(place.tip.heading);
             let length_mm = length_mm + step_mm;
-            nodes.push(Node { place: next, before, length_mm, from: Some((from, arc)) });
+            nodes.push(Node { place: next, previous_heading, length_mm, from: Some((from, arc)) });
         }
     }
     field.visited = lattice.visited;
@@ -113,17 +114,18 @@ pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path 
     improved(field, problem, Path { start: problem.start, arcs }.joined())
 }
 
-/// The path with changes that bring its end nearer to the target, the best one first each time.
+/// The path after changes that bring its end nearer to the target. Each time the best change is made.
 fn improved(field: &mut Field<'_>, problem: &Problem, mut path: Path) -> Path {
-    for _ in 0..ROUNDS_MAX {
+    for _ in 0..CHANGES_MAX {
         let Some((along_mm, ways)) = best_change(field, problem, &path) else { break };
         path = Path { arcs: [path.first(along_mm), ways.to_vec()].concat(), ..path }.joined();
     }
     path
 }
 
-/// Where to leave `path` by one arc, and go on by the sharpest toward the target, to end nearest to it; `None`
-/// if that gains too little.
+/// The change of `path` that brings its end nearest to the target: leave it somewhere on one arc, then go on by
+/// the sharpest arc toward the target. Returns where to leave it, mm, and the two arcs; `None` if the gain is too
+/// small.
 fn best_change(field: &mut Field<'_>, problem: &Problem, path: &Path) -> Option<(f64, [Arc; 2])> {
     let Problem { curvature_per_mm, in_plane, length_max_mm, .. } = *problem;
     let mut best_mm = problem.to_target_mm(&path.end().position_mm) - GAIN_MIN_MM;
@@ -157,7 +159,7 @@ fn best_change(field: &mut Field<'_>, problem: &Problem, path: &Path) -> Option<
     best
 }
 
-/// Directions to bend to, each with a share of the curvature.
+/// The directions in which an arc may bend, each with a share of the curvature.
 fn bends(tip: &Tip, in_plane: bool) -> Vec<(Vector3<f64>, f64)> {
     let [first, second] = match in_plane {
         true => [Vector3::new(0.0, -tip.heading.z, tip.heading.y), Vector3::zeros()],

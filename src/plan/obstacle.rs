@@ -34,13 +34,14 @@ pub enum Obstacle {
 }
 
 impl Obstacle {
-    /// Distance of `point_mm` to the surface, mm, negative inside. Exact; of a mask a lower bound.
+    /// Distance of `point_mm` to the surface, mm, negative inside. It is exact, except that for a mask it is a
+    /// lower bound.
     pub fn distance_mm(&self, point_mm: &Vector3<f64>) -> f64 {
         match self {
             Obstacle::Sphere { centre_mm, radius_mm } => (point_mm - centre_mm).norm() - radius_mm,
             Obstacle::Cylinder { from_mm, to_mm, radius_mm } => {
                 let length_mm = (to_mm - from_mm).norm();
-                // Without a length it has no axis: then it is taken for a ball.
+                // Without a length it has no axis, and counts as a ball.
                 let axis = (to_mm - from_mm).try_normalize(0.0).unwrap_or_default();
                 let to_point = point_mm - from_mm;
                 let along_mm = to_point.dot(&axis);
@@ -60,8 +61,8 @@ impl Obstacle {
     }
 }
 
-/// Signed distance to a box, an interval a coordinate; negative inside. `over` is how far the point is past
-/// the nearer end of each interval, negative within it.
+/// Signed distance to a box, negative inside. For each coordinate, `over` is how far the point is past the nearer
+/// end of the box's interval, negative within it.
 fn signed_distance<const N: usize>(over: [f64; N]) -> f64 {
     let squared: f64 = over.iter().map(|over| over.max(0.0).powi(2)).sum();
     if squared > 0.0 { squared.sqrt() } else { over.into_iter().fold(f64::NEG_INFINITY, f64::max) }
@@ -84,9 +85,9 @@ pub struct Workspace {
 
 impl Workspace {
     /// How far `point_mm` is inside, mm: at most the distance to the boundary. Negative outside, where the
-    /// distance to the workspace may be larger; a point that is no number is outside.
+    /// distance to the workspace may be larger. A point with a NaN is outside.
     pub fn depth_mm(&self, point_mm: &Vector3<f64>) -> f64 {
-        // Least and greatest ignore NaN.
+        // `inf` and `min` ignore NaN.
         if point_mm.iter().any(|mm| mm.is_nan()) {
             return f64::NEG_INFINITY;
         }
@@ -95,7 +96,7 @@ impl Workspace {
         self.start_mm.map_or(depth_mm, |start_mm| depth_mm.max(of_start_mm(start_mm)))
     }
 
-    /// The corners of the box around all of it, mm.
+    /// The corners of the bounding box, with the ball around the start, mm.
     pub(super) fn bounds_mm(&self) -> [Vector3<f64>; 2] {
         let room = Vector3::repeat(START_ROOM_MM);
         let [low_mm, high_mm] = match self.start_mm {
@@ -109,7 +110,7 @@ impl Workspace {
 /// Obstacles in a workspace.
 #[derive(Debug, Clone, PartialEq)]
 pub struct World {
-    /// What the path keeps clear of.
+    /// The obstacles.
     pub obstacles: Vec<Obstacle>,
     /// Where the tip may be.
     pub workspace: Workspace,
@@ -128,8 +129,8 @@ impl World {
         (self.distance_mm(point_mm) - clearance_mm).min(self.workspace.depth_mm(point_mm))
     }
 
-    /// The same without masks. Another point has at most its distance from `point_mm` more; where masks count,
-    /// it may have more, because the distance to a mask jumps between voxels.
+    /// The slack without masks. It grows by at most the distance from `point_mm` to another point. With masks it
+    /// may grow by more, because the distance to a mask jumps between voxels.
     pub(super) fn slack_at_most_mm(&self, point_mm: &Vector3<f64>, clearance_mm: f64) -> f64 {
         let is_exact = |obstacle: &&Obstacle| !matches!(obstacle, Obstacle::Mask(_));
         let exact = self.obstacles.iter().filter(is_exact);

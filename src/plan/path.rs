@@ -1,4 +1,4 @@
-//! A planned path: arcs from the tip on.
+//! A planned path: a chain of arcs that starts at the tip.
 
 use super::arc::{Arc, Tip};
 use super::obstacle::World;
@@ -12,7 +12,7 @@ const MEASURE_STEP_MM: f64 = 0.02;
 pub struct Path {
     /// Where the path starts.
     pub start: Tip,
-    /// The arcs; none where the start is the end.
+    /// The arcs; empty if the path ends at its start.
     pub arcs: Vec<Arc>,
 }
 
@@ -35,7 +35,8 @@ impl Path {
         })
     }
 
-    /// The tip `along_mm` from the start, and the arc it is on; the end beyond the end.
+    /// The tip `along_mm` from the start, and the arc it is on. Beyond the end of the path it is the end, on no
+    /// arc.
     pub fn at(&self, along_mm: f64) -> (Tip, Option<Arc>) {
         let mut left_mm = along_mm.max(0.0);
         for (tip, arc) in self.pieces() {
@@ -74,7 +75,7 @@ impl Path {
             while along_mm < arc.length_mm {
                 let at = tip.after(&arc.with_length(along_mm)).position_mm;
                 let distance_mm = world.distance_mm(&at);
-                // Nearer than this part of the way, no obstacle can be.
+                // The distance cannot fall below `least_mm` within this part of the way.
                 along_mm += (distance_mm - least_mm).max(MEASURE_STEP_MM);
                 least_mm = least_mm.min(distance_mm);
             }
@@ -82,7 +83,7 @@ impl Path {
         least_mm.min(world.distance_mm(&self.end().position_mm))
     }
 
-    /// The path without arcs of no length, and with arcs joined that continue one another.
+    /// The path without arcs of zero length, with arcs joined that continue one another.
     pub(super) fn joined(mut self) -> Self {
         const SAME: f64 = 1e-6;
         let mut joined: Vec<(Tip, Arc)> = Vec::new();
@@ -103,7 +104,7 @@ impl Path {
     }
 }
 
-/// The bend of `arc`, which starts at `tip`, as it is at its end.
+/// The bend at the end of `arc`, which starts at `tip`.
 pub(super) fn bend_after(tip: &Tip, arc: &Arc) -> Vector3<f64> {
     let (sin, cos) = crate::math::sin_cos(arc.curvature_per_mm * arc.length_mm);
     arc.bend * cos - tip.heading * sin

@@ -1,4 +1,4 @@
-//! What the tip can still reach, for the operator to see.
+//! The points that the tip can still reach, to show them to the operator.
 
 use super::arc::Tip;
 use super::field::Field;
@@ -7,7 +7,7 @@ use super::search::Problem;
 use nalgebra::Vector3;
 use std::borrow::Cow;
 
-/// How far around the target points are judged, mm.
+/// Points within this distance of the target are judged, mm.
 const AROUND_MM: f64 = 30.0;
 /// Distance between two of them in the plane and in space, mm.
 const SPACING_MM: [f64; 2] = [1.0, 3.0];
@@ -15,9 +15,9 @@ const SPACING_MM: [f64; 2] = [1.0, 3.0];
 /// Whether one arc of the needle leads from the tip to a point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reach {
-    /// It does, keeps the clearance, and stays in the workspace.
+    /// An arc leads there, keeps the clearance, and stays in the workspace.
     Clear,
-    /// It comes nearer to an obstacle than the clearance, or leaves the workspace.
+    /// The arc comes nearer to an obstacle than the clearance, or leaves the workspace.
     Obstructed,
     /// The needle does not bend enough, or the point is behind it.
     OutOfReach,

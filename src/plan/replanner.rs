@@ -1,4 +1,4 @@
-//! Planning again each millimetre of a run: what the needle is to do next.
+//! Plans again at each step of a run, and decides what the needle does next.
 
 use super::arc::{Arc, Tip};
 use super::field::Field;
@@ -7,37 +7,38 @@ use super::obstacle::World;
 use super::path::{Path, bend_after};
 use super::reserve::RESERVE_MM;
 use super::route::Route;
-use super::search::{Problem, Status, plan_along, plan_thoroughly};
+use super::search::{Problem, Status, plan_thoroughly, search_only};
 use derive_more::Display;
 use nalgebra::Vector3;
 use std::borrow::Cow;
 
 mod known;
 
-/// Standard deviations of the position by which obstacles are kept farther away than the clearance.
+/// This many standard deviations of the position count as its uncertainty: paths keep that much more than the
+/// clearance from obstacles, and the estimated tip may be that much nearer.
 const SDS: f64 = 2.0;
-/// The same a step ahead: there the next estimate may be nearer than this one.
-const AHEAD_SDS: f64 = 1.0;
-/// A path is kept to come back to only if the tip's position is known better than this, mm.
-const KNOWN_SD_MM: f64 = 0.3;
-/// If the heading is known no better than this, rad, the tip may still be on the last path, …
-const UNKNOWN_RAD: f64 = 0.01;
+/// The same for the position one step ahead. It is less, because the next estimate may be nearer to an obstacle.
+const NEXT_STEP_SDS: f64 = 1.0;
+/// A path is remembered, to come back to it, only if the position's standard deviation is at most this, mm.
+const REMEMBER_SD_MAX_MM: f64 = 0.3;
+/// If the heading's standard deviation is over this, rad, the tip may still be on the remembered path, …
+const HEADING_UNKNOWN_SD_RAD: f64 = 0.01;
 /// … even if it is farther off than the position's deviation by this much, mm: whole turns shake the path.
 const ON_PATH_MM: f64 = 0.1;
 /// When the target has moved this far, the lengths around the obstacles are computed again, mm.
 const ROUTE_MOVED_MM: f64 = 1.0;
-/// A tip nearer than this before the target has arrived, mm.
+/// A tip has arrived if the target is no farther ahead than this, mm.
 const ARRIVED_MM: f64 = 0.02;
-/// Without a path the needle is bent toward the target for this depth, mm: a later estimate may give a path.
+/// Without a path the needle is bent toward the target for this depth, mm, since a later estimate may give a path.
 const PATIENCE_MM: f64 = 5.0;
-/// A path after a whole turn of the base may end farther from the target by this much, mm.
-const MORE_MM: f64 = 0.05;
-/// Meanwhile this much of the way ahead must be clear of obstacles, mm.
-const AHEAD_MM: f64 = 3.0;
+/// After a whole turn of the base, the path may end farther from the target by this much, mm.
+const TURN_LOSS_MAX_MM: f64 = 0.05;
+/// On a path that does not surely lead to the target, this much of the way ahead must be clear of obstacles, mm.
+const CLEAR_AHEAD_MM: f64 = 3.0;
 
 /// The estimate of the tip.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Estimate {
+pub struct TipEstimate {
     /// Position and heading.
     pub tip: Tip,
     /// Curvature of the needle, over 0, per mm.
@@ -48,43 +49,43 @@ pub struct Estimate {
     pub heading_sd_rad: f64,
 }
 
-/// What to do until the next call.
+/// What to do in the next step.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Step {
-    /// Insert on.
+    /// Steer and insert.
     Steer(Steer),
-    /// The target is as near as it will be: insert no further.
+    /// The tip is as near to the target as it will come: insert no further.
     Arrived {
-        /// Distance left, mm.
+        /// Distance from the target, mm.
         error_mm: f64,
     },
-    /// No way is left: hold the insertion.
-    Hold(Hold),
+    /// The insertion must stop.
+    Stop(StopReason),
 }
 
-/// How the next millimetre is inserted.
+/// How to steer in the next step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Steer {
     /// The path bends toward this unit vector across the heading.
     pub bend: Vector3<f64>,
-    /// The mean curvature wanted, at most that of the needle, per mm; under 0 where the path soon bends to the
+    /// The wanted mean curvature, at most that of the needle, per mm; negative if the path soon bends to the
     /// other side.
     pub curvature_per_mm: f64,
-    /// How far the path from here to its end is, mm.
-    pub left_mm: f64,
+    /// Remaining length of the path, mm.
+    pub remaining_mm: f64,
     /// Distance from the target at the end of the path, mm.
     pub error_mm: f64,
 }
 
-/// Why the insertion is held.
+/// Why the insertion must stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
-pub enum Hold {
+pub enum StopReason {
     /// The tip is outside the workspace, or nearer to an obstacle than the clearance.
     #[display(
         "the tip is nearer to an obstacle than goal.clearance_mm, or outside goal.workspace_mm"
     )]
     TipNotAllowed,
-    /// Another step straight ahead leads there.
+    /// A step straight ahead may lead there.
     #[display(
         "the next step may lead nearer to an obstacle than goal.clearance_mm, or out of \
          goal.workspace_mm"
@@ -95,30 +96,31 @@ pub enum Hold {
     NoPath,
 }
 
-/// Keeps the plan of a run. It holds no clock: the budget of each call is a number of expansions.
+/// Keeps the plan of a run. It uses no clock: the budget of each call is a number of expansions.
 #[derive(Debug, Clone)]
 pub struct Replanner {
     field: Field<'static>,
     route: Route,
     problem: Problem,
-    /// The last path that was feasible, from where the tip was then.
+    /// The path of the last step, from where the tip was then.
     path: Option<Path>,
-    /// The last path that was found, where it was found, and how far along it the tip has come, mm.
-    found: Option<(Path, f64)>,
-    /// The reserve that known paths keep where they can: as much as the path at the start, mm.
+    /// The last path that was found with a well-known position, from where it was found, and how far the tip
+    /// has come along it, mm.
+    remembered: Option<(Path, f64)>,
+    /// The reserve that known paths keep if they can, mm: as much as the path at the start.
     reserve_mm: f64,
-    /// The part of the curvature that is left unused where there is a way without it.
+    /// The share of the curvature that paths leave unused if they can.
     curvature_margin: f64,
-    /// Inserted since there was a path, mm.
+    /// Depth inserted since a path was found, mm.
     without_path_mm: f64,
     /// Nodes that the searches of this step may still expand.
     expansions_left: u32,
 }
 
 impl Replanner {
-    /// For the run of `problem`, in which `expansions_max` is the budget of each call. `path` is the plan
+    /// A replanner for `problem`, in which `expansions_max` is the budget of each call. `path` is the plan
     /// with which the run begins, if there is one. Paths leave the share `curvature_margin` of the needle's
-    /// curvature unused where there is such a path.
+    /// curvature unused if they can.
     pub fn new(world: World, problem: Problem, curvature_margin: f64, path: Option<Path>) -> Self {
         let mut field = Field::new(Cow::Owned(world), problem.clearance_mm, problem.in_plane);
         let route = Route::new(&mut field, &problem.target_mm);
@@ -130,28 +132,28 @@ impl Replanner {
             route,
             problem,
             curvature_margin,
-            found: path.clone().map(|path| (path, 0.0)),
+            remembered: path.clone().map(|path| (path, 0.0)),
             path,
             without_path_mm: 0.0,
             expansions_left: 0,
         }
     }
 
-    /// The target has moved.
+    /// Sets the position of the target, plane frame, mm.
     pub fn set_target(&mut self, target_mm: Vector3<f64>) {
         self.problem.target_mm = target_mm;
     }
 
-    /// The last feasible path.
+    /// The path of the last step; `None` if there was none.
     pub fn path(&self) -> Option<&Path> {
         self.path.as_ref()
     }
 
-    /// Whether a path that is not too long leads from `start` to the target, by the curvature of the problem:
-    /// the one that is known, or one that a search finds.
+    /// Checks that a path that is not too long leads from `start` to the target, with the curvature of the
+    /// problem: the known path, or one that a search finds.
     ///
     /// # Errors
-    /// Why none is found, in words.
+    /// Why no path is found, in words.
     pub fn check_start(&mut self, start: Tip) -> Result<(), String> {
         self.problem.start = start;
         let last = self.path.as_ref().map(|path| rest_of(path, 0.0, start));
@@ -170,17 +172,17 @@ impl Replanner {
         }
     }
 
-    /// What to do for the next `step_mm`, from the present `estimate`; since the last call the tip went
-    /// `inserted_mm`.
+    /// What to do for the next `step_mm`, from the present `estimate`. Since the last call, the tip was inserted
+    /// by `inserted_mm`.
     ///
-    /// Known paths are tried first, in this order: one arc to the target; the last path, left at some
-    /// point for the target; the sharpest arc toward the target, or the last path as it is, where that ends
-    /// within the tolerance; in the plane, back onto the last path. They keep the clearance, twice the
-    /// standard deviation of the position and the reserve, where that leaves one. Then the path is searched.
-    /// Where the estimate leaves open whether the tip is still on the last path that was found, that is
-    /// followed. The last resort is a known path at the clearance less twice the deviation.
-    pub fn step(&mut self, estimate: &Estimate, inserted_mm: f64, step_mm: f64) -> Step {
-        let Estimate { mut tip, position_sd_mm, heading_sd_rad, .. } = *estimate;
+    /// Known paths are tried first, in this order: one arc to the target; the last path up to some point, then
+    /// directly to the target; the sharpest arc toward the target, or the last path as it is, if that ends
+    /// within the tolerance; in the plane, back onto the remembered path. They keep the clearance, plus twice the
+    /// standard deviation of the position, plus the reserve if a path is left with it. Then a path is searched
+    /// for. If that fails and the estimate is so uncertain that the tip may still be on the remembered path,
+    /// this path is followed. The last resort is a known path at the clearance minus twice the deviation.
+    pub fn step(&mut self, estimate: &TipEstimate, inserted_mm: f64, step_mm: f64) -> Step {
+        let TipEstimate { mut tip, position_sd_mm, heading_sd_rad, .. } = *estimate;
         if self.problem.in_plane {
             tip = in_plane(&tip);
         }
@@ -189,16 +191,16 @@ impl Replanner {
         if ahead_mm <= ARRIVED_MM && error_mm <= self.problem.tolerance_mm.max(step_mm) {
             return Step::Arrived { error_mm };
         }
-        let left_mm = self.problem.length_max_mm - inserted_mm;
-        self.problem.length_max_mm = left_mm.max(0.0);
-        // It goes no farther than a target ahead.
+        let remaining_mm = self.problem.length_max_mm - inserted_mm;
+        self.problem.length_max_mm = remaining_mm.max(0.0);
+        // The step goes no farther than a target that is ahead.
         let next_mm = if ahead_mm > 0.0 { step_mm.min(ahead_mm) } else { step_mm };
-        if let Some(hold) = self.not_allowed(estimate, &tip, next_mm) {
-            return Step::Hold(hold);
+        if let Some(reason) = self.stop_reason(estimate, &tip, next_mm) {
+            return Step::Stop(reason);
         }
         self.problem.start = tip;
         let last = self.path.take().map(|path| rest_of(&path, inserted_mm, tip));
-        if let Some((_, along_mm)) = &mut self.found {
+        if let Some((_, along_mm)) = &mut self.remembered {
             *along_mm += inserted_mm;
         }
         let path = self.find(estimate, step_mm, last.as_ref());
@@ -206,51 +208,51 @@ impl Replanner {
             Some(_) => 0.0,
             None => self.without_path_mm + inserted_mm,
         };
-        if let Some(path) = path.as_ref().filter(|_| position_sd_mm <= KNOWN_SD_MM) {
-            self.found = Some((path.clone(), 0.0));
+        if let Some(path) = path.as_ref().filter(|_| position_sd_mm <= REMEMBER_SD_MAX_MM) {
+            self.remembered = Some((path.clone(), 0.0));
         }
         let path = path
-            .or_else(|| self.blindly(last?, heading_sd_rad))
+            .or_else(|| self.last_path_blindly(last?, heading_sd_rad))
             .or_else(|| self.nearest_path(estimate))
             .or_else(|| self.toward_target(heading_sd_rad));
-        let Some(path) = path else { return Step::Hold(Hold::NoPath) };
+        let Some(path) = path else { return Step::Stop(StopReason::NoPath) };
         let first = path.arcs.iter().find(|arc| arc.length_mm > 0.0).copied();
         let first =
             first.unwrap_or(Arc { bend: tip.across()[0], curvature_per_mm: 0.0, length_mm: 0.0 });
         let steer = Steer {
             bend: first.bend,
             curvature_per_mm: mean_curvature_per_mm(&path, &first, step_mm),
-            left_mm: path.length_mm(),
+            remaining_mm: path.length_mm(),
             error_mm: self.miss_mm(&path),
         };
         self.path = Some(path);
         Step::Steer(steer)
     }
 
-    /// Why the tip must not go on: the estimate, or the `tip` in the plane, is where it must not be; or the next
-    /// `next_mm` straight ahead lead there. The needle may go straight ahead: while it turns, and off the plane,
-    /// in which the path is.
-    fn not_allowed(&self, estimate: &Estimate, tip: &Tip, next_mm: f64) -> Option<Hold> {
+    /// Why the tip must not go on: the estimated tip, or the same `tip` moved into the plane, is where it must not
+    /// be, or the next `next_mm` straight ahead lead there. The needle may go straight ahead while its base turns,
+    /// and off the plane, although the path is in the plane.
+    fn stop_reason(&self, estimate: &TipEstimate, tip: &Tip, next_mm: f64) -> Option<StopReason> {
         let Tip { position_mm, heading } = estimate.tip;
         let is_allowed = |at: &Vector3<f64>, sds: f64| {
             let clearance_mm = self.problem.clearance_mm - sds * estimate.position_sd_mm;
             self.field.world.slack_mm(at, clearance_mm) >= 0.0
         };
         if !is_allowed(&position_mm, SDS) || !is_allowed(&tip.position_mm, SDS) {
-            return Some(Hold::TipNotAllowed);
+            return Some(StopReason::TipNotAllowed);
         }
         let next_mm = position_mm + heading * next_mm;
-        (!is_allowed(&next_mm, AHEAD_SDS)).then_some(Hold::AheadNotAllowed)
+        (!is_allowed(&next_mm, NEXT_STEP_SDS)).then_some(StopReason::AheadNotAllowed)
     }
 
-    /// True if a way to the target is left after `turn_mm` straight ahead: so far the needle goes while the
-    /// base turns once around. It ends as near to the target as the path of the last step, keeps what that
-    /// keeps, and may use the whole curvature of `estimate`. Where that path ends sooner, the way straight ahead
-    /// need only be clear.
-    pub fn may_turn(&mut self, estimate: &Estimate, turn_mm: f64) -> bool {
+    /// True if a path to the target is left after `turn_mm` straight ahead, the distance that the needle goes while
+    /// the base turns once around. That path must end as near to the target as the path of the last step, keeps
+    /// the same distance from obstacles, and may use the whole curvature of `estimate`. If the path of the last
+    /// step ends sooner, the way straight ahead need only be clear.
+    pub fn may_turn(&mut self, estimate: &TipEstimate, turn_mm: f64) -> bool {
         let Some(path) = self.path.as_ref() else { return true };
-        let (start, left_mm) = (path.start, path.length_mm());
-        let length_mm = turn_mm.min(left_mm);
+        let (start, remaining_mm) = (path.start, path.length_mm());
+        let length_mm = turn_mm.min(remaining_mm);
         let straight = Arc { bend: start.across()[0], curvature_per_mm: 0.0, length_mm };
         let after = start.after(&straight);
         let (rest, miss_mm) = (rest_of(path, turn_mm, after), self.miss_mm(path));
@@ -258,46 +260,47 @@ impl Replanner {
         if !self.field.is_clear(&start, &straight) {
             return false;
         }
-        if left_mm <= turn_mm {
+        if remaining_mm <= turn_mm {
             return true;
         }
         self.problem.start = after;
-        let left = self.known(Some(&rest));
+        let path_after = self.known(Some(&rest));
         self.problem.start = start;
-        left.is_some_and(|left| self.miss_mm(&left) <= miss_mm + MORE_MM)
+        path_after.is_some_and(|path| self.miss_mm(&path) <= miss_mm + TURN_LOSS_MAX_MM)
     }
 
+    /// Distance of the end of `path` from the target, mm.
     fn miss_mm(&self, path: &Path) -> f64 {
         self.problem.to_target_mm(&path.end().position_mm)
     }
 
-    /// A path for what is known of the tip. The searches share one budget; each may spend half of what is
-    /// left of it.
-    fn find(&mut self, estimate: &Estimate, step_mm: f64, last: Option<&Path>) -> Option<Path> {
+    /// A path that suits the uncertainty of the estimate. The searches share one budget; each may spend half of
+    /// what remains of it.
+    fn find(&mut self, estimate: &TipEstimate, step_mm: f64, last: Option<&Path>) -> Option<Path> {
         let doubt_mm = SDS * estimate.position_sd_mm;
         let (clearance_mm, margin) = (self.problem.clearance_mm, self.curvature_margin);
-        let (doubted_mm, tip) = (clearance_mm + doubt_mm, self.problem.start);
+        let (cautious_mm, tip) = (clearance_mm + doubt_mm, self.problem.start);
         self.expansions_left = self.problem.expansions_max;
-        let keep = |this: &mut Self, clearance_mm, margin| {
+        let set_limits = |this: &mut Self, clearance_mm, margin| {
             this.field.clearance_mm = clearance_mm;
             this.problem.curvature_per_mm = estimate.curvature_per_mm * (1.0 - margin);
         };
         let known =
-            [(doubted_mm + self.reserve_mm, margin), (doubted_mm, margin), (doubted_mm, 0.0)];
+            [(cautious_mm + self.reserve_mm, margin), (cautious_mm, margin), (cautious_mm, 0.0)];
         for (clearance_mm, margin) in known {
-            keep(self, clearance_mm, margin);
+            set_limits(self, clearance_mm, margin);
             if let Some(path) = self.known(last) {
                 return Some(path);
             }
         }
-        keep(self, doubted_mm, margin);
+        set_limits(self, cautious_mm, margin);
         let searched = self.search().or_else(|| {
-            keep(self, clearance_mm, 0.0);
+            set_limits(self, clearance_mm, 0.0);
             self.known(last).or_else(|| self.search())
         });
         searched.or_else(|| {
-            keep(self, clearance_mm - doubt_mm, 0.0);
-            self.found_from(tip, estimate, step_mm).or_else(|| self.known(last))
+            set_limits(self, clearance_mm - doubt_mm, 0.0);
+            self.remembered_from(tip, estimate, step_mm).or_else(|| self.known(last))
         })
     }
 
@@ -310,14 +313,14 @@ impl Replanner {
         }
         let expansions_max = self.expansions_left.div_ceil(2);
         let problem = Problem { clearance_mm, expansions_max, ..self.problem.clone() };
-        let answer = plan_along(&mut self.field, &problem, &self.route);
+        let answer = search_only(&mut self.field, &problem, &self.route);
         self.expansions_left -= answer.expansions;
         answer.path
     }
 
-    /// A path that the searches missed: the one that ends nearest to the target, where that is within the
-    /// tolerance. It spends what is left of the budget.
-    fn nearest_path(&mut self, estimate: &Estimate) -> Option<Path> {
+    /// The path that ends nearest to the target, if that is within the tolerance: the searches may have missed it.
+    /// This spends the rest of the budget.
+    fn nearest_path(&mut self, estimate: &TipEstimate) -> Option<Path> {
         if self.expansions_left == 0 {
             return None;
         }
@@ -330,36 +333,38 @@ impl Replanner {
         (self.miss_mm(&path) <= tolerance_mm).then_some(path)
     }
 
-    /// The sharpest arc toward the target, where there has been a path lately and its next millimetres are
-    /// clear; or where it is all clear and, with the heading as little known as it is, may end within the
-    /// tolerance.
+    /// The sharpest arc toward the target, if there was a path lately and the arc's next millimetres are clear; or
+    /// if the whole arc is clear and, given the uncertainty of the heading, may end within the tolerance.
     fn toward_target(&mut self, heading_sd_rad: f64) -> Option<Path> {
         let path = self.sharpest();
-        let was_lately = self.without_path_mm < PATIENCE_MM && self.begins_clear(&path, AHEAD_MM);
+        let was_lately =
+            self.without_path_mm < PATIENCE_MM && self.begins_clear(&path, CLEAR_AHEAD_MM);
         let may_end_near = self.may_end_near(&path, heading_sd_rad)
             && self.field.is_clear(&path.start, &path.arcs[0]);
         (was_lately || may_end_near).then_some(path)
     }
 
-    /// The last path as it is from here, where its next millimetres are clear and, with the heading as
-    /// little known as it is, it may end within the tolerance.
-    fn blindly(&mut self, last: Path, heading_sd_rad: f64) -> Option<Path> {
+    /// The last path as it is from here, if its next millimetres are clear and, given the uncertainty of the
+    /// heading, it may end within the tolerance.
+    fn last_path_blindly(&mut self, last: Path, heading_sd_rad: f64) -> Option<Path> {
         let is_free =
-            self.may_end_near(&last, heading_sd_rad) && self.begins_clear(&last, AHEAD_MM);
+            self.may_end_near(&last, heading_sd_rad) && self.begins_clear(&last, CLEAR_AHEAD_MM);
         is_free.then_some(last)
     }
 
-    /// The rest of the last path that was found, as it would be from `tip`, where the tip may be on it and
-    /// the next step is clear.
-    fn found_from(&mut self, tip: Tip, estimate: &Estimate, step_mm: f64) -> Option<Path> {
-        let (path, along_mm) = self.found.as_ref()?;
-        let (there, _) = path.at(*along_mm);
-        let off_mm = (there.position_mm - tip.position_mm).norm();
-        let off_rad = (there.heading - tip.heading).norm();
+    /// The rest of the remembered path, moved to start at `tip`, if the tip may still be on it and the next step
+    /// is clear.
+    fn remembered_from(&mut self, tip: Tip, estimate: &TipEstimate, step_mm: f64) -> Option<Path> {
+        let (path, along_mm) = self.remembered.as_ref()?;
+        let (expected, _) = path.at(*along_mm);
+        let off_mm = (expected.position_mm - tip.position_mm).norm();
+        let off_rad = (expected.heading - tip.heading).norm();
         let may_be_on = off_mm <= SDS * estimate.position_sd_mm + ON_PATH_MM
             && off_rad <= SDS * estimate.heading_sd_rad;
-        let is_open = may_be_on && estimate.heading_sd_rad > UNKNOWN_RAD;
-        let rest = is_open.then(|| rest_of(path, *along_mm, tip))?;
+        if !may_be_on || estimate.heading_sd_rad <= HEADING_UNKNOWN_SD_RAD {
+            return None;
+        }
+        let rest = rest_of(path, *along_mm, tip);
         self.begins_clear(&rest, step_mm).then_some(rest)
     }
 
@@ -368,32 +373,32 @@ impl Replanner {
     }
 
     fn begins_clear(&mut self, path: &Path, ahead_mm: f64) -> bool {
-        let mut left_mm = ahead_mm;
+        let mut remaining_mm = ahead_mm;
         path.pieces().all(|(start, arc)| {
-            let next = arc.with_length(arc.length_mm.min(left_mm));
-            left_mm -= next.length_mm;
+            let next = arc.with_length(arc.length_mm.min(remaining_mm));
+            remaining_mm -= next.length_mm;
             self.field.is_clear(&start, &next)
         })
     }
 }
 
-/// The tip as the law that holds the plane will have it.
+/// The tip moved into the plane, where the control law will bring it.
 fn in_plane(tip: &Tip) -> Tip {
     let flat = |v: &Vector3<f64>| Vector3::new(0.0, v.y, v.z);
     let heading = flat(&tip.heading).try_normalize(1e-9).unwrap_or(Vector3::z());
     Tip { position_mm: flat(&tip.position_mm), heading }
 }
 
-/// The rest of `path` after `inserted_mm`, as it would be from `tip`.
+/// The rest of `path` after `inserted_mm`, moved to start at `tip`.
 fn rest_of(path: &Path, inserted_mm: f64, tip: Tip) -> Path {
-    let mut left_mm = inserted_mm;
+    let mut remaining_mm = inserted_mm;
     let mut rest = Vec::new();
     let mut to = tip;
     for (start, arc) in path.pieces() {
-        let cut_mm = left_mm.min(arc.length_mm);
-        left_mm -= cut_mm;
+        let cut_mm = remaining_mm.min(arc.length_mm);
+        remaining_mm -= cut_mm;
         let bend = bend_after(&start, &arc.with_length(cut_mm));
-        // Across the heading that the tip has now.
+        // The bend must be across the heading that the tip has now.
         let bend = bend - to.heading * bend.dot(&to.heading);
         let bend = bend.try_normalize(1e-9).unwrap_or_else(|| to.across()[0]);
         let arc = Arc { bend, length_mm: arc.length_mm - cut_mm, ..arc };
@@ -403,16 +408,16 @@ fn rest_of(path: &Path, inserted_mm: f64, tip: Tip) -> Path {
     Path { start: tip, arcs: rest }.joined()
 }
 
-/// The mean curvature toward the bend of the first arc over the next `step_mm`: where two arcs bend to
-/// opposite sides, less than either.
+/// The mean curvature toward the bend of the first arc over the next `step_mm`. If two arcs bend to opposite
+/// sides, it is less than the curvature of either.
 fn mean_curvature_per_mm(path: &Path, first: &Arc, step_mm: f64) -> f64 {
-    let mut left_mm = step_mm.min(path.length_mm());
-    let whole_mm = left_mm;
+    let mut remaining_mm = step_mm.min(path.length_mm());
+    let whole_mm = remaining_mm;
     let mut turn_rad = 0.0;
     for (_, arc) in path.pieces() {
-        let length_mm = left_mm.min(arc.length_mm);
+        let length_mm = remaining_mm.min(arc.length_mm);
         turn_rad += arc.curvature_per_mm * length_mm * arc.bend.dot(&first.bend);
-        left_mm -= length_mm;
+        remaining_mm -= length_mm;
     }
     if whole_mm > 0.0 { turn_rad / whole_mm } else { 0.0 }
 }

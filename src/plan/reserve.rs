@@ -20,8 +20,8 @@ pub struct RoomyPath {
     pub reserve_mm: f64,
 }
 
-/// Plans the path with which a run begins: with as much of the reserve as leaves one, and no less than
-/// `least_mm`. `shortest` is the answer to `problem`. Each try may spend `problem.expansions_max`.
+/// Plans the path with which a run begins, with as much of the reserve as possible, but no less than `least_mm`.
+/// `shortest` is the answer to `problem`. Each try may spend `problem.expansions_max`.
 ///
 /// # Errors
 /// Why there is no such path, in words.

@@ -1,12 +1,12 @@
-//! How far it is to the target around the obstacles, for a tip that could turn on the spot.
+//! Lengths of the ways to the target around the obstacles, for a tip that could turn on the spot.
 
 use super::field::{Field, Grid};
 use nalgebra::Vector3;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
-/// How far a step over the nodes reaches, and how much longer than a straight line a way over them may
-/// be, in the plane.
+/// In the plane: how far a step over the nodes reaches, and how much longer than a straight line a way over
+/// nodes may be.
 const PLANE: (i32, f64) = (2, 1.0275);
 /// The same in space.
 const SPACE: (i32, f64) = (1, 1.128);
@@ -17,7 +17,7 @@ const TICK_MM: f64 = 1e-3;
 #[derive(Debug, Clone)]
 pub(super) struct Route {
     grid: Grid,
-    /// Of each node; infinite where there is no way.
+    /// The length from each node; infinite if there is no way.
     lengths_mm: Vec<f32>,
     longer: f64,
     target_mm: Vector3<f64>,
@@ -26,8 +26,8 @@ pub(super) struct Route {
 impl Route {
     /// The ways to `target_mm` that keep the clearance of `field`.
     ///
-    /// A node is blocked only if no point near it is free. So where this finds no way, there is none,
-    /// and but for the longer ways over nodes its lengths are lower bounds.
+    /// A node is blocked only if no point near it is free. So if this finds no way, there is none; and its
+    /// lengths, divided by how much longer ways over nodes may be, are lower bounds.
     pub(super) fn new(field: &mut Field<'_>, target_mm: &Vector3<f64>) -> Self {
         let grid = field.grid.clone();
         let (reach, longer) = if field.in_plane { PLANE } else { SPACE };
@@ -35,7 +35,7 @@ impl Route {
         let mut lengths = vec![u32::MAX; grid.nodes()];
         let mut queue = BinaryHeap::new();
         for at in corners(&grid, target_mm) {
-            let away_mm = (grid.place_mm(at) - target_mm).norm();
+            let away_mm = (grid.position_mm(at) - target_mm).norm();
             let node = grid.node(at);
             lengths[node] = (away_mm / TICK_MM) as u32;
             queue.push(Reverse((lengths[node], node)));
@@ -62,7 +62,7 @@ impl Route {
         Route { grid, lengths_mm, longer, target_mm: *target_mm }
     }
 
-    /// How far `target_mm` is from the target of this route, mm: ways to it may be shorter by this much.
+    /// Distance of `target_mm` from the target of this route, mm. Ways to `target_mm` may be shorter by this much.
     pub(super) fn moved_mm(&self, target_mm: &Vector3<f64>) -> f64 {
         (target_mm - self.target_mm).norm()
     }
@@ -70,7 +70,7 @@ impl Route {
     /// The length of the shortest way from `point_mm`, in the workspace; infinite if there is none.
     pub(super) fn length_mm(&self, point_mm: &Vector3<f64>) -> f64 {
         let by_way_of = |at: [usize; 3]| {
-            let away_mm = (self.grid.place_mm(at) - point_mm).norm();
+            let away_mm = (self.grid.position_mm(at) - point_mm).norm();
             f64::from(self.lengths_mm[self.grid.node(at)]) + away_mm
         };
         corners(&self.grid, point_mm).map(by_way_of).fold(f64::INFINITY, f64::min) / self.longer
@@ -92,8 +92,8 @@ fn neighbour(grid: &Grid, at: [usize; 3], step: [i32; 3]) -> Option<usize> {
     Some(grid.node(next))
 }
 
-/// Steps to the neighbours, each with its length in nodes: those of up to `reach` in each coordinate that
-/// are not multiples of another.
+/// Steps to the neighbours, each with its length in nodes: up to `reach` in each coordinate, without steps that are
+/// multiples of another.
 fn steps(reach: i32, counts: [usize; 3]) -> Vec<([i32; 3], f64)> {
     let [rx, ry, rz] = counts.map(|count| if count > 1 { reach } else { 0 });
     let mut steps = Vec::new();

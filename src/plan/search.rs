@@ -11,23 +11,23 @@ use derive_more::Display;
 use nalgebra::Vector3;
 use std::borrow::Cow;
 
-/// A plan is accepted once nothing can be shorter by more than this share.
+/// A plan is accepted once no other can be shorter by more than this share.
 const SLACK: f64 = 0.01;
-/// Cost of a change of curvature, mm: of two paths of the same length the one with fewer arcs is taken.
+/// Cost of a change of curvature, mm, so that of two paths of the same length the one with fewer arcs is chosen.
 const CHANGE_MM: f64 = 0.02;
 /// Width of a bucket of the queue, mm.
 const BUCKET_MM: f64 = 0.25;
-/// The share of the budget that each level of a search in space may spend.
-const SHARES: [u32; LEVELS.len()] = [8, 3, 1];
+/// Each level of a search in space may spend the remaining budget divided by this.
+const BUDGET_DIVISORS: [u32; LEVELS.len()] = [8, 3, 1];
 
-/// What is to be planned. Plane frame.
+/// A planning problem, in the plane frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Problem {
     /// Where the path starts.
     pub start: Tip,
-    /// Where it is to end.
+    /// Where the path should end.
     pub target_mm: Vector3<f64>,
-    /// How far from the target it may end, mm.
+    /// How far from the target the path may end, mm.
     pub tolerance_mm: f64,
     /// The largest curvature, over 0, per mm.
     pub curvature_per_mm: f64,
@@ -54,7 +54,7 @@ pub enum Status {
     /// A path. At this resolution no path is shorter by more than 1%, or no other path was found.
     #[display("plan")]
     Plan,
-    /// There is none at this resolution: the search came to its end.
+    /// There is no path at this resolution: the search was exhausted.
     #[display("none")]
     None,
     /// The budget was spent: there may be a path, or a shorter one than the one found.
@@ -67,7 +67,7 @@ pub enum Status {
 pub struct Answer {
     /// What the search found.
     pub status: Status,
-    /// The path; always there with a plan, never with none.
+    /// The path: always present with [`Status::Plan`], never with [`Status::None`].
     pub path: Option<Path>,
     /// Nodes expanded.
     pub expansions: u32,
@@ -75,37 +75,37 @@ pub struct Answer {
     pub resolution: Resolution,
     /// Why there is no path.
     pub reason: Option<String>,
-    /// The reachable point nearest to the target, mm: of all where there is no path, else of those
-    /// reached; none where even the start is not allowed.
+    /// The reachable point nearest to the target, mm. With a path it is only the nearest of those that the search
+    /// visited. `None` if even the start is not allowed.
     pub nearest_mm: Option<Vector3<f64>>,
 }
 
-/// Plans a path that ends at the target, or where that is not possible within the tolerance: the
-/// shortest, with a millimetre of distance left counted as a millimetre of length.
+/// Plans the shortest path that ends at the target, or if that is not possible, within the tolerance of it. A
+/// millimetre of distance from the target counts as a millimetre of length.
 ///
-/// The search is best-first over arcs of full curvature and straights of one length, in cells of position
+/// The search is best-first over arcs of full curvature and straights, all of one length, in cells of position
 /// and heading that are visited once. Nodes are ordered by the length so far plus a lower bound of the
-/// rest: the larger of the arc-then-straight with nothing in the way and the way around obstacles for a
-/// tip that turns on the spot. From each node the target is tried directly. In space the resolution is
-/// made finer while none is found. The same problem has the same answer on every machine.
+/// rest: the larger of the arc-then-straight without obstacles and the way around obstacles for a
+/// tip that turns on the spot. From each node the target is tried directly. In space, the resolution is
+/// refined until a path is found. The same problem has the same answer on every machine.
 pub fn plan(world: &World, problem: &Problem) -> Answer {
     let mut field = Field::new(Cow::Borrowed(world), problem.clearance_mm, problem.in_plane);
     let route = Route::new(&mut field, &problem.target_mm);
     plan_thoroughly(&mut field, problem, &route)
 }
 
-/// The same with the `route` to the target known.
+/// As [`plan`], with the `route` to the target already known.
 pub(super) fn plan_thoroughly(field: &mut Field<'_>, problem: &Problem, route: &Route) -> Answer {
     // No path leaves the workspace, or comes nearer to an obstacle than the clearance.
     let slack_mm = field.world.slack_at_most_mm(&problem.target_mm, problem.clearance_mm);
     let is_closed = slack_mm < -problem.tolerance_mm;
     let expansions_max = if is_closed { 0 } else { problem.expansions_max };
-    let mut answer = plan_along(field, &Problem { expansions_max, ..problem.clone() }, route);
+    let mut answer = search_only(field, &Problem { expansions_max, ..problem.clone() }, route);
     if is_closed {
         answer.status = Status::None;
     }
-    // The search does not follow ways on which the target is out of reach, and they may come nearer. One
-    // whose budget was spent does not know what can be reached.
+    // The search does not follow ways from which the target is out of reach, but those may come nearer to it.
+    // This is done only after an exhausted search: one whose budget was spent does not know what can be reached.
     if let (Status::None, Some(nearest_mm)) = (answer.status, answer.nearest_mm) {
         let path = path_to_nearest(field, problem);
         let end_mm = path.end().position_mm;
@@ -120,14 +120,14 @@ pub(super) fn plan_thoroughly(field: &mut Field<'_>, problem: &Problem, route: &
     answer
 }
 
-/// The best-first search alone. In space it may miss a path between its cells, of which it visits each once.
-pub(super) fn plan_along(field: &mut Field<'_>, problem: &Problem, route: &Route) -> Answer {
+/// The best-first search alone. It visits each cell once, so in space it may miss a path between its cells.
+pub(super) fn search_only(field: &mut Field<'_>, problem: &Problem, route: &Route) -> Answer {
     let levels = if problem.in_plane { 1 } else { LEVELS.len() };
     let mut level = 0;
     let mut expansions = 0;
     loop {
-        let left = problem.expansions_max - expansions;
-        let budget = if problem.in_plane { left } else { left / SHARES[level] };
+        let remaining = problem.expansions_max - expansions;
+        let budget = if problem.in_plane { remaining } else { remaining / BUDGET_DIVISORS[level] };
         let curvature_per_mm = problem.curvature_per_mm;
         let visited = std::mem::take(&mut field.visited);
         let workspace = &field.world.workspace;
@@ -139,7 +139,7 @@ pub(super) fn plan_along(field: &mut Field<'_>, problem: &Problem, route: &Route
             lattice,
             nodes: Vec::new(),
             buckets: Vec::new(),
-            first_mm: 0.0,
+            first_bound_mm: 0.0,
             best: None,
             nearest: (f64::INFINITY, problem.start.position_mm),
         };
@@ -158,26 +158,26 @@ struct Node {
     slack_mm: f32,
     length_mm: f32,
     changes: u16,
-    by: u8,
+    arc_number: u8,
     /// No obstacle is known to be in the way to the target.
     may_be_free: bool,
     parent: u32,
 }
 
-/// A path found: the node it goes through, and the arcs from there on.
+/// A path that was found: the last node that it goes through, and the arcs from there on.
 struct Found {
     cost_mm: f64,
     node: u32,
     rest: [Arc; 2],
 }
 
-/// Where obstacles make the way longer by more than this, the target is not tried directly, mm.
+/// If obstacles make the way longer by more than this, mm, the target is not tried directly.
 const DETOUR_MM: f64 = 2.0;
-/// Costs that differ by no more are the same, but for rounding, mm.
+/// Costs that differ by no more than this are equal up to rounding, mm.
 const SAME_MM: f64 = 1e-9;
-/// Points of an arc where a path may end.
+/// Number of parts of an arc at whose ends a path may end.
 const PARTS: u32 = 10;
-/// Goes nowhere.
+/// An arc of zero length.
 const NO_ARC: Arc =
     Arc { bend: Vector3::new(0.0, 0.0, 0.0), curvature_per_mm: 0.0, length_mm: 0.0 };
 
@@ -187,9 +187,10 @@ struct Search<'a, 'w> {
     route: &'a Route,
     lattice: Lattice,
     nodes: Vec<Node>,
-    /// Nodes by their lower bound of the whole.
+    /// The queue: nodes by the lower bound of a whole path through them.
     buckets: Vec<Vec<u32>>,
-    first_mm: f64,
+    /// The lower bound of the first bucket, mm.
+    first_bound_mm: f64,
     best: Option<Found>,
     nearest: (f64, Vector3<f64>),
 }
@@ -202,13 +203,13 @@ impl Search<'_, '_> {
             path: None,
             expansions: 0,
             resolution: self.lattice.resolution,
-            reason: self.not_allowed(),
+            reason: self.explain_bad_start(),
             nearest_mm: None,
         };
         if answer.reason.is_some() {
             return answer;
         }
-        self.first_mm = self.rest_mm(&self.problem.start).0;
+        self.first_bound_mm = self.lower_bound_mm(&self.problem.start).0;
         let slack_mm = self.field.slack_mm(&self.problem.start.position_mm).max(0.0) as f32;
         self.push(start, slack_mm, 0.0, 0, STRAIGHT, 0);
         let mut bucket = 0;
@@ -217,7 +218,7 @@ impl Search<'_, '_> {
                 bucket += 1;
                 continue;
             };
-            let bound_mm = self.first_mm + BUCKET_MM * bucket as f64;
+            let bound_mm = self.first_bound_mm + BUCKET_MM * bucket as f64;
             if self.best.as_ref().is_some_and(|best| best.cost_mm <= bound_mm * (1.0 + SLACK)) {
                 break;
             }
@@ -234,13 +235,13 @@ impl Search<'_, '_> {
         if answer.status == Status::None && answer.path.is_some() {
             answer.status = Status::Plan;
         }
-        answer.reason = answer.path.is_none().then(|| self.why_none(answer.status));
+        answer.reason = answer.path.is_none().then(|| self.explain_no_path(answer.status));
         self.field.visited = self.lattice.visited;
         answer
     }
 
-    /// Why there can be no path at all.
-    fn not_allowed(&self) -> Option<String> {
+    /// Why the start is not allowed; `None` if it is.
+    fn explain_bad_start(&self) -> Option<String> {
         let Problem { start, clearance_mm, .. } = self.problem;
         let (world, at) = (&self.field.world, &start.position_mm);
         let out_mm = -world.workspace.depth_mm(at);
@@ -251,44 +252,44 @@ impl Search<'_, '_> {
         }
         let distance_mm = world.distance_mm(at);
         (distance_mm < *clearance_mm).then(|| {
-            let place = placed(distance_mm);
+            let place = describe_distance(distance_mm);
             format!("the start is {place}, goal.clearance_mm is {clearance_mm}; start elsewhere")
         })
     }
 
-    /// A lower bound of length and distance left, mm, from `tip`, and whether the way may be free.
-    fn rest_mm(&self, tip: &Tip) -> (f64, bool) {
+    /// A lower bound of length plus remaining distance from `tip`, mm, and whether the direct way may be free.
+    fn lower_bound_mm(&self, tip: &Tip) -> (f64, bool) {
         let Problem { target_mm, curvature_per_mm, tolerance_mm, .. } = self.problem;
         let unobstructed_mm = tip.shortest_mm(target_mm, *curvature_per_mm, *tolerance_mm);
         let moved_mm = self.route.moved_mm(target_mm);
         let route_mm = self.route.length_mm(&tip.position_mm) - moved_mm;
         match route_mm.is_finite() {
             true => (unobstructed_mm.max(route_mm), unobstructed_mm > route_mm - DETOUR_MM),
-            // The point nearest to the target is still looked for.
+            // The search goes on, to find the point nearest to the target.
             false => (unobstructed_mm, false),
         }
     }
 
-    /// Adds a node; the bucket it goes to.
+    /// Adds a node, unless every path through it is too long. Returns its bucket, or `usize::MAX`.
     fn push(
         &mut self,
         place: Place,
         slack_mm: f32,
         length_mm: f64,
         changes: u16,
-        by: u8,
+        arc_number: u8,
         parent: u32,
     ) -> usize {
         let distance_mm = self.problem.to_target_mm(&place.tip.position_mm);
         if distance_mm < self.nearest.0 {
             self.nearest = (distance_mm, place.tip.position_mm);
         }
-        let (rest_mm, may_be_free) = self.rest_mm(&place.tip);
-        if length_mm + rest_mm - self.problem.tolerance_mm > self.problem.length_max_mm {
+        let (lower_bound_mm, may_be_free) = self.lower_bound_mm(&place.tip);
+        if length_mm + lower_bound_mm - self.problem.tolerance_mm > self.problem.length_max_mm {
             return usize::MAX;
         }
-        let bound_mm = length_mm + f64::from(changes) * CHANGE_MM + rest_mm;
-        let bucket = ((bound_mm - self.first_mm) / BUCKET_MM).max(0.0) as usize;
+        let bound_mm = length_mm + f64::from(changes) * CHANGE_MM + lower_bound_mm;
+        let bucket = ((bound_mm - self.first_bound_mm) / BUCKET_MM).max(0.0) as usize;
         if bucket >= self.buckets.len() {
             self.buckets.resize_with(bucket + 1, Vec::new);
         }
@@ -298,22 +299,24 @@ impl Search<'_, '_> {
             slack_mm,
             length_mm: length_mm as f32,
             changes,
-            by,
+            arc_number,
             may_be_free,
             parent,
         });
         bucket
     }
 
+    /// Adds the nodes that the arcs from a node lead to. Returns the lowest bucket that one was added to.
     fn expand(&mut self, from: u32) -> usize {
-        let Node { place, slack_mm, length_mm, changes, by: last, .. } = self.nodes[from as usize];
-        let before = self.before(from);
+        let Node { place, slack_mm, length_mm, changes, arc_number: last, .. } =
+            self.nodes[from as usize];
+        let previous_heading = self.previous_heading(from);
         let step_mm = self.lattice.resolution.step_mm;
         let mut lowest = usize::MAX;
-        for by in (0..self.lattice.arcs()).rev() {
-            let next = self.lattice.next(&place, before, by);
+        for arc_number in (0..self.lattice.arcs()).rev() {
+            let next = self.lattice.next(&place, previous_heading, arc_number);
             let cell = self.lattice.cell(&next);
-            if self.lattice.visited.has(cell) {
+            if self.lattice.visited.contains(cell) {
                 continue;
             }
             // The end first: most arcs that are not clear fail there.
@@ -323,27 +326,28 @@ impl Search<'_, '_> {
             }
             let slacks_mm = [f64::from(slack_mm), next_slack_mm];
             if slacks_mm.iter().sum::<f64>() < step_mm {
-                let arc = self.lattice.arc(&place.tip, before, by);
+                let arc = self.lattice.arc(&place.tip, previous_heading, arc_number);
                 if !self.field.is_clear_between(&place.tip, &arc, slacks_mm) {
                     continue;
                 }
             }
-            self.lattice.visited.add(cell);
-            let changes = changes + u16::from(by != last);
+            self.lattice.visited.insert(cell);
+            let changes = changes + u16::from(arc_number != last);
             let length_mm = f64::from(length_mm) + step_mm;
-            let bucket = self.push(next, next_slack_mm as f32, length_mm, changes, by, from);
+            let bucket =
+                self.push(next, next_slack_mm as f32, length_mm, changes, arc_number, from);
             lowest = lowest.min(bucket);
         }
         lowest
     }
 
     /// The heading at the start of the arc that led to `node`.
-    fn before(&self, node: u32) -> Option<Vector3<f64>> {
-        let Node { parent, by, .. } = self.nodes[node as usize];
-        (by != STRAIGHT).then(|| self.nodes[parent as usize].place.tip.heading)
+    fn previous_heading(&self, node: u32) -> Option<Vector3<f64>> {
+        let Node { parent, arc_number, .. } = self.nodes[node as usize];
+        (arc_number != STRAIGHT).then(|| self.nodes[parent as usize].place.tip.heading)
     }
 
-    /// Tries to end here, or to go to the target directly.
+    /// Tries to end on an arc from this node, or to go to the target directly.
     fn try_target(&mut self, node: u32) {
         let Problem { target_mm, tolerance_mm, curvature_per_mm, .. } = self.problem;
         let Node { place: Place { tip, .. }, length_mm, changes, may_be_free, .. } =
@@ -358,7 +362,7 @@ impl Search<'_, '_> {
             tip_aims.and_then(|tip| tip.arc_then_straight_to(target_mm, *curvature_per_mm));
         let bent = tip_aims.and_then(|tip| tip.arc_to(target_mm));
         let bent = bent.filter(|arc| arc.curvature_per_mm <= *curvature_per_mm);
-        // If two cost the same, the first wins: it ends at the target.
+        // If two cost the same, the first wins: the direct ways end at the target.
         let ways = [turning.map(|arcs| (0.0, arcs)), bent.map(|arc| (0.0, [arc, NO_ARC])), near];
         for (left_mm, rest) in ways.into_iter().flatten() {
             let whole_mm = length_mm + rest.iter().map(|arc| arc.length_mm).sum::<f64>();
@@ -370,10 +374,13 @@ impl Search<'_, '_> {
         }
     }
 
-    /// The point within tolerance on the arcs from `node` that costs least: distance left, and the way.
+    /// The cheapest end within the tolerance on the arcs from `node`: its distance from the target, and the arcs
+    /// there.
     fn nearest_on_arcs(&self, node: u32) -> Option<(f64, [Arc; 2])> {
-        let (tip, before) = (self.nodes[node as usize].place.tip, self.before(node));
-        let arcs = (0..self.lattice.arcs()).map(|by| self.lattice.arc(&tip, before, by));
+        let (tip, previous_heading) =
+            (self.nodes[node as usize].place.tip, self.previous_heading(node));
+        let arcs = (0..self.lattice.arcs())
+            .map(|arc_number| self.lattice.arc(&tip, previous_heading, arc_number));
         let parts = arcs.flat_map(|arc| {
             (0..=PARTS).map(move |part| {
                 arc.with_length(arc.length_mm * f64::from(part) / f64::from(PARTS))
@@ -395,9 +402,9 @@ impl Search<'_, '_> {
         let mut arcs = Vec::new();
         let mut node = found.node;
         while node != 0 {
-            let Node { parent, by, .. } = self.nodes[node as usize];
+            let Node { parent, arc_number, .. } = self.nodes[node as usize];
             let tip = self.nodes[parent as usize].place.tip;
-            arcs.push(self.lattice.arc(&tip, self.before(parent), by));
+            arcs.push(self.lattice.arc(&tip, self.previous_heading(parent), arc_number));
             node = parent;
         }
         arcs.reverse();
@@ -405,8 +412,8 @@ impl Search<'_, '_> {
         Path { start: self.problem.start, arcs }.joined()
     }
 
-    /// Why there is no path, of which the search found none.
-    fn why_none(&self, status: Status) -> String {
+    /// Why the search found no path.
+    fn explain_no_path(&self, status: Status) -> String {
         let Problem { start, target_mm, tolerance_mm, clearance_mm, length_max_mm, .. } =
             self.problem;
         let world = &self.field.world;
@@ -416,7 +423,7 @@ impl Search<'_, '_> {
         }
         let distance_mm = world.distance_mm(target_mm);
         if distance_mm < clearance_mm - tolerance_mm {
-            let place = placed(distance_mm);
+            let place = describe_distance(distance_mm);
             return format!("the target is {place}, goal.clearance_mm is {clearance_mm}");
         }
         if self.route.length_mm(&start.position_mm).is_infinite() {
@@ -443,8 +450,8 @@ impl Search<'_, '_> {
     }
 }
 
-/// Where a point is that has this distance to an obstacle.
-fn placed(distance_mm: f64) -> String {
+/// Describes the distance of a point from an obstacle.
+fn describe_distance(distance_mm: f64) -> String {
     match distance_mm < 0.0 {
         true => format!("{:.1} mm inside an obstacle", -distance_mm),
         false => format!("{distance_mm:.1} mm from an obstacle"),

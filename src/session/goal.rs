@@ -182,7 +182,7 @@ impl Pursuit {
         let nominal_per_mm = self.curvature_per_mm;
         let curvature_per_mm =
             estimate.belief.map_or(nominal_per_mm, |belief| belief.curvature_per_mm);
-        let known = plan::Estimate {
+        let known = plan::TipEstimate {
             tip: Tip { position_mm: estimate.x_pb.translation, heading },
             // An estimate above the configured curvature may be chance.
             curvature_per_mm: curvature_per_mm.clamp(0.1 * nominal_per_mm, nominal_per_mm),
@@ -200,7 +200,7 @@ impl Pursuit {
                 let bend = Bend {
                     toward: steer.bend,
                     curvature_per_mm: steer.curvature_per_mm,
-                    remaining_mm: steer.left_mm,
+                    remaining_mm: steer.remaining_mm,
                     may_turn: self.replanner.may_turn(&known, self.law.turn_mm()),
                     in_plane: self.goal.problem.in_plane,
                 };
@@ -210,7 +210,7 @@ impl Pursuit {
                 (approach, command.map(Some).map_err(|error| format!("control: {error}")))
             }
             Step::Arrived { .. } => (end, Ok(None)),
-            Step::Hold(why) => (end, Err(format!("goal: {why}"))),
+            Step::Stop(why) => (end, Err(format!("goal: {why}"))),
         }
     }
 }

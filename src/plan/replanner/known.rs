@@ -9,11 +9,11 @@ use crate::math;
 use nalgebra::Vector3;
 use std::f64::consts::{FRAC_PI_2, TAU};
 
-/// Points of the last path from which the target is tried again, mm apart.
+/// Distance between the points of the last path from which the target is tried again, mm.
 const TRY_MM: f64 = 2.0;
-/// Points of the last path at which the tip may come back onto it, mm apart.
+/// Distance between the points of the remembered path at which the tip may come back onto it, mm.
 const JOIN_MM: f64 = 4.0;
-/// An arc of a known path may be sharper by this share than the needle is believed to bend.
+/// An arc of a known path may be sharper by this share than the estimated curvature of the needle allows.
 const CURVATURE_SLACK: f64 = 0.05;
 
 impl Replanner {
@@ -27,11 +27,11 @@ impl Replanner {
         known.or_else(|| self.continued(last?)).or_else(|| self.rejoined())
     }
 
-    /// Back onto the last path that was found, where that was found, if that is clear from there on.
+    /// In the plane: back onto the remembered path, if the way there and the path from there on are clear.
     fn rejoined(&mut self) -> Option<Path> {
         let Problem { start, curvature_per_mm, in_plane, .. } = self.problem;
-        let (path, along_mm) = self.found.clone().filter(|_| in_plane)?;
-        if !self.ends_near(&path) || !path.arcs.iter().all(|arc| self.can_be(arc)) {
+        let (path, along_mm) = self.remembered.clone().filter(|_| in_plane)?;
+        if !self.ends_near(&path) || !path.arcs.iter().all(|arc| self.can_follow(arc)) {
             return None;
         }
         let joins = ((path.length_mm() - along_mm) / JOIN_MM) as u32;
@@ -46,7 +46,7 @@ impl Replanner {
         })
     }
 
-    /// The arc to the target, or the sharpest toward it, to where that is nearest to it.
+    /// The arc to the target; if that is too sharp, the sharpest arc toward it, up to the point nearest to it.
     pub(super) fn sharpest(&self) -> Path {
         let Problem { start, length_max_mm, target_mm, curvature_per_mm, .. } = self.problem;
         let direct =
@@ -55,7 +55,7 @@ impl Replanner {
         Path { start, arcs: vec![arc] }
     }
 
-    /// That arc, if it is clear and ends within the tolerance.
+    /// The arc of [`Replanner::sharpest`], if it is clear and ends within the tolerance.
     fn nearly_direct(&mut self) -> Option<Path> {
         let path = self.sharpest();
         let is_free = self.ends_near(&path) && self.field.is_clear(&path.start, &path.arcs[0]);
@@ -68,16 +68,16 @@ impl Replanner {
 
     /// The last path as it is from here, if it is clear and ends within the tolerance.
     fn continued(&mut self, last: &Path) -> Option<Path> {
-        let can_be = last.arcs.iter().all(|arc| self.can_be(arc));
-        (can_be && self.ends_near(last) && self.is_clear(last)).then(|| last.clone())
+        let can_follow = last.arcs.iter().all(|arc| self.can_follow(arc));
+        (can_follow && self.ends_near(last) && self.is_clear(last)).then(|| last.clone())
     }
 
     fn is_clear(&mut self, path: &Path) -> bool {
         self.begins_clear(path, f64::INFINITY)
     }
 
-    /// True for an arc of a known path that the needle can bend by, as far as the estimate tells.
-    fn can_be(&self, arc: &Arc) -> bool {
+    /// True if the needle can follow this arc of a known path, by the estimate of its curvature.
+    fn can_follow(&self, arc: &Arc) -> bool {
         arc.curvature_per_mm <= self.problem.curvature_per_mm * (1.0 + CURVATURE_SLACK)
     }
 
@@ -90,13 +90,13 @@ impl Replanner {
         is_free.then(|| Path { start, arcs: vec![arc] })
     }
 
-    /// The last path from here, left for the target at the point from which the whole is the shortest.
+    /// The last path from here up to some point, then directly to the target; the shortest of these.
     fn mended(&mut self, last: &Path) -> Option<Path> {
         let mut best: Option<Path> = None;
         let mut arcs = Vec::new();
         for (start, arc) in last.pieces() {
-            // The needle was believed to bend by more than it does.
-            if !self.can_be(&arc) {
+            // The needle bends by less than it was estimated to.
+            if !self.can_follow(&arc) {
                 break;
             }
             let parts = (arc.length_mm / TRY_MM).ceil().max(1.0);
@@ -124,7 +124,7 @@ impl Replanner {
         best.map(Path::joined)
     }
 
-    /// The shorter one of arc-then-straight and one arc from `tip` to the target that is clear.
+    /// An arc and a straight from `tip` to the target, or if that is not clear, a single arc.
     fn shortest_clear(&mut self, tip: &Tip) -> Option<Vec<Arc>> {
         let Problem { target_mm, curvature_per_mm, .. } = self.problem;
         let turning = tip.arc_then_straight_to(&target_mm, curvature_per_mm);
@@ -136,16 +136,17 @@ impl Replanner {
     }
 }
 
-/// Which way an arc turns: toward +y of the heading, or away from it.
+/// The side to which an arc turns: toward [`across`] of the heading, or away from it.
 const SIDES: [f64; 2] = [1.0, -1.0];
 /// Rounding must not turn "straight ahead" into a full turn, rad.
 const NO_TURN_RAD: f64 = 1e-9;
 
-/// Arc, straight, arc of `curvature_per_mm` from `from` to the place and heading of `to`, both in the
-/// plane x = 0: of each choice of sides the way, if it turns by less than a quarter each time.
+/// Ways from `from` to the position and heading of `to`, both in the plane x = 0: an arc of `curvature_per_mm`, a
+/// straight, and another such arc. For each choice of sides there is a way if both arcs turn by less than a
+/// quarter turn.
 ///
-/// With the centres of the two circles D apart, the straight is the tangent to both (Dubins 1957): as long
-/// as D on one side, √(D² − 4 r²) across.
+/// The straight is the common tangent of the two circles (Dubins 1957). With their centres D apart its length is D
+/// if both arcs turn to the same side, else √(D² − 4 r²).
 fn ways_in_plane(from: &Tip, to: &Tip, curvature_per_mm: f64) -> impl Iterator<Item = [Arc; 3]> {
     let (from, to) = (*from, *to);
     let sides = SIDES.into_iter().flat_map(|first| SIDES.map(|second| (first, second)));

@@ -54,7 +54,7 @@ impl Simulated {
     /// One step with `steer`, of which the bench believes the radius to be `believed_mm`.
     fn step(&mut self, steer: &Steer, believed_mm: f64) {
         let share = 0.5 * (1.0 + (steer.curvature_per_mm * believed_mm).clamp(-1.0, 1.0));
-        let step_mm = steer.left_mm.min(STEP_MM);
+        let step_mm = steer.remaining_mm.min(STEP_MM);
         for (side, part) in [(1.0, share), (-1.0, 1.0 - share)] {
             let heading = self.tip.heading;
             let bend = steer.bend - heading * steer.bend.dot(&heading);
@@ -70,7 +70,7 @@ fn run(world: &World, problem: &Problem, true_mm: f64) -> (Step, f64, Simulated)
     let mut needle = Simulated::new(true_mm);
     let mut least_mm = f64::INFINITY;
     for step in 0..300 {
-        let estimate = Estimate {
+        let estimate = TipEstimate {
             tip: needle.tip,
             curvature_per_mm: problem.curvature_per_mm,
             position_sd_mm: 0.05,
@@ -113,7 +113,7 @@ fn a_whole_turn_needs_a_path_after_it() {
     for ((target_mm, obstacles), may_turn) in cases {
         let problem = problem(target_mm, true);
         let mut planner = Replanner::new(world(obstacles.clone()), problem.clone(), 0.0, None);
-        let estimate = Estimate {
+        let estimate = TipEstimate {
             tip: problem.start,
             curvature_per_mm: problem.curvature_per_mm,
             position_sd_mm: 0.05,
@@ -191,7 +191,7 @@ fn a_plan_that_is_given_is_followed() {
     problem.clearance_mm += 0.5;
     let path = plan(&world, &problem).path;
     (problem.clearance_mm, problem.expansions_max) = (2.0, 0);
-    let estimate = Estimate {
+    let estimate = TipEstimate {
         tip: problem.start,
         curvature_per_mm: 1.0 / RADIUS_MM,
         position_sd_mm: 0.05,
@@ -220,7 +220,7 @@ fn a_plan_is_followed_while_the_heading_is_hardly_known() {
     problem.expansions_max = 0;
     let off_rad = 6f64.to_radians();
     let heading = Vector3::new(0.0, off_rad.sin(), off_rad.cos());
-    let estimate = Estimate {
+    let estimate = TipEstimate {
         tip: Tip { heading, ..problem.start },
         curvature_per_mm: 1.0 / RADIUS_MM,
         position_sd_mm: 0.3,
@@ -241,7 +241,7 @@ fn a_plan_is_followed_while_the_heading_is_hardly_known() {
 fn when_no_way_is_left_the_insertion_is_held() {
     let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, 1.0, 60.0), radius_mm: 6.0 };
     let (end, least_mm, needle) = run(&world(vec![ball]), &problem([0.0, 0.0, 130.0], true), 1e5);
-    assert_eq!(end, Step::Hold(Hold::NoPath));
+    assert_eq!(end, Step::Stop(StopReason::NoPath));
     assert!(least_mm >= 2.0 && needle.tip.position_mm.z > 10.0, "{least_mm}");
 }
 
@@ -256,11 +256,11 @@ fn a_step_ahead_that_is_nearer_than_the_clearance_is_not_made() {
         let first = |position_sd_mm| {
             let (tip, curvature_per_mm) = (problem.start, 1.0 / RADIUS_MM);
             let estimate =
-                Estimate { tip, curvature_per_mm, position_sd_mm, heading_sd_rad: 0.001 };
+                TipEstimate { tip, curvature_per_mm, position_sd_mm, heading_sd_rad: 0.001 };
             let world = world(vec![ball.clone()]);
             Replanner::new(world, problem.clone(), 0.0, None).step(&estimate, 0.0, STEP_MM)
         };
-        assert_eq!(first(0.1), Step::Hold(Hold::AheadNotAllowed));
+        assert_eq!(first(0.1), Step::Stop(StopReason::AheadNotAllowed));
         assert!(matches!(first(0.16), Step::Steer(_)), "{:?}", first(0.16));
     }
 }
@@ -290,7 +290,7 @@ fn one_arc_that_is_too_long_does_not_replace_a_path_that_is_not() {
     let mut planner = Replanner::new(world, problem.clone(), 0.0, path);
     let mut needle = Simulated::new(RADIUS_MM);
     for step in 0..100 {
-        let estimate = Estimate {
+        let estimate = TipEstimate {
             tip: needle.tip,
             curvature_per_mm: problem.curvature_per_mm,
             position_sd_mm: 0.05,
@@ -300,7 +300,7 @@ fn one_arc_that_is_too_long_does_not_replace_a_path_that_is_not() {
         let Step::Steer(steer) = planner.step(&estimate, inserted_mm, STEP_MM) else {
             panic!("no path at {step} mm");
         };
-        let end_mm = f64::from(step) * STEP_MM + steer.left_mm;
+        let end_mm = f64::from(step) * STEP_MM + steer.remaining_mm;
         assert!(end_mm <= problem.length_max_mm, "{end_mm} mm");
         needle.step(&steer, RADIUS_MM);
     }
@@ -313,7 +313,7 @@ fn beyond_the_longest_path_nothing_leads_back() {
     problem.start.position_mm.z = 10.0;
     let mut planner = Replanner::new(world(vec![]), problem.clone(), 0.0, None);
     for inserted_mm in [0.0, 1.5] {
-        let estimate = Estimate {
+        let estimate = TipEstimate {
             tip: problem.start,
             curvature_per_mm: problem.curvature_per_mm,
             position_sd_mm: 0.05,
@@ -329,13 +329,13 @@ fn beyond_the_longest_path_nothing_leads_back() {
 fn a_tip_that_is_no_number_is_held() {
     let problem = problem([0.0, 0.0, 120.0], false);
     let mut planner = Replanner::new(world(vec![]), problem.clone(), 0.0, None);
-    let estimate = Estimate {
+    let estimate = TipEstimate {
         tip: Tip { position_mm: Vector3::new(0.0, f64::NAN, 10.0), ..problem.start },
         curvature_per_mm: problem.curvature_per_mm,
         position_sd_mm: 0.05,
         heading_sd_rad: 0.001,
     };
-    assert_eq!(planner.step(&estimate, 1.0, STEP_MM), Step::Hold(Hold::TipNotAllowed));
+    assert_eq!(planner.step(&estimate, 1.0, STEP_MM), Step::Stop(StopReason::TipNotAllowed));
 }
 
 /// No step goes beyond the target, to what is behind it.
@@ -354,7 +354,7 @@ fn a_target_right_before_an_obstacle_is_met() {
 fn a_target_that_moves_is_followed_and_a_tip_at_an_obstacle_is_held() {
     let mut planner = Replanner::new(world(vec![]), problem([0.0, 0.0, 120.0], true), 0.0, None);
     let mut needle = Simulated::new(RADIUS_MM);
-    let estimate = |needle: &Simulated| Estimate {
+    let estimate = |needle: &Simulated| TipEstimate {
         tip: needle.tip,
         curvature_per_mm: 1.0 / RADIUS_MM,
         position_sd_mm: 0.0,
@@ -374,5 +374,5 @@ fn a_target_that_moves_is_followed_and_a_tip_at_an_obstacle_is_held() {
     let mut planner =
         Replanner::new(world(vec![ball]), problem([0.0, 0.0, 120.0], true), 0.0, None);
     let first = planner.step(&estimate(&Simulated::new(RADIUS_MM)), 0.0, 1.0);
-    assert_eq!(first, Step::Hold(Hold::TipNotAllowed));
+    assert_eq!(first, Step::Stop(StopReason::TipNotAllowed));
 }
