@@ -4,7 +4,7 @@ use super::Failure;
 use super::output::{merged, print_result, print_stderr};
 use super::records::{Insertion, Insertions};
 use crate::session::ObserverConfig;
-use crate::study::{Evaluation, Recording, Score, evaluate as evaluate_observer};
+use crate::study::{Evaluation, Recording, RecordingScore, evaluate as evaluate_observer};
 use crate::text::screen;
 use clap::Args;
 use minijinja::context;
@@ -64,10 +64,10 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<(), Failure> {
 /// Scores `observer`, and adds the roll error of the same observer if it does not know the roll at the start.
 fn score_with_and_without_roll(
     observer: &ObserverConfig,
-    score: impl Fn(&ObserverConfig) -> Result<Score, String>,
-) -> Result<Score, String> {
+    score: impl Fn(&ObserverConfig) -> Result<RecordingScore, String>,
+) -> Result<RecordingScore, String> {
     let with_roll = score(observer)?;
     let without_roll = observer.with_roll_unknown().as_ref().map(&score).transpose()?;
     let roll_unknown_rms_deg = without_roll.and_then(|score| score.roll_rms_deg);
-    Ok(Score { roll_unknown_rms_deg, ..with_roll })
+    Ok(RecordingScore { roll_unknown_rms_deg, ..with_roll })
 }

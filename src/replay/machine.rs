@@ -196,8 +196,8 @@ impl Replay<'_> {
                 None
             }
             Record::Stage(stage) => {
-                self.figures.follow(stage);
-                self.what_if.follow(stage);
+                self.figures.take_feedback(stage);
+                self.what_if.take_feedback(stage);
                 None
             }
             Record::Step(step) => self.step(step.as_ref().clone())?,
@@ -214,10 +214,10 @@ impl Replay<'_> {
         let asked = if self.asks { step.decision.shadows.pop() } else { None };
         let recorded = self.comparison.step(&step)?.unwrap_or_default();
         let truth = self.comparison.columns.truth(&recorded);
-        self.figures.take(&step, truth.as_ref());
+        self.figures.take_step(&step, truth.as_ref());
         if let Some((_, estimate)) = asked {
             step.decision.estimate = estimate;
-            self.what_if.take(&step, truth.as_ref());
+            self.what_if.take_step(&step, truth.as_ref());
         }
         let row = StepRow::new(&step, None).to_string();
         self.steps.push(with_recorded_truth(&row, &recorded));

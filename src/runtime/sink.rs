@@ -186,13 +186,13 @@ impl Witness for Sink<'_> {
     fn take(&mut self, record: Record, truth: Option<Truth>) {
         self.operator.record(&record);
         match &record {
-            Record::Step(step) => self.figures.take(step, truth.as_ref()),
+            Record::Step(step) => self.figures.take_step(step, truth.as_ref()),
             Record::Event { time, lane, severity, text } => {
                 self.operator.event(*time, *lane, *severity, text);
             }
             Record::Drive { axis, node, identity, .. } => self.identify(*axis, *node, identity),
-            Record::Stage(stage) => self.figures.follow(stage),
-            Record::Sample(sample) => self.figures.see(sample),
+            Record::Stage(stage) => self.figures.take_feedback(stage),
+            Record::Sample(sample) => self.figures.take_sample(sample),
             Record::State { state: State::Holding, .. } => self.holds.tracker += 1,
             Record::State { state: State::HeldByOperator, .. } => self.holds.operator += 1,
             Record::State { state: State::HeldAfterStep, .. } => self.holds.step += 1,

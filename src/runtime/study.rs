@@ -4,7 +4,7 @@ use super::virtual_time::{TipSource, run_unwatched};
 use crate::emulator::{Noise, TrackerModel, Truth, VirtualStage, VirtualStageConfig};
 use crate::geometry::Pose;
 use crate::session::{Goal, Outcome, Record, Session, SessionConfig};
-use crate::study::{Prior, Timetable, TimetableBuilder, TrialResult, TrialScore, insert};
+use crate::study::{Prior, Timetable, TimetableBuilder, TrialResult, TrialScorer, insert};
 use crate::units::Time;
 use nalgebra::Vector3;
 use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
@@ -82,7 +82,7 @@ impl Study<'_> {
         &self,
         seeds: &[u64],
         done: &(dyn Fn() + Sync),
-        insert: impl Fn(SessionConfig, VirtualStageConfig, &mut TrialScore) -> Result<Outcome, String>
+        insert: impl Fn(SessionConfig, VirtualStageConfig, &mut TrialScorer) -> Result<Outcome, String>
         + Sync,
     ) -> Result<Vec<TrialResult>, String> {
         let trial = |&seed: &u64| {
@@ -92,7 +92,7 @@ impl Study<'_> {
                 Err(why) => TrialResult::refused(seed, stage, &self.prior, &why),
                 Ok(goal) => {
                     let mut score =
-                        TrialScore::new(seed, stage.clone(), &self.prior, goal.as_ref());
+                        TrialScorer::new(seed, stage.clone(), &self.prior, goal.as_ref());
                     let session = SessionConfig { goal, ..self.session.clone() };
                     let outcome = insert(session, stage, &mut score)?;
                     score.finish(outcome)

@@ -16,8 +16,8 @@ impl BasePath {
         BasePath { knots: vec![(0.0, 0.0)], rate_rad_per_mm: 0.0 }
     }
 
-    /// Sets the rate from `from_mm` on, which must not be less than the start of the last rate.
-    pub(super) fn turn(&mut self, from_mm: f64, rate_rad_per_mm: f64) {
+    /// Sets the rotation rate from `from_mm` on, which must not be before the start of the last rate.
+    pub(super) fn set_rate(&mut self, from_mm: f64, rate_rad_per_mm: f64) {
         self.knots.push((from_mm, self.rotation_at(from_mm)));
         self.rate_rad_per_mm = rate_rad_per_mm;
     }
@@ -62,9 +62,9 @@ mod tests {
     #[test]
     fn a_path_is_straight_between_its_knots() {
         let mut path = BasePath::new();
-        path.turn(0.0, 0.1);
-        path.turn(2.0, -0.3);
-        path.turn(3.0, 0.0);
+        path.set_rate(0.0, 0.1);
+        path.set_rate(2.0, -0.3);
+        path.set_rate(3.0, 0.0);
         for (depth_mm, rotation_rad) in
             [(0.0, 0.0), (1.0, 0.1), (2.0, 0.2), (2.5, 0.05), (4.0, -0.1)]
         {

@@ -1,4 +1,4 @@
-//! An observer over a recorded insertion, scored against the recorded tip.
+//! Runs an observer over a recorded insertion and scores it against the recorded tip.
 
 use super::recording::{RecordedRow, Recording};
 use super::statistics::{quantile, rms};
@@ -15,7 +15,7 @@ const AHEAD_MM: f64 = 5.0;
 
 /// The score of one observer on one recording.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Score {
+pub struct RecordingScore {
     /// Length of the insertion, mm.
     pub insertion_mm: f64,
     /// Steps scored.
@@ -32,7 +32,7 @@ pub struct Score {
     /// RMS distance of the position predicted 5 mm ahead, with the base's actual rotation, from the
     /// recorded position, mm.
     pub prediction_5mm_rms_mm: Option<f64>,
-    /// Where and why a run would have stopped: the observer detected its own divergence.
+    /// Where and why a run would have stopped because the observer diverged; `None` if it did not.
     pub diverged: Option<String>,
 }
 
@@ -60,8 +60,8 @@ pub struct Quantiles {
 
 impl Evaluation {
     /// The figures over all recordings.
-    pub fn of<'a>(scores: impl Iterator<Item = &'a Score> + Clone) -> Self {
-        let quantile = |of: fn(&Score) -> Option<f64>, q: f64| {
+    pub fn of<'a>(scores: impl Iterator<Item = &'a RecordingScore> + Clone) -> Self {
+        let quantile = |of: fn(&RecordingScore) -> Option<f64>, q: f64| {
             quantile(&scores.clone().filter_map(of).collect::<Vec<f64>>(), q)
         };
         let quantiles = |of| Quantiles { median: quantile(of, 0.5), p90: quantile(of, 0.9) };
@@ -91,7 +91,7 @@ pub struct Scoring {
 
 /// A row as the observer sees it, in its plane frame.
 struct Step {
-    /// Since the row before.
+    /// The measured increment since the row before.
     increment: Increment,
     /// Largest depth so far, from the first row, mm.
     depth_mm: f64,
@@ -103,7 +103,7 @@ struct Step {
 /// The rows of `recording` in the plane frame P, which is the tip frame at the first row.
 ///
 /// # Errors
-/// The line of a row that has a number far beyond any needle.
+/// If a row has a number far beyond any needle; the text names its line.
 fn steps(recording: &Recording, r_sb: &Rotation3<f64>) -> Result<Vec<Step>, String> {
     let first = &recording.rows[0];
     let lacks_roll = recording.lacks_roll();
@@ -141,8 +141,8 @@ fn prediction_error_mm(observer: &dyn Observer, steps: &[Step], at: usize) -> Op
 }
 
 /// Runs `observer` over `recording`: it predicts with the measured increments of every row and
-/// corrects once in every step. Each correction that is deep enough is scored. The position is
-/// scored before the correction, which uses the recorded position; the roll is scored after it.
+/// corrects it, at every row or once a step ([`Scoring::samples`]). Once a step is scored, if it is deep
+/// enough: the position before the correction, which uses the recorded position, and the roll after it.
 ///
 /// The observer's plane frame P is the tip frame at the first row, so a start with all angles zero
 /// is correct. The observer gets depth, base rotation and position, never the recorded orientation.
@@ -155,7 +155,7 @@ pub fn evaluate(
     observer: &mut dyn Observer,
     recording: &Recording,
     scoring: &Scoring,
-) -> Result<Score, String> {
+) -> Result<RecordingScore, String> {
     let steps = steps(recording, &scoring.r_sb)?;
     let depth_mm = steps.last().map_or(0.0, |step| step.depth_mm);
     if depth_mm < scoring.score_after_mm {
@@ -191,7 +191,7 @@ pub fn evaluate(
         if !is_due {
             continue;
         }
-        // One step after a gap, however many it spans.
+        // A gap counts as one step, however many steps it spans.
         next_mm += (((step.depth_mm - next_mm) / scoring.step_mm).floor() + 1.0) * scoring.step_mm;
         if step.depth_mm < scoring.score_after_mm {
             continue;
@@ -206,7 +206,7 @@ pub fn evaluate(
             rolls.push(turn_about_axis(rotation_true, &estimate.x_pb));
         }
     }
-    Ok(Score {
+    Ok(RecordingScore {
         insertion_mm: depth_mm,
         steps: scored,
         roll_rms_deg: rms(rolls).map(f64::to_degrees),

@@ -62,14 +62,14 @@ impl TipError {
         [self.x_mm, self.y_mm, self.z_mm, self.yaw_deg, self.pitch_deg, self.roll_deg]
     }
 
-    /// `of` each coordinate of all `errors`, such as their RMS; `None` if `of` gives `None` for any.
+    /// A `statistic`, such as the RMS, of each coordinate over all `errors`; `None` if it is `None` for any.
     pub fn by_coordinate(
         errors: &[TipError],
-        of: impl Fn(Vec<f64>) -> Option<f64>,
+        statistic: impl Fn(Vec<f64>) -> Option<f64>,
     ) -> Option<Self> {
         let mut all = [0.0; 6];
         for (i, value) in all.iter_mut().enumerate() {
-            *value = of(errors.iter().map(|error| error.coordinates()[i]).collect())?;
+            *value = statistic(errors.iter().map(|error| error.coordinates()[i]).collect())?;
         }
         Some(TipError::from(all))
     }
@@ -82,7 +82,7 @@ impl From<[f64; 6]> for TipError {
     }
 }
 
-/// Values at depths, mm.
+/// Values, each with its depth, mm.
 pub(super) type ByDepth<T> = Vec<(f64, T)>;
 
 /// The values in the last third of `insertion_mm`.
@@ -102,7 +102,7 @@ pub struct RunFigures {
     /// Estimated x, mm, at steps with an estimate.
     estimated: ByDepth<f64>,
     saturated: usize,
-    /// The other figures, kept as they come; [`report`](Self::report) adds those above.
+    /// The figures that are updated at once; [`report`](Self::report) adds those that need all steps.
     so_far: FigureReport,
     /// Acquisition time of the newest accepted position.
     tip_seen: Option<Time>,
@@ -110,7 +110,7 @@ pub struct RunFigures {
     path: VecDeque<(Time, f64)>,
 }
 
-/// Raises `greatest`, the largest magnitude so far, to that of `value`.
+/// Updates `greatest`, the largest magnitude so far, with `value`.
 fn raise(greatest: &mut Option<f64>, value: f64) {
     if value.is_finite() {
         *greatest = Some(greatest.unwrap_or(0.0).max(value.abs()));
@@ -136,7 +136,7 @@ pub struct FigureReport {
     pub estimate_rms: Option<TipError>,
     /// The estimate's error at the last step, if the truth is known.
     pub final_error: Option<TipError>,
-    /// The largest difference of target and position of the insertion axis at a SYNC, mm, including
+    /// The largest difference between target and position of the insertion axis at a SYNC, mm, including
     /// the stop.
     pub following_error_mm_max: Option<f64>,
     /// The same for the rotation axis, deg.
@@ -151,22 +151,22 @@ pub struct FigureReport {
     pub blind_mm_max: Option<f64>,
     /// True distance of the tip from the target at the last step, mm; if the truth is known.
     pub target_error_mm: Option<f64>,
-    /// The same as estimated.
+    /// Estimated distance of the tip from the target at the last step, mm.
     pub target_error_est_mm: Option<f64>,
     /// The least distance of the tip from an obstacle, mm, as estimated; null without obstacles.
     pub clearance_mm_min: Option<f64>,
 }
 
-/// What became of the plan of a run to a target.
+/// How a run to a target ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display, Serialize)]
 #[display(rename_all = "snake_case")]
 #[serde(rename_all = "snake_case")]
 pub enum PlanStatus {
     /// The run completed, and the estimated tip is within the tolerance.
     Arrived,
-    /// The run completed, and it is not.
+    /// The run completed, but the estimated tip is not within the tolerance.
     Missed,
-    /// The run was stopped before.
+    /// The run was stopped before its end.
     Lost,
 }
 
@@ -177,7 +177,7 @@ impl FigureReport {
         self.target_error_mm.or(self.target_error_est_mm)
     }
 
-    /// What became of the plan, by the estimate; `None` without a target.
+    /// How the run to the target ended, by the estimate; `None` without a target.
     pub fn plan_status(&self, is_completed: bool, tolerance_mm: f64) -> Option<PlanStatus> {
         let error_mm = self.target_error_est_mm?;
         Some(match is_completed {
@@ -190,7 +190,7 @@ impl FigureReport {
 
 impl RunFigures {
     /// Adds one step.
-    pub fn take(&mut self, step: &StepRecord, truth: Option<&Truth>) {
+    pub fn take_step(&mut self, step: &StepRecord, truth: Option<&Truth>) {
         let x_est_mm = step.decision.estimate.as_ref().map(|estimate| estimate.x_pb.translation.x);
         self.estimated.extend(x_est_mm.map(|x_mm| (step.insertion_meas_mm, x_mm)));
         let x_mm = truth.map(|truth| truth.x_pb().translation.x).or(x_est_mm);
@@ -216,7 +216,7 @@ impl RunFigures {
         }
     }
 
-    /// Takes a step from a row of `steps.csv`: its depth, its distance from the plane (true where
+    /// Adds a step from a row of `steps.csv`: its depth, its distance from the plane (true if
     /// known, else estimated), and the estimate's error.
     pub fn take_scored(&mut self, insertion_mm: f64, x_mm: Option<f64>, error: Option<TipError>) {
         self.steps.push((insertion_mm, (x_mm, error)));
@@ -224,12 +224,12 @@ impl RunFigures {
     }
 
     /// Adds a sample of the tracker.
-    pub fn see(&mut self, sample: &SampleRecord) {
+    pub fn take_sample(&mut self, sample: &SampleRecord) {
         self.tip_seen = self.tip_seen.max(sample.acquisition_time);
     }
 
     /// Adds the stage's position at a SYNC.
-    pub fn follow(&mut self, stage: &Feedback) {
+    pub fn take_feedback(&mut self, stage: &Feedback) {
         let figures = &mut self.so_far;
         figures.insertion_mm = stage.measured.insertion_mm;
         if let Some(seen) = self.tip_seen {
@@ -249,12 +249,12 @@ impl RunFigures {
 
     /// All figures so far.
     pub fn report(&self) -> FigureReport {
-        let last_third = || last_third(&self.steps, self.so_far.insertion_mm);
-        let errors: Vec<TipError> = last_third().filter_map(|(_, error)| error).collect();
+        let steps = || last_third(&self.steps, self.so_far.insertion_mm);
+        let errors: Vec<TipError> = steps().filter_map(|(_, error)| error).collect();
         FigureReport {
             steps: self.steps.len(),
             steps_saturated: Some(self.saturated),
-            off_plane_rms_mm: rms(last_third().filter_map(|(x_mm, _)| x_mm)),
+            off_plane_rms_mm: rms(steps().filter_map(|(x_mm, _)| x_mm)),
             settling_mm: self.settling_mm(),
             estimate_rms: TipError::by_coordinate(&errors, rms),
             final_error: self.steps.last().and_then(|(_, (_, error))| *error),
@@ -306,13 +306,13 @@ mod tests {
         let mut figures = RunFigures::default();
         let xs = [5.0, 0.5, 2.0, 0.9, 0.3, 0.3, 0.3, 0.4, 0.4, 0.4];
         for (n, x) in xs.into_iter().enumerate() {
-            figures.take(&step(n as f64, x), None);
+            figures.take_step(&step(n as f64, x), None);
         }
         assert_eq!(figures.report().settling_mm, Some(3.0));
         assert!((figures.report().off_plane_rms_mm.unwrap() - 0.4).abs() < 1e-12);
         assert_eq!(figures.report().estimate_rms, None);
         assert_eq!(figures.plane_missed_by_mm(), None);
-        figures.take(&step(10.0, 3.0), None);
+        figures.take_step(&step(10.0, 3.0), None);
         assert_eq!(figures.report().settling_mm, None);
     }
 
@@ -322,7 +322,7 @@ mod tests {
         let mut figures = RunFigures::default();
         assert_eq!(figures.plane_missed_by_mm(), None);
         for n in 0..10 {
-            figures.take(&step(f64::from(n), 2.5), Some(&Truth::new(Pose::identity())));
+            figures.take_step(&step(f64::from(n), 2.5), Some(&Truth::new(Pose::identity())));
         }
         assert_eq!(figures.plane_missed_by_mm(), Some(2.5));
         assert_eq!(figures.report().off_plane_rms_mm, Some(0.0));
@@ -336,10 +336,10 @@ mod tests {
             tip_meas_insertion_mm: Some(at_mm),
             ..step(10.0, 0.1)
         };
-        figures.take(&late(0.3, 9.5), None);
-        figures.take(&late(0.1, 9.75), None);
+        figures.take_step(&late(0.3, 9.5), None);
+        figures.take_step(&late(0.1, 9.75), None);
         for (insertion_cmd_mm, rotation_cmd_rad) in [(9.5, 0.0), (10.25, -0.5), (f64::NAN, 0.0)] {
-            figures.follow(&Feedback {
+            figures.take_feedback(&Feedback {
                 time: Time::ZERO,
                 sync: 1,
                 measured: SetPoint { insertion_mm: 10.0, rotation_rad: 0.0 },
@@ -364,7 +364,7 @@ mod tests {
         let mut figures = RunFigures::default();
         for n in 0..=14 {
             let time = Time::from_secs_f64(0.1 * f64::from(n));
-            figures.see(&SampleRecord {
+            figures.take_sample(&SampleRecord {
                 received: Sample {
                     receive_time: time,
                     source_unix_ns: None,
@@ -377,7 +377,7 @@ mod tests {
                 acquisition_time: (n <= 10).then_some(time),
                 refused: (n > 10).then(|| Refusal::new(GateName::Zero, "not seen")),
             });
-            figures.follow(&Feedback {
+            figures.take_feedback(&Feedback {
                 time,
                 sync: 1,
                 measured: SetPoint { insertion_mm: 0.1 * f64::from(n), rotation_rad: 0.0 },

@@ -9,8 +9,8 @@ const REQUIRED: [&str; 5] = ["insertion_mm", "rotation_rad", "x_mm", "y_mm", "z_
 
 /// Two orientations that differ by less are the same, rad.
 const SAME_MAX_RAD: f64 = 1e-3;
-/// A base that has turned by so much shows whether the orientations turn with it, rad: no needle bends by
-/// half of it, and no shaft holds back half of it.
+/// Once the base has turned by this much, rad, the orientations show whether they turn with it: no needle bends by
+/// half of this, and no shaft holds back half of it.
 const TURNED_RAD: f64 = 2.5;
 
 /// One row of a recording, in the recording's own frame.
@@ -60,9 +60,9 @@ impl Recording {
         }
     }
 
-    /// True if the orientations hold no roll. A sensor of five degrees of freedom gives the heading alone, so
-    /// that its orientations do not turn with the base; a tracker without orientations may fill in one for
-    /// all rows.
+    /// True if the orientations contain no roll. A sensor with five degrees of freedom measures only the heading,
+    /// so its orientations do not turn with the base. A tracker without orientations may send the same one in
+    /// every row.
     pub fn lacks_roll(&self) -> bool {
         let first = &self.rows[0];
         let turns = self.rows.iter().filter_map(|row| {
@@ -70,15 +70,15 @@ impl Recording {
             let base_rad = (row.rotation_meas_rad - first.rotation_meas_rad).rem_euclid(TAU);
             Some((seen_rad, base_rad.min(TAU - base_rad)))
         });
-        let most =
+        let largest =
             |(seen, base): (f64, f64), turn: (f64, f64)| (seen.max(turn.0), base.max(turn.1));
-        let (seen_rad, base_rad) = turns.fold((0.0, 0.0), most);
+        let (seen_rad, base_rad) = turns.fold((0.0, 0.0), largest);
         self.rows.len() > 1
             && first.sensor_orientation.is_some()
             && (seen_rad < SAME_MAX_RAD || (base_rad > TURNED_RAD && seen_rad < 0.5 * TURNED_RAD))
     }
 
-    /// True if `other` is the same recording, on whatever lines of its file.
+    /// True if `other` has the same rows; their line numbers may differ.
     pub fn is_same(&self, other: &Recording) -> bool {
         let is_same =
             |(a, b): (&RecordedRow, &RecordedRow)| RecordedRow { line: b.line, ..*a } == *b;

@@ -12,15 +12,15 @@ use crate::session::{Goal, Outcome, StepRecord};
 /// The result of one trial.
 #[derive(Debug, Clone)]
 pub struct TrialResult {
-    /// The seed that repeats it.
+    /// The seed that repeats the trial.
     pub seed: u64,
     /// The emulated stage, needle and tracker of the trial.
     pub stage: VirtualStageConfig,
-    /// How it ended.
+    /// How the trial ended.
     pub outcome: Outcome,
     /// The figures of the insertion, by the true tip.
     pub figures: FigureReport,
-    /// The shortest path into the plane, mm: two arcs, from far out with a straight between them.
+    /// The length of the shortest path into the plane, mm: two arcs, and far from the plane a straight between them.
     pub shortest_settling_mm: Option<f64>,
     /// The information bound of the estimate's errors, as RMS over the last third; `None` without noise.
     pub bound_rms: Option<TipError>,
@@ -28,7 +28,7 @@ pub struct TrialResult {
     pub nees: Option<TrialNees>,
     /// Mean of the normalised innovation squared over the last third.
     pub nis: Option<f64>,
-    /// How near it came to its target; `None` without one.
+    /// How near the tip came to its target; `None` without a target.
     pub target: Option<TargetScore>,
 }
 
@@ -66,14 +66,14 @@ impl TrialResult {
             is_reached: false,
             clearance_mm: f64::INFINITY,
         };
-        let score = TrialScore::new(seed, stage, prior, None);
-        TrialResult { target: Some(target), ..score.finish(Outcome::Stopped(why.to_string())) }
+        let scorer = TrialScorer::new(seed, stage, prior, None);
+        TrialResult { target: Some(target), ..scorer.finish(Outcome::Stopped(why.to_string())) }
     }
 }
 
 /// Collects a [`TrialResult`] step by step.
 #[derive(Debug)]
-pub struct TrialScore {
+pub struct TrialScorer {
     seed: u64,
     stage: VirtualStageConfig,
     figures: RunFigures,
@@ -84,20 +84,27 @@ pub struct TrialScore {
     nees: ByDepth<f64>,
     /// The normalised innovation squared at each step with a position.
     nis: ByDepth<f64>,
-    /// The target's obstacles, its tolerance, mm, and the least distance from an obstacle so far, mm.
-    goal: Option<(World, f64, f64)>,
+    goal: Option<GoalScore>,
 }
 
-impl TrialScore {
-    /// A score for the trial with this seed and stage, its start drawn from `prior`.
+#[derive(Debug)]
+struct GoalScore {
+    obstacles: World,
+    tolerance_mm: f64,
+    /// The least distance of the true tip from an obstacle so far, mm.
+    clearance_mm: f64,
+}
+
+impl TrialScorer {
+    /// A scorer for the trial with this seed and stage, its start drawn from `prior`.
     pub fn new(seed: u64, stage: VirtualStageConfig, prior: &Prior, goal: Option<&Goal>) -> Self {
-        // Noise that is correlated over much less than the estimate remembers acts as so much white
-        // noise.
+        // Noise with a correlation much shorter than the memory of the estimate acts like white noise of
+        // this variance.
         let measurement_mm2 = stage.tracker.long_mean_variance_mm2();
         let bound = (measurement_mm2 > 0.0).then(|| {
             InformationBound::new(prior, measurement_mm2, stage.start, stage.needle, stage.torsion)
         });
-        TrialScore {
+        TrialScorer {
             seed,
             stage,
             figures: RunFigures::default(),
@@ -105,15 +112,20 @@ impl TrialScore {
             bounds: ByDepth::new(),
             nees: ByDepth::new(),
             nis: ByDepth::new(),
-            goal: goal.map(|goal| (goal.world.clone(), goal.problem.tolerance_mm, f64::INFINITY)),
+            goal: goal.map(|goal| GoalScore {
+                obstacles: goal.world.clone(),
+                tolerance_mm: goal.problem.tolerance_mm,
+                clearance_mm: f64::INFINITY,
+            }),
         }
     }
 
     /// Adds one step.
     pub fn take(&mut self, step: &StepRecord, truth: &Truth) {
-        self.figures.take(step, Some(truth));
-        if let Some((world, _, least_mm)) = &mut self.goal {
-            *least_mm = least_mm.min(world.distance_mm(&truth.x_pb().translation));
+        self.figures.take_step(step, Some(truth));
+        if let Some(goal) = &mut self.goal {
+            let distance_mm = goal.obstacles.distance_mm(&truth.x_pb().translation);
+            goal.clearance_mm = goal.clearance_mm.min(distance_mm);
         }
         let depth_mm = step.insertion_meas_mm;
         if let Some(bound) = &mut self.bound {
@@ -140,11 +152,11 @@ impl TrialScore {
         let figures = self.figures.report();
         let insertion_mm = figures.insertion_mm;
         let error_mm = figures.target_error_mm.filter(|_| outcome == Outcome::Completed);
-        let target = self.goal.as_ref().map(|(_, tolerance_mm, clearance_mm)| TargetScore {
+        let target = self.goal.as_ref().map(|goal| TargetScore {
             is_refused: false,
             error_mm,
-            is_reached: error_mm.is_some_and(|error_mm| error_mm <= *tolerance_mm),
-            clearance_mm: *clearance_mm,
+            is_reached: error_mm.is_some_and(|error_mm| error_mm <= goal.tolerance_mm),
+            clearance_mm: goal.clearance_mm,
         });
         let bounds: Vec<TipError> = last_third(&self.bounds, insertion_mm).collect();
         let (start, _) = Reduced::split(&self.stage.start);

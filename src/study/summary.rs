@@ -14,8 +14,8 @@ pub fn trial_seed(seed: u64, trial: u64) -> u64 {
     counted(seed, trial) >> 11
 }
 
-/// Order statistics of a distance, mm. A stopped trial counts as infinitely far off. In JSON infinite values
-/// are null, and so are those of no trials, which are NaN.
+/// Order statistics of a distance, mm. A stopped trial counts as infinitely far off. Without trials they are NaN.
+/// In JSON, infinite values and NaN are null.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct OffPlane {
     /// Half of the trials are better.
@@ -66,7 +66,7 @@ pub struct FailedTrial {
     pub off_plane_rms_mm: Option<f64>,
     /// Why it was stopped; `None` if it reached its depth.
     pub stop_reason: Option<String>,
-    /// It was not begun: there was no path to its target.
+    /// The trial was not begun, since there was no path to its target.
     pub refused: bool,
 }
 
@@ -86,7 +86,7 @@ pub struct StudySummary {
     pub shortest_settling_mm: Median,
     /// The estimate's RMS errors over the last third, medians over the trials.
     pub estimate_rms: Option<TipError>,
-    /// The estimate's errors over the information bound, both RMS over the last third of all
+    /// The estimate's errors divided by the information bound, both RMS over the last third of all
     /// trials: 1 is the best possible. The bound is on mean squares, so the squares of all trials are
     /// pooled; the RMS of a single trial may be under its bound.
     pub bound_ratio: Option<TipError>,
@@ -94,7 +94,7 @@ pub struct StudySummary {
     pub nees: Option<Nees>,
     /// The innovations relative to their predicted covariance, over the last third of each trial.
     pub nis: Option<Consistency>,
-    /// What became of the targets; nothing is printed of a study without them.
+    /// The figures of a study with targets; without targets these keys are absent.
     #[serde(flatten)]
     pub target: Option<Targets>,
     /// The trials that did not settle, or did not reach their target, with the seeds that repeat them.
@@ -133,23 +133,23 @@ impl Targets {
             return None;
         }
         let begun: Vec<_> = all.iter().filter(|target| !target.is_refused).collect();
-        let part = |some: usize, of: usize| some as f64 / of as f64;
+        let fraction = |count: usize, total: usize| count as f64 / total as f64;
         let errors: Vec<f64> =
             begun.iter().map(|target| target.error_mm.unwrap_or(f64::INFINITY)).collect();
         let clearances: Vec<f64> = begun.iter().map(|target| target.clearance_mm).collect();
         let touched = clearances.iter().filter(|mm| **mm <= 0.0).count();
         Some(Targets {
             target_error_mm: OffPlane::of(&errors),
-            reached_fraction: part(
+            reached_fraction: fraction(
                 begun.iter().filter(|target| target.is_reached).count(),
                 begun.len(),
             ),
-            refused_fraction: part(all.len() - begun.len(), all.len()),
+            refused_fraction: fraction(all.len() - begun.len(), all.len()),
             clearance_mm_min: Clearance {
                 p5: order_statistic(&clearances, 0.05),
                 min: order_statistic(&clearances, 0.0),
             },
-            touched_fraction: part(touched, begun.len()),
+            touched_fraction: fraction(touched, begun.len()),
         })
     }
 }
@@ -161,11 +161,11 @@ impl StudySummary {
             return None;
         }
         let completed = |pick: fn(&FigureReport) -> Option<f64>| -> Vec<f64> {
-            let of = |trial: &TrialResult| match trial.outcome {
+            let value = |trial: &TrialResult| match trial.outcome {
                 Outcome::Completed => pick(&trial.figures).unwrap_or(f64::INFINITY),
                 Outcome::Stopped(_) => f64::INFINITY,
             };
-            trials.iter().map(of).collect()
+            trials.iter().map(value).collect()
         };
         let off_plane = completed(|figures| figures.off_plane_rms_mm);
         let settling = completed(|figures| figures.settling_mm);

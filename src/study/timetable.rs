@@ -26,13 +26,13 @@ impl SampleDue {
 /// One step.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct StepDue {
-    /// What corrects the observers since the step before, in order.
+    /// The positions that correct the observers since the step before, in order.
     pub(super) samples: Vec<SampleDue>,
-    /// The mean of all positions since the last step that had any.
+    /// The mean of all positions since the last step that had any, for the handedness watch.
     pub(super) mean: Option<SampleDue>,
     /// Depth of the step, mm.
     pub(super) insertion_mm: f64,
-    /// Depth from which its command is in force, mm.
+    /// Depth from which the command of the step applies, mm.
     pub(super) command_mm: f64,
 }
 
@@ -49,11 +49,10 @@ pub struct TimetableBuilder {
     tracker: TrackerModel,
     /// Positions averaged at a step.
     averaged: u32,
-    /// Every position corrects by itself.
+    /// Every position corrects the observers individually.
     takes_all: bool,
     is_inserting: bool,
-    /// When each position accepted since the step before was taken to be acquired, and when it was
-    /// received.
+    /// The assumed acquisition time and the receive time of each position accepted since the step before.
     received: Vec<(Time, Time)>,
     /// Time and measured depth of every SYNC.
     stage: Vec<(Time, f64)>,
@@ -62,7 +61,7 @@ pub struct TimetableBuilder {
 }
 
 impl TimetableBuilder {
-    /// A builder for these insertions, at a stage with this tracker.
+    /// A builder for insertions with this configuration, on a stage with this tracker.
     pub fn new(insertion: &InsertionConfig, tracker: TrackerModel) -> Self {
         let (averaged, takes_all) = match insertion.mode {
             InsertionMode::Continuous => (1, insertion.corrected_by == Samples::All),
@@ -96,9 +95,10 @@ impl TimetableBuilder {
                     .extend(acquired.map(|acquired| (acquired, sample.received.receive_time)));
             }
             Record::Step(step) => {
-                let samples = if self.takes_all { self.each() } else { self.newest(step) };
+                let samples =
+                    if self.takes_all { self.all_samples() } else { self.newest_sample(step) };
                 self.steps.push(StepDue {
-                    mean: samples.last().map(|sample| self.mean(sample)),
+                    mean: samples.last().map(|sample| self.mean_since_last_step(sample)),
                     samples,
                     insertion_mm: step.insertion_meas_mm,
                     command_mm: self.command_mm,
@@ -114,14 +114,14 @@ impl TimetableBuilder {
     }
 
     /// Every position accepted since the step before.
-    fn each(&mut self) -> Vec<SampleDue> {
+    fn all_samples(&mut self) -> Vec<SampleDue> {
         let received = std::mem::take(&mut self.received);
-        let due = |(acquired, received)| self.due(received, self.insertion_at(acquired));
+        let due = |(acquired, received)| self.sample_due(received, self.insertion_at(acquired));
         received.into_iter().map(due).collect()
     }
 
     /// The position that the step itself used; empty if it had none.
-    fn newest(&mut self, step: &StepRecord) -> Vec<SampleDue> {
+    fn newest_sample(&mut self, step: &StepRecord) -> Vec<SampleDue> {
         let received = std::mem::take(&mut self.received);
         let (Some(age_s), Some(insertion_meas_mm)) =
             (step.tip_meas_age_s, step.tip_meas_insertion_mm)
@@ -131,11 +131,14 @@ impl TimetableBuilder {
         let acquired_s = step.time.as_secs_f64() - age_s;
         let off_s = |&&(acquired, _): &&(Time, Time)| (acquired.as_secs_f64() - acquired_s).abs();
         let newest = received.iter().min_by(|a, b| off_s(a).total_cmp(&off_s(b)));
-        newest.map(|&(_, received)| self.due(received, insertion_meas_mm)).into_iter().collect()
+        newest
+            .map(|&(_, received)| self.sample_due(received, insertion_meas_mm))
+            .into_iter()
+            .collect()
     }
 
-    /// The position received at `received`, or its mean with those before it.
-    fn due(&self, received: Time, insertion_meas_mm: f64) -> SampleDue {
+    /// The position received at `received`, or the mean of it and those before it.
+    fn sample_due(&self, received: Time, insertion_meas_mm: f64) -> SampleDue {
         // The true latency, which may differ from the one that the session assumes.
         let sent_s = (received - self.tracker.latency).as_secs_f64();
         let sent = (sent_s / self.tracker.period.as_secs_f64()).round() as u64;
@@ -148,8 +151,8 @@ impl TimetableBuilder {
         }
     }
 
-    /// Every position after that of the last step, up to that of `sample`.
-    fn mean(&self, sample: &SampleDue) -> SampleDue {
+    /// The mean of all positions after those of the last step, up to `sample`.
+    fn mean_since_last_step(&self, sample: &SampleDue) -> SampleDue {
         let last = *sample.numbers.end();
         let before = self.steps.iter().rev().find_map(|step| step.mean.as_ref());
         let first = before.map_or(last, |mean| (mean.numbers.end() + 1).min(last));
@@ -160,7 +163,7 @@ impl TimetableBuilder {
         SampleDue { numbers: first..=last, insertion_true_mm, insertion_meas_mm }
     }
 
-    /// Depth of the tip when the position of this number was measured, mm.
+    /// Depth of the tip when the position with this number was measured, mm.
     fn measured_at_mm(&self, number: u64) -> f64 {
         let period_s = self.tracker.period.as_secs_f64();
         self.insertion_at(Time::from_secs_f64((number * self.times_sent()) as f64 * period_s))
@@ -171,7 +174,7 @@ impl TimetableBuilder {
         u64::from(self.tracker.repeats) + 1
     }
 
-    /// Depth at `time`, on the line between two SYNCs; 0 before the first, and as at the last after it.
+    /// Depth at `time`, mm, interpolated between two SYNCs; 0 before the first, constant after the last.
     fn insertion_at(&self, time: Time) -> f64 {
         let after = self.stage.partition_point(|&(sync, _)| sync < time);
         let Some(&(from, from_mm)) = after.checked_sub(1).and_then(|at| self.stage.get(at)) else {

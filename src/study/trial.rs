@@ -22,7 +22,7 @@ use nalgebra::Vector3;
 /// thousand under white noise.
 ///
 /// # Errors
-/// [`ObserverError`] if an observer refuses an input.
+/// [`ObserverError`] if an observer refuses its parameters.
 pub fn insert(
     session: &SessionConfig,
     stage: &VirtualStageConfig,
@@ -31,7 +31,7 @@ pub fn insert(
 ) -> Result<Outcome, ObserverError> {
     let mut steering = Steering::new(session)?;
     let mut needle = EmulatedNeedle::new(stage);
-    let (mut seen_mm, mut watched_mm) = (0.0, 0.0);
+    let (mut observed_mm, mut watched_mm) = (0.0, 0.0);
     let interval_s = stage.tracker.interval().as_secs_f64();
     let target_tool = session.goal.as_ref().and_then(|goal| goal.tool.as_ref());
     let mut corrected: Option<u64> = None;
@@ -40,7 +40,7 @@ pub fn insert(
         let (mut measured, mut innovation_mm, mut tip_positions) = (None, None, 0);
         for sample in &due.samples {
             let Some(tip_meas) = needle.measure(sample) else { continue };
-            let path = needle.base.between(seen_mm, sample.insertion_meas_mm);
+            let path = needle.base.between(observed_mm, sample.insertion_meas_mm);
             path.into_iter().for_each(|increment| steering.predict(increment));
             let (positions, newest) = (sample.positions(), *sample.numbers.end());
             let since = corrected
@@ -48,7 +48,7 @@ pub fn insert(
                 .map_or(f64::INFINITY, |last| (newest - last) as f64 * interval_s);
             let spacing_s = if positions > 1 { interval_s } else { since };
             innovation_mm = steering.correct(&tip_meas, positions, spacing_s);
-            seen_mm = seen_mm.max(sample.insertion_meas_mm);
+            observed_mm = observed_mm.max(sample.insertion_meas_mm);
             tip_positions += positions;
             measured = Some((sample.insertion_meas_mm, tip_meas));
         }
@@ -66,7 +66,7 @@ pub fn insert(
         }
         needle.seen_target_mm().into_iter().for_each(|target_mm| steering.set_target(target_mm));
         let is_last = step + 1 == timetable.steps.len();
-        let ahead = needle.base.between(seen_mm, due.insertion_mm);
+        let ahead = needle.base.between(observed_mm, due.insertion_mm);
         let decision = steering.decide(&ahead, is_last);
         let command = decision.rotation_cmd_rad_per_mm;
         let refused = decision.refused.clone();
@@ -77,14 +77,14 @@ pub fn insert(
             tip_meas_mm: measured.map(|(_, tip_meas)| tip_meas.mm()),
             tip_meas_insertion_mm: measured.map(|(insertion_meas_mm, _)| insertion_meas_mm),
             innovation_mm,
-            ..record(step, due.insertion_mm, &needle.base, decision)
+            ..step_record(step, due.insertion_mm, &needle.base, decision)
         };
         take(&record, &needle.truth(due.insertion_mm));
         if let Some(error) = refused {
             return Ok(Outcome::Stopped(error.to_string()));
         }
         if let Some(rate_rad_per_mm) = command {
-            needle.base.turn(due.command_mm, rate_rad_per_mm);
+            needle.base.set_rate(due.command_mm, rate_rad_per_mm);
             needle.insert_to(due.command_mm);
         }
         let rotation_rad = needle.base.rotation_at(due.command_mm);
@@ -98,8 +98,8 @@ pub fn insert(
         let next_mm = timetable.steps.get(step + 1).map(|next| next.insertion_mm);
         if let Some(end_mm) = end_mm.filter(|end_mm| next_mm.is_some_and(|next| *end_mm < next)) {
             needle.insert_to(end_mm);
-            let decision = steering.decide(&needle.base.between(seen_mm, end_mm), true);
-            let last = self::record(step + 1, end_mm, &needle.base, decision);
+            let decision = steering.decide(&needle.base.between(observed_mm, end_mm), true);
+            let last = step_record(step + 1, end_mm, &needle.base, decision);
             take(&last, &needle.truth(end_mm));
             break;
         }
@@ -112,7 +112,7 @@ struct EmulatedNeedle<'a> {
     stage: &'a VirtualStageConfig,
     tissue: Tissue,
     base: BasePath,
-    /// Where the tracker has seen the target, where it does.
+    /// The mean of the target's tracked positions; `None` before the first.
     target: Option<MovingMean>,
 }
 
@@ -131,7 +131,8 @@ impl<'a> EmulatedNeedle<'a> {
         Truth::new(*self.tissue.tip_true()).with_target(target_mm)
     }
 
-    /// Sees the target whenever it sees the tip; before the insertion, long enough for a mean.
+    /// Tracks the target at the times of the tip's samples, and before the insertion for as long as its mean
+    /// takes.
     fn see_target(&mut self, tool: &TargetTool, samples: &[SampleDue]) {
         let (Some(target), Some(first)) = (self.stage.target, samples.first()) else { return };
         let model = TargetModel::seen_by(self.stage.tracker);
@@ -167,8 +168,8 @@ impl<'a> EmulatedNeedle<'a> {
     }
 }
 
-/// The record of a step as a session makes it; a study has no times.
-fn record(step: usize, insertion_mm: f64, base: &BasePath, decision: Decision) -> StepRecord {
+/// The record of a step as a session makes it, without the times, which a study does not have.
+fn step_record(step: usize, insertion_mm: f64, base: &BasePath, decision: Decision) -> StepRecord {
     StepRecord {
         step: u32::try_from(step).unwrap_or(u32::MAX),
         insertion_meas_mm: insertion_mm,
