@@ -2,6 +2,7 @@
 
 use super::config::TrackerConfig;
 use super::record::SampleRecord;
+use super::tracking::Trouble;
 use crate::geometry::Pose;
 use crate::tracker::gate::is_tool;
 use crate::tracker::refusal::short;
@@ -179,11 +180,10 @@ impl TargetTracking {
         self.track.last().map(|fix| fix.acquisition_time)
     }
 
-    /// Why the needle cannot be steered to the target at `now`, with the last refusal or what the operator should
-    /// check; `None` while it can.
-    pub(super) fn trouble(&self, now: Time) -> Option<(String, String)> {
+    /// Why the needle cannot be steered to the target at `now`; `None` while it can.
+    pub(super) fn trouble(&self, now: Time) -> Option<Trouble> {
         let limit_s = self.hold_after.as_secs_f64();
-        let trouble = match self.last_acquisition().map(|last| now.seconds_after(last)) {
+        let what = match self.last_acquisition().map(|last| now.seconds_after(last)) {
             None => "the target has not been seen".to_owned(),
             _ if self.track.state(now) == TrackState::Waiting => {
                 "the target is not found yet: too few positions agree".to_owned()
@@ -196,9 +196,11 @@ impl TargetTracking {
             }
             Some(_) => return None,
         };
-        let why = self.last_refusal.as_ref().map(Refusal::to_string);
-        let tool = &self.tool.gate.tool;
-        Some((trouble, why.unwrap_or_else(|| format!("is \"{tool}\" in view? See goal.tool"))))
+        let why = match &self.last_refusal {
+            Some(refusal) => refusal.to_string(),
+            None => format!("is \"{}\" in view? See goal.tool", self.tool.gate.tool),
+        };
+        Some(Trouble { what, why })
     }
 }
 

@@ -26,6 +26,15 @@ const NEVER_PAIRED: &str = "the stage gave no position at its acquisition before
 /// Why the oldest of too many positions that wait is refused.
 const TOO_MANY_WAIT: &str = "too many positions wait for the stage's position at their acquisition";
 
+/// Why the needle cannot be steered for now.
+#[derive(Debug, Clone)]
+pub(super) struct Trouble {
+    /// What is wrong, with its numbers and limits.
+    pub(super) what: String,
+    /// What led to it, or what the operator should check.
+    pub(super) why: String,
+}
+
 /// The stream of the tracker.
 ///
 /// A sample first passes the gates that look at it alone ([`Tracking::take`]). During an insertion

@@ -5,6 +5,7 @@ use super::InsertTask;
 use crate::session::config::Resume;
 use crate::session::insertion::Insertion;
 use crate::session::shell::Shell;
+use crate::session::tracking::Trouble;
 use crate::session::{Lane, Severity, State};
 use crate::text::clipped;
 use crate::units::Time;
@@ -42,10 +43,9 @@ pub(super) struct EndedHold {
 #[derive(Debug, Clone)]
 enum HeldBy {
     Tracker {
-        /// How long and how far the insertion went on blind, or how the stream contradicts the model.
-        cause: String,
-        /// Why the tip was not seen, or what the operator should check.
-        why: String,
+        /// How long and how far the insertion went on blind, or how the stream contradicts the model; and why the
+        /// tip was not seen, or what the operator should check.
+        trouble: Trouble,
         /// The hold interrupted a single step, which never goes on by itself.
         in_step: bool,
     },
@@ -67,14 +67,14 @@ impl InsertTask {
         insertion_meas_mm: f64,
         insertion: &mut Insertion,
     ) -> Result<(), String> {
-        let found = self.hold_cause(now, insertion_meas_mm, insertion);
+        let found = self.trouble(now, insertion_meas_mm, insertion);
         let Some(hold) = &self.hold else {
-            if let Some((cause, why)) = found {
-                let text = format!("{cause}; insertion held; {why}");
+            if let Some(trouble) = found {
+                let text = format!("{}; insertion held; {}", trouble.what, trouble.why);
                 let text = clipped(&text, MESSAGE_MAX).into_owned();
                 insertion.profile.hold(self.config.tracker.hold.braking_mm_per_s2);
                 let in_step = insertion.profile.is_stepping();
-                let by = HeldBy::Tracker { cause, why, in_step };
+                let by = HeldBy::Tracker { trouble, in_step };
                 let before = self.ended_hold.map_or(Duration::ZERO, |ended| {
                     ended.lasted.saturating_sub(now.since(ended.at))
                 });
@@ -86,7 +86,7 @@ impl InsertTask {
             }
             return Ok(());
         };
-        let HeldBy::Tracker { cause, why, in_step } = &hold.by else { return Ok(()) };
+        let HeldBy::Tracker { trouble: first, in_step } = &hold.by else { return Ok(()) };
         let tracker = &self.config.tracker;
         let is_standing = insertion.is_standing(insertion_meas_mm);
         if tracker.hold.resume == Resume::Automatic
@@ -108,19 +108,18 @@ impl InsertTask {
             shell.report_at(now, Lane::Tracker, Severity::Info, text);
             return Ok(());
         }
-        let began = (cause.clone(), why.clone());
-        let (end, (cause, why)) = if tracker.hold.resume == Resume::Stop && is_standing {
-            ("held and stopped".to_owned(), began)
+        let (end, trouble) = if tracker.hold.resume == Resume::Stop && is_standing {
+            ("held and stopped".to_owned(), first)
         } else if now.since(hold.since) + hold.before >= tracker.hold.timeout {
             let in_a_row = if hold.before.is_zero() { "" } else { " in a row" };
             let timeout_s = tracker.hold.timeout.as_secs_f64();
-            // The first cause may be over and another may hold the insertion now.
-            let latest = found.unwrap_or(began);
+            // The first trouble may be over and another may hold the insertion now.
+            let latest = found.as_ref().unwrap_or(first);
             (format!("held for {timeout_s:.1} s{in_a_row} and stopped"), latest)
         } else {
             return Ok(());
         };
-        let text = format!("tracker: {cause}; {end}; {why}");
+        let text = format!("tracker: {}; {end}; {}", trouble.what, trouble.why);
         Err(clipped(&text, MESSAGE_MAX).into_owned())
     }
 
@@ -190,8 +189,8 @@ impl InsertTask {
         if !insertion.is_standing(insertion_mm) {
             return Err("the needle is still braking; try again once it stands".to_owned());
         }
-        if let Some((cause, why)) = self.hold_cause(shell.now, insertion_mm, insertion) {
-            return Err(clipped(&format!("{cause}; {why}"), MESSAGE_MAX).into_owned());
+        if let Some(Trouble { what, why }) = self.trouble(shell.now, insertion_mm, insertion) {
+            return Err(clipped(&format!("{what}; {why}"), MESSAGE_MAX).into_owned());
         }
         let remaining_mm = insertion.remaining_mm();
         // Many steps accumulate rounding errors; the insertion still ends exactly at its depth.
@@ -207,18 +206,13 @@ impl InsertTask {
         Ok(format!("{what} at {insertion_mm:.2} mm, held for {held_s:.2} s"))
     }
 
-    /// Why the insertion must be held, and what led to that or what the operator should check.
-    fn hold_cause(
-        &self,
-        now: Time,
-        insertion_meas_mm: f64,
-        insertion: &Insertion,
-    ) -> Option<(String, String)> {
+    /// Why the insertion must be held; `None` if nothing calls for a hold.
+    fn trouble(&self, now: Time, insertion_meas_mm: f64, insertion: &Insertion) -> Option<Trouble> {
         if let Some(jump) = &self.tracking.jump {
-            return Some((jump.clone(), JUMP_ADVICE.to_owned()));
+            return Some(Trouble { what: jump.clone(), why: JUMP_ADVICE.to_owned() });
         }
-        if let Some(blindness) = self.blindness(now, insertion_meas_mm, insertion) {
-            return Some((blindness, self.tracking.explain_silence()));
+        if let Some(what) = self.blindness(now, insertion_meas_mm, insertion) {
+            return Some(Trouble { what, why: self.tracking.explain_silence() });
         }
         self.target.as_ref()?.trouble(now)
     }

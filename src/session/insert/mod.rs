@@ -15,7 +15,7 @@ use super::state::State;
 use super::steering::Decision;
 use super::target::{MovingMean, TargetTracking};
 use super::task::Task;
-use super::tracking::Tracking;
+use super::tracking::{Tracking, Trouble};
 use super::{OperatorCommand, Progress, tracker_news};
 use crate::geometry::coordinates;
 use crate::observer::{Estimate, ObserverError};
@@ -296,8 +296,8 @@ impl InsertTask {
         let limit_s = self.config.tracker.timeout.as_secs_f64();
         let target = self.target.as_ref().filter(|_| self.tracking.is_seen(now));
         let text = match target.and_then(|target| target.trouble(now)) {
-            Some((trouble, why)) => {
-                format!("tracker: no target within {limit_s:.1} s; {trouble}; {why}")
+            Some(Trouble { what, why }) => {
+                format!("tracker: no target within {limit_s:.1} s; {what}; {why}")
             }
             None => {
                 let fresh_s = self.config.tracker.hold.after.as_secs_f64();
