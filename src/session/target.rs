@@ -125,7 +125,7 @@ impl TargetTracking {
         let (acquisition_time, position_mm) = match self.admit(sample) {
             Ok(admitted) => admitted,
             Err(refusal) => {
-                self.track.refuse(&refusal);
+                self.track.note_refusal(&refusal);
                 return Err(refusal);
             }
         };
@@ -172,7 +172,7 @@ impl TargetTracking {
 
     /// Where the target is, plane frame, mm, once it is found.
     pub(super) fn position_mm(&self) -> Option<Vector3<f64>> {
-        self.mean.mean_mm().filter(|_| self.track.is_held())
+        self.mean.mean_mm().filter(|_| self.track.is_established())
     }
 
     /// When its newest accepted position was acquired.
@@ -188,7 +188,7 @@ impl TargetTracking {
             _ if self.track.state(now) == TrackState::Waiting => {
                 "the target is not found yet: too few positions agree".to_owned()
             }
-            _ if !self.track.is_held() => {
+            _ if !self.track.is_established() => {
                 format!("the target is lost, {} refused in a row", self.track.refused_in_a_row())
             }
             Some(age_s) if age_s > limit_s => {

@@ -164,7 +164,7 @@ impl Tracking {
                 }
             }
             Err(refusal) => {
-                self.track.refuse(&refusal);
+                self.track.note_refusal(&refusal);
                 self.settle(now, &mut record, Some(refusal));
             }
         }
@@ -282,7 +282,7 @@ impl Tracking {
             return;
         }
         self.off_model_pairs += 1;
-        if self.off_model_pairs.is_power_of_two() && self.track.is_held() {
+        if self.off_model_pairs.is_power_of_two() && self.track.is_established() {
             let text = format!(
                 "two positions in a row do not fit the model (pair {} of this run): {refusal}",
                 self.off_model_pairs
@@ -367,7 +367,7 @@ impl Tracking {
 
     /// True while the tip is found, not lost, and was seen lately.
     pub(crate) fn is_seen(&self, now: Time) -> bool {
-        self.track.is_held() && self.is_fresh(now)
+        self.track.is_established() && self.is_fresh(now)
     }
 
     /// True while the newest accepted position is recent enough to steer by.

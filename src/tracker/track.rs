@@ -186,19 +186,19 @@ impl Track {
         let judged = self.check(&fix, prediction);
         match &judged {
             Ok(()) => self.believe(fix),
-            Err(refusal) => self.refuse(refusal),
+            Err(refusal) => self.note_refusal(refusal),
         }
         judged
     }
 
     /// Takes note of a sample that another gate has refused.
-    pub fn refuse(&mut self, refusal: &Refusal) {
+    pub fn note_refusal(&mut self, refusal: &Refusal) {
         let is_no_news =
             refusal.gate == GateName::Repeat && self.settings.kind == TrackerKind::Imaging;
         if refusal.effect != Effect::None && !is_no_news {
             self.refused = self.refused.saturating_add(1);
         }
-        let is_over = self.is_held() && self.refused >= self.settings.lost_after;
+        let is_over = self.is_established() && self.refused >= self.settings.lost_after;
         if is_over || refusal.effect == Effect::Loses {
             self.is_lost = true;
             self.agreeing = 0;
@@ -222,7 +222,7 @@ impl Track {
     }
 
     /// True once the tip is found and while it is not lost.
-    pub fn is_held(&self) -> bool {
+    pub fn is_established(&self) -> bool {
         self.is_found && !self.is_lost
     }
 

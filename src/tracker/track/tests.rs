@@ -63,10 +63,10 @@ fn a_repeated_frame_finds_no_lost_track() {
         assert_eq!(track.seek(standing(n, 0.1 * f64::from(n))), Ok(()));
     }
     let missing = Refusal::new(GateName::Status, "tool missing");
-    (0..5).for_each(|_| track.refuse(&missing));
-    assert!(!track.is_held());
+    (0..5).for_each(|_| track.note_refusal(&missing));
+    assert!(!track.is_established());
     assert_eq!(gate(track.seek(standing(3, 0.1 * 2.0))), Some(GateName::Repeat));
-    assert!(!track.is_held());
+    assert!(!track.is_established());
 }
 
 #[test]
@@ -101,11 +101,11 @@ fn a_tip_is_found_by_positions_that_agree() {
         "step: 30.0 mm in 0.025 s since the last tip (limit 3.8); is it another tool?"
     );
     assert_eq!(track.seek(standing(2, 0.1)), Ok(()));
-    assert!(!track.is_held());
+    assert!(!track.is_established());
     assert_eq!(track.seek(standing(3, 0.0)), Ok(()));
-    assert!(track.is_held());
+    assert!(track.is_established());
     assert!(track.seek(standing(4, 30.0)).is_err());
-    assert!(!track.is_held(), "it may be the one before that was wrong");
+    assert!(!track.is_established(), "it may be the one before that was wrong");
 }
 
 #[test]
@@ -117,7 +117,7 @@ fn spikes_of_one_and_two_are_refused_and_forgotten() {
         assert_eq!(gate(judge(&mut track, n, 18.0)), Some(GateName::Step));
     }
     assert_eq!(judge(&mut track, 14, 0.0), Ok(()));
-    assert!(track.is_held());
+    assert!(track.is_established());
 }
 
 /// A jump that stays is never followed, however long it lasts.
@@ -125,7 +125,7 @@ fn spikes_of_one_and_two_are_refused_and_forgotten() {
 fn a_lost_track_is_found_by_the_model_alone() {
     let mut track = followed(settings());
     for n in 10..15 {
-        assert!(track.is_held());
+        assert!(track.is_established());
         assert!(judge(&mut track, n, 12.0).is_err());
     }
     assert_eq!(track.state(fix(15, 0.0).receive_time), TrackState::Lost);
@@ -171,14 +171,14 @@ fn positions_far_off_are_no_part_of_the_mean() {
 fn a_lost_track_is_found_as_far_off_as_the_model_is_unsure() {
     let mut track = followed(settings());
     (10..15).for_each(|n| drop(judge(&mut track, n, 30.0)));
-    assert!(!track.is_held());
+    assert!(!track.is_established());
     for n in 15..18 {
         let fix = fix(n, 9.0);
         let unsure = Prediction { covariance_mm2: Some(Matrix3::identity() * 25.0), ..model(&fix) };
         let judged = track.judge(fix, Some(&unsure));
         assert_eq!(judged.is_ok(), n == 17, "{n}: {judged:?}");
     }
-    assert!(track.is_held());
+    assert!(track.is_established());
 }
 
 #[test]
@@ -193,11 +193,11 @@ fn a_frozen_value_is_refused_once_the_needle_has_moved_and_loses_the_track() {
     let mut track = followed(settings());
     let frozen = |n| Fix { position_mm: fix(9, 0.0).position_mm, ..fix(n, 0.0) };
     for n in 10..15 {
-        assert!(track.is_held());
+        assert!(track.is_established());
         let (fix, times) = (frozen(n), n as u32 - 9);
         assert_eq!(track.judge(fix, Some(&model(&fix))), Err(Refusal::repeat(times)));
     }
-    assert!(!track.is_held());
+    assert!(!track.is_established());
 }
 
 /// Without noise a standing needle gives the same value, and that is measured.
@@ -224,7 +224,7 @@ fn repeated_frames_of_an_imaging_tracker_are_no_news_and_lose_nothing() {
             Ok(()) => accepted += 1,
             Err(refusal) => assert_eq!(refusal.gate, GateName::Repeat, "{refusal}"),
         }
-        assert!(track.is_held());
+        assert!(track.is_established());
     }
     assert_eq!(accepted, 20);
     assert_eq!(track.state(fix(110, 0.0).receive_time), TrackState::Tracking, "its own period");
