@@ -177,7 +177,7 @@ impl TargetTracking {
 
     /// When its newest accepted position was acquired.
     pub(super) fn last_acquisition(&self) -> Option<Time> {
-        self.track.last().map(|fix| fix.acquisition_time)
+        self.track.last_believed().map(|fix| fix.acquisition_time)
     }
 
     /// Why the needle cannot be steered to the target at `now`; `None` while it can.

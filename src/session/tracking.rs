@@ -377,7 +377,7 @@ impl Tracking {
 
     /// When the newest accepted position was acquired.
     pub(crate) fn last_acquisition(&self) -> Option<Time> {
-        self.track.last().map(|fix| fix.acquisition_time)
+        self.track.last_believed().map(|fix| fix.acquisition_time)
     }
 
     /// Why there is no tip to steer by, and what to do: for the operator.

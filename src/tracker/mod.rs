@@ -2,10 +2,10 @@
 //! observer may see it.
 //!
 //! Everything here is pure: bytes and times come in, samples and refusals go out. Sockets are in
-//! `transport`. A sample goes through [`gate`] (which holds the [`registration`]), is dated by
-//! [`timing`], set against the stage's position by [`pairing`], and against its neighbours and the
-//! model by [`track`]; it is then a tip position at a known depth and rotation. A gate that refuses it
-//! says why in a [`refusal`].
+//! `transport`. [`gate`] checks a sample by itself and transforms it with the [`registration`],
+//! [`timing`] dates it, [`pairing`] finds the stage's position at that time, and [`track`] compares it
+//! with its neighbours and the model. It is then a tip position at a known depth and rotation. A check
+//! that refuses it says why in a [`refusal`].
 
 mod clock_offset;
 pub mod csv;

@@ -1,4 +1,4 @@
-//! Whether the positions of a stream are one needle's: against one another, and the model.
+//! Checks that the positions of a stream agree with one another and with the model of the needle.
 
 use super::refusal::{Effect, GateName, Refusal, short};
 use crate::keys::{choice, over, section, within};
@@ -17,12 +17,12 @@ choice! {
 }
 
 section! {
-    /// What a [`Track`] asks of positions.
+    /// The limits of a [`Track`].
     #[derive(Copy)]
     pub struct TrackSettings {
         /// Standard deviation of the noise of each coordinate, mm; ±1 mm uniform has 0.58.
         noise_sd_mm: f64 [over(0.0, 100.0)] = 0.6;
-        /// The tip moves no faster, mm/s.
+        /// The tip moves no faster than this, mm/s.
         tip_speed_max_mm_per_s: f64 [within(0.1, 10_000.0)] = 10.0;
         /// Noise allowed between two positions, in standard deviations.
         step_sds: f64 [within(1.0, 1e6)] = 6.0;
@@ -30,7 +30,7 @@ section! {
         innovation_chi2: f64 [within(1.0, 1e9)] = 16.3;
         /// Standard deviation of each coordinate of the model, mm, for observers without a covariance.
         model_sd_mm: f64 [within(0.0, 100.0)] = 1.0;
-        /// Added to any observer's, per mm since it was last corrected, mm.
+        /// Growth of the model's standard deviation per mm since the observer's last correction, mm.
         model_sd_per_mm: f64 [within(0.0, 10.0)] = 0.2;
         /// After so many refusals in a row the track is lost.
         lost_after: u32 [within(1.0, 1000.0)] = 5;
@@ -45,14 +45,14 @@ section! {
     }
 }
 
-/// A position of the tip that is to be judged.
+/// A position of the tip to judge.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Fix {
     /// When the bench received it.
     pub receive_time: Time,
     /// When the tip was there.
     pub acquisition_time: Time,
-    /// Where, mm, in a frame that stands still.
+    /// Where it was, mm, in a fixed frame.
     pub position_mm: Vector3<f64>,
     /// The stage's depth at that moment, mm; none before an insertion.
     pub insertion_mm: Option<f64>,
@@ -84,64 +84,66 @@ pub enum TrackState {
     Lost,
 }
 
-/// The last value, and how often it has come again.
+/// The position of the newest sample, accepted or not, and how often it was repeated.
 #[derive(Debug, Clone, Copy)]
-struct Value {
+struct Newest {
     position_mm: Vector3<f64>,
-    /// The stage's depth when the value first came, mm.
+    /// The stage's depth when this position first came, mm.
     insertion_mm: Option<f64>,
-    times: u32,
+    repeats: u32,
 }
 
-/// Less than this, mm, is no motion: counts of an encoder, and a drive that holds its target.
+/// A smaller change of depth, mm, is not motion: encoder counts, or a drive that holds its target.
 const STANDSTILL_MM: f64 = 0.01;
-/// Innovations over which a jump is looked for: 0.2 s of a tracker at 40 Hz.
+/// The test for a jump takes the mean of this many innovations: 0.2 s of a tracker at 40 Hz.
 const JUMP_POSITIONS: usize = 8;
-/// The innovation of a refused position counts among them up to this multiple of the largest step of
-/// the noise: one farther off would move their mean by itself.
+/// The innovation of a refused position is part of the mean only up to this multiple of the step that
+/// noise may cause (`step_sds`): a larger one would shift the mean by itself.
 const JUMP_STEPS: f64 = 2.0;
-/// Only so many of them count as independent: real noise is correlated.
+/// The mean has the noise of this many independent innovations: real noise is correlated.
 const JUMP_INDEPENDENT: f64 = 4.0;
-/// The limit of the squared Mahalanobis distance of their mean is this multiple of that of a single one:
-/// 41 by default, exceeded by chance once in 1e8.
+/// The χ² limit of the mean is this multiple of the limit of a single innovation: 41 by default, exceeded
+/// by chance once in 1e8.
 const JUMP_CHI2_TIMES: f64 = 2.5;
-/// The limit of the mean's lag behind the model along the heading (one degree of freedom, one side) is this
-/// share of the limit of the mean: 31.5 by default, exceeded by chance as seldom.
+/// The χ² limit of the mean's lag behind the model along the heading (one-sided, one degree of freedom) is
+/// this share of the limit of the mean: 31.5 by default, exceeded by chance as seldom.
 const LAG_CHI2_SHARE: f64 = 0.77;
 /// Standard deviation, mm, added to that of any model when a jump is looked for.
 const JUMP_MODEL_SD_MM: f64 = 0.2;
 const NO_MODEL: &str = "no observer has an estimate yet to find the tip again";
-/// The period is averaged over about so many positions.
+/// The period is averaged over about this many positions.
 const PERIOD_MEMORY: f64 = 16.0;
 
 /// The track of a tip: believes positions that follow from the ones before and from the model.
 ///
 /// Before an insertion the tip may be anywhere: it is found once some positions in a row are
-/// within a step of one another ([`Track::seek`]). During one ([`Track::judge`]):
+/// within a step of one another ([`Track::seek`]). During an insertion ([`Track::judge`]) a position must
+/// pass these checks:
 ///
-/// - **repeat**: the value of the last sample to the bit. From an electromagnetic tracker that is
-///   no measurement as soon as the needle has moved on; from an imaging one it never is.
+/// - **repeat**: it differs from the last sample. An electromagnetic tracker may repeat a position to
+///   the bit while the needle stands; a repeat from an imaging tracker is never a measurement.
 /// - **step**: `|p − p_last| ≤ v_max Δt + k σ`, from the last position believed.
 /// - **innovation**: `rᵀ S⁻¹ r` under the χ² limit, with r the distance from the model and
 ///   `S = P + (g d)² I + σ² I`, P the observer's covariance or a configured prior, d the
 ///   millimetres since its last correction and g the configured growth.
 /// - **jump**: the same test of the mean of the last innovations, which has less noise. Refused positions
 ///   count in it unless they are far off. It shows a jump that the noise of a single position hides, and
-///   the track is lost at once.
+///   the track is lost at once. A jump is reported before a step or an innovation.
 ///
-/// A jump is reported before what is wrong with the position by itself. After some refusals in a row the
-/// track is lost. Then the step is not checked, and the track is found again by positions that agree with
-/// the model, one after the other and in their mean, wherever the stream may have jumped to.
+/// After some refusals in a row the track is lost. Then the step is not checked: the stream may have
+/// jumped anywhere. The track is found again once enough positions in a row, and their mean, agree with
+/// the model.
 #[derive(Debug, Clone)]
 pub struct Track {
     settings: TrackSettings,
-    last: Option<Fix>,
-    value: Option<Value>,
+    last_believed: Option<Fix>,
+    newest: Option<Newest>,
     is_found: bool,
     is_lost: bool,
+    /// Positions in a row that agree: with one another before an insertion, with the model while lost.
     agreeing: u32,
-    refused: u32,
-    /// The last distances from the model, believed or not, without those far off.
+    refused_in_a_row: u32,
+    /// The last distances from the model, of believed and refused positions, without those far off.
     innovations_mm: VecDeque<Vector3<f64>>,
     period_s: Option<f64>,
 }
@@ -151,12 +153,12 @@ impl Track {
     pub fn new(settings: TrackSettings) -> Self {
         Track {
             settings,
-            last: None,
-            value: None,
+            last_believed: None,
+            newest: None,
             is_found: false,
             is_lost: false,
             agreeing: 0,
-            refused: 0,
+            refused_in_a_row: 0,
             innovations_mm: VecDeque::with_capacity(JUMP_POSITIONS),
             period_s: None,
         }
@@ -165,8 +167,8 @@ impl Track {
     /// Judges a position while the needle stands and no insertion has begun.
     ///
     /// # Errors
-    /// `Repeat` from an imaging tracker; `Step` away from the position before, which this one then
-    /// takes the place of.
+    /// `Repeat` from an imaging tracker; `Step` if it is too far from the position before, which it then
+    /// replaces.
     pub fn seek(&mut self, fix: Fix) -> Result<(), Refusal> {
         self.check_repeat(&fix)?;
         self.is_lost = false;
@@ -191,15 +193,15 @@ impl Track {
         judged
     }
 
-    /// Takes note of a sample that another gate has refused.
+    /// Counts a refusal, also one by another gate. Enough in a row lose the track.
     pub fn note_refusal(&mut self, refusal: &Refusal) {
-        let is_no_news =
+        let is_usual =
             refusal.gate == GateName::Repeat && self.settings.kind == TrackerKind::Imaging;
-        if refusal.effect != Effect::None && !is_no_news {
-            self.refused = self.refused.saturating_add(1);
+        if refusal.effect != Effect::None && !is_usual {
+            self.refused_in_a_row = self.refused_in_a_row.saturating_add(1);
         }
-        let is_over = self.is_established() && self.refused >= self.settings.lost_after;
-        if is_over || refusal.effect == Effect::Loses {
+        let is_limit_reached = self.refused_in_a_row >= self.settings.lost_after;
+        if (self.is_established() && is_limit_reached) || refusal.effect == Effect::Loses {
             self.is_lost = true;
             self.agreeing = 0;
         }
@@ -207,7 +209,7 @@ impl Track {
 
     /// What the operator sees at `now`.
     pub fn state(&self, now: Time) -> TrackState {
-        match self.last {
+        match self.last_believed {
             _ if self.is_lost => TrackState::Lost,
             Some(last) if self.is_found => {
                 let silent_s = now.seconds_after(last.receive_time);
@@ -221,19 +223,19 @@ impl Track {
         }
     }
 
-    /// True once the tip is found and while it is not lost.
+    /// True from when the tip is found until it is lost.
     pub fn is_established(&self) -> bool {
         self.is_found && !self.is_lost
     }
 
     /// Refusals in a row.
     pub fn refused_in_a_row(&self) -> u32 {
-        self.refused
+        self.refused_in_a_row
     }
 
     /// The last position believed.
-    pub fn last(&self) -> Option<&Fix> {
-        self.last.as_ref()
+    pub fn last_believed(&self) -> Option<&Fix> {
+        self.last_believed.as_ref()
     }
 
     fn check(&mut self, fix: &Fix, prediction: Option<&Prediction>) -> Result<(), Refusal> {
@@ -272,25 +274,25 @@ impl Track {
     }
 
     fn check_repeat(&mut self, fix: &Fix) -> Result<(), Refusal> {
-        let value = match &mut self.value {
-            Some(value) if value.position_mm == fix.position_mm => value,
+        let newest = match &mut self.newest {
+            Some(newest) if newest.position_mm == fix.position_mm => newest,
             _ => {
                 let Fix { position_mm, insertion_mm, .. } = *fix;
-                self.value = Some(Value { position_mm, insertion_mm, times: 0 });
+                self.newest = Some(Newest { position_mm, insertion_mm, repeats: 0 });
                 return Ok(());
             }
         };
-        value.times = value.times.saturating_add(1);
+        newest.repeats = newest.repeats.saturating_add(1);
         // Before an insertion the needle stands, wherever the stage is.
         let moved_mm =
-            fix.insertion_mm.map_or(0.0, |mm| mm - *value.insertion_mm.get_or_insert(mm));
-        let is_measured_anew =
+            fix.insertion_mm.map_or(0.0, |mm| mm - *newest.insertion_mm.get_or_insert(mm));
+        let may_repeat =
             self.settings.kind == TrackerKind::Electromagnetic && moved_mm.abs() <= STANDSTILL_MM;
-        if is_measured_anew { Ok(()) } else { Err(Refusal::repeat(value.times)) }
+        if may_repeat { Ok(()) } else { Err(Refusal::repeat(newest.repeats)) }
     }
 
     fn check_step(&self, fix: &Fix) -> Result<(), Refusal> {
-        let Some(last) = &self.last else { return Ok(()) };
+        let Some(last) = &self.last_believed else { return Ok(()) };
         let TrackSettings { tip_speed_max_mm_per_s, step_sds, noise_sd_mm, .. } = self.settings;
         let step_mm = (fix.position_mm - last.position_mm).norm();
         let after_s = fix.acquisition_time.seconds_after(last.acquisition_time).max(0.0);
@@ -330,8 +332,9 @@ impl Track {
         Err(Refusal::new(GateName::Innovation, why))
     }
 
-    /// Tests the mean of the last innovations, of which `independent` are independent, and how far it lags
-    /// behind the model. The lag shows first that a position stands while the tip goes on.
+    /// Tests the mean of the last `positions` innovations, which has the noise of `independent` independent
+    /// ones, and how far it lags behind the model along the heading. The lag is the first sign of a frozen
+    /// stream.
     fn check_jump(
         &self,
         prediction: &Prediction,
@@ -345,15 +348,15 @@ impl Track {
         let lag = prediction.heading * mean.dot(&prediction.heading).min(0.0);
         let lag_limit = LAG_CHI2_SHARE * limit;
         let tests = [(mean, limit, "off the model"), (lag, lag_limit, "behind the model")];
-        for (off, limit, how) in tests {
-            let chi2 = self.chi2(&off, prediction, noise_mm2 + JUMP_MODEL_SD_MM.powi(2));
+        for (offset, limit, direction) in tests {
+            let chi2 = self.chi2(&offset, prediction, noise_mm2 + JUMP_MODEL_SD_MM.powi(2));
             // Written so that NaN is refused.
             if chi2 <= limit {
                 continue;
             }
             let why = format!(
-                "the mean of {positions} is {} mm {how}, chi2 {} (limit {limit:.1})",
-                short(off.norm()),
+                "the mean of {positions} is {} mm {direction}, chi2 {} (limit {limit:.1})",
+                short(offset.norm()),
                 short(chi2)
             );
             let refusal = Refusal::new(GateName::Innovation, why);
@@ -376,15 +379,17 @@ impl Track {
     }
 
     fn believe(&mut self, fix: Fix) {
-        let since = self.last.map(|last| fix.acquisition_time.seconds_after(last.acquisition_time));
-        if let Some(interval_s) = since.filter(|interval_s| *interval_s > 0.0) {
-            // A gap is no period; a stream that has become slower is learnt all the same.
+        let interval_s = self
+            .last_believed
+            .map(|last| fix.acquisition_time.seconds_after(last.acquisition_time));
+        if let Some(interval_s) = interval_s.filter(|interval_s| *interval_s > 0.0) {
+            // Cut, so that a gap hardly changes the period; a stream that has become slower is still learnt.
             let period_s = self.period_s.unwrap_or(interval_s);
             let interval_s = interval_s.min(self.settings.coast_after_periods * period_s);
             self.period_s = Some(period_s + (interval_s - period_s) / PERIOD_MEMORY);
         }
-        self.refused = 0;
-        self.last = Some(fix);
+        self.refused_in_a_row = 0;
+        self.last_believed = Some(fix);
     }
 }
 

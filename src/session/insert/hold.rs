@@ -226,7 +226,7 @@ impl InsertTask {
         insertion: &Insertion,
     ) -> Option<String> {
         let tracker = &self.config.tracker;
-        let seen_at_mm = self.tracking.track.last().and_then(|fix| fix.insertion_mm);
+        let seen_at_mm = self.tracking.track.last_believed().and_then(|fix| fix.insertion_mm);
         let seen_at_mm = seen_at_mm.map_or(0.0, |mm| insertion.depth_mm(mm).max(0.0));
         let stands_at_mm = insertion
             .profile

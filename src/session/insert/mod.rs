@@ -325,7 +325,8 @@ impl Task for InsertTask {
     /// The axes get power only while the tip is seen at a start from which the plane, or the target, can be
     /// reached.
     fn permits_power(&mut self, shell: &mut Shell) -> Result<bool, String> {
-        let newest = self.tracking.track.last().copied().filter(|_| self.is_seen(shell.now));
+        let newest =
+            self.tracking.track.last_believed().copied().filter(|_| self.is_seen(shell.now));
         let Some(newest) = newest else {
             (self.is_start_accepted, self.start_in_doubt) = (false, None);
             return Ok(false);
