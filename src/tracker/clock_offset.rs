@@ -11,26 +11,27 @@ const AHEAD_MAX_NS: i64 = 50_000_000;
 /// An offset is learnt from at least this many samples, over at least this time.
 const SETTLING_SAMPLES: u32 = 3;
 const SETTLING_TIME: Duration = Duration::from_millis(200);
-/// None of them was delivered quicker than the first by more than this: while a queue empties, each
-/// delivery is quicker than the one before.
+/// Learning starts again if a sample is delivered quicker than the first by more than this: while a queue
+/// empties, each delivery is quicker than the one before.
 const SETTLING_FALL_NS: i64 = 20_000_000;
-/// None was delivered slower than the first by more than this.
+/// Learning starts again if a sample is delivered slower than the first by more than this.
 const SETTLING_RISE_NS: i64 = 1_000_000_000;
 
 /// A stamp that trails the quickest delivery by more than this is late, or the sender's clock was set
 /// back.
 const BEHIND_MIN_NS: i64 = 10_000_000;
-/// One that trails it by more than this is far late, and is not dated by the old offset while a new one
-/// is learnt.
+/// A stamp that trails it by more than this is far late. While a new offset is learnt, it is not dated by
+/// the old one.
 const DATED_BEHIND_MAX_NS: i64 = 40_000_000;
 /// A clock that goes back by this much or more is another clock, not a corrected one. Its offset is
 /// learnt over a longer time.
 const ANOTHER_CLOCK_NS: i64 = 500_000_000;
 const ANOTHER_CLOCK_TIME: Duration = Duration::from_secs(1);
-/// The operator is told when all stamps are far late for this time …
-const FAR_LATE_TIME: Duration = Duration::from_secs(1);
-/// … or late for this time, and at least this many of them.
-const LATE_TIME: Duration = Duration::from_secs(5);
+/// The operator is told when all stamps trail by more than the first limit for 1 s, or by more than the
+/// second for 5 s …
+const LATE_LIMITS: [(i64, Duration); 2] =
+    [(DATED_BEHIND_MAX_NS, Duration::from_secs(1)), (BEHIND_MIN_NS, Duration::from_secs(5))];
+/// … and there are at least this many of them.
 const LATE_SAMPLES: u32 = 10;
 
 /// Tracks the minimum of `receive − source` over the last 30 to 60 s. The quickest delivery shows the offset
@@ -39,12 +40,12 @@ const LATE_SAMPLES: u32 = 10;
 ///
 /// - The first samples of a connection are not believed: they may have waited in a queue, and there
 ///   are no others to compare them with. The offset counts once it has stopped falling.
-/// - A single stamp ahead would be the minimum for a minute, so it is set aside. If the stamps after
+/// - A single stamp ahead would be the minimum for a minute, so it is refused. If the stamps after
 ///   it agree with it, the sender's clock was set, and the offset is learnt again.
 /// - If a stamp goes back and the next ones go on from there, the sender's clock was set back: a
-///   connection keeps its order, so a queue never makes a stamp go back. The offset is learnt again if
-///   it is larger than just before the step back; where one stamp was only overtaken, it is not. Meanwhile
-///   stamps that are a little late are dated by the old offset, and others are refused.
+///   connection keeps its order, so a queue never makes a stamp go back. The new offset counts if it is
+///   larger than just before the step back; otherwise a stamp was only overtaken by another. While it is
+///   learnt, stamps that are a little late are dated by the old offset, and others are refused.
 /// - Stamps that are later than before but never went back may have waited. They are dated by the
 ///   old offset. If it was the clock after all, they are dated too old, never too young. The
 ///   operator is told.
@@ -54,7 +55,7 @@ pub(super) struct ClockOffset {
     candidate: Settling,
     /// A stamp went back, and none since has matched the old offset.
     went_back: bool,
-    /// Stamps that are all far late, and that are all late.
+    /// The present run of late stamps by each of [`LATE_LIMITS`].
     late: [Option<Late>; 2],
     news: Option<String>,
 }
@@ -65,8 +66,16 @@ struct Known {
     offset: Minimum,
     /// The last stamp that was dated.
     last_source_ns: i64,
-    /// `receive − source` of the last one that was dated before a stamp went back.
-    before_ns: Option<i64>,
+    /// `receive − source` of the last stamp that was dated before a stamp went back.
+    before_step_back_ns: Option<i64>,
+}
+
+impl Known {
+    /// True if `offset` is larger than just before the step back.
+    fn has_risen_to(&self, offset: &Minimum) -> bool {
+        let rise_ns = |before_ns| offset.ns().saturating_sub(before_ns);
+        self.before_step_back_ns.is_none_or(|before_ns| rise_ns(before_ns) > BEHIND_MIN_NS)
+    }
 }
 
 /// A run of stamps that are all late.
@@ -75,7 +84,7 @@ struct Late {
     since: Time,
     samples: u32,
     least_ns: i64,
-    is_told: bool,
+    is_reported: bool,
 }
 
 impl ClockOffset {
@@ -86,7 +95,7 @@ impl ClockOffset {
     pub(super) fn update(&mut self, receive: Time, source_ns: i64) -> Result<i64, Refusal> {
         let offset_ns = receive.as_nanos().saturating_sub(source_ns);
         let Some(known) = &mut self.known else {
-            let learnt = self.candidate.take(receive, source_ns, offset_ns, SETTLING_TIME);
+            let learnt = self.candidate.add(receive, source_ns, offset_ns, SETTLING_TIME);
             let offset = learnt.map_err(still_learning)?;
             return Ok(self.learn(offset, source_ns, None));
         };
@@ -98,18 +107,14 @@ impl ClockOffset {
         let known_ns = known.offset.ns();
         let behind_ns = offset_ns.saturating_sub(known_ns);
         let is_ahead = behind_ns < -AHEAD_MAX_NS;
-        let goes_on = self.went_back && self.candidate.goes_on(source_ns, offset_ns);
-        self.went_back = behind_ns > BEHIND_MIN_NS && (goes_on || back_ns > 0);
+        let continues = self.went_back && self.candidate.is_continued_by(source_ns, offset_ns);
+        self.went_back = behind_ns > BEHIND_MIN_NS && (continues || back_ns > 0);
         if is_ahead || self.went_back {
             let is_another = behind_ns >= ANOTHER_CLOCK_NS;
-            let time = if is_another { ANOTHER_CLOCK_TIME } else { SETTLING_TIME };
-            let has_risen = |offset: &Minimum| {
-                let rise_ns = |before_ns| offset.ns().saturating_sub(before_ns);
-                known.before_ns.is_none_or(|before_ns| rise_ns(before_ns) > BEHIND_MIN_NS)
-            };
-            match self.candidate.take(receive, source_ns, offset_ns, time) {
+            let settling_time = if is_another { ANOTHER_CLOCK_TIME } else { SETTLING_TIME };
+            match self.candidate.add(receive, source_ns, offset_ns, settling_time) {
                 Ok(offset) if is_ahead => return Ok(self.learn(offset, source_ns, None)),
-                Ok(offset) if has_risen(&offset) => {
+                Ok(offset) if known.has_risen_to(&offset) => {
                     let by_s = seconds(offset.ns().saturating_sub(known_ns));
                     let news = format!(
                         "the sender's clock was set back by {by_s:.3} s; its offset was learnt again"
@@ -119,10 +124,12 @@ impl ClockOffset {
                 // Stamps were only overtaken.
                 Ok(_) => (self.candidate, self.went_back) = (Settling::default(), false),
                 Err(samples) if is_ahead || behind_ns > DATED_BEHIND_MAX_NS => {
-                    return Err(match is_ahead {
-                        _ if back_ns > 0 => went_back(back_ns),
-                        true => ahead(behind_ns.saturating_neg()),
-                        false => still_learning(samples),
+                    return Err(if back_ns > 0 {
+                        went_back(back_ns)
+                    } else if is_ahead {
+                        ahead(behind_ns.saturating_neg())
+                    } else {
+                        still_learning(samples)
                     });
                 }
                 Err(_) => {}
@@ -135,17 +142,17 @@ impl ClockOffset {
         }
         known.last_source_ns = source_ns;
         if !self.went_back {
-            known.before_ns = Some(offset_ns);
+            known.before_step_back_ns = Some(offset_ns);
         }
         let dated_by_ns = known.offset.update(receive, offset_ns);
         self.note_late(receive, offset_ns.saturating_sub(dated_by_ns));
         Ok(dated_by_ns)
     }
 
-    /// Starts anew with an offset that was learnt with this stamp.
+    /// Starts again with an offset that was learnt up to this stamp.
     fn learn(&mut self, offset: Minimum, source_ns: i64, news: Option<String>) -> i64 {
         let ns = offset.ns();
-        let known = Known { offset, last_source_ns: source_ns, before_ns: None };
+        let known = Known { offset, last_source_ns: source_ns, before_step_back_ns: None };
         *self = ClockOffset { known: Some(known), news, ..ClockOffset::default() };
         ns
     }
@@ -155,22 +162,21 @@ impl ClockOffset {
         self.news.take()
     }
 
-    /// Counts stamps that are late by `late_ns`, and reports each kind once.
+    /// Counts a stamp that is late by `late_ns`, and reports a run of late stamps once.
     fn note_late(&mut self, receive: Time, late_ns: i64) {
-        let kinds = [(DATED_BEHIND_MAX_NS, FAR_LATE_TIME), (BEHIND_MIN_NS, LATE_TIME)];
-        let mut is_told = false;
-        for (run, (min_ns, time)) in self.late.iter_mut().zip(kinds) {
-            if late_ns <= min_ns {
+        let mut is_reported = false;
+        for (run, (limit_ns, time)) in self.late.iter_mut().zip(LATE_LIMITS) {
+            if late_ns <= limit_ns {
                 *run = None;
                 continue;
             }
-            let first = Late { since: receive, samples: 0, least_ns: late_ns, is_told: false };
+            let first = Late { since: receive, samples: 0, least_ns: late_ns, is_reported: false };
             let late = run.get_or_insert(first);
             late.samples = late.samples.saturating_add(1);
             late.least_ns = late.least_ns.min(late_ns);
             let lasts = late.samples >= LATE_SAMPLES && receive.since(late.since) >= time;
-            // Those that are far late are late as well.
-            if lasts && !late.is_told && !is_told {
+            // A run over the first limit is over the second as well.
+            if lasts && !late.is_reported && !is_reported {
                 self.news = Some(format!(
                     "by their stamps, positions come {:.3} s later than before: delayed, or the sender's \
                      clock was set back or runs slow; they are dated as delayed; if it was the clock, \
@@ -178,8 +184,8 @@ impl ClockOffset {
                     seconds(late.least_ns)
                 ));
             }
-            late.is_told |= lasts || is_told;
-            is_told |= late.is_told;
+            late.is_reported |= lasts || is_reported;
+            is_reported |= late.is_reported;
         }
     }
 }
@@ -239,27 +245,29 @@ struct Settling {
 
 impl Settling {
     /// True if a stamp continues those that the offset is being learnt from.
-    fn goes_on(&self, source_ns: i64, offset_ns: i64) -> bool {
+    fn is_continued_by(&self, source_ns: i64, offset_ns: i64) -> bool {
         let rise_ns = offset_ns.saturating_sub(self.first_ns);
         self.since.is_some()
             && source_ns >= self.last_source_ns
             && (-SETTLING_FALL_NS..=SETTLING_RISE_NS).contains(&rise_ns)
     }
 
-    /// The offset once it has been stable for `time`; before that, the number of samples it is being
-    /// learnt from.
-    fn take(
+    /// Adds a stamp. Returns the offset once it has been stable for `time`.
+    ///
+    /// # Errors
+    /// Before that, the number of samples so far.
+    fn add(
         &mut self,
         receive: Time,
         source_ns: i64,
         offset_ns: i64,
         time: Duration,
     ) -> Result<Minimum, u32> {
-        let goes_on = self.goes_on(source_ns, offset_ns);
+        let continues = self.is_continued_by(source_ns, offset_ns);
         let since = match self.since {
             // Sent twice: it says nothing about the clock.
             Some(_) if source_ns == self.last_source_ns => return Err(self.samples),
-            Some(since) if goes_on => {
+            Some(since) if continues => {
                 self.samples += 1;
                 self.least_ns = self.least_ns.min(offset_ns);
                 since
