@@ -1,54 +1,64 @@
-//! Whether the tip travels as far as the needle is inserted.
+//! Checks that the tip travels as far as the needle is inserted.
 //!
 //! A needle's shaft does not stretch: whatever way it bends, its tip travels a millimetre for each
 //! millimetre inserted. Over a stretch of depth the slope of the positions against the depth, a
 //! vector, therefore has a length near 1, whatever the needle, the start and the turns of the base.
-//! A stream that is frozen but for noise has 0, one of wrong scale its scale, one that jumped more.
+//! In a stream that is frozen but for noise the length is near 0, in one of wrong scale it is the scale,
+//! and after a jump it is larger than 1.
 
 mod change;
 
 use super::refusal::{Effect, Refusal};
-use change::{Change, FASTER, SLOWER, Tenths};
+use change::{FASTER, SLOWER, ScaleChange, Tenths};
 use nalgebra::Vector3;
 use std::collections::VecDeque;
 
 /// Positions are summed in bins of this depth, mm.
 const BIN_MM: f64 = 0.25;
-/// Bins in each stretch that is looked at: 3 to 64 mm.
+/// Lengths of the stretches that are checked, in bins: 3 to 64 mm.
 const STRETCHES: [usize; 10] = [12, 16, 24, 32, 48, 64, 96, 128, 192, BINS_MAX];
 const BINS_MAX: usize = 256;
-/// Fewer positions than this in a stretch say nothing.
+/// A stretch with fewer positions is not checked.
 const POSITIONS_MIN: f64 = 6.0;
-/// Positions count as independent only so many to a mm: real noise is correlated.
+/// At most this many positions per mm count as independent: real noise is correlated.
 const INDEPENDENT_PER_MM: f64 = 10.0;
 /// Standard deviations of the slope's length that are allowed for noise, besides the tolerance.
 const NOISE_SDS: f64 = 5.5;
-/// Bins over which positions that contradict the model are explained: 8 mm.
+/// The explanation of a refusal looks at this many bins: 8 mm.
 const EXPLAINED_BINS: usize = 32;
-/// What is tolerated besides noise: a share of the way, and a length over the whole stretch, mm.
-/// 59 recorded insertions of a real needle (docs/decisions/0013) stay inside with every stretch:
-/// 0.70 to 1.22 over 2.5 mm, 0.89 to 1.05 over 10 mm, 0.93 to 1.02 over 30 mm.
-const SHORT: (f64, f64) = (0.06, 0.75);
-const LONG: (f64, f64) = (0.03, 0.5);
+/// The tolerances of a slope that is too short and of one that is too long. 59 recorded insertions of a
+/// real needle (docs/decisions/0013) stay within them over every stretch: 0.70 to 1.22 over 2.5 mm, 0.89
+/// to 1.05 over 10 mm, 0.93 to 1.02 over 30 mm.
+const SHORT: Tolerance = Tolerance { share: 0.06, length_mm: 0.75 };
+const LONG: Tolerance = Tolerance { share: 0.03, length_mm: 0.5 };
 /// The slope along an arc of angle φ is shorter than the arc by φ²/40 of it; a needle may be more curved than
 /// configured by this factor.
 const CURVATURE_MARGIN: f64 = 1.3;
+
+/// What is tolerated besides noise.
+struct Tolerance {
+    /// A share of the travel.
+    share: f64,
+    /// A length over the whole stretch, mm.
+    length_mm: f64,
+}
 
 /// Follows the slope of the accepted positions over the depth.
 #[derive(Debug, Clone)]
 pub struct TravelCheck {
     noise_sd_mm: f64,
     curvature_per_mm: f64,
-    bins: VecDeque<Bin>,
-    /// Number of the bin at the back.
-    number: i64,
+    /// The sums of each bin, the newest at the back.
+    bins: VecDeque<Sums>,
+    /// The depth of the newest bin, in bins.
+    newest_bin: i64,
     error: Option<String>,
 }
 
-/// Sums over the positions of a stretch: `Σ 1, Σ ℓ, Σ ℓ², Σ p, Σ ℓ p, Σ pᵀp`, depth and position
-/// counted from a common origin.
+/// Sums over the positions of a bin or a stretch: `Σ 1, Σ ℓ, Σ ℓ², Σ p, Σ ℓ p, Σ pᵀp`. Depth and position
+/// are counted from a common origin.
 #[derive(Debug, Clone, Copy, Default)]
-struct Bin {
+struct Sums {
     count: f64,
     depth_mm: f64,
     depth_mm2: f64,
@@ -57,10 +67,10 @@ struct Bin {
     square_mm2: f64,
 }
 
-impl Bin {
+impl Sums {
     /// The sums of one position.
     fn of(insertion_mm: f64, position_mm: &Vector3<f64>) -> Self {
-        Bin {
+        Sums {
             count: 1.0,
             depth_mm: insertion_mm,
             depth_mm2: insertion_mm * insertion_mm,
@@ -70,7 +80,7 @@ impl Bin {
         }
     }
 
-    fn add(&mut self, other: &Bin) {
+    fn add(&mut self, other: &Sums) {
         self.count += other.count;
         self.depth_mm += other.depth_mm;
         self.depth_mm2 += other.depth_mm2;
@@ -81,55 +91,56 @@ impl Bin {
 }
 
 impl TravelCheck {
-    /// A check of the positions of a needle of this curvature, with this noise, mm, the standard
-    /// deviation of each coordinate; more is allowed for where the positions themselves scatter more.
+    /// A check for a needle of this curvature. `noise_sd_mm` is the standard deviation of the noise of each
+    /// coordinate; where the positions scatter more, their own scatter counts instead.
     pub fn new(noise_sd_mm: f64, curvature_per_mm: f64) -> Self {
-        TravelCheck { noise_sd_mm, curvature_per_mm, bins: VecDeque::new(), number: 0, error: None }
+        let (bins, newest_bin) = (VecDeque::new(), 0);
+        TravelCheck { noise_sd_mm, curvature_per_mm, bins, newest_bin, error: None }
     }
 
     /// Takes an accepted position, measured at this depth of the stage, mm.
     pub fn take(&mut self, insertion_mm: f64, position_mm: &Vector3<f64>) {
-        let number = (insertion_mm / BIN_MM).floor() as i64;
-        if self.bins.is_empty() || number > self.number {
+        let bin = (insertion_mm / BIN_MM).floor() as i64;
+        if self.bins.is_empty() || bin > self.newest_bin {
             self.check_stretches();
-            // Bins without a position are kept empty, so that places tell depths.
-            let first = if self.bins.is_empty() { number - 1 } else { self.number };
-            for _ in 0..(number - first).min(BINS_MAX as i64) {
-                self.bins.push_back(Bin::default());
+            // A bin without positions is kept, so that the place of a bin gives its depth.
+            let added = if self.bins.is_empty() { 1 } else { bin - self.newest_bin };
+            for _ in 0..added.min(BINS_MAX as i64) {
+                self.bins.push_back(Sums::default());
                 if self.bins.len() > BINS_MAX {
                     self.bins.pop_front();
                 }
             }
-            self.number = number;
+            self.newest_bin = bin;
         }
-        // An encoder's step back belongs to the newest bin.
-        if let Some(bin) = self.bins.back_mut() {
-            bin.add(&Bin::of(insertion_mm, position_mm));
+        // After an encoder's step back the position still counts to the newest bin.
+        if let Some(newest) = self.bins.back_mut() {
+            newest.add(&Sums::of(insertion_mm, position_mm));
         }
     }
 
-    /// Whether the tip may travel like this.
+    /// Checks that no stretch so far contradicts the insertion.
     ///
     /// # Errors
-    /// From the first stretch on that contradicts the insertion: the run is to be stopped.
+    /// The first stretch that does: the run must stop.
     pub fn check(&self) -> Result<(), String> {
         self.error.clone().map_or(Ok(()), Err)
     }
 
-    /// Looks at every stretch that ends with the newest bin, the shortest first.
+    /// Checks every stretch that ends with the newest bin, the shortest first.
     fn check_stretches(&mut self) {
-        let mut sum = Bin::default();
+        let mut sums = Sums::default();
         for (bins, bin) in (1..).zip(self.bins.iter().rev()) {
-            sum.add(bin);
+            sums.add(bin);
             if STRETCHES.contains(&bins) {
-                let error = self.contradiction(&sum, bins);
+                let error = self.contradiction(&sums, bins);
                 self.error = self.error.take().or(error);
             }
         }
     }
 
-    /// Adds the likely cause to a refusal that loses the track: frozen or of too small a scale, where the
-    /// travel shows it.
+    /// Adds the likely cause to a refusal that loses the track: a frozen stream or too small a scale if the
+    /// travel shows it, otherwise a list.
     pub fn explain(&self, mut refusal: Refusal) -> Refusal {
         if refusal.effect == Effect::Loses {
             refusal.why += &match self.change_over(EXPLAINED_BINS, SLOWER) {
@@ -140,35 +151,40 @@ impl TravelCheck {
         refusal
     }
 
-    /// What changed over the last bins, to a scale in this range.
-    fn change_over(&self, bins: usize, tenths: Tenths) -> Option<Change> {
+    /// The change to a scale in this range that fits the last `bins` bins, if any does.
+    fn change_over(&self, bins: usize, tenths: Tenths) -> Option<ScaleChange> {
         let bins = self.bins.iter().rev().take(bins);
-        Change::fitted(bins, tenths, self.noise_sd_mm.powi(2))
+        ScaleChange::fitted(bins, tenths, self.noise_sd_mm.powi(2))
     }
 
-    /// What the sums over a stretch of so many bins say against the insertion.
-    fn contradiction(&self, sum: &Bin, bins: usize) -> Option<String> {
-        let (n, stretch_mm) = (sum.count, bins as f64 * BIN_MM);
+    /// How the positions over the last `bins` bins, with these sums, contradict the insertion, if they do.
+    fn contradiction(&self, sums: &Sums, bins: usize) -> Option<String> {
+        let (n, stretch_mm) = (sums.count, bins as f64 * BIN_MM);
         if n < POSITIONS_MIN {
             return None;
         }
-        let spread_mm2 = (sum.depth_mm2 - sum.depth_mm * sum.depth_mm / n).max(0.0);
-        // Where the positions do not fill the stretch evenly, as much as would have their spread.
+        let spread_mm2 = (sums.depth_mm2 - sums.depth_mm * sums.depth_mm / n).max(0.0);
+        // The length of an evenly filled stretch with the same spread.
         let filled_mm = (12.0 * spread_mm2 / n).sqrt().min(stretch_mm);
         if filled_mm < 0.75 * stretch_mm {
             return None;
         }
-        let slope = (sum.product_mm2 - sum.position_mm * (sum.depth_mm / n)) / spread_mm2;
-        let scatter_mm2 = sum.square_mm2 - sum.position_mm.norm_squared() / n;
+        let slope = (sums.product_mm2 - sums.position_mm * (sums.depth_mm / n)) / spread_mm2;
+        let scatter_mm2 = sums.square_mm2 - sums.position_mm.norm_squared() / n;
         let residual_mm2 = (scatter_mm2 - slope.norm_squared() * spread_mm2).max(0.0);
         let variance_mm2 = (residual_mm2 / (3.0 * (n - 2.0))).max(self.noise_sd_mm.powi(2));
         let independent = n.min(INDEPENDENT_PER_MM * filled_mm);
         let sd = (variance_mm2 / (spread_mm2 * independent / n)).sqrt();
         let ratio = slope.norm();
         let bend_rad = CURVATURE_MARGIN * self.curvature_per_mm * stretch_mm;
-        let min = 1.0 - SHORT.0 - SHORT.1 / filled_mm - bend_rad * bend_rad / 40.0 - NOISE_SDS * sd;
+        let min = 1.0
+            - SHORT.share
+            - SHORT.length_mm / filled_mm
+            - bend_rad * bend_rad / 40.0
+            - NOISE_SDS * sd;
         // On average noise lengthens the slope: its two components across it add 2 sd² to the squared length.
-        let max = (1.0 + 2.0 * sd * sd).sqrt() + LONG.0 + LONG.1 / filled_mm + NOISE_SDS * sd;
+        let max =
+            (1.0 + 2.0 * sd * sd).sqrt() + LONG.share + LONG.length_mm / filled_mm + NOISE_SDS * sd;
         (ratio < min || ratio > max).then(|| {
             let change = self.change_over(bins, if ratio < min { SLOWER } else { FASTER });
             let what = change.map_or("a jump, or a drift".to_owned(), |change| change.to_string());

@@ -1,30 +1,31 @@
 //! The depth from which a tip no longer travels as far as the needle is inserted, and its scale since.
 
-use super::{BIN_MM, Bin};
+use super::{BIN_MM, Sums};
 use std::fmt;
 use std::ops::RangeInclusive;
 
-/// Scales that are tried, in tenths.
+/// A range of scales to try, in tenths.
 pub(super) type Tenths = RangeInclusive<u32>;
-/// A frozen stream, and those of too small a scale …
+/// A frozen stream (0), and scales that are too small.
 pub(super) const SLOWER: Tenths = 0..=9;
-/// … and of too large a one.
+/// Scales that are too large.
 pub(super) const FASTER: Tenths = 11..=20;
-/// A stream is called frozen unless a scale fits better by so much, in variances of the noise …
+/// A stream is called frozen unless another scale fits better by this margin, in variances of the noise.
 const FROZEN_MARGIN: f64 = 10.0;
-/// … and nothing has changed unless a change fits better by so much.
+/// A change is reported only if it fits better than none by this margin, in variances of the noise.
 const CHANGE_MARGIN: f64 = 15.0;
 
-/// A tip that travels as far as the needle is inserted up to a depth, and by a scale of it from there.
+/// A tip that travels as far as the needle is inserted up to a depth, and from there on by `scale` times
+/// as far.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(in crate::tracker) struct Change {
-    /// Inserted since, mm.
+pub(in crate::tracker) struct ScaleChange {
+    /// Depth inserted since the change, mm.
     since_mm: f64,
-    /// Travel of the tip per mm inserted since; 0 is frozen.
+    /// Travel of the tip per mm inserted since the change; 0 is frozen.
     scale: f64,
 }
 
-impl fmt::Display for Change {
+impl fmt::Display for ScaleChange {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.scale {
             0.0 => write!(f, "frozen for the last {:.1} mm", self.since_mm),
@@ -33,29 +34,29 @@ impl fmt::Display for Change {
     }
 }
 
-impl Change {
+impl ScaleChange {
     /// The change to a scale of `tenths` that fits the positions of these bins best, newest bin first, with
     /// noise of this variance in each coordinate, mm²; `None` if a stream without a change fits as well.
     pub(super) fn fitted<'a>(
-        bins: impl Iterator<Item = &'a Bin>,
+        bins: impl Iterator<Item = &'a Sums>,
         tenths: Tenths,
         variance_mm2: f64,
-    ) -> Option<Change> {
-        // The sums after each depth where it may have changed.
-        let mut after = vec![Bin::default()];
+    ) -> Option<Self> {
+        // The sums over the positions after each depth at which the scale may have changed.
+        let mut after = vec![Sums::default()];
         for bin in bins {
-            let mut sum = after[after.len() - 1];
-            sum.add(bin);
-            after.push(sum);
+            let mut sums = after[after.len() - 1];
+            sums.add(bin);
+            after.push(sums);
         }
         let all = *after.last()?;
         let best = |tenths: Tenths| {
             let scales = tenths.map(|tenths| f64::from(tenths) / 10.0);
             let fits = scales.flat_map(|scale| {
-                let after = after.iter().enumerate().filter(|(_, sum)| sum.count > 0.0);
-                after.map(move |(bins, sum)| {
+                let after = after.iter().enumerate().filter(|(_, sums)| sums.count > 0.0);
+                after.map(move |(bins, sums)| {
                     let since_mm = bins as f64 * BIN_MM;
-                    (misfit_mm2(&all, sum, scale), Change { since_mm, scale })
+                    (misfit_mm2(&all, sums, scale), ScaleChange { since_mm, scale })
                 })
             });
             fits.min_by(|(a, _), (b, _)| a.total_cmp(b))
@@ -70,17 +71,18 @@ impl Change {
     }
 }
 
-/// The least sum of squares, mm², that a straight line leaves whose travel is the depth, and `scale`
-/// times the depth over the positions of `after`.
+/// The smallest sum of squared residuals, mm², of a tip that moves on a straight line, by 1 mm per mm of
+/// depth before the change and by `scale` after it. `after` are the sums over the positions after the
+/// change.
 ///
-/// With `m` the travel, the line is `a + u m`, `|u| = 1`: `a` and `u` at their best leave
+/// With the travel `m` the line is `a + u m`, `|u| = 1`. The best `a` and `u` leave
 /// `S_pp + S_mm − 2 |S_mp|`, sums about the mean.
-fn misfit_mm2(all: &Bin, after: &Bin, scale: f64) -> f64 {
-    // The depth at which the positions of `after` begin, half their spread before their mean.
+fn misfit_mm2(all: &Sums, after: &Sums, scale: f64) -> f64 {
+    // The depth of the change: positions spread evenly begin √3 standard deviations before their mean.
     let mean_mm = after.depth_mm / after.count;
     let spread_mm2 = after.depth_mm2 / after.count - mean_mm * mean_mm;
     let change_mm = mean_mm - (3.0 * spread_mm2.max(0.0)).sqrt();
-    // After it, m = c (1 − s) + s ℓ: what the sums over the depth gain by that.
+    // After the change at depth c, m = c (1 − s) + s ℓ. The sums over the travel:
     let at_change_mm = change_mm * (1.0 - scale);
     let travel_mm =
         all.depth_mm - after.depth_mm + at_change_mm * after.count + scale * after.depth_mm;
@@ -104,22 +106,22 @@ mod tests {
     use nalgebra::Vector3;
 
     /// What fits a tip whose travel is `travel` of the depth, over 8 mm, in a direction that is no axis.
-    fn fitted(tenths: Tenths, travel: impl Fn(f64) -> f64) -> Option<Change> {
+    fn fitted(tenths: Tenths, travel: impl Fn(f64) -> f64) -> Option<ScaleChange> {
         let heading = Vector3::new(1.0, 2.0, 2.0) / 3.0;
         let bins = (0..32).rev().map(|bin| {
-            let mut sum = Bin::default();
+            let mut sum = Sums::default();
             for n in 0..5 {
                 let depth_mm = 100.0 + BIN_MM * (f64::from(bin) + f64::from(n) / 5.0);
-                sum.add(&Bin::of(depth_mm, &(heading * travel(depth_mm - 100.0))));
+                sum.add(&Sums::of(depth_mm, &(heading * travel(depth_mm - 100.0))));
             }
             sum
         });
-        Change::fitted(bins.collect::<Vec<_>>().iter(), tenths, 0.01)
+        ScaleChange::fitted(bins.collect::<Vec<_>>().iter(), tenths, 0.01)
     }
 
     #[test]
     fn a_change_is_found_with_its_scale_and_where_it_came() {
-        let change = |since_mm, scale| Some(Change { since_mm, scale });
+        let change = |since_mm, scale| Some(ScaleChange { since_mm, scale });
         let after_5 = |scale: f64| move |mm: f64| mm.min(5.0) + scale * (mm - 5.0).max(0.0);
         assert_eq!(fitted(SLOWER, after_5(0.0)), change(3.0, 0.0));
         assert_eq!(fitted(SLOWER, after_5(0.5)), change(3.0, 0.5));
@@ -131,13 +133,13 @@ mod tests {
 
     #[test]
     fn without_positions_nothing_is_said() {
-        assert_eq!(Change::fitted([].iter(), SLOWER, 0.36), None);
-        assert_eq!(Change::fitted([Bin::default()].iter(), SLOWER, 0.36), None);
+        assert_eq!(ScaleChange::fitted([].iter(), SLOWER, 0.36), None);
+        assert_eq!(ScaleChange::fitted([Sums::default()].iter(), SLOWER, 0.36), None);
     }
 
     #[test]
     fn a_change_is_told_with_its_numbers() {
-        let said = |scale| Change { since_mm: 3.04, scale }.to_string();
+        let said = |scale| ScaleChange { since_mm: 3.04, scale }.to_string();
         assert_eq!(said(0.0), "frozen for the last 3.0 mm");
         assert_eq!(said(0.5), "of scale 0.5 for the last 3.0 mm");
     }
