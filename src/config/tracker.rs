@@ -12,8 +12,8 @@ use crate::observer::PositionNoise;
 use crate::session::{self, HoldConfig};
 use crate::tracker::openigtlink::ToolStream;
 use crate::tracker::{
-    AcquisitionClock, CsvMapping, Gate, Protocol, Registration, StampPolicy, TrackSettings,
-    TrackerKind, Workspace,
+    AcquisitionClock, ContentChecks, CsvMapping, Gate, Protocol, Registration, StampPolicy,
+    TrackSettings, TrackerKind, Workspace,
 };
 
 pub(super) const FILE: Rule = named("the path of a file");
@@ -184,9 +184,11 @@ impl TrackerConfig {
             tool: self.tool.clone(),
             registration: Registration::new(Pose::identity()),
             workspace: None,
-            rotation: self.gates.rotation,
-            zero: self.gates.zero,
-            status: self.gates.status,
+            checks: ContentChecks {
+                rotation: self.gates.rotation,
+                zero: self.gates.zero,
+                status: self.gates.status,
+            },
         }
     }
 

@@ -1,4 +1,4 @@
-//! What a sample must pass by itself, before it is dated and set against the others.
+//! The checks of a single sample, before it is dated and compared with others.
 
 use super::openigtlink::DEVICE_NAME_LEN;
 use super::refusal::{GateName, Refusal, short};
@@ -8,16 +8,16 @@ use crate::keys::{Rule, section, within};
 use crate::text::clipped;
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 
-/// How far the squared length of a quaternion may be from 1: rounding alone.
+/// How far the squared length of a quaternion may be from 1: enough for rounding.
 const ROTATION_TOLERANCE: f64 = 1e-6;
-/// A message shows this many characters of what a peer chose.
+/// A message shows at most this many characters of a peer's text.
 const SHOWN_MAX: usize = 40;
 /// Senders send this when they have no measurement.
 const ZERO_POSE: &str = "the exact zero pose, which stands for a tool that was not seen";
 
 /// Passes samples that can be a measurement at all. It checks in this order: the tool, finite
 /// numbers, a rotation, not the exact zero or identity that stands for "nothing seen", valid by the
-/// tracker's own word, registered, inside the workspace.
+/// tracker's own status, registered, inside the workspace.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Gate {
     /// The tool to steer by; samples of other tools are refused.
@@ -26,6 +26,13 @@ pub struct Gate {
     pub registration: Registration,
     /// The box on the bench that the tip can be in.
     pub workspace: Option<Workspace>,
+    /// The checks that the configuration asks for.
+    pub checks: ContentChecks,
+}
+
+/// Checks of a sample's content that can be switched off.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ContentChecks {
     /// Refuse a sample whose orientation is not a rotation; without this check its position is used
     /// alone.
     pub rotation: bool,
@@ -50,9 +57,9 @@ section! {
 
 impl Gate {
     /// True for a sample that is a measurement by itself, wherever the tracker stands: finite, a
-    /// rotation, not the exact zero, and valid by the tracker's own word.
+    /// rotation, not the exact zero, and valid by the tracker's own status.
     pub fn is_measurement(sample: &Sample) -> bool {
-        is_finite(&sample.position_mm) && check_content(sample, true, true, true).is_ok()
+        is_finite(&sample.position_mm) && ContentChecks::ALL.check(sample).is_ok()
     }
 
     /// The tip's position on the bench, `p_WB` in mm, finite.
@@ -68,7 +75,7 @@ impl Gate {
         if !is_finite(&sample.position_mm) {
             return Err(Refusal::not_finite(&sample.position_mm));
         }
-        check_content(sample, self.rotation, self.zero, self.status)?;
+        self.checks.check(sample)?;
         let p_wb_mm = self.registration.tip_mm(sample)?;
         // The registration can overflow what was finite.
         if !is_finite(&p_wb_mm) {
@@ -82,15 +89,13 @@ impl Gate {
 }
 
 impl Workspace {
-    /// Whether the tip can be there.
+    /// Checks that the tip can be at `p_wb_mm`.
     ///
     /// # Errors
-    /// [`Refusal`], by the first coordinate outside.
+    /// [`Refusal`] of the first coordinate outside the box.
     pub fn check(&self, p_wb_mm: &Vector3<f64>) -> Result<(), Refusal> {
-        let limits = self.min_mm.iter().zip(&self.max_mm);
-        for ((axis, &value_mm), (&min_mm, &max_mm)) in
-            ['x', 'y', 'z'].iter().zip(p_wb_mm).zip(limits)
-        {
+        for (k, axis) in ['x', 'y', 'z'].into_iter().enumerate() {
+            let (value_mm, min_mm, max_mm) = (p_wb_mm[k], self.min_mm[k], self.max_mm[k]);
             if !(min_mm..=max_mm).contains(&value_mm) {
                 let why = format!(
                     "tip at {axis} = {} mm, outside {min_mm:.1} to {max_mm:.1} mm; check the registration",
@@ -103,28 +108,30 @@ impl Workspace {
     }
 }
 
-/// Checks the orientation, the zeros and the status.
-fn check_content(sample: &Sample, rotation: bool, zero: bool, status: bool) -> Result<(), Refusal> {
-    let turned = sample.orientation.as_ref().is_none_or(is_rotation);
-    if rotation && !(turned && sample.validity != Validity::NotARotation) {
-        return Err(Refusal::new(GateName::Rotation, "the orientation sent is not a rotation"));
-    }
-    let at_zero = sample.position_mm == Vector3::zeros()
-        && sample.orientation.is_none_or(|q| q.to_rotation_matrix() == Rotation3::identity());
-    if zero && at_zero {
-        return Err(Refusal::new(GateName::Zero, ZERO_POSE));
-    }
-    match &sample.validity {
-        Validity::Valid | Validity::NotARotation => Ok(()),
-        invalid if status => {
-            let why = clipped(&invalid.to_string(), SHOWN_MAX).into_owned();
-            Err(Refusal::new(GateName::Status, why))
+impl ContentChecks {
+    const ALL: Self = ContentChecks { rotation: true, zero: true, status: true };
+
+    fn check(self, sample: &Sample) -> Result<(), Refusal> {
+        let is_bad_rotation = sample.validity == Validity::NotARotation
+            || sample.orientation.is_some_and(|orientation| !is_rotation(&orientation));
+        if self.rotation && is_bad_rotation {
+            return Err(Refusal::new(GateName::Rotation, "the orientation sent is not a rotation"));
         }
-        _ => Ok(()),
+        let is_zero = sample.position_mm == Vector3::zeros()
+            && sample.orientation.is_none_or(|q| q.to_rotation_matrix() == Rotation3::identity());
+        if self.zero && is_zero {
+            return Err(Refusal::new(GateName::Zero, ZERO_POSE));
+        }
+        let is_valid = matches!(sample.validity, Validity::Valid | Validity::NotARotation);
+        if self.status && !is_valid {
+            let why = clipped(&sample.validity.to_string(), SHOWN_MAX).into_owned();
+            return Err(Refusal::new(GateName::Status, why));
+        }
+        Ok(())
     }
 }
 
-/// A source may fill a `UnitQuaternion` unchecked.
+/// True for a unit quaternion: a `UnitQuaternion` can be built without a check.
 fn is_rotation(quaternion: &UnitQuaternion<f64>) -> bool {
     // Written so that NaN is refused.
     (quaternion.norm_squared() - 1.0).abs() <= ROTATION_TOLERANCE
@@ -156,9 +163,7 @@ mod tests {
                 min_mm: Vector3::new(-50.0, -50.0, -1.0),
                 max_mm: Vector3::new(50.0, 50.0, 200.0),
             }),
-            rotation: true,
-            zero: true,
-            status: true,
+            checks: ContentChecks::ALL,
         }
     }
 
@@ -228,11 +233,11 @@ mod tests {
         let missing = Sample { validity: Validity::Missing, ..sample(1.0, 2.0, 3.0) };
         let skewed = Sample { validity: Validity::NotARotation, ..sample(1.0, 2.0, 3.0) };
         assert!([&zero, &missing, &skewed].iter().all(|sample| gate.admit(sample).is_err()));
-        gate.zero = false;
+        gate.checks.zero = false;
         assert_eq!(gate.admit(&zero), Ok(Vector3::zeros()));
-        gate.status = false;
+        gate.checks.status = false;
         assert!(gate.admit(&missing).is_ok() && gate.admit(&skewed).is_err());
-        gate.rotation = false;
+        gate.checks.rotation = false;
         assert!(gate.admit(&skewed).is_ok());
         gate.workspace = None;
         assert!(gate.admit(&sample(1.0, 2.0, 200.5)).is_ok());

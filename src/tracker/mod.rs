@@ -27,7 +27,7 @@ mod travel;
 
 pub use csv::{CsvMapping, TimeColumns};
 pub use event::{Census, Event};
-pub use gate::{Gate, Workspace};
+pub use gate::{ContentChecks, Gate, Workspace};
 pub use pairing::{StageHistory, StageIncrement, StagePoint};
 pub use reader::{Protocol, Reader};
 pub use refusal::{Effect, GateCounts, GateName, Refusal};
