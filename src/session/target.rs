@@ -4,7 +4,7 @@ use super::config::TrackerConfig;
 use super::record::SampleRecord;
 use super::tracking::Trouble;
 use crate::geometry::Pose;
-use crate::tracker::gate::is_tool;
+use crate::tracker::gate::is_same_tool;
 use crate::tracker::refusal::short;
 use crate::tracker::{
     AcquisitionClock, Fix, Gate, GateName, Prediction, Refusal, Sample, Track, TrackState,
@@ -86,7 +86,7 @@ impl TargetTracking {
 
     /// True if `sample` is of the target.
     pub(super) fn is_own(&self, sample: &Sample) -> bool {
-        is_tool(&sample.tool, &self.tool.gate.tool)
+        is_same_tool(&sample.tool, &self.tool.gate.tool)
     }
 
     /// A new connection may have another sender's clock.

@@ -6,7 +6,7 @@ use super::record::{Record, SampleRecord, Severity};
 use crate::geometry::Pose;
 use crate::needle::TipPosition;
 use crate::session::{Lane, State};
-use crate::tracker::gate::is_tool;
+use crate::tracker::gate::is_same_tool;
 use crate::tracker::openigtlink::Status;
 use crate::tracker::{
     AcquisitionClock, Census, Effect, Event, Fix, GateCounts, GateName, Refusal, Sample,
@@ -262,7 +262,7 @@ impl Tracking {
                     _ if refusal.gate == GateName::Innovation => self.warn_of_jump(now, &refusal),
                     _ => {}
                 }
-                if is_tool(&record.received.tool, &self.config.gate.tool) {
+                if is_same_tool(&record.received.tool, &self.config.gate.tool) {
                     self.last_refusal = Some(refusal.to_string());
                 }
                 record.position_plane_mm = None;

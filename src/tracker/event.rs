@@ -1,6 +1,6 @@
 //! The events of a tracker's connection, and a census of them.
 
-use super::gate::is_tool;
+use super::gate::is_same_tool;
 use super::openigtlink::Status;
 use super::sample::Sample;
 use crate::text::clipped;
@@ -118,7 +118,7 @@ impl Census {
 
     /// True once a sample of `tool` has come.
     pub fn has(&self, tool: &str) -> bool {
-        self.samples.keys().any(|sent| is_tool(sent, tool))
+        self.samples.keys().any(|sent| is_same_tool(sent, tool))
     }
 
     /// Says that `tool` has not come, what has instead, and what to do.

@@ -67,7 +67,7 @@ impl Gate {
     /// # Errors
     /// [`Refusal`], by the first check that fails.
     pub fn admit(&self, sample: &Sample) -> Result<Vector3<f64>, Refusal> {
-        if !is_tool(&sample.tool, &self.tool) {
+        if !is_same_tool(&sample.tool, &self.tool) {
             let sent = clipped(&sample.tool, SHOWN_MAX);
             let why = format!("\"{sent}\" is not the tool steered by");
             return Err(Refusal::new(GateName::Tool, why));
@@ -143,7 +143,7 @@ fn is_finite(p_mm: &Vector3<f64>) -> bool {
 
 /// True if `sent` names the tool `wanted`. A name that fills the header's field may be the start
 /// of a longer one: version 1 has no room for the rest.
-pub fn is_tool(sent: &str, wanted: &str) -> bool {
+pub fn is_same_tool(sent: &str, wanted: &str) -> bool {
     sent == wanted || (sent.len() == DEVICE_NAME_LEN && wanted.starts_with(sent))
 }
 
@@ -267,8 +267,8 @@ mod tests {
 
     #[test]
     fn a_name_cut_by_the_protocol_is_still_the_tool() {
-        assert!(is_tool("NeedleTipToTrackerBa", "NeedleTipToTrackerBase"));
-        assert!(!is_tool("NeedleTipToTracker", "NeedleTipToTrackerBase"));
-        assert!(!is_tool("NeedleTipToTrackerBase", "NeedleTipToTrackerBa"));
+        assert!(is_same_tool("NeedleTipToTrackerBa", "NeedleTipToTrackerBase"));
+        assert!(!is_same_tool("NeedleTipToTracker", "NeedleTipToTrackerBase"));
+        assert!(!is_same_tool("NeedleTipToTrackerBase", "NeedleTipToTrackerBa"));
     }
 }

@@ -1,6 +1,6 @@
 //! One measurement of a tool, whatever protocol it came by.
 
-use super::gate::is_tool;
+use super::gate::is_same_tool;
 use super::openigtlink::{Body, Message, Quaternion, tool_kind};
 use super::orientation::Orientation;
 use crate::units::Time;
@@ -147,7 +147,7 @@ fn device_validity(message: &Message) -> Validity {
 fn tool_validity(message: &Message, tool: &str) -> Validity {
     let of_tool = message.metadata.iter().find_map(|(key, status)| {
         let name = key.strip_suffix("Status")?;
-        is_tool(tool, name).then(|| Validity::from_status(status))
+        is_same_tool(tool, name).then(|| Validity::from_status(status))
     });
     of_tool.unwrap_or_else(|| device_validity(message))
 }

@@ -1,7 +1,7 @@
 //! Keeps other tools, and floods of notices, away from the session.
 
 use super::event::{Event, has_positions};
-use super::gate::is_tool;
+use super::gate::is_same_tool;
 use super::reader::Reader;
 use crate::units::Time;
 use std::collections::BTreeSet;
@@ -69,7 +69,7 @@ impl Sieve {
     }
 
     fn is_own(&self, sent: &str) -> bool {
-        self.tools.is_empty() || self.tools.iter().any(|tool| is_tool(sent, tool))
+        self.tools.is_empty() || self.tools.iter().any(|tool| is_same_tool(sent, tool))
     }
 
     /// Takes one of the notices that may pass at `now`; false if none is left.

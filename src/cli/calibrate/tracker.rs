@@ -94,7 +94,7 @@ fn recorded(text: &str, tracker: &TrackerConfig) -> Result<Vec<RestSample>, Stri
             _ => None,
         })
     };
-    let of_tool = |sample: &&Sample| gate::is_tool(&sample.tool, &tracker.tool);
+    let of_tool = |sample: &&Sample| gate::is_same_tool(&sample.tool, &tracker.tool);
     let found: Vec<RestSample> = samples().filter(of_tool).map(rest_sample).collect();
     if found.is_empty() {
         let other = samples().map(|sample| sample.tool.as_str()).next().unwrap_or_default();

@@ -12,7 +12,7 @@ use crate::cli::output::{has_no_reader, print_stderr, print_stdout, refuse_exist
 use crate::config::TrackerConfig;
 use crate::session::SampleRecord;
 use crate::text::{clipped, table};
-use crate::tracker::gate::is_tool;
+use crate::tracker::gate::is_same_tool;
 use crate::tracker::{AcquisitionClock, Event, Gate, GateCounts, Refusal, Sample, Validity};
 use crate::units::Time;
 use clap::{Args, Subcommand};
@@ -149,7 +149,7 @@ fn list(arguments: &ListArguments) -> Result<(), Failure> {
         return Err(listener.no_samples());
     }
     let configured = &listener.config.tracker.tool;
-    let is_configured = |name: &String| is_tool(name, configured);
+    let is_configured = |name: &String| is_same_tool(name, configured);
     if arguments.json {
         let tools: Vec<Value> =
             tools.iter().map(|(name, tool)| tool.json(name, is_configured(name))).collect();
