@@ -155,7 +155,7 @@ impl Columns {
             orientation: None,
             validity: Validity::Valid,
         };
-        Ok(Some(sample.oriented(orientation)))
+        Ok(Some(sample.with_orientation(orientation)))
     }
 }
 

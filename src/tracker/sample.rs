@@ -16,21 +16,21 @@ pub struct Sample {
     pub tool: String,
     /// When the sample was received, on the session's time line.
     pub receive_time: Time,
-    /// When the sender says it was measured, in nanoseconds since 1970; none without a stamp.
+    /// When the sender says it was measured, in nanoseconds since 1970; `None` without a stamp.
     pub source_unix_ns: Option<i64>,
     /// `p_TS`: position of the tool's sensor S in T, mm.
     pub position_mm: Vector3<f64>,
-    /// `R_TS`: orientation of the sensor in T; none where none was sent, or nothing that is a
-    /// rotation. A quaternion, as it is recorded, so that a replay turns by the same bits.
+    /// `R_TS`: orientation of the sensor in T; `None` if none was sent, or what was sent is not a
+    /// rotation. It is kept as a quaternion, like in the record, so that a replay has the same bits.
     pub orientation: Option<UnitQuaternion<f64>>,
-    /// The tracker's own verdict on it.
+    /// The tracker's own verdict on the sample.
     pub validity: Validity,
 }
 
 /// The tracker's own verdict on a measurement.
 #[derive(Debug, Clone, PartialEq, Eq, derive_more::Display)]
 pub enum Validity {
-    /// Measured, or nothing was said of it.
+    /// Measured, or sent without a status.
     #[display("valid")]
     Valid,
     /// The tool is not plugged in (`MISSING`).
@@ -48,8 +48,8 @@ pub enum Validity {
 }
 
 impl Validity {
-    /// What PLUS's word for a transform's status says: `OK`, `MISSING`, `OUT_OF_VIEW`, or another
-    /// fault, which is kept.
+    /// The validity for PLUS's status of a transform: `OK`, `MISSING`, `OUT_OF_VIEW`, or another fault,
+    /// whose text is kept.
     pub fn from_status(status: &str) -> Self {
         match status {
             "OK" => Validity::Valid,
@@ -60,7 +60,7 @@ impl Validity {
         }
     }
 
-    /// The word that [`Validity::from_status`] reads.
+    /// The status that [`Validity::from_status`] reads as this validity.
     pub fn status(&self) -> &str {
         match self {
             Validity::Valid => "OK",
@@ -72,7 +72,7 @@ impl Validity {
     }
 }
 
-/// The bench's own word, beside those of PLUS.
+/// A status of the bench, in addition to those of PLUS.
 const NOT_A_ROTATION: &str = "NOT_A_ROTATION";
 
 impl Sample {
@@ -88,35 +88,35 @@ impl Sample {
                 orientation: None,
                 validity,
             }
-            .oriented(orientation)
+            .with_orientation(orientation)
         };
-        let of_device =
+        let device_sample =
             |pose| vec![sample(message.full_device_name(), device_validity(message), pose)];
-        let of_tool = |name: &str, kind, (position, orientation)| {
+        let tool_sample = |name: &str, kind, (position, orientation)| {
             let has_orientation = kind != tool_kind::THREE_D;
             let orientation = if has_orientation { orientation } else { Orientation::Absent };
             sample(name, tool_validity(message, name), (position, orientation))
         };
         match &message.body {
-            Body::Transform(matrix) => of_device(matrix_pose(matrix)),
+            Body::Transform(matrix) => device_sample(matrix_pose(matrix)),
             Body::Position { position_mm, quaternion } => {
-                of_device((*position_mm, quaternion_orientation(quaternion)))
+                device_sample((*position_mm, quaternion_orientation(quaternion)))
             }
             Body::TrackingData(tools) => tools
                 .iter()
-                .map(|tool| of_tool(&tool.name, tool.kind, matrix_pose(&tool.pose)))
+                .map(|tool| tool_sample(&tool.name, tool.kind, matrix_pose(&tool.pose)))
                 .collect(),
             Body::QuaternionTrackingData(tools) => tools
                 .iter()
-                .map(|tool| of_tool(&tool.name, tool.kind, quaternion_pose(&tool.pose)))
+                .map(|tool| tool_sample(&tool.name, tool.kind, quaternion_pose(&tool.pose)))
                 .collect(),
             Body::Status(_) | Body::Other(_) => Vec::new(),
         }
     }
 
-    /// The sample with the orientation that was sent with it, if any; one that is no rotation makes
-    /// it invalid, unless the tracker has called it so already.
-    pub(super) fn oriented(mut self, sent: Orientation) -> Self {
+    /// The sample with the orientation that was sent with it. One that is not a rotation makes the sample
+    /// invalid, unless the tracker already called it invalid.
+    pub(super) fn with_orientation(mut self, sent: Orientation) -> Self {
         match sent {
             Orientation::Absent => {}
             Orientation::Rotation(quaternion) => self.orientation = Some(quaternion),
@@ -129,37 +129,37 @@ impl Sample {
     }
 }
 
-/// PLUS's metadata of the device: `TransformStatus` names the fault, `TransformValid` is true or
-/// false. Valid where neither is there.
+/// The validity by PLUS's metadata of the device: `TransformStatus` names the fault, `TransformValid` is
+/// true or false. Without either the device is valid.
 fn device_validity(message: &Message) -> Validity {
     let status = message.metadata("TransformStatus").map_or(Validity::Valid, Validity::from_status);
-    let is_true = |word: &str| word.eq_ignore_ascii_case("true") || word == "1";
-    match message.metadata("TransformValid").filter(|word| !is_true(word)) {
-        Some(word) if status == Validity::Valid => {
-            Validity::Invalid(format!("TransformValid is {word}"))
+    let is_true = |value: &str| value.eq_ignore_ascii_case("true") || value == "1";
+    match message.metadata("TransformValid").filter(|value| !is_true(value)) {
+        Some(value) if status == Validity::Valid => {
+            Validity::Invalid(format!("TransformValid is {value}"))
         }
         _ => status,
     }
 }
 
-/// PLUS's metadata of one tool of several, `<name>Status`, its name whole where the message has it
-/// cut; else what is said of the device.
+/// The validity of one of several tools by PLUS's metadata `<name>Status`, which has the tool's whole name
+/// even where the message truncates it. Without this key it is the validity of the device.
 fn tool_validity(message: &Message, tool: &str) -> Validity {
-    let of_tool = message.metadata.iter().find_map(|(key, status)| {
+    let own = message.metadata.iter().find_map(|(key, status)| {
         let name = key.strip_suffix("Status")?;
         is_same_tool(tool, name).then(|| Validity::from_status(status))
     });
-    of_tool.unwrap_or_else(|| device_validity(message))
+    own.unwrap_or_else(|| device_validity(message))
 }
 
-/// Position and orientation in the numbers of a TRANSFORM.
+/// Position and orientation from the numbers of a TRANSFORM.
 fn matrix_pose(numbers: &[f32; 12]) -> ([f32; 3], Orientation) {
     let [xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz] = *numbers;
     let columns = [xx, xy, xz, yx, yy, yz, zx, zy, zz].map(f64::from);
     ([px, py, pz], Orientation::of_matrix(&Matrix3::from_column_slice(&columns)))
 }
 
-/// The same in the numbers of a tool of QTDATA.
+/// Position and orientation from the numbers of a QTDATA tool.
 fn quaternion_pose(numbers: &[f32; 7]) -> ([f32; 3], Orientation) {
     let [px, py, pz, x, y, z, w] = *numbers;
     ([px, py, pz], quaternion_orientation(&Quaternion::Full([x, y, z, w])))

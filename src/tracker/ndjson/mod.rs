@@ -93,7 +93,7 @@ impl Line {
             orientation: None,
             validity: self.status.map_or(Validity::Valid, |status| Validity::from_status(&status)),
         }
-        .oriented(orientation)
+        .with_orientation(orientation)
     }
 }
 
