@@ -2,9 +2,10 @@
 
 use super::gate::is_same_tool;
 use super::openigtlink::Status;
+use super::reader::Reader;
 use super::sample::Sample;
 use crate::text::clipped;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// An event on the connection to a tracker.
 #[derive(Debug, Clone, PartialEq)]
@@ -59,9 +60,7 @@ impl Event {
     }
 }
 
-/// The most names kept of one connection: a peer with more is faulty or hostile.
-const NAMES_MAX: usize = 64;
-/// Names shown of those, and characters of each.
+/// A message shows at most this many names, and this many characters of each.
 const NAMES_SHOWN: usize = 2;
 const SHOWN_MAX: usize = 22;
 /// The message about a missing tool has at most this many characters.
@@ -75,8 +74,10 @@ pub struct Census {
     messages: u64,
     /// How many messages were refused, and why the last one was.
     refused: Option<(u64, String)>,
-    samples: BTreeMap<String, u64>,
-    unread: BTreeMap<String, String>,
+    /// Tools whose samples came.
+    tools: BTreeSet<String>,
+    /// Devices that were reported by name, with the type of their messages.
+    devices: BTreeMap<String, String>,
 }
 
 impl Census {
@@ -86,10 +87,8 @@ impl Census {
             Event::Connected { peer } => *self = Census { peer: peer.clone(), ..Census::default() },
             Event::Sample(sample) => {
                 self.messages += 1;
-                if let Some(count) = self.samples.get_mut(&sample.tool) {
-                    *count += 1;
-                } else if self.samples.len() < NAMES_MAX {
-                    self.samples.insert(sample.tool.clone(), 1);
+                if self.tools.len() < Reader::NAMES_MAX {
+                    self.tools.insert(sample.tool.clone());
                 }
             }
             Event::Status { .. } => self.messages += 1,
@@ -99,9 +98,10 @@ impl Census {
                 let before = self.refused.take().map_or(0, |(count, _)| count);
                 self.refused = Some((before + 1, error.clone()));
             }
-            Event::SawTool { tool, message_type } if self.unread.len() < NAMES_MAX => {
-                let known = self.unread.entry(tool.clone()).or_insert_with(|| message_type.clone());
-                // A tool may be the device of a status as well.
+            Event::SawTool { tool, message_type } if self.devices.len() < Reader::NAMES_MAX => {
+                let known =
+                    self.devices.entry(tool.clone()).or_insert_with(|| message_type.clone());
+                // A device may send a status first and positions later.
                 if has_positions(message_type) {
                     known.clone_from(message_type);
                 }
@@ -118,29 +118,32 @@ impl Census {
 
     /// True once a sample of `tool` has come.
     pub fn has(&self, tool: &str) -> bool {
-        self.samples.keys().any(|sent| is_same_tool(sent, tool))
+        self.tools.iter().any(|sent| is_same_tool(sent, tool))
     }
 
-    /// Says that `tool` has not come, what has instead, and what to do.
+    /// Says that no position of `tool` has come, what has come instead, and what to do.
     pub fn explain_missing(&self, tool: &str) -> String {
-        let Census { peer, messages, refused, samples, unread } = self;
-        let shown = |name| format!("\"{}\"", clipped(name, SHOWN_MAX));
+        let Census { peer, messages, refused, tools, devices } = self;
+        let shown = |name: &str| format!("\"{}\"", clipped(name, SHOWN_MAX));
         if peer.is_empty() {
-            return format!("tracker: not connected, so nothing of {}", shown(tool));
+            return format!("tracker: not connected, so no position of {}", shown(tool));
         }
-        // Tools first, which have no kind.
-        let others = unread.iter().filter(|(name, _)| !samples.contains_key(*name));
-        let (tools, others): (Vec<_>, Vec<_>) = others.partition(|(_, kind)| has_positions(kind));
-        let tools = samples.keys().chain(tools.into_iter().map(|(name, _)| name));
-        let mut seen: Vec<String> = tools.map(|name| shown(name)).collect();
+        // Tools first, and without the type of their messages.
+        let devices = devices.iter().filter(|(name, _)| !tools.contains(*name));
+        let (more_tools, others): (Vec<_>, Vec<_>) =
+            devices.partition(|(_, message_type)| has_positions(message_type));
+        let tool_names = tools.iter().chain(more_tools.into_iter().map(|(name, _)| name));
+        let mut seen: Vec<String> = tool_names.map(|name| shown(name)).collect();
         let has_tools = !seen.is_empty();
-        seen.extend(others.into_iter().map(|(name, kind)| format!("{} ({kind})", shown(name))));
+        let with_type =
+            |(name, message_type): (&String, &String)| format!("{} ({message_type})", shown(name));
+        seen.extend(others.into_iter().map(with_type));
         let more = match seen.len().saturating_sub(NAMES_SHOWN) {
             0 => String::new(),
             more => format!(" and {more} more"),
         };
         seen.truncate(NAMES_SHOWN);
-        let (of_tool, next) = match refused {
+        let (count_of_tool, next) = match refused {
             _ if self.has(tool) => ("no new position", IN_VIEW.to_owned()),
             _ if !seen.is_empty() => {
                 let advice = if has_tools { "set tracker.tool" } else { IN_VIEW };
@@ -150,14 +153,18 @@ impl Census {
             None => ("none", "is the tool in view, and does the server send it?".to_owned()),
         };
         let (peer, tool) = (clipped(peer, SHOWN_MAX), shown(tool));
-        let text = format!("tracker: {peer} sent {messages} messages, {of_tool} of {tool}; {next}");
+        let text =
+            format!("tracker: {peer} sent {messages} messages, {count_of_tool} of {tool}; {next}");
         clipped(&text, MESSAGE_MAX).into_owned()
     }
 }
 
+/// The message type reported for NDJSON lines and for recordings.
+pub(super) const NDJSON: &str = "NDJSON";
+
 /// True for a type of message that contains samples.
 pub(super) fn has_positions(message_type: &str) -> bool {
-    matches!(message_type, "TRANSFORM" | "POSITION" | "TDATA" | "QTDATA" | "NDJSON")
+    matches!(message_type, "TRANSFORM" | "POSITION" | "TDATA" | "QTDATA" | NDJSON)
 }
 
 #[cfg(test)]
@@ -303,7 +310,7 @@ mod tests {
         let mut census = Census::default();
         assert_eq!(
             census.explain_missing("Needle"),
-            "tracker: not connected, so nothing of \"Needle\""
+            "tracker: not connected, so no position of \"Needle\""
         );
         census.note(&sample("Needle"));
         census.note(&connected());
@@ -321,7 +328,7 @@ mod tests {
         for i in 0..1000 {
             census.note(&sample(&format!("tool {i}")));
         }
-        assert_eq!((census.samples.len(), census.messages()), (NAMES_MAX, 1000));
+        assert_eq!((census.tools.len(), census.messages()), (Reader::NAMES_MAX, 1000));
         census.note(&Event::Connected { peer: "x".repeat(500) });
         (0..9).for_each(|i| census.note(&sample(&format!("{i}").repeat(500))));
         let text = census.explain_missing(&"y".repeat(500));

@@ -1,6 +1,6 @@
 //! Turns the bytes of a tracker's connection into events, for either protocol.
 
-use super::event::{Event, has_positions};
+use super::event::{Event, NDJSON, has_positions};
 use super::ndjson::LineDecoder;
 use super::openigtlink::{Body, Message, StreamDecoder};
 use super::sample::Sample;
@@ -23,7 +23,7 @@ pub enum Protocol {
 pub struct Reader {
     decoder: Decoder,
     received: Time,
-    /// Names seen on this connection, and whether with positions.
+    /// Names seen on this connection, and whether positions came with them.
     names: BTreeMap<String, bool>,
     events: VecDeque<Event>,
     messages: u64,
@@ -101,7 +101,7 @@ impl Reader {
                 Ok(None) => return Ok(false),
                 Ok(Some(line)) => {
                     self.messages += 1;
-                    self.take_sample(line.into_sample(self.received), "NDJSON");
+                    self.take_sample(line.into_sample(self.received), NDJSON);
                 }
                 Err(error) => self.events.push_back(Event::Malformed(error)),
             },
@@ -114,7 +114,7 @@ impl Reader {
         let samples = Sample::from_message(&message, self.received);
         let message_type = message.body.type_name();
         if samples.is_empty() {
-            // Without tools the device is not taken for one.
+            // The device of a message without tools must not be taken for a tool.
             let without = if has_positions(message_type) { " without tools" } else { "" };
             self.note_name(message.full_device_name(), &format!("{message_type}{without}"));
         }

@@ -1,6 +1,6 @@
-//! Keeps other tools, and floods of notices, away from the session.
+//! Keeps samples of other tools, and floods of other messages, away from the session.
 
-use super::event::{Event, has_positions};
+use super::event::{Event, NDJSON, has_positions};
 use super::gate::is_same_tool;
 use super::reader::Reader;
 use crate::units::Time;
@@ -8,20 +8,21 @@ use std::collections::BTreeSet;
 use std::time::Duration;
 
 /// Passes what a session needs: the samples of its tools, the name of every other tool once, and
-/// statuses and refused messages at a bounded rate. It counts what it does not pass.
+/// statuses and refused messages (notices) at a rate bounded by a token bucket. It counts what it does
+/// not pass.
 #[derive(Debug, Clone)]
 pub struct Sieve {
     tools: Vec<String>,
     /// Names reported on this connection.
     names: BTreeSet<String>,
-    /// Statuses and refused messages that may still pass.
-    notices: u32,
+    /// Notices that may still pass.
+    tokens: u32,
     refilled: Time,
     passed_over: u64,
 }
 
 impl Sieve {
-    /// At most this many statuses and refused messages pass at once.
+    /// At most this many notices pass at once.
     pub const NOTICES_MAX: u32 = 100;
     /// One more may pass after each such period.
     pub const NOTICE_PERIOD: Duration = Duration::from_millis(50);
@@ -31,13 +32,13 @@ impl Sieve {
         Sieve {
             tools: tools.to_vec(),
             names: BTreeSet::new(),
-            notices: Self::NOTICES_MAX,
+            tokens: Self::NOTICES_MAX,
             refilled: Time::ZERO,
             passed_over: 0,
         }
     }
 
-    /// The event that passes for `event`, received at `now`, if any. The first sample of another tool
+    /// What to pass on for `event`, received at `now`; `None` for nothing. The first sample of another tool
     /// becomes [`Event::SawTool`], unless its name was reported before.
     pub fn pass(&mut self, now: Time, event: Event) -> Option<Event> {
         match event {
@@ -51,10 +52,10 @@ impl Sieve {
                     self.names.len() < Reader::NAMES_MAX && !self.names.contains(&sample.tool);
                 return is_new.then(|| {
                     self.names.insert(sample.tool.clone());
-                    Event::SawTool { tool: sample.tool, message_type: RECORDED.to_owned() }
+                    Event::SawTool { tool: sample.tool, message_type: NDJSON.to_owned() }
                 });
             }
-            Event::Status { .. } | Event::Malformed(_) if !self.has_notice(now) => {
+            Event::Status { .. } | Event::Malformed(_) if !self.take_token(now) => {
                 self.passed_over += 1;
                 return None;
             }
@@ -72,22 +73,19 @@ impl Sieve {
         self.tools.is_empty() || self.tools.iter().any(|tool| is_same_tool(sent, tool))
     }
 
-    /// Takes one of the notices that may pass at `now`; false if none is left.
-    fn has_notice(&mut self, now: Time) -> bool {
+    /// Takes the token for one notice at `now`; false if none is left.
+    fn take_token(&mut self, now: Time) -> bool {
         let due = now.since(self.refilled).as_nanos() / Self::NOTICE_PERIOD.as_nanos();
         if due > 0 {
             let due = u32::try_from(due).unwrap_or(u32::MAX);
-            self.notices = self.notices.saturating_add(due).min(Self::NOTICES_MAX);
+            self.tokens = self.tokens.saturating_add(due).min(Self::NOTICES_MAX);
             self.refilled = now;
         }
-        let has_notice = self.notices > 0;
-        self.notices = self.notices.saturating_sub(1);
-        has_notice
+        let has_token = self.tokens > 0;
+        self.tokens = self.tokens.saturating_sub(1);
+        has_token
     }
 }
-
-/// The message type of a recording's samples.
-const RECORDED: &str = "NDJSON";
 
 #[cfg(test)]
 mod tests {
