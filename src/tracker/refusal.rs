@@ -41,8 +41,8 @@ pub enum GateName {
 /// What a refusal does to the track.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Effect {
-    /// None: samples of another tool, samples sent twice, and samples that come too late or while
-    /// the bench learns the sender's clock bring nothing new.
+    /// None: a sample of another tool, sent twice, too old to pair, or received while the bench learns
+    /// the sender's clock says nothing about the track.
     None,
     /// Enough of these in a row, and the track is lost.
     Counts,
@@ -56,7 +56,7 @@ pub enum Effect {
 pub struct Refusal {
     /// The gate that refused.
     pub gate: GateName,
-    /// What that does to the track.
+    /// What the refusal does to the track.
     pub effect: Effect,
     /// Why, with the numbers and the limit.
     pub why: String,
@@ -80,10 +80,10 @@ impl Refusal {
         Refusal::new(GateName::Finite, format!("position ({x}, {y}, {z}) mm"))
     }
 
-    /// The same position as before, to the bit, for the `times`-th time in a row.
-    pub fn repeat(times: u32) -> Self {
+    /// The same position as before, to the bit, repeated `repeats` times in a row.
+    pub fn repeat(repeats: u32) -> Self {
         let why =
-            format!("the same position to the bit, {times} in a row; is the tool still in view?");
+            format!("the same position to the bit, {repeats} in a row; is the tool still in view?");
         Refusal::new(GateName::Repeat, why)
     }
 }
@@ -99,7 +99,7 @@ pub(crate) fn short(value: f64) -> String {
 /// What the gates did with the samples so far.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct GateCounts {
-    /// Passed.
+    /// Samples that passed.
     pub accepted: u64,
     refused: BTreeMap<GateName, u64>,
 }
@@ -123,7 +123,7 @@ impl GateCounts {
         self.by_gate().map(|(_, count)| count).sum()
     }
 
-    /// The gates of the tool's own samples that refused any, with how many.
+    /// Each gate that refused samples of the tool, with their number.
     pub fn by_gate(&self) -> impl Iterator<Item = (GateName, u64)> + '_ {
         let counts = self.refused.iter().map(|(gate, count)| (*gate, *count));
         counts.filter(|(gate, _)| *gate != GateName::Tool)
