@@ -19,7 +19,7 @@ const COLUMN: Rule = named("the name of a column");
 section! {
     /// `[tracker.csv]`: which columns of a CSV file hold what, named as in the file's header.
     pub struct CsvMapping {
-        /// What paces the replay. Columns given as s, ms, us and ns are added.
+        /// When each position was received: the pace of the replay. Columns of s, ms, us and ns are added.
         time: TimeColumns => "{ s = \"time_s\" }", whole;
         /// When the sender says each position was measured, since 1970.
         stamp: Option<TimeColumns>, whole;
@@ -29,7 +29,7 @@ section! {
         position_unit_mm: f64 [over(0.0, 1e6)] = 1.0;
         /// w, x, y and z of the sensor's orientation in that frame.
         quaternion_wxyz: Option<[String; 4]> [COLUMN];
-        /// Length of the beginning to leave out.
+        /// How much of the beginning to leave out.
         skip as "skip_s": Duration [within(0.0, 1e6)] = 0.0;
     }
 }
@@ -61,7 +61,7 @@ impl TimeColumns {
 /// Reads all samples of `tool` in a recording, each with its time on the recording's own time line.
 ///
 /// # Errors
-/// What is wrong, with the line: a missing column, a wrong row, times that go back, no sample.
+/// A missing column, a wrong row or a time that goes back, with its line; no sample.
 pub fn recording(
     text: &str,
     mapping: &CsvMapping,
@@ -75,11 +75,11 @@ pub fn recording(
         let sample = columns.sample(row, mapping, tool).map_err(|error| error.to_string())?;
         let Some(sample) = sample else { continue };
         let time = sample.receive_time;
-        let by_ns =
+        let back_ns =
             newest.map_or(0, |newest: Time| newest.as_nanos().saturating_sub(time.as_nanos()));
-        if by_ns > 0 {
+        if back_ns > 0 {
             return Err(format!(
-                "line {}: time goes back by {by_ns} ns; is that the column to pace by?",
+                "line {}: time goes back by {back_ns} ns; is that the column to pace by?",
                 row.line
             ));
         }
@@ -98,7 +98,7 @@ pub fn recording(
     }
 }
 
-/// The columns of a mapping as a file has them.
+/// The columns of a mapping, found in a file.
 struct Columns {
     time: Vec<(Column, i64)>,
     stamp: Vec<(Column, i64)>,
@@ -124,22 +124,24 @@ impl Columns {
         })
     }
 
-    /// The sample in a row, received at its time; `None` where its coordinates are blank.
+    /// The sample in a row; `None` if its coordinates are blank.
     fn sample(
         &self,
         row: &Row,
         mapping: &CsvMapping,
         tool: &str,
     ) -> Result<Option<Sample>, TableError> {
-        let blank = |columns: &[Column]| columns.iter().all(|column| row.text(column).is_empty());
-        if blank(&self.position) {
+        let is_blank =
+            |columns: &[Column]| columns.iter().all(|column| row.text(column).is_empty());
+        if is_blank(&self.position) {
             return Ok(None);
         }
         let numbers = |columns: &[Column]| -> Result<Vec<f64>, TableError> {
             columns.iter().map(|column| row.number(column)).collect()
         };
         let position_mm = Vector3::from_vec(numbers(&self.position)?) * mapping.position_unit_mm;
-        let orientation = match blank(&self.quaternion_wxyz) {
+        let orientation = match is_blank(&self.quaternion_wxyz) {
+            // Also where the mapping has no such columns.
             true => Orientation::Absent,
             false => match numbers(&self.quaternion_wxyz)?[..] {
                 [w, x, y, z] => Orientation::of_quaternion([w, x, y, z]),

@@ -1,4 +1,4 @@
-//! Orientations as senders write them: read as rotations, or refused.
+//! Converts orientations as senders write them to rotations, or refuses them.
 
 use crate::geometry::so3;
 use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion};
@@ -45,7 +45,7 @@ impl Orientation {
         Orientation::Rotation(so3::quaternion(&Rotation3::from_matrix_unchecked(polished)))
     }
 
-    /// The rotation of a quaternion w, x, y, z of any length that is near 1.
+    /// The rotation of a quaternion w, x, y, z, if its length is within [`QUATERNION_NORM`].
     pub(super) fn of_quaternion([w, x, y, z]: [f64; 4]) -> Self {
         let quaternion = Quaternion::new(w, x, y, z);
         if !QUATERNION_NORM.contains(&quaternion.norm()) {

@@ -1,4 +1,4 @@
-//! Where the stage was when a sample was measured, and how it moved since.
+//! Where the stage was when a sample was measured, and how it has moved since.
 
 use crate::units::Time;
 use std::collections::VecDeque;
@@ -14,7 +14,7 @@ pub struct StagePoint {
     pub rotation_rad: f64,
 }
 
-/// What the stage moved between two instants.
+/// The stage's motion between two times.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StageIncrement {
     /// Change of depth, mm; negative on withdrawal.
@@ -23,7 +23,7 @@ pub struct StageIncrement {
     pub rotation_rad: f64,
 }
 
-/// The stage's measured positions of the last seconds, straight lines between them.
+/// The stage's measured positions of the last seconds, interpolated linearly.
 #[derive(Debug, Clone)]
 pub struct StageHistory {
     points: VecDeque<StagePoint>,
@@ -42,7 +42,7 @@ impl StagePoint {
         }
     }
 
-    /// What the stage moved from `earlier` to here.
+    /// The stage's motion from `earlier` to here.
     pub fn since(&self, earlier: &StagePoint) -> StageIncrement {
         StageIncrement {
             insertion_mm: self.insertion_mm - earlier.insertion_mm,
@@ -59,10 +59,10 @@ impl StageHistory {
         StageHistory { points: VecDeque::with_capacity(capacity), capacity }
     }
 
-    /// Takes in the position of a SYNC; the oldest goes when the history is full.
+    /// Adds the position of a SYNC. A full history drops its oldest.
     ///
     /// # Errors
-    /// Unless it is later than all before; it is left out.
+    /// The position is not later than the newest one. It is not added.
     pub fn push(&mut self, point: StagePoint) -> Result<(), String> {
         if let Some(newest) = self.newest()
             && point.time <= newest.time
@@ -79,7 +79,7 @@ impl StageHistory {
         Ok(())
     }
 
-    /// The last position taken in.
+    /// The last position added.
     pub fn newest(&self) -> Option<&StagePoint> {
         self.points.back()
     }
@@ -87,7 +87,7 @@ impl StageHistory {
     /// The stage at `time`: on the line between the positions before and after.
     ///
     /// # Errors
-    /// No position is kept of before `time`, or none of after it.
+    /// `time` is before the oldest position kept, or after the newest one.
     pub fn at(&self, time: Time) -> Result<StagePoint, String> {
         let (Some(oldest), Some(newest)) = (self.points.front(), self.points.back()) else {
             return Err("tracker: no stage position is known yet to pair a sample with".to_owned());
@@ -117,7 +117,7 @@ impl StageHistory {
     /// next, the first and last cut to the times asked for. Their sum is the whole motion.
     ///
     /// # Errors
-    /// As [`StageHistory::at`] for both ends; an end before its beginning.
+    /// As [`StageHistory::at`] for either end; `to` is before `from`.
     pub fn between(
         &self,
         from: Time,
@@ -130,9 +130,9 @@ impl StageHistory {
         let first = self.points.partition_point(|point| point.time <= from);
         let last = self.points.partition_point(|point| point.time < to).max(first);
         let within = self.points.range(first..last).copied();
-        Ok(within.chain([end]).scan(start, |at, next| {
-            let increment = next.since(at);
-            *at = next;
+        Ok(within.chain([end]).scan(start, |previous, next| {
+            let increment = next.since(previous);
+            *previous = next;
             Some(increment)
         }))
     }

@@ -20,7 +20,7 @@ impl Registration {
         Registration { x_wt, x_sb: Pose::identity() }
     }
 
-    /// The same with the tip at `x_sb` in the sensor's frame: mm, finite.
+    /// The same registration with the tip at `x_sb` in the sensor's frame: mm, finite.
     pub fn with_tip(self, x_sb: Pose) -> Self {
         Registration { x_sb, ..self }
     }
@@ -30,8 +30,8 @@ impl Registration {
         &self.x_wt
     }
 
-    /// `p_WB`: the tip's position on the bench, mm. Finite if the sample's position is, short of
-    /// overflow.
+    /// `p_WB`: the tip's position on the bench, mm. It is finite if the sample's position is, unless it
+    /// overflows.
     ///
     /// # Errors
     /// [`Refusal`] if the tip is off the sensor and the sample has no orientation.
@@ -51,14 +51,14 @@ impl Registration {
         Ok(self.x_wt.transform(&(sample.position_mm + offset_mm)))
     }
 
-    /// The tip's heading on the bench, the z axis of `R_WB`, a unit vector; none where the sample
-    /// has no orientation. It needs no roll: a sensor of five degrees of freedom gives it as well,
-    /// if it is not tilted.
+    /// The tip's heading on the bench, the z axis of `R_WB`, a unit vector; `None` if the sample has no
+    /// orientation. The roll does not matter: a sensor with five degrees of freedom gives it as well, if
+    /// its axis is the needle's.
     pub fn heading(&self, sample: &Sample) -> Option<Vector3<f64>> {
         Some(self.rotation(sample)? * Vector3::z())
     }
 
-    /// `R_WB`: the tip's orientation on the bench; none where the sample has none.
+    /// `R_WB`: the tip's orientation on the bench; `None` if the sample has none.
     pub fn rotation(&self, sample: &Sample) -> Option<Rotation3<f64>> {
         let r_ts = sample.orientation?.to_rotation_matrix();
         Some(self.x_wt.rotation * r_ts * self.x_sb.rotation)
