@@ -53,7 +53,7 @@ impl Reader {
         }
     }
 
-    /// Takes in what was received at `now`.
+    /// Adds what was received at `now`.
     pub fn push(&mut self, now: Time, chunk: &[u8]) {
         self.received = now;
         match &mut self.decoder {

@@ -1,6 +1,6 @@
 //! Splits a stream of bytes into lines.
 
-use super::{LINE_LIMIT, Line, wrong};
+use super::{LINE_LIMIT, Line, line_error};
 
 /// Turns the chunks of a connection into lines, wherever the chunks were cut. It skips blank lines.
 ///
@@ -10,7 +10,7 @@ pub(in crate::tracker) struct LineDecoder {
     buffer: Vec<u8>,
     /// Bytes of `buffer` already used.
     used: usize,
-    /// Lines so far, including the one being skipped.
+    /// Lines so far, including one that is being skipped.
     lines: u64,
     /// True inside a line that is too long.
     skipping: bool,
@@ -23,27 +23,28 @@ impl LineDecoder {
         self.buffer.extend_from_slice(chunk);
     }
 
-    /// The next line, or none until more bytes are pushed.
+    /// The next line, or `None` until more bytes are pushed.
     ///
     /// # Errors
-    /// What is wrong with one line; poll on.
+    /// What is wrong with one line. Keep polling for the next lines.
     pub(in crate::tracker) fn poll(&mut self) -> Result<Option<Line>, String> {
         loop {
             let unread = self.buffer.get(self.used..).unwrap_or_default();
             let end = unread.iter().position(|byte| *byte == b'\n');
             let text = &unread[..end.unwrap_or(unread.len())];
             let is_too_long = text.len() > LINE_LIMIT;
-            if end.is_none() && (text.is_empty() || !is_too_long && !self.skipping) {
+            // Bytes of a line that is too long are used at once, so that they are not kept.
+            let is_skipped = is_too_long || self.skipping;
+            if end.is_none() && (text.is_empty() || !is_skipped) {
                 return Ok(None);
             }
-            // Skipped bytes are not kept.
             self.used += text.len() + usize::from(end.is_some());
             if std::mem::replace(&mut self.skipping, end.is_none()) {
                 continue;
             }
             self.lines += 1;
             if is_too_long {
-                return Err(wrong(self.lines, format_args!("longer than {LINE_LIMIT} bytes")));
+                return Err(line_error(self.lines, format_args!("longer than {LINE_LIMIT} bytes")));
             }
             if !text.trim_ascii().is_empty() {
                 return Ok(Some(Line::parse(self.lines, text)?.printable()));
@@ -57,12 +58,13 @@ impl LineDecoder {
     /// The stream ends within a line.
     pub(in crate::tracker) fn finish(&self) -> Result<(), String> {
         let unread = self.buffer.get(self.used..).unwrap_or_default();
+        // A line that is too long was already reported.
         if self.skipping || unread.trim_ascii().is_empty() {
             return Ok(());
         }
         let length = unread.len();
         let problem = format_args!("{length} bytes and no end of line; it was cut off");
-        Err(wrong(self.lines + 1, problem))
+        Err(line_error(self.lines + 1, problem))
     }
 }
 

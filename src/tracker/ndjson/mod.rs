@@ -34,11 +34,11 @@ use std::fmt::Display;
 /// The longest line, bytes. A sample takes about 300.
 pub const LINE_LIMIT: usize = 16 * 1024;
 
-/// The longest text of serde_json in an error, characters.
+/// An error shows at most this many characters of serde_json's message.
 const SHOWN_MAX: usize = 150;
 
-/// Says what is wrong with line `line` of a stream, from 1.
-fn wrong(line: u64, problem: impl Display) -> String {
+/// The error for line number `line` of a stream, from 1.
+fn line_error(line: u64, problem: impl Display) -> String {
     format!("ndjson: line {line}: {problem}")
 }
 
@@ -69,7 +69,7 @@ impl Line {
             let message = message.split(" at line ").next().unwrap_or_default();
             let message = escaped(message);
             let message = clipped(&message, SHOWN_MAX);
-            wrong(line, format_args!("{message} (column {})", error.column()))
+            line_error(line, format_args!("{message} (column {})", error.column()))
         })
     }
 
@@ -133,26 +133,26 @@ pub fn recording(text: &str) -> Result<Vec<(Time, Event)>, String> {
 /// # Errors
 /// The line is not a sample, or has no time of receipt.
 pub fn recorded(line: u64, text: &str) -> Result<Sample, String> {
-    let (read, time) = timed_line(line, text)?;
-    let source_unix_ns = read.source_unix_ns;
-    Ok(Sample { source_unix_ns, ..read.into_sample(time) })
+    let (parsed, time) = timed_line(line, text)?;
+    let source_unix_ns = parsed.source_unix_ns;
+    Ok(Sample { source_unix_ns, ..parsed.into_sample(time) })
 }
 
 const NO_TIME: &str = "no receive_time_ns: a replay needs it to keep the pace of the recording";
 
 fn timed_line(line: u64, text: &str) -> Result<(Line, Time), String> {
-    let read = Line::parse(line, text.as_bytes())?;
-    let time_ns = read.receive_time_ns.ok_or_else(|| wrong(line, NO_TIME))?;
-    Ok((read, Time::from_nanos(time_ns)))
+    let parsed = Line::parse(line, text.as_bytes())?;
+    let time_ns = parsed.receive_time_ns.ok_or_else(|| line_error(line, NO_TIME))?;
+    Ok((parsed, Time::from_nanos(time_ns)))
 }
 
 fn timed_sample(line: u64, text: &str, newest: Option<Time>) -> Result<Sample, String> {
-    let (read, time) = timed_line(line, text)?;
+    let (parsed, time) = timed_line(line, text)?;
     let back_ns = newest.map_or(0, |newest| newest.as_nanos().saturating_sub(time.as_nanos()));
     if back_ns > 0 {
-        return Err(wrong(line, format_args!("receive_time_ns goes back by {back_ns} ns")));
+        return Err(line_error(line, format_args!("receive_time_ns goes back by {back_ns} ns")));
     }
-    Ok(read.printable().into_sample(time))
+    Ok(parsed.printable().into_sample(time))
 }
 
 /// A JSON number, or the word for one that JSON lacks.

@@ -1,7 +1,7 @@
 //! The contents of the message types that the bench reads and writes.
 //!
-//! A server of TDATA or QTDATA, which hold several tools, sends nothing before it is asked to (STT_TDATA);
-//! STP_TDATA ends it. QTDATA has quaternions in place of matrices.
+//! TDATA and QTDATA hold several tools, with matrices or quaternions. A server sends them only after a
+//! request (STT_TDATA, STT_QTDATA), until another one ends the stream (STP_…).
 //!
 //! Source: the specification's tables; `igtl_tdata.h` and `igtl_qtdata.h` of the reference library.
 
@@ -19,16 +19,16 @@ const TOOL_HEAD_LEN: usize = DEVICE_NAME_LEN + 2;
 /// position in mm, then the quaternion x, y, z, w.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tool<const N: usize> {
-    /// The tool's name, 20 bytes at most; 19 are sent, and a zero, since the reference library takes
-    /// a name without one for none.
+    /// The tool's name, at most 20 bytes. At most 19 are sent, and a zero, since the reference library
+    /// reads a name without a zero as empty.
     pub name: String,
-    /// What is known of it: a [`tool_kind`].
+    /// What its pose contains: a [`tool_kind`].
     pub kind: u8,
     /// Its pose.
     pub pose: [f32; N],
 }
 
-/// What a tool's pose says; other codes are kept.
+/// What a tool's pose contains; other codes are kept.
 pub mod tool_kind {
     /// The tracker itself.
     pub const TRACKER: u8 = 1;
@@ -56,7 +56,7 @@ impl ToolStream {
         packet(&format!("STT_{}", self.name), "", None, &content)
     }
 
-    /// The message that asks it to end.
+    /// The message that asks it to stop.
     pub fn stop(&self) -> Vec<u8> {
         packet(&format!("STP_{}", self.name), "", None, &[])
     }
@@ -140,17 +140,17 @@ impl Body {
     }
 
     pub(super) fn decode(message_type: &[u8], content: &[u8]) -> Result<Self, String> {
-        let length = |expected| format!("content of {} bytes ({expected} expected)", content.len());
-        match message_type {
-            b"TRANSFORM" => floats(content).map(Body::Transform).ok_or(length("48")),
-            b"POSITION" | b"QTRANS" => position(content).ok_or(length("12, 24 or 28")),
-            b"TDATA" => tools(content).map(Body::TrackingData).ok_or(length("a multiple of 70")),
+        let (body, expected) = match message_type {
+            b"TRANSFORM" => (floats(content).map(Body::Transform), "48"),
+            b"POSITION" | b"QTRANS" => (decode_position(content), "12, 24 or 28"),
+            b"TDATA" => (decode_tools(content).map(Body::TrackingData), "a multiple of 70"),
             b"QTDATA" => {
-                tools(content).map(Body::QuaternionTrackingData).ok_or(length("a multiple of 50"))
+                (decode_tools(content).map(Body::QuaternionTrackingData), "a multiple of 50")
             }
-            b"STATUS" => status(content).map(Body::Status).ok_or(length("30 or more")),
-            _ => Ok(Body::Other(text(message_type))),
-        }
+            b"STATUS" => (decode_status(content).map(Body::Status), "30 or more"),
+            _ => (Some(Body::Other(text(message_type))), ""),
+        };
+        body.ok_or_else(|| format!("content of {} bytes ({expected} expected)", content.len()))
     }
 
     pub(super) fn encode(&self) -> Vec<u8> {
@@ -164,8 +164,8 @@ impl Body {
                 };
                 bytes(&[position_mm, orientation].concat())
             }
-            Body::TrackingData(tools) => bytes_of_tools(tools),
-            Body::QuaternionTrackingData(tools) => bytes_of_tools(tools),
+            Body::TrackingData(tools) => encode_tools(tools),
+            Body::QuaternionTrackingData(tools) => encode_tools(tools),
             Body::Status(Status { code, subcode, error_name, message }) => [
                 &code.to_be_bytes()[..],
                 &subcode.to_be_bytes(),
@@ -190,24 +190,24 @@ fn floats<const N: usize>(bytes: &[u8]) -> Option<[f32; N]> {
     rest.is_empty().then(|| chunks.map(f32::from_be_bytes))
 }
 
-/// The tools of a TDATA (`N` = 12) or QTDATA (7) message; none if its length is no multiple of a
+/// The tools of a TDATA (`N` = 12) or QTDATA (7) message; `None` if its length is not a multiple of a
 /// tool's.
-fn tools<const N: usize>(content: &[u8]) -> Option<Vec<Tool<N>>> {
+fn decode_tools<const N: usize>(content: &[u8]) -> Option<Vec<Tool<N>>> {
     let chunks = content.chunks_exact(TOOL_HEAD_LEN + 4 * N);
     if !chunks.remainder().is_empty() {
         return None;
     }
-    chunks.map(tool).collect()
+    chunks.map(decode_tool).collect()
 }
 
-fn tool<const N: usize>(bytes: &[u8]) -> Option<Tool<N>> {
+fn decode_tool<const N: usize>(bytes: &[u8]) -> Option<Tool<N>> {
     let (name, rest) = bytes.split_first_chunk::<DEVICE_NAME_LEN>()?;
     let ([kind, _reserved], numbers) = rest.split_first_chunk()?;
     let pose = floats(numbers)?;
     Some(Tool { name: text(name), kind: *kind, pose })
 }
 
-fn bytes_of_tools<const N: usize>(tools: &[Tool<N>]) -> Vec<u8> {
+fn encode_tools<const N: usize>(tools: &[Tool<N>]) -> Vec<u8> {
     let tool = |tool: &Tool<N>| {
         let name = padded::<{ DEVICE_NAME_LEN - 1 }>(&tool.name);
         [&name[..], &[0, tool.kind, 0], &bytes(&tool.pose)].concat()
@@ -215,7 +215,7 @@ fn bytes_of_tools<const N: usize>(tools: &[Tool<N>]) -> Vec<u8> {
     tools.iter().flat_map(tool).collect()
 }
 
-fn position(content: &[u8]) -> Option<Body> {
+fn decode_position(content: &[u8]) -> Option<Body> {
     let (position, rest) = content.split_at_checked(12)?;
     let quaternion = match rest.len() {
         0 => Quaternion::Absent,
@@ -225,7 +225,7 @@ fn position(content: &[u8]) -> Option<Body> {
     Some(Body::Position { position_mm: floats(position)?, quaternion })
 }
 
-fn status(content: &[u8]) -> Option<Status> {
+fn decode_status(content: &[u8]) -> Option<Status> {
     let (code, rest) = content.split_first_chunk()?;
     let (subcode, rest) = rest.split_first_chunk()?;
     let (error_name, message) = rest.split_first_chunk::<STATUS_NAME_LEN>()?;
@@ -279,12 +279,12 @@ mod tests {
         let sent = [tool_kind::SIX_D, tool_kind::THREE_D, 9];
         let sent =
             sent.map(|kind| Tool { name: format!("Tool{kind}"), kind, pose: [1.0; 7] }).to_vec();
-        let bytes = bytes_of_tools(&sent);
+        let bytes = encode_tools(&sent);
         assert_eq!(bytes.len(), 3 * 50);
-        assert_eq!(tools(&bytes), Some(sent));
-        assert_eq!(tools::<7>(&[]), Some(Vec::new()));
+        assert_eq!(decode_tools(&bytes), Some(sent));
+        assert_eq!(decode_tools::<7>(&[]), Some(Vec::new()));
         for len in [1, 49, 51, 149] {
-            assert_eq!(tools::<7>(&bytes[..len]), None, "{len} bytes");
+            assert_eq!(decode_tools::<7>(&bytes[..len]), None, "{len} bytes");
         }
     }
 
@@ -292,11 +292,11 @@ mod tests {
     fn a_name_of_20_bytes_is_read_and_sent_with_a_zero_at_its_end() {
         let name = "ReferenceToTrackerBa".to_owned();
         let sent = Tool { name: name.clone(), kind: tool_kind::SIX_D, pose: [0.0; 7] };
-        let mut bytes = bytes_of_tools(&[sent]);
+        let mut bytes = encode_tools(&[sent]);
         assert_eq!(bytes[..22], *b"ReferenceToTrackerB\0\x02\0");
         bytes[19] = b'a';
         assert_eq!(
-            tools::<7>(&bytes).and_then(|tools| Some(tools.first()?.name.clone())),
+            decode_tools::<7>(&bytes).and_then(|tools| Some(tools.first()?.name.clone())),
             Some(name)
         );
     }

@@ -5,7 +5,7 @@ use super::header::{BODY_LIMIT, HEADER_LEN, Header, SKIPPED_BODY_LIMIT, crc64};
 use super::message::Message;
 use thiserror::Error;
 
-/// Bytes that are not a message the bench can take.
+/// Bytes that are not a message the bench can read.
 ///
 /// The protocol has no mark that shows where the next message starts. If only the content of a message
 /// is wrong, the sender made a mistake, and the reader goes on with the next message.
@@ -57,7 +57,7 @@ enum State {
 }
 
 impl StreamDecoder {
-    /// Takes in what was received. After an error that loses the framing, input is ignored.
+    /// Adds what was received. After an error that loses the framing, input is ignored.
     pub fn push(&mut self, chunk: &[u8]) {
         if matches!(self.state, State::Lost(_)) {
             return;

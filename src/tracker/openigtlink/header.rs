@@ -16,10 +16,10 @@ pub const BODY_LIMIT: u64 = 1 << 20;
 pub const SKIPPED_BODY_LIMIT: u64 = 1 << 28;
 
 pub(super) const TYPE_LEN: usize = 12;
-/// The longest device name that fits the header; a longer one is cut there.
+/// The longest device name that fits the header; a longer one is truncated.
 pub const DEVICE_NAME_LEN: usize = 20;
 
-/// A header as it stands on the wire: version, type, device name, stamp, body size, CRC.
+/// A header as on the wire: version, type, device name, stamp, body size, CRC.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Header {
     pub(super) version: u16,
@@ -64,7 +64,7 @@ impl Header {
         text(&self.message_type)
     }
 
-    /// The device name as far as the header holds it.
+    /// The device name, truncated to what the header holds.
     pub(super) fn device_name(&self) -> String {
         text(&self.device_name)
     }
@@ -85,7 +85,7 @@ fn take<const N: usize>(bytes: &[u8]) -> ([u8; N], &[u8]) {
     bytes.split_first_chunk().map_or(([0; N], bytes), |(head, rest)| (*head, rest))
 }
 
-/// `text` in a field of `N` bytes, padded with zeros; cut at a character if it is too long.
+/// `text` in a field of `N` bytes, padded with zeros; truncated at a character if it is too long.
 pub(super) fn padded<const N: usize>(text: &str) -> [u8; N] {
     let fitting = &text.as_bytes()[..text.floor_char_boundary(N)];
     let mut field = [0; N];
@@ -120,7 +120,7 @@ pub struct IgtlStamp(u64);
 const NANOS_PER_S: u64 = 1_000_000_000;
 
 impl IgtlStamp {
-    /// The stamp of the raw 64 bits; none for zero.
+    /// The stamp of the raw 64 bits; `None` for zero.
     pub fn from_bits(bits: u64) -> Option<Self> {
         (bits != 0).then_some(IgtlStamp(bits))
     }
@@ -130,7 +130,7 @@ impl IgtlStamp {
         self.0
     }
 
-    /// The stamp nearest to `ns` nanoseconds since 1970; none at or before 1970 and past 2106.
+    /// The stamp nearest to `ns` nanoseconds since 1970; `None` at or before 1970 and after 2106.
     pub fn from_unix_ns(ns: i64) -> Option<Self> {
         let ns = u64::try_from(ns).ok()?;
         let seconds = u32::try_from(ns / NANOS_PER_S).ok()?;

@@ -10,7 +10,7 @@ const DEVICE_NAME_KEY: &str = "IGTL_DEVICE_NAME";
 /// One OpenIGTLink message.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Message {
-    /// The device's name as in the header, where it is cut to 20 bytes; see
+    /// The device's name as in the header, where it is truncated to 20 bytes; see
     /// [`Message::full_device_name`].
     pub device_name: String,
     /// When the data were made; `None` if the sender gives no stamp.
@@ -50,13 +50,13 @@ impl Message {
         Ok(Message { metadata, ..Message::new(&header.device_name(), header.timestamp(), body) })
     }
 
-    /// The message whose body was skipped.
+    /// A message whose body was skipped.
     pub(super) fn skipped(header: &Header) -> Self {
         Message::new(&header.device_name(), header.timestamp(), Body::Other(header.message_type()))
     }
 }
 
-/// The bytes of a message, in version 1: a device name over 20 bytes is cut, metadata are left out.
+/// The bytes of a message in version 1: a device name over 20 bytes is truncated, metadata are left out.
 pub fn encode(message: &Message) -> Vec<u8> {
     let Message { device_name, timestamp, body, .. } = message;
     packet(body.type_name(), device_name, *timestamp, &body.encode())

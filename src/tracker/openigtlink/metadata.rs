@@ -30,12 +30,13 @@ pub(super) fn split(body: &[u8]) -> Result<(&[u8], Metadata), String> {
             "extended header of {size} bytes (expected {EXTENDED_HEADER_LEN}, at most the body's {len})"
         ));
     }
-    let rest = &body[size..];
-    let stated = index_len.saturating_add(text_len);
-    let content_len = rest.len().checked_sub(stated).ok_or_else(|| {
-        format!("{stated} bytes of metadata, but {} follow the extended header", rest.len())
+    let after_header = &body[size..];
+    let metadata_len = index_len.saturating_add(text_len);
+    let content_len = after_header.len().checked_sub(metadata_len).ok_or_else(|| {
+        let available = after_header.len();
+        format!("{metadata_len} bytes of metadata, but {available} follow the extended header")
     })?;
-    let (content, metadata) = rest.split_at(content_len);
+    let (content, metadata) = after_header.split_at(content_len);
     let (index, text) = metadata.split_at(index_len);
     Ok((content, entries(index, text)?))
 }
