@@ -7,7 +7,7 @@ use thiserror::Error;
 
 /// The columns of an orientation: a table has all four or none.
 const QUATERNION: [&str; 4] = ["qw", "qx", "qy", "qz"];
-/// An error shows this many characters of what the file holds.
+/// An error shows at most this many characters of the file.
 const SHOWN_MAX: usize = 80;
 
 /// Why a table was refused: the line, what it holds and what was expected.
@@ -15,8 +15,7 @@ const SHOWN_MAX: usize = 80;
 #[error("{0}")]
 pub struct TableError(pub String);
 
-/// A table as text. Spaces around a field do not count; a byte order mark and blank lines are
-/// skipped.
+/// A table as text. Spaces around a field, a byte order mark and blank lines are ignored.
 #[derive(Debug, Clone)]
 pub struct Table {
     header: StringRecord,
@@ -34,7 +33,7 @@ pub struct Row {
 /// A column that a [`Table`] has.
 #[derive(Debug, Clone)]
 pub struct Column {
-    place: usize,
+    index: usize,
     name: String,
 }
 
@@ -48,7 +47,7 @@ impl Table {
             .from_reader(csv.as_bytes());
         // No error is possible: text in memory is UTF-8, and rows may be of any length.
         let records = reader.records().map_while(Result::ok);
-        // The crate counts blank lines to the record after them.
+        // The csv crate takes the blank lines before a record as part of it.
         let (mut line, mut counted) = (1, 0);
         let mut rows = records.map(|fields| {
             let from = fields.position().map_or(0, |position| position.byte() as usize);
@@ -64,9 +63,9 @@ impl Table {
         Table { header, rows }
     }
 
-    /// The names of the columns.
+    /// The columns.
     pub fn columns(&self) -> impl Iterator<Item = Column> + '_ {
-        let column = |(place, name): (usize, &str)| Column { place, name: name.to_owned() };
+        let column = |(index, name): (usize, &str)| Column { index, name: name.to_owned() };
         self.header.iter().enumerate().map(column)
     }
 
@@ -119,12 +118,12 @@ impl Table {
         self.rows.iter().map(numbers).collect()
     }
 
-    /// The orientation in every row, from the columns `qw,qx,qy,qz`; `None` for all rows without
-    /// those columns.
+    /// The orientation in every row, from the columns `qw,qx,qy,qz`; `None` in every row if the table has
+    /// none of them.
     ///
     /// # Errors
     /// Some of the columns without the others, a field that is not a finite number, or a quaternion
-    /// without a direction.
+    /// that cannot be normalised.
     pub fn rotations(&self) -> Result<Vec<Option<Rotation3<f64>>>, TableError> {
         if !QUATERNION.iter().any(|name| self.column(name).is_ok()) {
             return Ok(vec![None; self.rows.len()]);
@@ -154,7 +153,7 @@ impl Column {
 impl Row {
     /// The text in `column`; empty where the row is too short.
     pub fn text(&self, column: &Column) -> &str {
-        self.fields.get(column.place).unwrap_or_default()
+        self.fields.get(column.index).unwrap_or_default()
     }
 
     /// The number in `column`, which may be NaN or infinite.
@@ -170,7 +169,7 @@ impl Row {
         number.ok_or_else(|| self.error(column, "finite number"))
     }
 
-    /// The error of a field in `column` that is not what was `expected`.
+    /// The error for a field in `column` that is not a `expected`.
     pub fn error(&self, column: &Column, expected: &str) -> TableError {
         let (line, name) = (self.line, &column.name);
         let field = clipped(self.text(column), SHOWN_MAX);
@@ -186,7 +185,7 @@ mod tests {
     fn columns_are_found_by_name_in_any_order() {
         let table = Table::parse("\u{feff}b,\"oth,er\", a\r\n2,x,1\r\n\n  \n4,y,3\n");
         assert_eq!(table.numbers(["a", "b"]), Ok(vec![[1.0, 2.0], [3.0, 4.0]]));
-        assert_eq!(table.column("oth,er").map(|column| column.place), Ok(1));
+        assert_eq!(table.column("oth,er").map(|column| column.index), Ok(1));
         assert_eq!(Table::parse("a\n").numbers(["a"]), Ok(vec![]));
     }
 

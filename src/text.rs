@@ -42,35 +42,38 @@ pub fn clipped(text: &str, max: usize) -> Cow<'_, str> {
 
 /// A line that an operator reads has at most this many characters.
 const LINE_MAX: usize = 199;
-/// Before what is left of a broken line.
+/// Before the continuation of a broken line.
 const INDENT: &str = "       ";
 
-/// `text`, its longer lines broken at a space, after a semicolon if the line is half full by then.
+/// `text` with its longer lines broken in their second half: after the last semicolon there, otherwise at
+/// the last space.
 pub fn wrapped(text: &str) -> Cow<'_, str> {
     if text.lines().all(|line| line.chars().nth(LINE_MAX).is_none()) {
         return Cow::Borrowed(text);
     }
     let mut lines = Vec::new();
-    for mut rest in text.split('\n') {
+    for mut unbroken in text.split('\n') {
         let mut indent = "";
-        while let Some((end, _)) = rest.char_indices().nth(LINE_MAX - indent.len()) {
-            let (line, half) = (&rest[..end], end / 2);
-            let after = line.rfind("; ").map(|at| at + 1).filter(|at| *at > half);
-            let Some(at) = after.or_else(|| line.rfind(' ').filter(|at| *at > half)) else { break };
-            lines.push(format!("{indent}{}", &line[..at]));
-            (rest, indent) = (&rest[at + 1..], INDENT);
+        while let Some((end, _)) = unbroken.char_indices().nth(LINE_MAX - indent.len()) {
+            let line = &unbroken[..end];
+            let in_second_half = |space: &usize| *space > end / 2;
+            let semicolon = line.rfind("; ").map(|semicolon| semicolon + 1).filter(in_second_half);
+            let space = semicolon.or_else(|| line.rfind(' ').filter(in_second_half));
+            let Some(space) = space else { break };
+            lines.push(format!("{indent}{}", &line[..space]));
+            (unbroken, indent) = (&unbroken[space + 1..], INDENT);
         }
-        lines.push(format!("{indent}{rest}"));
+        lines.push(format!("{indent}{unbroken}"));
     }
     Cow::Owned(lines.join("\n"))
 }
 
 /// The screen that `template` (minijinja) describes, with the fields of `object` and the values of
-/// `more`. A line with nothing but a statement leaves no line. The filters `escaped`, `fixed` and `table`
+/// `more`. A template line that holds only a statement gives no line. The filters `escaped`, `fixed` and `table`
 /// are [`escaped`], [`fixed`] and the lines of [`table`].
 ///
 /// # Errors
-/// A fault in the template, or a value that it misses.
+/// A mistake in the template, or a value that is missing.
 pub fn screen(template: &str, object: &impl Serialize, more: Value) -> Result<String, Error> {
     let mut environment = Environment::new();
     environment.set_syntax(SyntaxConfig::builder().trim_blocks(true).lstrip_blocks(true).build()?);
@@ -83,14 +86,15 @@ pub fn screen(template: &str, object: &impl Serialize, more: Value) -> Result<St
     Ok(screen.trim_end_matches('\n').to_owned())
 }
 
-/// `value` with `decimals`; infinity, which is never reached, as `never`, and a dash for none. A zero has no sign.
+/// `value` with `decimals`; `never` for infinity, a depth or time that is never reached; a dash for `None`.
+/// A zero has no sign.
 pub fn fixed(value: Option<f64>, decimals: usize) -> String {
     match value {
         None => "-".to_owned(),
         Some(f64::INFINITY) => "never".to_owned(),
         Some(value) => {
             let text = format!("{value:.decimals$}");
-            let is_zero = |rest: &&str| rest.bytes().all(|byte| matches!(byte, b'0' | b'.'));
+            let is_zero = |digits: &&str| digits.bytes().all(|byte| matches!(byte, b'0' | b'.'));
             text.strip_prefix('-').filter(is_zero).map_or(text.clone(), str::to_owned)
         }
     }

@@ -18,7 +18,7 @@ pub struct Time(i64);
 impl Time {
     /// The origin of the run.
     pub const ZERO: Time = Time(0);
-    /// Later than any other time: the deadline of a machine that has none.
+    /// Later than any other time: the deadline of a machine that waits for nothing.
     pub const NEVER: Time = Time(i64::MAX);
 
     /// The time `ns` nanoseconds after the origin.
