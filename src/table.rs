@@ -169,7 +169,7 @@ impl Row {
         number.ok_or_else(|| self.error(column, "finite number"))
     }
 
-    /// The error for a field in `column` that is not a `expected`.
+    /// The error for a field in `column` that does not hold what was `expected`.
     pub fn error(&self, column: &Column, expected: &str) -> TableError {
         let (line, name) = (self.line, &column.name);
         let field = clipped(self.text(column), SHOWN_MAX);

@@ -27,8 +27,8 @@ const DISTANCE_MAX_MM: f64 = 5000.0;
 #[error("{0}")]
 pub struct CalibrationError(String);
 
-/// Refuses a position that is not finite, or that no bench reaches. `what` names the calibration and
-/// a position in it.
+/// Refuses a position that is not finite, or farther away than any bench reaches. `what` names the
+/// calibration and a position in it.
 fn check_distances(
     what: &str,
     frame: &str,
@@ -48,15 +48,16 @@ fn mean(points: &[Vector3<f64>]) -> Vector3<f64> {
     points.iter().sum::<Vector3<f64>>() / points.len() as f64
 }
 
-/// The covariance of two sets, whose points are in pairs and whose mean is zero.
-fn covariance(a: &[Vector3<f64>], b: &[Vector3<f64>]) -> Matrix3<f64> {
+/// The cross-covariance of paired points, both with zero mean.
+fn cross_covariance(a: &[Vector3<f64>], b: &[Vector3<f64>]) -> Matrix3<f64> {
     a.iter().zip(b).map(|(a, b)| a * b.transpose()).sum::<Matrix3<f64>>() / a.len() as f64
 }
 
-/// RMS extents along the principal axes of points whose mean is zero, largest first, and the axes as
+/// The principal axes of points with zero mean: RMS extents along them, largest first, and the axes as
 /// columns in that order.
-fn principal(points: &[Vector3<f64>]) -> ([f64; 3], Matrix3<f64>) {
-    let SymmetricEigen { eigenvalues, eigenvectors } = covariance(points, points).symmetric_eigen();
+fn principal_axes(points: &[Vector3<f64>]) -> ([f64; 3], Matrix3<f64>) {
+    let SymmetricEigen { eigenvalues, eigenvectors } =
+        cross_covariance(points, points).symmetric_eigen();
     let mut order = [0, 1, 2];
     order.sort_by(|&a, &b| eigenvalues[b].total_cmp(&eigenvalues[a]));
     let extents = order.map(|k| eigenvalues[k].max(0.0).sqrt());

@@ -1,6 +1,6 @@
 //! The tracker's pose on the bench from fiducials: points measured in both frames.
 
-use super::{CalibrationError, check_distances, covariance, mean, principal};
+use super::{CalibrationError, check_distances, cross_covariance, mean, principal_axes};
 use crate::geometry::Pose;
 use crate::keys::{Rule, section, within};
 use crate::table::{Table, TableError};
@@ -78,7 +78,8 @@ const MIRRORED: &str = "the sets are mirror images: one axis of one frame points
 /// A scale counts as wrong if it differs from 1 by more than this many of its standard errors.
 const SCALE_SDS: f64 = 5.0;
 /// A smaller error of the scale is not reported: over 250 mm it moves a point by 0.5 mm at most.
-const SCALE_SAID: f64 = 0.002;
+const SCALE_ERROR_MIN: f64 = 0.002;
+const FLAT: &str = "the points lie in a plane, and so cannot show a mirrored axis of the tracker: touch one off it";
 const SCATTERED: &str =
     "measure that one again, and see that both frames have the points in the same order";
 
@@ -106,7 +107,7 @@ impl RegistrationFit {
         let (centre_tracker, centre_bench) = (mean(&tracker_mm), mean(&bench_mm));
         let tracker_mm: Vec<_> = tracker_mm.iter().map(|p| p - centre_tracker).collect();
         let bench_mm: Vec<_> = bench_mm.iter().map(|p| p - centre_bench).collect();
-        let (rotation, is_mirrored) = nearest_rotation(&covariance(&bench_mm, &tracker_mm));
+        let (rotation, is_mirrored) = nearest_rotation(&cross_covariance(&bench_mm, &tracker_mm));
         let x_wt = Pose { rotation, translation: centre_bench - rotation * centre_tracker };
 
         let residual_mm = |p: &FiducialPair| (p.bench_mm - x_wt.transform(&p.tracker_mm)).norm();
@@ -115,18 +116,18 @@ impl RegistrationFit {
         let rms_mm = (squares / points as f64).sqrt();
         let worst = (1..).zip(residuals_mm).min_by(|a, b| b.1.total_cmp(&a.1));
         let (worst_point, worst_mm) = worst.unwrap_or_default();
-        let (spread_tracker_mm, _) = principal(&tracker_mm);
-        let (spread_mm, axes) = principal(&bench_mm);
+        let (spread_tracker_mm, _) = principal_axes(&tracker_mm);
+        let (spread_mm, axes) = principal_axes(&bench_mm);
 
         let size_mm = |spread_mm: [f64; 3]| Vector3::from(spread_mm).norm();
-        let times = size_mm(spread_tracker_mm) / size_mm(spread_mm);
-        if !(1.0 / SCALE_MAX..=SCALE_MAX).contains(&times) {
+        let ratio = size_mm(spread_tracker_mm) / size_mm(spread_mm);
+        if !(1.0 / SCALE_MAX..=SCALE_MAX).contains(&ratio) {
             return refused(format!(
-                "the tracker's points are {times:.4} times as far apart as the bench's; give both in mm"
+                "the tracker's points are {ratio:.4} times as far apart as the bench's; give both in mm"
             ));
         }
         let turned_mm: Vec<_> = tracker_mm.iter().map(|p| rotation * p).collect();
-        let scale = scale_off(&turned_mm, &bench_mm);
+        let scale = wrong_scale(&turned_mm, &bench_mm);
         let breadth_mm = spread_tracker_mm[1].min(spread_mm[1]);
         let check_breadth = |limit_mm: f64| match breadth_mm >= limit_mm {
             true => Ok(()),
@@ -141,7 +142,7 @@ impl RegistrationFit {
             let is_solid = spread_mm[2] > BREADTH_PER_LENGTH_MIN * spread_mm[0];
             let hint = match scale {
                 _ if is_mirrored && is_solid => MIRRORED.to_owned(),
-                Some(scale) => scaled(scale),
+                Some(scale) => scale_remark(scale),
                 None => SCATTERED.to_owned(),
             };
             return refused(format!(
@@ -164,13 +165,16 @@ impl RegistrationFit {
         Ok(fit)
     }
 
-    /// What the fit does not show by its residuals, in words.
+    /// Remarks on what the residuals may hide: points in a plane, a wrong scale.
     pub fn remarks(&self) -> Vec<String> {
-        let is_flat = self.spread_mm[2]
-            < (BREADTH_PER_LENGTH_MIN * self.spread_mm[0]).max(self.localisation_error_mm());
-        let flat = "the points lie in a plane, and so cannot show a mirrored axis of the tracker: touch one \
-                    off it";
-        is_flat.then(|| flat.to_owned()).into_iter().chain(self.scale.map(scaled)).collect()
+        let mut remarks = Vec::new();
+        let flat_max_mm =
+            (BREADTH_PER_LENGTH_MIN * self.spread_mm[0]).max(self.localisation_error_mm());
+        if self.spread_mm[2] < flat_max_mm {
+            remarks.push(FLAT.to_owned());
+        }
+        remarks.extend(self.scale.map(scale_remark));
+        remarks
     }
 
     /// The RMS error of locating one fiducial (FLE), mm, from the remaining distances:
@@ -197,32 +201,32 @@ impl RegistrationFit {
     }
 }
 
-fn scaled(scale: f64) -> String {
+fn scale_remark(scale: f64) -> String {
     format!(
         "the tracker has the points {scale:.3} times as far apart as the bench: is its scale right, and are \
          both in mm?"
     )
 }
 
-/// How many times as far apart `tracker_mm` are as `bench_mm`, both about their mean and of the same
-/// orientation, if that differs from 1 by more than chance: the least squares of `bench = s tracker`,
-/// whose residuals give the standard error of s.
-fn scale_off(tracker_mm: &[Vector3<f64>], bench_mm: &[Vector3<f64>]) -> Option<f64> {
+/// Scale of the tracker's distances to the bench's, `1/s` of the least squares of `bench = s tracker`, if s
+/// differs from 1 by more than chance. The residuals give the standard error of s. Both sets have zero mean
+/// and the same orientation.
+fn wrong_scale(tracker_mm: &[Vector3<f64>], bench_mm: &[Vector3<f64>]) -> Option<f64> {
     let pairs = || tracker_mm.iter().zip(bench_mm);
     let square_mm2: f64 = tracker_mm.iter().map(Vector3::norm_squared).sum();
     let scale = pairs().map(|(t, b)| t.dot(b)).sum::<f64>() / square_mm2;
-    let left_mm2: f64 = pairs().map(|(t, b)| (b - t * scale).norm_squared()).sum();
-    // Seven parameters of a similarity.
-    let free = (3 * tracker_mm.len()).checked_sub(7).filter(|free| *free >= 5)?;
-    let sd = (left_mm2 / free as f64 / square_mm2).sqrt();
-    ((scale - 1.0).abs() > (SCALE_SDS * sd).max(SCALE_SAID)).then_some(scale.recip())
+    let residual_mm2: f64 = pairs().map(|(t, b)| (b - t * scale).norm_squared()).sum();
+    // A similarity has seven parameters. Fewer than five degrees of freedom do not show a standard error.
+    let freedom = (3 * tracker_mm.len()).checked_sub(7).filter(|freedom| *freedom >= 5)?;
+    let sd = (residual_mm2 / freedom as f64 / square_mm2).sqrt();
+    ((scale - 1.0).abs() > (SCALE_SDS * sd).max(SCALE_ERROR_MIN)).then_some(scale.recip())
 }
 
 fn refused<T>(reason: String) -> Result<T, CalibrationError> {
     Err(CalibrationError(format!("registration: {reason}")))
 }
 
-/// Refuses positions that no bench reaches, and two that are the same.
+/// Refuses positions farther away than any bench reaches, and two that are the same.
 fn check_positions(frame: &str, positions_mm: &[Vector3<f64>]) -> Result<(), CalibrationError> {
     check_distances("registration: point", frame, positions_mm)?;
     let mut numbered: Vec<([f64; 3], usize)> =

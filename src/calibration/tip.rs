@@ -1,20 +1,20 @@
 //! The tip's pose on the sensor, from a recording in which only the base turns. The sensor then
 //! moves on a circle about the needle's axis.
 
-use super::{CalibrationError, check_distances, mean, principal};
+use super::{CalibrationError, check_distances, mean, principal_axes};
 use crate::geometry::{FixedAngles, Pose};
 use crate::math;
 use crate::table::{Table, TableError};
 use nalgebra::{Matrix2, Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
 use std::f64::consts::{PI, TAU};
 
-const POSITION: [&str; 4] = ["rotation_rad", "x_mm", "y_mm", "z_mm"];
+const TURN_COLUMNS: [&str; 4] = ["rotation_rad", "x_mm", "y_mm", "z_mm"];
 
 /// A circle in space has six unknowns; two more points show whether it fits.
 const POINTS_MIN: usize = 8;
 /// Less than half a circle does not determine its centre.
 const ARC_MIN_RAD: f64 = PI;
-/// A radius under this many times the noise may be only noise.
+/// A radius under this many times the RMS distance from the circle may be only noise.
 const RADIUS_PER_RMS_MIN: f64 = 3.0;
 /// The least length of the mean of unit vectors that should all be equal: 0.9 is a spread of 26°,
 /// which leaves room for the shaft's torsion.
@@ -36,11 +36,11 @@ impl TurnSample {
     /// none, `qw,qx,qy,qz`, in any order.
     ///
     /// # Errors
-    /// A missing column, a field that is not a finite number, or a quaternion without a direction,
+    /// A missing column, a field that is not a finite number, or a quaternion that cannot be normalised,
     /// with its line.
     pub fn parse(csv: &str) -> Result<Vec<Self>, TableError> {
         let table = Table::parse(csv);
-        let samples = table.numbers(POSITION)?.into_iter().zip(table.rotations()?);
+        let samples = table.numbers(TURN_COLUMNS)?.into_iter().zip(table.rotations()?);
         Ok(samples
             .map(|([rotation_meas_rad, x, y, z], orientation_meas)| TurnSample {
                 rotation_meas_rad,
@@ -66,7 +66,7 @@ pub struct TipFit {
     pub centre_mm: Vector3<f64>,
     /// Standard error of the centre in its least certain direction, mm, if the noise is independent.
     pub centre_sd_mm: f64,
-    /// The same of the direction, rad.
+    /// Standard error of the direction in its least certain direction, rad, if the noise is independent.
     pub axis_sd_rad: f64,
     /// The needle's direction in the tracker's frame, a unit vector. The base turns right-handed about
     /// it.
@@ -116,7 +116,7 @@ impl TipFit {
             return refused(format!(
                 "{points} positions, {rms_mm:.2} mm RMS off a circle (limit {rms_max_mm:.2}), {:.2} mm \
                  of it out of its plane; turn the base alone, in air, the needle standing",
-                circle.rms_mm.1
+                circle.out_of_plane_rms_mm
             ));
         }
         let angles = circle.angles(&positions_mm);
@@ -137,16 +137,16 @@ impl TipFit {
                  tracker.tip_offset_mm at zero"
             ));
         }
-        // The angle increases with the base if the normal is right-handed, and decreases if it is
-        // left-handed.
-        let agreement = |sign: f64| {
+        // The angle increases with the base's rotation if the normal points along the insertion, and
+        // decreases if it points the other way.
+        let coherence = |sign: f64| {
             let differences =
                 angles.iter().zip(samples).map(|(a, sample)| a - sign * sample.rotation_meas_rad);
             let sum: Vector2<f64> =
                 differences.map(|d| Vector2::new(math::cos(d), math::sin(d))).sum();
             sum.norm() / points as f64
         };
-        let (along, against) = (agreement(1.0), agreement(-1.0));
+        let (along, against) = (coherence(1.0), coherence(-1.0));
         if against > along {
             circle.normal = -circle.normal;
         }
@@ -154,10 +154,10 @@ impl TipFit {
         if coherence < COHERENCE_MIN || coherence.is_nan() {
             return refused(format!(
                 "the sensor does not follow the base: their angles agree to {coherence:.2} (at least \
-                 {COHERENCE_MIN:.2}, 1 being exactly); is rotation_rad in rad, and is the needle in air?"
+                 {COHERENCE_MIN:.2}, 1 is exact); is rotation_rad in rad, and is the needle in air?"
             ));
         }
-        let (centre_sd_mm, axis_sd_rad) = circle.errors(&angles);
+        let (centre_sd_mm, axis_sd_rad) = circle.standard_errors(&angles);
         let mount = SensorMount::of(samples, &circle);
         if let Some(SensorMount { axis, .. }) = mount
             && axis.z < 0.0
@@ -224,7 +224,7 @@ impl SensorMount {
     }
 }
 
-/// Gauss-Newton steps: from the algebraic fit a few converge, the others cost nothing.
+/// Gauss-Newton steps: from the algebraic fit a few are enough, the others cost nothing.
 const STEPS: usize = 20;
 
 /// A circle in space.
@@ -234,25 +234,27 @@ struct Circle {
     /// Unit vector.
     normal: Vector3<f64>,
     radius_mm: f64,
-    /// RMS distance of the points from the circle within its plane, and from its plane, mm.
-    rms_mm: (f64, f64),
+    /// RMS distance of the points from the circle within its plane, mm.
+    in_plane_rms_mm: f64,
+    /// RMS distance of the points from its plane, mm.
+    out_of_plane_rms_mm: f64,
 }
 
 impl Circle {
     /// Standard errors of a fit to points at `angles`: of the centre, mm, and of the normal, rad, each in
     /// the direction in which it is largest. The distances from the circle in its plane determine centre
     /// and radius, those from the plane its place and tilt.
-    fn errors(&self, angles: &[f64]) -> (f64, f64) {
+    fn standard_errors(&self, angles: &[f64]) -> (f64, f64) {
         let rows =
             || angles.iter().map(|&angle| Vector3::new(math::cos(angle), math::sin(angle), 1.0));
         let normal: Matrix3<f64> = rows().map(|row| row * row.transpose()).sum();
-        let of_both = normal.try_inverse().map_or(f64::INFINITY, |inverse| {
+        let variance_factor = normal.try_inverse().map_or(f64::INFINITY, |inverse| {
             let directions: Matrix2<f64> = inverse.fixed_view::<2, 2>(0, 0).into();
             directions.symmetric_eigenvalues().max().max(0.0)
         });
         let points = angles.len() as f64;
-        let sd = |rms_mm: f64| rms_mm * (of_both * points / (points - 3.0)).sqrt();
-        (sd(self.rms_mm.0), sd(self.rms_mm.1) / self.radius_mm)
+        let sd = |rms_mm: f64| rms_mm * (variance_factor * points / (points - 3.0)).sqrt();
+        (sd(self.in_plane_rms_mm), sd(self.out_of_plane_rms_mm) / self.radius_mm)
     }
 
     /// The least-squares circle within the least-squares plane of the points; `None` if the points
@@ -261,7 +263,7 @@ impl Circle {
         let n = points_mm.len() as f64;
         let centroid_mm = mean(points_mm);
         let centred: Vec<Vector3<f64>> = points_mm.iter().map(|p| p - centroid_mm).collect();
-        let (spread_mm, axes) = principal(&centred);
+        let (spread_mm, axes) = principal_axes(&centred);
         let flat: Vec<Vector2<f64>> = centred.iter().map(|d| axes.tr_mul(d).xy()).collect();
         let centre_mm = refine(algebraic(&flat)?, &flat);
         let distances_mm: Vec<f64> = flat.iter().map(|p| (p - centre_mm).norm()).collect();
@@ -271,16 +273,17 @@ impl Circle {
             centre_mm: centroid_mm + axes * centre_mm.push(0.0),
             normal: axes.column(2).into(),
             radius_mm,
-            rms_mm: ((squares / n).sqrt(), spread_mm[2]),
+            in_plane_rms_mm: (squares / n).sqrt(),
+            out_of_plane_rms_mm: spread_mm[2],
         })
     }
 
     /// RMS distance of the points from the circle, mm.
     fn rms_mm(&self) -> f64 {
-        math::hypot(self.rms_mm.0, self.rms_mm.1)
+        math::hypot(self.in_plane_rms_mm, self.out_of_plane_rms_mm)
     }
 
-    /// The angle of each point about the normal, from a direction of its own, rad.
+    /// The angle of each point about the normal, from an arbitrary direction, rad.
     fn angles(&self, points_mm: &[Vector3<f64>]) -> Vec<f64> {
         // Any direction that is not close to the normal.
         let aside = Vector3::ith(self.normal.iamin(), 1.0);
@@ -295,12 +298,12 @@ impl Circle {
 fn solve<const N: usize>(
     rows: impl Iterator<Item = (SVector<f64, N>, f64)>,
 ) -> Option<SVector<f64, N>> {
-    let (mut normal, mut right) = (SMatrix::<f64, N, N>::zeros(), SVector::zeros());
+    let (mut normal, mut rhs) = (SMatrix::<f64, N, N>::zeros(), SVector::zeros());
     for (row, value) in rows {
         normal += row * row.transpose();
-        right += row * value;
+        rhs += row * value;
     }
-    let solution = normal.try_inverse()? * right;
+    let solution = normal.try_inverse()? * rhs;
     solution.iter().all(|x| x.is_finite()).then_some(solution)
 }
 
@@ -316,11 +319,11 @@ fn refine(mut centre_mm: Vector2<f64>, points_mm: &[Vector2<f64>]) -> Vector2<f6
     let n = points_mm.len() as f64;
     for _ in 0..STEPS {
         let radial = points_mm.iter().map(|p| p - centre_mm);
-        let towards: Vec<(Vector2<f64>, f64)> =
+        let directions: Vec<(Vector2<f64>, f64)> =
             radial.map(|d| (d / d.norm().max(f64::MIN_POSITIVE), d.norm())).collect();
-        let mean = towards.iter().map(|(u, _)| u).sum::<Vector2<f64>>() / n;
-        let radius_mm = towards.iter().map(|(_, d)| d).sum::<f64>() / n;
-        let Some(step) = solve(towards.iter().map(|(u, d)| (u - mean, d - radius_mm))) else {
+        let mean = directions.iter().map(|(u, _)| u).sum::<Vector2<f64>>() / n;
+        let radius_mm = directions.iter().map(|(_, d)| d).sum::<f64>() / n;
+        let Some(step) = solve(directions.iter().map(|(u, d)| (u - mean, d - radius_mm))) else {
             break;
         };
         centre_mm += step;
@@ -328,7 +331,7 @@ fn refine(mut centre_mm: Vector2<f64>, points_mm: &[Vector2<f64>]) -> Vector2<f6
     centre_mm
 }
 
-/// The part of a turn that `angles` cover: all except the widest gap between neighbours, rad.
+/// The part of a turn that `angles` cover: all but the widest gap between neighbours, rad.
 fn arc_of(angles: &[f64]) -> f64 {
     let mut sorted: Vec<f64> = angles.iter().map(|angle| angle.rem_euclid(TAU)).collect();
     sorted.sort_by(f64::total_cmp);
