@@ -5,8 +5,7 @@ use crate::keys::{Rule, section, within};
 use crate::needle::TorsionConfig;
 
 const LENGTH: Rule = within(0.0, 10_000.0);
-/// A standard error.
-const ERROR: Rule = within(0.0, 1e6);
+const STANDARD_ERROR: Rule = within(0.0, 1e6);
 
 section! {
     /// Origin and quality of a computed registration.
@@ -15,7 +14,7 @@ section! {
         provenance: Provenance, flat;
         /// Number of fiducials.
         points: u32 [within(3.0, u32::MAX as f64)];
-        /// RMS of the distances left, mm.
+        /// RMS of the remaining distances between the fiducials, mm.
         rms_mm: f64 [LENGTH];
         /// RMS extent of the fiducials along their principal axes, mm.
         spread_mm: [f64; 3] [LENGTH];
@@ -58,16 +57,16 @@ section! {
         provenance: Provenance, flat;
         /// Number of insertions.
         insertions: u32 [within(1.0, u32::MAX as f64)];
-        /// RMS of the recorded roll less the base's through the torsion, degrees.
-        roll_rms_deg: f64 [ERROR];
+        /// RMS of the tip's recorded roll minus the roll that the torsion predicts, degrees.
+        roll_rms_deg: f64 [STANDARD_ERROR];
         /// Standard error of the curvature, per mm.
-        curvature_sd_per_mm: f64 [ERROR];
+        curvature_sd_per_mm: f64 [STANDARD_ERROR];
         /// Standard error of `tip_ahead_mm`, mm.
-        tip_ahead_sd_mm: f64 [ERROR];
+        tip_ahead_sd_mm: f64 [STANDARD_ERROR];
         /// Standard error of the bend axis about the shaft's, degrees.
-        bend_axis_sd_deg: f64 [ERROR];
+        bend_axis_sd_deg: f64 [STANDARD_ERROR];
         /// Standard deviation of the torsion's offset from one insertion to the next, degrees.
-        offset_spread_deg: f64 [ERROR];
+        offset_spread_deg: f64 [STANDARD_ERROR];
         /// Standard errors of the torsion.
         torsion_sd: TorsionConfig, whole;
     }

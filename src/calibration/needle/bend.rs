@@ -7,12 +7,12 @@
 //! all insertions is summed, and the nearest bicycle model is fitted to it: `S = a (K_y, −K_x)`.
 
 use super::insertion::Insertion;
-use super::{CalibrationError, covariance, refused};
+use super::{CalibrationError, needle_error, sandwich_covariance};
 use crate::geometry::{Pose, Twist};
 use crate::math;
 use nalgebra::{Matrix3, Matrix4, Rotation3, SMatrix, SVector, Vector2, Vector3, Vector4, Vector6};
 
-/// Wide priors of the first position, mm; the heading, rad; the bend, rad/mm; the slip.
+/// Standard deviations of the prior: first position, mm; heading and roll, rad; bend, rad/mm; slip.
 const POSITION_SD_MM: f64 = 0.1;
 const HEADING_SD_RAD: f64 = 0.1;
 const ROLL_SD_RAD: f64 = 1e-3;
@@ -57,14 +57,15 @@ pub struct BendFit {
     pub bend_axis_sd_rad: f64,
 }
 
-/// One insertion's information on (K_x, K_y, S_x, S_y): `J` and `J θ`.
+/// One insertion's information on `θ = (K_x, K_y, S_x, S_y)`: the information matrix `Y` and the information
+/// vector `Y θ`.
 struct Information {
-    weight: Matrix4<f64>,
-    weighted: Vector4<f64>,
+    matrix: Matrix4<f64>,
+    vector: Vector4<f64>,
 }
 
 fn no_bend() -> CalibrationError {
-    refused(
+    needle_error(
         "the positions show no clear bend of the path; let the tip keep its roll over some mm now and \
          then, or insert deeper",
     )
@@ -76,8 +77,12 @@ fn prior() -> Covariance {
     Covariance::from_diagonal(&sd.component_mul(&sd))
 }
 
-/// The filter over one insertion, bend and slip starting at `start`.
-fn follow(insertion: &Insertion, start: &Vector4<f64>, noise: &PathNoise) -> Option<Information> {
+/// Runs the filter over one insertion, with bend and slip starting at `start`.
+fn run_filter(
+    insertion: &Insertion,
+    start: &Vector4<f64>,
+    noise: &PathNoise,
+) -> Option<Information> {
     let (mut pose, mut bend) = (Pose::identity(), *start);
     let mut p = prior();
     let (mut deeper_mm, mut turn_rad) = (0.0, 0.0);
@@ -97,8 +102,8 @@ fn follow(insertion: &Insertion, start: &Vector4<f64>, noise: &PathNoise) -> Opt
         let mut f = Covariance::identity();
         f.fixed_view_mut::<6, 6>(0, 0).copy_from(&whole);
         for (column, row) in [3, 4, 0, 1].into_iter().enumerate() {
-            let by = jacobian.column(row) * deeper_mm;
-            f.fixed_view_mut::<6, 1>(0, 6 + column).copy_from(&by);
+            let derivative = jacobian.column(row) * deeper_mm;
+            f.fixed_view_mut::<6, 1>(0, 6 + column).copy_from(&derivative);
         }
         pose = (pose * exp(1.0)).renormalized();
         p = f * p * f.transpose();
@@ -126,19 +131,19 @@ fn follow(insertion: &Insertion, start: &Vector4<f64>, noise: &PathNoise) -> Opt
     }
     let before = prior().fixed_view::<4, 4>(6, 6).try_inverse()?;
     let after = p.fixed_view::<4, 4>(6, 6).try_inverse()?;
-    Some(Information { weight: after - before, weighted: after * bend - before * start })
+    Some(Information { matrix: after - before, vector: after * bend - before * start })
 }
 
-/// (K_x, K_y, S_x, S_y) of the bicycle (K_x, K_y, a), and its derivatives.
+/// (K_x, K_y, S_x, S_y) of the bicycle (K_x, K_y, a), and the Jacobian.
 fn bicycle(p: &Vector3<f64>) -> (Vector4<f64>, SMatrix<f64, 4, 3>) {
     let (kx, ky, a) = (p.x, p.y, p.z);
-    let by = SMatrix::<f64, 4, 3>::from_rows(&[
+    let jacobian = SMatrix::<f64, 4, 3>::from_rows(&[
         [1.0, 0.0, 0.0].into(),
         [0.0, 1.0, 0.0].into(),
         [0.0, a, ky].into(),
         [-a, 0.0, -kx].into(),
     ]);
-    (Vector4::new(kx, ky, a * ky, -a * kx), by)
+    (Vector4::new(kx, ky, a * ky, -a * kx), jacobian)
 }
 
 impl BendFit {
@@ -149,29 +154,29 @@ impl BendFit {
         noise: &PathNoise,
     ) -> Result<Self, CalibrationError> {
         let (mut bend, mut information) = (Vector4::zeros(), Vec::new());
-        let (mut weight, mut weighted) = (Matrix4::zeros(), Vector4::zeros());
+        let (mut matrix, mut vector) = (Matrix4::zeros(), Vector4::zeros());
         for _ in 0..PASSES {
-            let follow = |insertion| follow(insertion, &bend, noise);
+            let run = |insertion| run_filter(insertion, &bend, noise);
             information =
-                insertions.iter().map(follow).collect::<Option<Vec<_>>>().ok_or_else(no_bend)?;
-            weight = information.iter().map(|one| one.weight).sum();
-            weighted = information.iter().map(|one| one.weighted).sum();
-            bend = weight.try_inverse().ok_or_else(no_bend)? * weighted;
+                insertions.iter().map(run).collect::<Option<Vec<_>>>().ok_or_else(no_bend)?;
+            matrix = information.iter().map(|part| part.matrix).sum();
+            vector = information.iter().map(|part| part.vector).sum();
+            bend = matrix.try_inverse().ok_or_else(no_bend)? * vector;
         }
         let mut p = Vector3::new(bend[0], bend[1], 0.0);
         for _ in 0..ITERATIONS {
-            let (model, by) = bicycle(&p);
-            let hessian = by.transpose() * weight * by;
-            let gradient = by.transpose() * (weighted - weight * model);
+            let (model, jacobian) = bicycle(&p);
+            let hessian = jacobian.transpose() * matrix * jacobian;
+            let gradient = jacobian.transpose() * (vector - matrix * model);
             p += hessian.try_inverse().ok_or_else(no_bend)? * gradient;
         }
-        let (model, by) = bicycle(&p);
+        let (model, jacobian) = bicycle(&p);
         let gradients: Vec<Vector3<f64>> = information
             .iter()
-            .map(|one| by.transpose() * (one.weighted - one.weight * model))
+            .map(|part| jacobian.transpose() * (part.vector - part.matrix * model))
             .collect();
-        let covariance =
-            covariance(&(by.transpose() * weight * by), &gradients).ok_or_else(no_bend)?;
+        let hessian = jacobian.transpose() * matrix * jacobian;
+        let covariance = sandwich_covariance(&hessian, &gradients).ok_or_else(no_bend)?;
         let curvature_per_mm = math::hypot(p.x, p.y);
         let along = Vector2::new(p.x, p.y) / curvature_per_mm;
         let across = Vector2::new(-along.y, along.x);
@@ -188,7 +193,7 @@ impl BendFit {
             bend_axis_sd_rad: sd(across) / curvature_per_mm,
         };
         // A bend that may be zero has no axis.
-        let clear = fit.curvature_per_mm > 3.0 * fit.curvature_sd_per_mm;
-        if clear { Ok(fit) } else { Err(no_bend()) }
+        let is_clear = fit.curvature_per_mm > 3.0 * fit.curvature_sd_per_mm;
+        if is_clear { Ok(fit) } else { Err(no_bend()) }
     }
 }

@@ -1,15 +1,15 @@
-//! A recorded insertion as the fits need it: depth, turns of base and tip, positions.
+//! A recorded insertion as the fits need it: depth, rotations of base and tip, positions.
 
-use super::{CalibrationError, refused};
+use super::{CalibrationError, needle_error};
 use crate::geometry::so3;
 use crate::needle::Increment;
 use nalgebra::{Matrix2, Matrix3, Rotation3, Vector2, Vector3};
 
 /// Shorter insertions are refused, mm.
 const DEPTH_MIN_MM: f64 = 20.0;
-/// Turns are compared over this much depth, mm.
+/// Rotations are compared over this much depth, mm.
 const SPACING_MM: f64 = 1.0;
-/// Turns above this depth, mm, do not count: so near to the skin nothing holds the needle yet.
+/// Rotations above this depth, mm, do not count: so close to the skin nothing holds the needle yet.
 pub(super) const ENTRY_MM: f64 = 3.0;
 /// The tip must turn back and forth by this much, RMS, rad/mm, to show its axis.
 const TURN_MIN_RAD_PER_MM: f64 = 0.05;
@@ -55,7 +55,7 @@ pub(super) fn shaft_axis(insertions: &[Vec<PosedRow>]) -> Result<Vector3<f64>, C
     }
     let count = normal[(0, 0)];
     if count == 0.0 {
-        return Err(refused(format!(
+        return Err(needle_error(format!(
             "no insertion goes on for {SPACING_MM:.0} mm below {ENTRY_MM:.0} mm; is insertion_mm in mm?"
         )));
     }
@@ -63,7 +63,7 @@ pub(super) fn shaft_axis(insertions: &[Vec<PosedRow>]) -> Result<Vector3<f64>, C
     let rms_rad_per_mm = variance.max(0.0).sqrt();
     let inverse = normal.try_inverse().filter(|_| rms_rad_per_mm >= TURN_MIN_RAD_PER_MM);
     let Some(inverse) = inverse else {
-        return Err(refused(format!(
+        return Err(needle_error(format!(
             "the tip turns back and forth by {rms_rad_per_mm:.3} rad/mm RMS, at least \
              {TURN_MIN_RAD_PER_MM} needed to tell its axis; turn the base both ways while inserting"
         )));
@@ -89,16 +89,16 @@ pub(super) struct Insertion {
 }
 
 impl Insertion {
-    /// From the insertion number `insertion`, from 1; `r_sa` is the shaft frame A in the sensor
+    /// The insertion with these rows; `number` counts from 1, `r_sa` is the shaft frame A in the sensor
     /// frame.
     pub(super) fn of(
-        insertion: usize,
+        number: usize,
         rows: &[PosedRow],
         r_sa: &Rotation3<f64>,
     ) -> Result<Self, CalibrationError> {
         let too_short = |depth_mm: f64| {
-            refused(format!(
-                "insertion {insertion} is {depth_mm:.1} mm deep, at least {DEPTH_MIN_MM:.0} needed; \
+            needle_error(format!(
+                "insertion {number} is {depth_mm:.1} mm deep, at least {DEPTH_MIN_MM:.0} needed; \
                  leave it out"
             ))
         };
@@ -115,7 +115,7 @@ impl Insertion {
             let turn = so3::log(&(last.orientation.inverse() * row.orientation));
             steps.push(Step {
                 base: Increment::new(deeper_mm, row.rotation_rad - last.rotation_rad).map_err(
-                    |error| refused(format!("insertion {insertion}, line {}: {error}", row.line)),
+                    |error| needle_error(format!("insertion {number}, line {}: {error}", row.line)),
                 )?,
                 tip_turn_rad: turn.dot(&axis),
                 position_mm: r_ao * (row.position_mm - first.position_mm),

@@ -32,19 +32,19 @@ pub struct NeedleFit {
     pub torsion: TorsionFit,
 }
 
-fn refused(reason: impl Display) -> CalibrationError {
+fn needle_error(reason: impl Display) -> CalibrationError {
     CalibrationError(format!("needle: {reason}"))
 }
 
 impl NeedleFit {
-    /// The needle of `insertions`, each with its rows in the order recorded. `noise` disturbs the
-    /// paths.
+    /// The needle of `insertions`, each with its rows in the order recorded. `noise` is that of the
+    /// positions and the paths.
     ///
     /// # Errors
     /// The insertions do not determine the needle.
     pub fn of(insertions: &[Vec<PosedRow>], noise: &PathNoise) -> Result<Self, CalibrationError> {
         if insertions.len() < INSERTIONS_MIN {
-            return Err(refused(format!(
+            return Err(needle_error(format!(
                 "{} insertions, at least {INSERTIONS_MIN} needed: how they differ says how sure the \
                  result is",
                 insertions.len()
@@ -72,7 +72,7 @@ impl NeedleFit {
 ///
 /// `hessian` is `H = JᵀJ` over all n insertions, `gradients` holds `gᵢ = Jᵢᵀ rᵢ` of each insertion
 /// at the fit. `None` if H has no inverse: the insertions do not determine the parameters.
-fn covariance<const N: usize>(
+fn sandwich_covariance<const N: usize>(
     hessian: &SMatrix<f64, N, N>,
     gradients: &[SVector<f64, N>],
 ) -> Option<SMatrix<f64, N, N>> {

@@ -138,13 +138,19 @@ fn of_a_mean_it_is_the_standard_error() {
     let values = [1.0, 2.0, 4.0, 9.0];
     let gradients = values.map(|value| SVector::<f64, 1>::new(value - 4.0));
     let squares: f64 = gradients.iter().map(|g| g.x * g.x).sum();
-    let found = covariance(&SMatrix::<f64, 1, 1>::new(4.0), &gradients).unwrap();
+    let found = sandwich_covariance(&SMatrix::<f64, 1, 1>::new(4.0), &gradients).unwrap();
     assert!((found.x - squares / (4.0 * 3.0)).abs() < 1e-12);
 }
 
 #[test]
 fn parameters_that_cannot_be_told_apart_have_none() {
     let gradients = [SVector::<f64, 2>::new(1.0, 1.0); 3];
-    assert_eq!(covariance(&SMatrix::<f64, 2, 2>::new(1.0, 1.0, 1.0, 1.0), &gradients), None);
-    assert_eq!(covariance(&SMatrix::<f64, 2, 2>::new(1.0, 0.0, 0.0, 0.0), &gradients), None);
+    assert_eq!(
+        sandwich_covariance(&SMatrix::<f64, 2, 2>::new(1.0, 1.0, 1.0, 1.0), &gradients),
+        None
+    );
+    assert_eq!(
+        sandwich_covariance(&SMatrix::<f64, 2, 2>::new(1.0, 0.0, 0.0, 0.0), &gradients),
+        None
+    );
 }

@@ -1,23 +1,24 @@
 //! Fits the torsion from the recorded rotations of base and tip.
 
 use super::insertion::{ENTRY_MM, Insertion};
-use super::{CalibrationError, covariance, refused};
+use super::{CalibrationError, needle_error, sandwich_covariance};
 use crate::needle::{NeedleError, Play, Torsion, TorsionConfig};
 use nalgebra::{SMatrix, SVector};
 
-/// w₀, w₁, c, L₀, L₁: band, offset, creep.
+/// w₀, w₁, c, L₀, L₁: half-width of the band and its growth with depth, offset, creep and its growth.
 const PARAMETERS: usize = 5;
+/// Index of the offset. The parameters before it are those of the band.
 const OFFSET: usize = 2;
 type Parameters = SVector<f64, PARAMETERS>;
 type Hessian = SMatrix<f64, PARAMETERS, PARAMETERS>;
 
 /// The start of the fit, and the steps of its numerical derivatives.
 const START: [f64; PARAMETERS] = [0.2, 0.002, 0.0, 0.5, 0.002];
-const DIFFERENCE: [f64; PARAMETERS] = [1e-5, 1e-7, 1e-5, 1e-5, 1e-7];
+const DERIVATIVE_STEP: [f64; PARAMETERS] = [1e-5, 1e-7, 1e-5, 1e-5, 1e-7];
 /// A band narrower than this many of its standard errors counts as no band.
 const CLEAR_SD: f64 = 2.0;
-/// The lower bounds of the parameters: a creep shorter than the distance of the rows is no creep.
-const LEAST: [f64; PARAMETERS] = [0.0, 0.0, f64::NEG_INFINITY, 0.02, 0.0];
+/// The lower bounds of the parameters: a creep shorter than the distance between rows is no creep.
+const MIN: [f64; PARAMETERS] = [0.0, 0.0, f64::NEG_INFINITY, 0.02, 0.0];
 const ITERATIONS_MAX: usize = 100;
 
 /// A torsion with its standard errors.
@@ -34,7 +35,7 @@ pub struct TorsionFit {
 }
 
 fn undetermined() -> CalibrationError {
-    refused(
+    needle_error(
         "the insertions do not determine the shaft's torsion; turn the base both ways, by more than the tip \
          lags, at several depths",
     )
@@ -66,30 +67,36 @@ fn residuals(insertion: &Insertion, p: &Parameters) -> Result<Vec<f64>, NeedleEr
     Ok(residuals)
 }
 
-/// `JᵀJ`, `Jᵀr` and `rᵀr` of one insertion.
-fn normal(
-    insertion: &Insertion,
-    p: &Parameters,
-) -> Result<(Hessian, Parameters, f64), NeedleError> {
-    let at = residuals(insertion, p)?;
-    let mut columns = Vec::with_capacity(PARAMETERS);
-    for (k, &difference) in DIFFERENCE.iter().enumerate() {
-        let mut moved = *p;
-        moved[k] += difference;
-        let moved = residuals(insertion, &moved)?;
-        let column: Vec<f64> = moved.iter().zip(&at).map(|(m, a)| (m - a) / difference).collect();
-        columns.push(column);
-    }
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    Ok((
-        Hessian::from_fn(|i, j| dot(&columns[i], &columns[j])),
-        Parameters::from_fn(|i, _| dot(&columns[i], &at)),
-        dot(&at, &at),
-    ))
+/// The least-squares problem of one insertion, linearised: `JᵀJ`, `Jᵀr` and `rᵀr`.
+struct Linearised {
+    hessian: Hessian,
+    gradient: Parameters,
+    cost: f64,
 }
 
-/// Leaves parameter number `k` out of a fit.
-fn hold(hessian: &mut Hessian, k: usize) {
+impl Linearised {
+    fn at(p: &Parameters, insertion: &Insertion) -> Result<Self, NeedleError> {
+        let residuals_at_p = residuals(insertion, p)?;
+        let mut columns = Vec::with_capacity(PARAMETERS);
+        for (k, &step) in DERIVATIVE_STEP.iter().enumerate() {
+            let mut moved = *p;
+            moved[k] += step;
+            let moved = residuals(insertion, &moved)?;
+            let column: Vec<f64> =
+                moved.iter().zip(&residuals_at_p).map(|(m, r)| (m - r) / step).collect();
+            columns.push(column);
+        }
+        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        Ok(Linearised {
+            hessian: Hessian::from_fn(|i, j| dot(&columns[i], &columns[j])),
+            gradient: Parameters::from_fn(|i, _| dot(&columns[i], &residuals_at_p)),
+            cost: dot(&residuals_at_p, &residuals_at_p),
+        })
+    }
+}
+
+/// Keeps parameter number `k` out of a fit.
+fn exclude(hessian: &mut Hessian, k: usize) {
     hessian.row_mut(k).fill(0.0);
     hessian.column_mut(k).fill(0.0);
     hessian[(k, k)] = 1.0;
@@ -98,45 +105,45 @@ fn hold(hessian: &mut Hessian, k: usize) {
 impl TorsionFit {
     /// Least squares of the tip's roll; without a band if none is clear.
     pub(super) fn of(insertions: &[Insertion]) -> Result<Self, CalibrationError> {
-        let fit = Self::with(insertions, true)?;
-        let clear = |width: f64, sd: f64| width > CLEAR_SD * sd;
+        let fit = Self::fit(insertions, true)?;
+        let is_clear = |width: f64, sd: f64| width > CLEAR_SD * sd;
         let TorsionConfig { half_width_rad, half_width_rad_per_mm, .. } = fit.torsion;
-        let banded = clear(half_width_rad, fit.sd.half_width_rad)
-            || clear(half_width_rad_per_mm, fit.sd.half_width_rad_per_mm);
-        if banded { Ok(fit) } else { Self::with(insertions, false) }
+        let has_band = is_clear(half_width_rad, fit.sd.half_width_rad)
+            || is_clear(half_width_rad_per_mm, fit.sd.half_width_rad_per_mm);
+        if has_band { Ok(fit) } else { Self::fit(insertions, false) }
     }
 
-    /// Levenberg and Marquardt's iteration, kept to what a torsion may be, with or without a band.
-    fn with(insertions: &[Insertion], banded: bool) -> Result<Self, CalibrationError> {
-        let all = |p: &Parameters| {
-            insertions.iter().map(|insertion| normal(insertion, p)).collect::<Result<Vec<_>, _>>()
+    /// Levenberg-Marquardt iteration within the bounds of the parameters, with or without a band.
+    fn fit(insertions: &[Insertion], has_band: bool) -> Result<Self, CalibrationError> {
+        let linearise = |p: &Parameters| {
+            let parts = insertions.iter().map(|insertion| Linearised::at(p, insertion));
+            parts.collect::<Result<Vec<_>, _>>().map_err(needle_error)
         };
-        let cost = |parts: &[(Hessian, Parameters, f64)]| parts.iter().map(|part| part.2).sum();
+        let cost = |parts: &[Linearised]| parts.iter().map(|part| part.cost).sum();
         let mut p = Parameters::from(START);
-        if !banded {
+        if !has_band {
             p.fixed_rows_mut::<OFFSET>(0).fill(0.0);
         }
-        let mut parts = all(&p).map_err(refused)?;
+        let mut parts = linearise(&p)?;
         let (mut damping, mut settled) = (1e-3, false);
         for _ in 0..ITERATIONS_MAX {
             let (mut hessian, mut gradient) = (Hessian::zeros(), Parameters::zeros());
-            for (h, g, _) in &parts {
-                (hessian, gradient) = (hessian + h, gradient + g);
+            for part in &parts {
+                (hessian, gradient) = (hessian + part.hessian, gradient + part.gradient);
             }
             hessian += Hessian::from_diagonal(&hessian.diagonal()) * damping;
-            // A parameter at its bound that would go below it stays; so does a band that is left out.
             for k in 0..PARAMETERS {
-                let held = p[k] <= LEAST[k] && gradient[k] > 0.0;
-                if !held && (banded || k >= OFFSET) {
-                    continue;
+                let would_pass_bound = p[k] <= MIN[k] && gradient[k] > 0.0;
+                let is_of_no_band = !has_band && k < OFFSET;
+                if would_pass_bound || is_of_no_band {
+                    exclude(&mut hessian, k);
+                    gradient[k] = 0.0;
                 }
-                hold(&mut hessian, k);
-                gradient[k] = 0.0;
             }
             let inverse = hessian.try_inverse().ok_or_else(undetermined)?;
             let mut next = p - inverse * gradient;
-            next.iter_mut().zip(LEAST).for_each(|(value, least)| *value = value.max(least));
-            let tried = all(&next).map_err(refused)?;
+            next.iter_mut().zip(MIN).for_each(|(value, min)| *value = value.max(min));
+            let tried = linearise(&next)?;
             let (before, after): (f64, f64) = (cost(&parts), cost(&tried));
             if after > before {
                 damping *= 10.0;
@@ -152,22 +159,23 @@ impl TorsionFit {
         if !settled {
             return Err(undetermined());
         }
-        let mut hessian: Hessian = parts.iter().map(|part| part.0).sum();
-        let mut gradients: Vec<Parameters> = parts.iter().map(|part| part.1).collect();
-        if !banded {
-            (0..OFFSET).for_each(|k| hold(&mut hessian, k));
+        let mut hessian: Hessian = parts.iter().map(|part| part.hessian).sum();
+        let mut gradients: Vec<Parameters> = parts.iter().map(|part| part.gradient).collect();
+        if !has_band {
+            (0..OFFSET).for_each(|k| exclude(&mut hessian, k));
             gradients.iter_mut().for_each(|g| g.fixed_rows_mut::<OFFSET>(0).fill(0.0));
         }
-        let covariance = covariance(&hessian, &gradients).ok_or_else(undetermined)?;
+        let covariance = sandwich_covariance(&hessian, &gradients).ok_or_else(undetermined)?;
         // Each insertion's own offset, by one Newton step with the other parameters kept.
-        let offsets = parts.iter().map(|part| part.1[OFFSET] / part.0[(OFFSET, OFFSET)]);
+        let offsets =
+            parts.iter().map(|part| part.gradient[OFFSET] / part.hessian[(OFFSET, OFFSET)]);
         let n = insertions.len() as f64;
         let spread = (offsets.map(|off| off * off).sum::<f64>() / (n - 1.0)).sqrt();
         let mut count = 0;
         for insertion in insertions {
-            count += residuals(insertion, &p).map_err(refused)?.len();
+            count += residuals(insertion, &p).map_err(needle_error)?.len();
         }
-        let squares: f64 = parts.iter().map(|part| part.2).sum();
+        let squares: f64 = parts.iter().map(|part| part.cost).sum();
         Ok(TorsionFit {
             torsion: config(&p),
             sd: config(&covariance.diagonal().map(|variance| variance.max(0.0).sqrt())),
