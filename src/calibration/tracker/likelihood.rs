@@ -3,13 +3,13 @@
 
 use crate::math;
 
-/// Rounds of the search, each over half the range of the one before.
+/// Rounds of the search, each over half the range of the round before.
 const ROUNDS: usize = 14;
 /// Points of the search along each coordinate: of the first round, and of the others.
 const POINTS_FIRST: [usize; 2] = [13, 9];
 const POINTS: [usize; 2] = [5, 5];
-/// Twice the gain of the log likelihood from which on a correlated part is reported: one white recording in
-/// 1000 reaches it (χ² of 2 degrees of freedom).
+/// A correlated part is reported if it raises twice the log likelihood by at least this. One white recording
+/// in 1000 reaches it (χ² with 2 degrees of freedom).
 const LIKELIHOOD_RATIO_MIN: f64 = 13.8;
 /// Steps of the numerical derivatives: of the correlated share, and of the logarithm of the time.
 const STEPS: [f64; 2] = [0.01, 0.02];
@@ -30,9 +30,9 @@ pub struct NoiseFit {
     pub sd_mm: Measured,
     /// Standard deviation of its white part, mm.
     pub white_sd_mm: Measured,
-    /// Standard deviation of its correlated part, mm; 0 where none is seen.
+    /// Standard deviation of its correlated part, mm; 0 if none is found.
     pub correlated_sd_mm: Measured,
-    /// Correlation time, s; 0 where none is seen.
+    /// Correlation time, s; 0 if none is found.
     pub correlation_time_s: Measured,
 }
 
@@ -47,13 +47,13 @@ impl NoiseFit {
 
 /// Coordinates of positions at rest, without their mean and drift, and the times between them.
 pub(super) struct Residuals<'a> {
-    /// Time of each after the one before, s; the first has none.
+    /// Time of each position after the one before, s; that of the first is not used.
     pub(super) gaps_s: &'a [f64],
-    /// One series a coordinate, mm.
+    /// One series for each coordinate, mm.
     pub(super) series: &'a [Vec<f64>],
-    /// The longest correlation time that is looked for, s.
+    /// The longest correlation time to look for, s.
     pub(super) time_max_s: f64,
-    /// The shortest that matters, s.
+    /// The shortest correlation time to look for, s.
     pub(super) time_min_s: f64,
 }
 
@@ -106,7 +106,7 @@ impl Residuals<'_> {
         self.filter(share, ln_time).0
     }
 
-    /// Logarithm of the likelihood with that variance, but for a constant.
+    /// Logarithm of the likelihood with the maximum-likelihood variance, except for a constant.
     fn ln_likelihood(&self, share: f64, ln_time: f64) -> f64 {
         let (variance_mm2, ln_determinant) = self.filter(share, ln_time);
         -0.5 * (self.count() * math::ln(variance_mm2) + ln_determinant)
@@ -128,7 +128,8 @@ impl Residuals<'_> {
             };
             for share in along(0) {
                 for ln_time in along(1) {
-                    // At 0 the likelihood does not depend on the time; a little above it shows which is better.
+                    // At a share of 0 the likelihood does not depend on the time; a small share shows which time
+                    // is better.
                     let share = share.max(1e-6);
                     let ln_likelihood = self.ln_likelihood(share, ln_time);
                     if ln_likelihood > best.0 {

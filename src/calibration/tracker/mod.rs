@@ -1,4 +1,4 @@
-//! The noise of a tracker, from a recording at rest.
+//! Fits the noise of a tracker to a recording at rest.
 
 mod likelihood;
 #[cfg(test)]
@@ -14,25 +14,24 @@ use nalgebra::Vector3;
 /// The fewest positions, and the shortest time.
 const POSITIONS_MIN: usize = 100;
 const DURATION_MIN_S: f64 = 5.0;
-/// A sensor at rest drifts no further over the recording, mm, unless its noise hides more.
+/// A sensor at rest drifts by at most this over the recording, mm, unless its noise hides more.
 const DRIFT_MAX_MM: f64 = 0.5;
-/// Standard errors of the drift that noise may explain.
+/// Noise may explain a drift of this many standard errors.
 const DRIFT_ERRORS: f64 = 6.0;
-/// Correlation times are looked for up to this part of the recording: over more, noise cannot be told
-/// from a motion.
-const TIME_PART_MAX: f64 = 0.05;
-/// A correlation time over this part of it is refused if the positions wander by more than this, mm RMS.
-const TIME_PART_REFUSED: f64 = 0.035;
+/// The longest correlation time, as a share of the recording: with a longer one, noise looks like motion.
+const TIME_SHARE_MAX: f64 = 0.05;
+/// A correlation time over this share is refused if the positions wander by more than this, mm RMS.
+const TIME_SHARE_REFUSED: f64 = 0.035;
 const WANDER_MAX_MM: f64 = 0.2;
-/// Robust standard deviations from the median over which a position is an outlier.
+/// An outlier is more than this many robust standard deviations from the median.
 const OUTLIER_SDS: f64 = 6.0;
-/// A tracker at rest has no larger share of them.
-const OUTLIERS_MAX: f64 = 0.05;
-/// Standard deviation of a normal number over its median absolute deviation.
+/// A tracker at rest has at most this share of outliers.
+const OUTLIER_SHARE_MAX: f64 = 0.05;
+/// Standard deviation of a normal distribution divided by its median absolute deviation.
 const SD_PER_MAD: f64 = 1.4826;
-/// A position that swings has a correlation under this after half a period; noise has none.
-const SWING: f64 = -0.5;
-/// Intervals over which a missing position counts as dropped out.
+/// A position that swings has a correlation below this after half a period; noise has none.
+const SWING_CORRELATION: f64 = -0.5;
+/// A gap of more than this many intervals has dropouts.
 const DROPOUT_INTERVALS: f64 = 1.5;
 
 /// One sample of a recording at rest.
@@ -61,7 +60,7 @@ pub struct AxisNoise {
 pub struct TrackerFit {
     /// Positions that the noise is fitted to.
     pub positions: usize,
-    /// Their time, s.
+    /// The time that they span, s.
     pub duration_s: f64,
     /// x, y and z of the tracker.
     pub axes: [AxisNoise; 3],
@@ -73,15 +72,15 @@ pub struct TrackerFit {
     pub rate_hz: Measured,
     /// Positions left out as outliers.
     pub outliers: usize,
-    /// Positions that are missing between others.
+    /// Positions that are missing in gaps of the stream.
     pub dropouts: usize,
     /// Samples that the tracker called invalid.
     pub invalid: usize,
     /// Samples that repeat the position before.
     pub repeats: usize,
-    /// Standard deviation of receipt less stamp, ms; `None` without stamps.
+    /// Standard deviation of receipt minus stamp, ms; `None` without stamps.
     pub latency_jitter_ms: Option<Measured>,
-    /// 99% of the samples are later than the quickest by less than this, ms; `None` without stamps.
+    /// 99% of the samples come later than the quickest by less than this, ms; `None` without stamps.
     pub latency_p99_ms: Option<f64>,
 }
 
@@ -129,30 +128,30 @@ impl TrackerFit {
         let dropouts = gaps_s.iter().filter(|gap| **gap > DROPOUT_INTERVALS * interval_s);
         let dropouts = dropouts.map(|gap| (gap / interval_s).round() as usize - 1).sum();
 
-        let before = points.len();
+        let with_outliers = points.len();
         let points = without_outliers(points)?;
-        let outliers = before - points.len();
-        let axes = Axes::of(&points);
-        axes.check_swing(interval_s)?;
+        let outliers = with_outliers - points.len();
+        let detrended = Detrended::of(&points);
+        detrended.check_swing(interval_s)?;
         let residuals = |series| Residuals {
-            gaps_s: &axes.gaps_s,
+            gaps_s: &detrended.gaps_s,
             series,
-            time_max_s: TIME_PART_MAX * duration_s,
-            time_min_s: (0.5 * interval_s).min(0.01 * TIME_PART_MAX * duration_s),
+            time_max_s: TIME_SHARE_MAX * duration_s,
+            time_min_s: (0.5 * interval_s).min(0.01 * TIME_SHARE_MAX * duration_s),
         };
-        let together = residuals(&axes.residuals_mm[..]).fit();
-        // A slow motion is further from its mean than a process of so short a time would be.
-        let square_mm2 = axes.residuals_mm.iter().flatten().map(|mm| mm * mm).sum::<f64>();
+        let together = residuals(&detrended.residuals_mm[..]).fit();
+        // A slow motion strays further than noise of the longest correlation time.
+        let square_mm2 = detrended.residuals_mm.iter().flatten().map(|mm| mm * mm).sum::<f64>();
         let white_mm2 = 3.0 * together.white_sd_mm.value.powi(2);
         let wander_mm = (square_mm2 / points.len() as f64 - white_mm2).max(0.0).sqrt();
         let spacing_s = duration_s / (points.len() - 1) as f64;
         let axes: [AxisNoise; 3] = std::array::from_fn(|axis| {
-            let noise = residuals(&axes.residuals_mm[axis..=axis]).fit();
-            let variance = noise.long_mean_variance_mm2(spacing_s) / axes.time_square_s2;
+            let noise = residuals(&detrended.residuals_mm[axis..=axis]).fit();
+            let variance = noise.long_mean_variance_mm2(spacing_s) / detrended.time_square_s2;
             AxisNoise {
                 noise,
                 drift_mm_per_min: Measured {
-                    value: 60.0 * axes.drift_mm_per_s[axis],
+                    value: 60.0 * detrended.drift_mm_per_s[axis],
                     error: 60.0 * variance.sqrt(),
                 },
             }
@@ -171,7 +170,7 @@ impl TrackerFit {
                  it still and record again"
             )));
         }
-        let refused_s = TIME_PART_REFUSED * duration_s;
+        let refused_s = TIME_SHARE_REFUSED * duration_s;
         if together.correlation_time_s.value > refused_s && wander_mm > WANDER_MAX_MM {
             return Err(CalibrationError(format!(
                 "the positions wander by {wander_mm:.3} mm (limit {WANDER_MAX_MM}) over more than \
@@ -196,7 +195,7 @@ impl TrackerFit {
     }
 }
 
-/// The middle one; 0 of none.
+/// The median, the upper one of an even number of values; 0 without values.
 fn median(values: &mut [f64]) -> f64 {
     let middle = values.len() / 2;
     match values.is_empty() {
@@ -212,7 +211,7 @@ fn moments(values: &[f64]) -> (f64, f64) {
     (mean, values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / count)
 }
 
-/// New positions a second; its error from how the intervals differ.
+/// New positions a second, with the standard error from the scatter of the intervals.
 fn rate(gaps_s: &[f64]) -> Measured {
     let (mean_s, variance) = moments(gaps_s);
     let error = (variance / gaps_s.len() as f64).sqrt() / (mean_s * mean_s);
@@ -222,7 +221,7 @@ fn rate(gaps_s: &[f64]) -> Measured {
 /// The points without the outliers.
 ///
 /// # Errors
-/// Too many of them: the sensor was moved.
+/// There are too many of them: the sensor was moved.
 fn without_outliers(
     points: Vec<(f64, Vector3<f64>)>,
 ) -> Result<Vec<(f64, Vector3<f64>)>, CalibrationError> {
@@ -232,7 +231,7 @@ fn without_outliers(
         values.iter_mut().for_each(|value| *value = (*value - middle).abs());
         let mad = median(&mut values);
         let squares = values.iter().map(|value| value * value).sum::<f64>();
-        // A tracker of coarse steps may give one value most of the time.
+        // A tracker with a coarse resolution may give one value most of the time.
         let sd_mm =
             if mad > 0.0 { SD_PER_MAD * mad } else { (squares / values.len() as f64).sqrt() };
         (middle, OUTLIER_SDS * sd_mm)
@@ -243,18 +242,19 @@ fn without_outliers(
     };
     let kept: Vec<_> = points.into_iter().filter(is_near).collect();
     let outliers = total - kept.len();
-    if outliers as f64 > OUTLIERS_MAX * total as f64 {
+    if outliers as f64 > OUTLIER_SHARE_MAX * total as f64 {
         return Err(CalibrationError(format!(
             "{outliers} of {total} positions are over {OUTLIER_SDS:.0} standard deviations from the median \
              (limit {:.0}%); the sensor moved, or another tool is in the recording",
-            100.0 * OUTLIERS_MAX
+            100.0 * OUTLIER_SHARE_MAX
         )));
     }
     Ok(kept)
 }
 
-/// The coordinates of positions, apart from their offset and drift.
-struct Axes {
+/// The coordinates of positions without their offset and drift.
+struct Detrended {
+    /// Time of each position after the one before, s; 0 for the first.
     gaps_s: Vec<f64>,
     residuals_mm: [Vec<f64>; 3],
     drift_mm_per_s: [f64; 3],
@@ -262,8 +262,8 @@ struct Axes {
     time_square_s2: f64,
 }
 
-impl Axes {
-    /// A straight line taken off each coordinate.
+impl Detrended {
+    /// Subtracts a straight line from each coordinate.
     fn of(points: &[(f64, Vector3<f64>)]) -> Self {
         let count = points.len() as f64;
         let mean_s = points.iter().map(|(time_s, _)| time_s).sum::<f64>() / count;
@@ -273,13 +273,13 @@ impl Axes {
             points.iter().map(|(time_s, position)| (position - mean_mm) * (time_s - mean_s)).sum();
         let drift = drift_sum / time_square_s2;
         let residual = |axis: usize| {
-            let at = |(time_s, position): &(f64, Vector3<f64>)| {
+            let without_line = |(time_s, position): &(f64, Vector3<f64>)| {
                 position[axis] - mean_mm[axis] - drift[axis] * (time_s - mean_s)
             };
-            points.iter().map(at).collect()
+            points.iter().map(without_line).collect()
         };
         let gaps_s = points.windows(2).map(|pair| pair[1].0 - pair[0].0);
-        Axes {
+        Detrended {
             gaps_s: std::iter::once(0.0).chain(gaps_s).collect(),
             residuals_mm: std::array::from_fn(residual),
             drift_mm_per_s: drift.into(),
@@ -287,29 +287,30 @@ impl Axes {
         }
     }
 
-    /// Refuses positions that go to and fro, as under a breathing hand: after half a period they are
-    /// on the other side.
+    /// Refuses positions that swing, as under a breathing hand: after half a period they are on the other
+    /// side.
     fn check_swing(&self, interval_s: f64) -> Result<(), CalibrationError> {
         let count = self.gaps_s.len();
-        let product = |lag: usize| -> f64 {
-            let of = |series: &Vec<f64>| -> f64 {
+        let autocovariance_mm2 = |lag: usize| -> f64 {
+            let products = |series: &Vec<f64>| -> f64 {
                 series.iter().zip(&series[lag..]).map(|(a, b)| a * b).sum()
             };
-            self.residuals_mm.iter().map(of).sum::<f64>() / (count - lag) as f64
+            self.residuals_mm.iter().map(products).sum::<f64>() / (count - lag) as f64
         };
-        let square_mm2 = product(0);
-        // Neighbours alone may be negatively correlated by a tracker's own filter. A lag that misses
-        // half a period by a twentieth still shows it.
-        let lags = std::iter::successors(Some(3), |lag| Some(lag + (lag / 10).max(1)));
-        let swings = lags.take_while(|lag| *lag < count / 4);
-        let swings = swings.map(|lag: usize| (lag, product(lag) / square_mm2));
-        let Some((lag, correlation)) = swings.min_by(|a, b| a.1.total_cmp(&b.1)) else {
+        let square_mm2 = autocovariance_mm2(0);
+        // From a lag of 3: a tracker's own filter may make close neighbours negatively correlated. In steps
+        // of a tenth: a lag that misses half a period by a twentieth still shows it.
+        let lags = std::iter::successors(Some(3), |lag: &usize| Some(lag + (lag / 10).max(1)));
+        let correlations = lags
+            .take_while(|lag| *lag < count / 4)
+            .map(|lag| (lag, autocovariance_mm2(lag) / square_mm2));
+        let Some((lag, correlation)) = correlations.min_by(|a, b| a.1.total_cmp(&b.1)) else {
             return Ok(());
         };
-        if correlation < SWING {
+        if correlation < SWING_CORRELATION {
             return Err(CalibrationError(format!(
                 "the sensor swings by {:.2} mm with a period of {:.1} s (correlation {correlation:.2} after \
-                 half of it, limit {SWING}); hold it still and record again",
+                 half of it, limit {SWING_CORRELATION}); hold it still and record again",
                 square_mm2.sqrt(),
                 2.0 * lag as f64 * interval_s
             )));
@@ -318,18 +319,18 @@ impl Axes {
     }
 }
 
-/// Standard deviation of receipt less stamp, and its 99% above the least, ms; `None` unless every
-/// sample has a stamp.
+/// Standard deviation of receipt minus stamp, and its 99th percentile above the smallest, ms; `None` unless
+/// every sample has a stamp.
 fn latency(samples: &[RestSample]) -> Option<(Measured, f64)> {
-    let late = |sample: &RestSample| {
+    let offset_ns = |sample: &RestSample| {
         Some(sample.receive_time.as_nanos().saturating_sub(sample.source_unix_ns?))
     };
-    let late_ns: Vec<i64> = samples.iter().map(late).collect::<Option<_>>()?;
-    let least_ns = *late_ns.iter().min()?;
-    let mut late_ms: Vec<f64> =
-        late_ns.iter().map(|late| late.saturating_sub(least_ns) as f64 * 1e-6).collect();
-    let value = moments(&late_ms).1.sqrt();
-    let jitter = Measured { value, error: value / (2.0 * late_ms.len() as f64).sqrt() };
-    let rank = (late_ms.len() - 1) * 99 / 100;
-    Some((jitter, *late_ms.select_nth_unstable_by(rank, f64::total_cmp).1))
+    let offsets_ns: Vec<i64> = samples.iter().map(offset_ns).collect::<Option<_>>()?;
+    let least_ns = *offsets_ns.iter().min()?;
+    let mut delays_ms: Vec<f64> =
+        offsets_ns.iter().map(|ns| ns.saturating_sub(least_ns) as f64 * 1e-6).collect();
+    let value = moments(&delays_ms).1.sqrt();
+    let jitter = Measured { value, error: value / (2.0 * delays_ms.len() as f64).sqrt() };
+    let rank = (delays_ms.len() - 1) * 99 / 100;
+    Some((jitter, *delays_ms.select_nth_unstable_by(rank, f64::total_cmp).1))
 }
