@@ -1,4 +1,4 @@
-//! The emulated tracker: noisy tip positions at a fixed rate. It may repeat positions as if new.
+//! The emulated tracker: noisy tip positions at a fixed rate. It may repeat a position as if it were new.
 
 use super::noise::{CorrelatedNoise, Noise};
 use super::truth::Truth;
@@ -48,27 +48,27 @@ impl TrackerModel {
     }
 }
 
-/// The noise of the target is not that of the tip.
+/// Changes the seed for the noise of the target, so that it differs from the noise of the tip.
 const TARGET_SEED: u64 = 0x7a96_e700_0000_0000;
 
 /// The emulated target: tissue moves as the needle goes in.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TargetModel {
-    /// Where it is before the insertion, plane frame, mm.
+    /// Its position before the insertion, plane frame, mm.
     pub start_mm: Vector3<f64>,
     /// How far it moves with each millimetre that is inserted, mm.
     pub drift_mm_per_mm: Vector3<f64>,
 }
 
 impl TargetModel {
-    /// Where it is at this depth, plane frame, mm.
+    /// Its position at this depth, plane frame, mm.
     pub fn position_mm(&self, insertion_mm: f64) -> Vector3<f64> {
         self.start_mm + self.drift_mm_per_mm * insertion_mm.max(0.0)
     }
 
-    /// How the tracker that sees the tip as `tip` sees the target: noise of its own.
-    pub fn seen_by(tip: TrackerModel) -> TrackerModel {
-        TrackerModel { seed: tip.seed ^ TARGET_SEED, ..tip }
+    /// The tracker of the target: like that of the tip, with noise of its own.
+    pub fn tracker_model(of_tip: TrackerModel) -> TrackerModel {
+        TrackerModel { seed: of_tip.seed ^ TARGET_SEED, ..of_tip }
     }
 }
 
@@ -77,9 +77,9 @@ impl TargetModel {
 pub struct TrackedTip {
     /// When the tip had this pose.
     pub acquisition_time: Time,
-    /// Sensor pose `X_TS` in tracker frame T, position in mm with its noise. Of a sensor on the
-    /// needle's axis the rotation has the tip's heading and no roll, as a five-degree-of-freedom coil
-    /// reports it.
+    /// Sensor pose `X_TS` in tracker frame T, position in mm with its noise. For a sensor on the needle's
+    /// axis the rotation has the tip's heading and no roll, as a coil with five degrees of freedom reports
+    /// it.
     pub x_ts: Pose,
 }
 
@@ -94,8 +94,8 @@ pub(crate) struct EmulatedTracker {
     next: Time,
     /// Positions measured so far.
     measured: u64,
-    /// The last measurement, and how often it is still to be repeated.
-    repeated: Option<(Pose, u32)>,
+    /// The last measurement, and how many repeats of it remain.
+    last: Option<(Pose, u32)>,
     /// Samples on their way, with their time of arrival and the truth at acquisition.
     under_way: VecDeque<(Time, TrackedTip, Truth)>,
 }
@@ -108,7 +108,7 @@ impl EmulatedTracker {
             x_bs,
             next: start,
             measured: 0,
-            repeated: None,
+            last: None,
             under_way: VecDeque::new(),
         }
     }
@@ -121,11 +121,11 @@ impl EmulatedTracker {
     /// Takes the sample that is due; the true tip pose is `X_PB`.
     pub(crate) fn acquire(&mut self, tip_true: &Pose) {
         let acquisition_time = self.next;
-        let (x_ts, left) = match self.repeated {
-            Some((x_ts, left)) if left > 0 => (x_ts, left - 1),
+        let (x_ts, repeats) = match self.last {
+            Some((x_ts, repeats)) if repeats > 0 => (x_ts, repeats - 1),
             _ => (self.measure(tip_true), self.model.repeats),
         };
-        self.repeated = Some((x_ts, left));
+        self.last = Some((x_ts, repeats));
         let sample = TrackedTip { acquisition_time, x_ts };
         let arrival = acquisition_time + self.model.latency;
         self.under_way.push_back((arrival, sample, Truth::new(*tip_true)));

@@ -1,7 +1,7 @@
 //! The emulated stage as the bench sees it: drives, needle and tracker.
 
 use super::drive::{Drive, DriveConfig};
-use super::fault::{Change, Fault, FaultKind, FaultyLine, Script, Toward};
+use super::fault::{Fault, FaultKind, FaultyLine, Script, ScriptEvent, Toward};
 use super::tissue::Tissue;
 use super::tracker::{EmulatedTracker, TargetModel, TrackedTip, TrackerModel};
 use super::truth::Truth;
@@ -13,7 +13,7 @@ use nalgebra::Vector3;
 use std::collections::VecDeque;
 use std::f64::consts::TAU;
 
-/// Maximum number of frames forwarded in one call; the rest waits for the next call. So two drives that
+/// At most this many frames are forwarded in one call; the others wait for the next call. So two drives that
 /// are mapped to answer each other's PDOs cannot block the caller.
 const FORWARDED_MAX: usize = 256;
 
@@ -92,7 +92,7 @@ impl VirtualStage {
         let (rotation, counts_per_turn) = config.rotation;
         let drives = [Drive::new(insertion), Drive::new(rotation)];
         let target = config.target.map(|target| {
-            let model = TargetModel::seen_by(config.tracker);
+            let model = TargetModel::tracker_model(config.tracker);
             (target, EmulatedTracker::new(model, config.x_tp, Pose::identity(), now))
         });
         let mut stage = VirtualStage {
@@ -132,8 +132,8 @@ impl VirtualStage {
         }
         self.sample_target(now);
         self.move_needle(now);
-        while let Some(change) = self.script.poll(now, self.position_true(now).0) {
-            self.change(now, change);
+        while let Some(event) = self.script.poll(now, self.position_true(now).0) {
+            self.apply(now, event);
         }
         for drive in &mut self.drives {
             if drive.deadline() <= now {
@@ -185,7 +185,8 @@ impl VirtualStage {
         drives.chain(lines).chain(own).chain(target).min().unwrap_or(Time::NEVER)
     }
 
-    /// The present fault of the bus: of several, the first in the script. A bus with a fault carries no frame.
+    /// The present fault of the bus; if there are several, the first in the script. A bus with a fault carries
+    /// no frame.
     pub fn bus_fault(&self) -> Option<FaultKind> {
         self.script.active().map(|fault| fault.kind).find(|kind| kind.is_of_bus())
     }
@@ -258,17 +259,17 @@ impl VirtualStage {
         }
     }
 
-    /// A fault begins or ends, or another node sends a frame.
-    fn change(&mut self, now: Time, change: Change) {
-        match change {
-            Change::Begins(fault, end) => {
+    /// Applies an event of the script.
+    fn apply(&mut self, now: Time, event: ScriptEvent) {
+        match event {
+            ScriptEvent::Begins(fault, end) => {
                 self.outputs.push_back(StageOutput::FaultBegan(fault.clone()));
                 for n in (0..2).filter(|n| fault.concerns(*n)) {
                     self.add_frame_faults(n, end, &fault);
                     self.change_drive(n, now, &fault, true);
                 }
             }
-            Change::Ends(fault) => {
+            ScriptEvent::Ends(fault) => {
                 self.release_held(now);
                 for n in (0..2).filter(|n| fault.concerns(*n)) {
                     let is_same = |other: &Fault| other.kind == fault.kind && other.concerns(n);
@@ -277,16 +278,16 @@ impl VirtualStage {
                     }
                 }
             }
-            Change::Foreign(frame) if self.bus_fault().is_none() => {
+            ScriptEvent::Foreign(frame) if self.bus_fault().is_none() => {
                 self.send_to_both(now, &frame);
                 self.outputs.push_back(StageOutput::Frame(frame));
             }
-            Change::Foreign(_) => {}
+            ScriptEvent::Foreign(_) => {}
         }
     }
 
-    /// Sends the frames that the bench's interface held, when it no longer does. Another fault of the bus
-    /// loses them.
+    /// Sends the frames that the bench's interface held, once it no longer holds them. Another fault of the
+    /// bus loses them.
     fn release_held(&mut self, now: Time) {
         let bus_fault = self.bus_fault();
         if bus_fault == Some(FaultKind::BusStuck) {
@@ -300,7 +301,7 @@ impl VirtualStage {
         }
     }
 
-    /// Adds what `fault` does to the frames of drive `n` until `end`.
+    /// Adds to the lines of drive `n` what `fault` does to its frames until `end`.
     fn add_frame_faults(&mut self, n: usize, end: Time, fault: &Fault) {
         let (from_drive, to_drive) = match fault.kind {
             FaultKind::Silent => (true, true),
@@ -311,7 +312,7 @@ impl VirtualStage {
                 kind.has("frames") && fault.toward == Toward::Drives,
             ),
         };
-        let id = fault.id(self.drives[n].id());
+        let id = fault.frame_id(self.drives[n].id());
         for (line, is_faulty) in
             [(&mut self.from_drive[n], from_drive), (&mut self.to_drive[n], to_drive)]
         {

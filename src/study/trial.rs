@@ -135,7 +135,7 @@ impl<'a> EmulatedNeedle<'a> {
     /// takes.
     fn see_target(&mut self, tool: &TargetTool, samples: &[SampleDue]) {
         let (Some(target), Some(first)) = (self.stage.target, samples.first()) else { return };
-        let model = TargetModel::seen_by(self.stage.tracker);
+        let model = TargetModel::tracker_model(self.stage.tracker);
         let interval_s = model.interval().as_secs_f64();
         let see = |mean: &mut MovingMean, number: u64, insertion_mm: f64| {
             let noise_mm = self.stage.x_tp.rotation.inverse() * model.noise_mm(number);

@@ -15,7 +15,8 @@ fn faults_are_told_in_the_order_they_are_written() {
         &[],
     );
     let stage = config.virtual_stage().expect("valid");
-    let told: Vec<_> = stage.faults.iter().map(|f| (f.at_mm, f.at, f.to_string())).collect();
+    let told: Vec<_> =
+        stage.faults.iter().map(|f| (f.at_mm, f.start_after, f.to_string())).collect();
     let at = |ms| Some(Duration::from_millis(ms));
     let expected = [
         (Some(10.0), None, "rotation: PDOs to the drives late by 2.5 ms, 3 of them, for 0.1 s"),
@@ -90,7 +91,7 @@ fn a_fault_without_what_it_needs_is_refused() {
              toward = \"{toward}\" }}]"
         );
         let refused = set_refusal(&[&set]);
-        let expected = format!("emulator.fault[0]: frames = \"{frames}\" go toward = ");
+        let expected = format!("emulator.fault[0]: frames = \"{frames}\" needs toward = ");
         assert!(refused.contains(&expected), "{refused}");
     }
     assert_eq!(

@@ -10,11 +10,11 @@ use crate::units::Time;
 /// A fault on a line.
 #[derive(Debug, Clone)]
 struct FrameFault {
-    /// Its count is of the frames that it still acts on.
+    /// The fault; its count is of the frames still to be affected.
     fault: Fault,
     /// The identifier of the frames it acts on; `None` for all frames.
     id: Option<CanId>,
-    /// The first time at which it acts no more.
+    /// It acts before this time.
     until: Time,
 }
 
@@ -34,7 +34,7 @@ pub(in crate::emulator) struct FaultyLine {
     faults: Vec<FrameFault>,
     /// Frames on their way with the time of their arrival, in the order of sending.
     under_way: VecDeque<(Time, Frame)>,
-    /// Reordered frames that wait for the next frame, with the delay they get then.
+    /// Reordered frames that wait for the next frame, and their delay after it.
     held: Vec<(Duration, Frame)>,
 }
 
@@ -47,17 +47,18 @@ impl FaultyLine {
     /// Takes a frame that is sent at `now`.
     pub(in crate::emulator) fn handle(&mut self, now: Time, frame: &Frame) {
         let (mut changed, mut copies) = (*frame, 1);
-        let (mut late, mut held) = (Duration::ZERO, false);
+        let (mut delay, mut is_held) = (Duration::ZERO, false);
         for FrameFault { fault, .. } in
             self.faults.iter_mut().filter(|fault| fault.acts_on(now, frame))
         {
-            fault.count = fault.count.map(|left| left - 1);
+            fault.count = fault.count.map(|count| count - 1);
             match fault.kind {
-                FaultKind::Delay => late += fault.delay.unwrap_or_default(),
+                FaultKind::Delay => delay += fault.delay.unwrap_or_default(),
                 FaultKind::Duplicate => copies *= 2,
                 // The frame after a held one passes.
-                FaultKind::Reorder => held = self.held.is_empty(),
-                FaultKind::Corrupt | FaultKind::Resize => changed = fault.applied_to(&changed),
+                FaultKind::Reorder => is_held = self.held.is_empty(),
+                FaultKind::Corrupt | FaultKind::Resize => changed = fault.altered(&changed),
+                // Lost: dropped, or its node is off the bus.
                 _ => {
                     copies = 0;
                     break;
@@ -65,17 +66,17 @@ impl FaultyLine {
             }
         }
         for _ in 0..copies {
-            if held {
-                self.held.push((late, changed));
-            } else if late.is_zero() {
+            if is_held {
+                self.held.push((delay, changed));
+            } else if delay.is_zero() {
                 self.pass(now, changed);
             } else {
-                self.under_way.push_back((now + late, changed));
+                self.under_way.push_back((now + delay, changed));
             }
         }
     }
 
-    /// The next frame to arrive at `now`; `None` when none is due.
+    /// The next frame that has arrived by `now`.
     pub(in crate::emulator) fn poll(&mut self, now: Time) -> Option<Frame> {
         let arrivals = self.under_way.iter().map(|(due, _)| *due).enumerate();
         let (first, _) = arrivals.min_by_key(|(_, due)| *due).filter(|(_, due)| *due <= now)?;
@@ -89,13 +90,13 @@ impl FaultyLine {
 
     fn pass(&mut self, now: Time, frame: Frame) {
         self.under_way.push_back((now, frame));
-        self.under_way.extend(self.held.drain(..).map(|(late, held)| (now + late, held)));
+        self.under_way.extend(self.held.drain(..).map(|(delay, held)| (now + delay, held)));
     }
 }
 
 impl Fault {
     /// `frame` with bits of a byte inverted, or of another length: cut off, or filled up with zeros.
-    fn applied_to(&self, frame: &Frame) -> Frame {
+    fn altered(&self, frame: &Frame) -> Frame {
         let (mut data, mut len) = ([0; 8], frame.data().len());
         data[..len].copy_from_slice(frame.data());
         match self.kind {

@@ -4,7 +4,7 @@ mod line;
 mod script;
 
 pub(super) use line::FaultyLine;
-pub(super) use script::{Change, Script};
+pub(super) use script::{Script, ScriptEvent};
 
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::{CanId, Frame, NodeId, cob};
@@ -25,7 +25,7 @@ section! {
         /// withdrawn.
         at_mm: Option<f64> [within(-1000.0, 1000.0)];
         /// It begins this long after the stage was switched on.
-        at as "at_s": Option<Duration> [within(0.0, 86_400.0)], instead_of("at_mm");
+        start_after as "at_s": Option<Duration> [within(0.0, 86_400.0)], instead_of("at_mm");
         /// The drives that have the fault.
         axis: FaultyDrives = "both";
         /// How long the fault lasts; left out, for good.
@@ -148,14 +148,14 @@ impl Fault {
         Fault { kind, ..Fault::take(None) }
     }
 
-    /// Refuses a fault without its moment, a kind without the key that it needs, and frames that go
-    /// the other way.
+    /// Refuses a fault without a start, a kind without the key that it needs, and frames in a direction in
+    /// which they are never sent.
     ///
     /// # Errors
     /// The key that is wrong, and why.
     pub(crate) fn check(&self) -> Result<(), (&'static str, String)> {
         let needs = match self.kind {
-            _ if self.at_mm.is_none() && self.at.is_none() => Some("at_mm or at_s"),
+            _ if self.at_mm.is_none() && self.start_after.is_none() => Some("at_mm or at_s"),
             FaultKind::Delay if self.delay.is_none() => Some("delay_ms"),
             FaultKind::Resize if self.length.is_none() => Some("length"),
             FaultKind::DriveFault if self.code.is_none() => Some("code"),
@@ -167,10 +167,10 @@ impl Fault {
         }
         let message = match (self.frames, self.toward) {
             (FrameClass::Emergency, Toward::Drives) => {
-                "frames = \"emergency\" go toward = \"bench\" alone: no drive reads them"
+                "frames = \"emergency\" needs toward = \"bench\": no drive reads emergency messages"
             }
             (FrameClass::Sync, Toward::Bench) => {
-                "frames = \"sync\" go toward = \"drives\" alone: the bench sends them"
+                "frames = \"sync\" needs toward = \"drives\": the bench sends SYNC"
             }
             _ => return Ok(()),
         };
@@ -185,8 +185,8 @@ impl Fault {
         )
     }
 
-    /// The identifier of the frames of `node` that it acts on; `None` for all frames.
-    pub(super) fn id(&self, node: NodeId) -> Option<CanId> {
+    /// The identifier of the frames of `node` that the fault acts on; `None` for all frames.
+    pub(super) fn frame_id(&self, node: NodeId) -> Option<CanId> {
         let cob_id = match (self.frames, self.toward) {
             (FrameClass::Any, _) => return None,
             (FrameClass::Pdo, Toward::Bench) => cob::tpdo(node),
@@ -201,12 +201,12 @@ impl Fault {
         Some(CanId::Base(cob_id))
     }
 
-    /// The frame of another node.
-    pub(super) fn foreign(&self) -> Option<Frame> {
+    /// The frame that another node sends.
+    pub(super) fn foreign_frame(&self) -> Option<Frame> {
         self.frame.as_deref().and_then(data_frame)
     }
 
-    /// What happens to frames, in words.
+    /// What happens to the frames, in words.
     fn action(&self) -> String {
         match self.kind {
             FaultKind::Delay => {
@@ -222,7 +222,7 @@ impl Fault {
     }
 }
 
-/// `insertion: PDOs to the bench lost`.
+/// For example `insertion: PDOs to the bench lost`.
 impl fmt::Display for Fault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if self.kind.has("axis") {
@@ -272,7 +272,7 @@ impl fmt::Display for Fault {
 }
 
 impl FaultKind {
-    /// True if such a fault has this key.
+    /// True if a fault of this kind has this key.
     pub(super) fn has(self, key: &str) -> bool {
         self.keys().contains(&key)
     }
@@ -285,7 +285,7 @@ impl FaultKind {
         )
     }
 
-    /// The keys that such a fault has beside its kind.
+    /// The keys that a fault of this kind has beside its kind.
     pub(crate) fn keys(self) -> Vec<&'static str> {
         let own: &[_] = match self {
             FaultKind::Drop | FaultKind::Duplicate | FaultKind::Reorder => {
