@@ -20,10 +20,10 @@ pub enum Noise {
 }
 
 impl Noise {
-    /// The noise of position number `k`, mm. It depends on the noise, the seed and `k` only, so the
-    /// positions before need not be drawn.
+    /// The noise of position number `k`, mm. It depends only on `self`, the seed and `k`, so the positions
+    /// before need not be drawn.
     pub fn draw(self, seed: u64, k: u64) -> Vector3<f64> {
-        let at = |draws_per_position: u128| {
+        let rng_at_k = |draws_per_position: u128| {
             let mut rng = Pcg64::seed_from_u64(seed);
             rng.advance(draws_per_position * u128::from(k));
             rng
@@ -31,11 +31,11 @@ impl Noise {
         match self {
             Noise::None => Vector3::zeros(),
             Noise::Uniform(half_mm) => {
-                let mut rng = at(3);
+                let mut rng = rng_at_k(3);
                 Vector3::from_fn(|_, _| half_mm * (2.0 * rng.random::<f64>() - 1.0))
             }
             Noise::Gaussian(sd_mm) => {
-                let mut rng = at(6);
+                let mut rng = rng_at_k(6);
                 Vector3::from_fn(|_, _| sd_mm * standard_normal(rng.random(), rng.random()))
             }
         }
@@ -62,10 +62,10 @@ pub struct CorrelatedNoise {
 }
 
 impl CorrelatedNoise {
-    /// So many correlation times apart two positions count as independent: exp(-40) is under the
-    /// rounding of a double.
-    const INDEPENDENT: f64 = 40.0;
-    /// Added to the seed, so that this noise has nothing to do with the white part's.
+    /// Two positions count as independent if they are this many correlation times apart: exp(-40) is under
+    /// the rounding of a double.
+    const INDEPENDENT_TIMES: f64 = 40.0;
+    /// The number of this noise's seed in the sequence [`counted`], so that it is independent of the white part.
     const STREAM: u64 = 0x434F_4C4F_5552_0000;
 
     /// The noise of position number `k` where positions are `interval_s` apart, mm.
@@ -78,7 +78,7 @@ impl CorrelatedNoise {
         let seed = counted(seed, Self::STREAM);
         let unit = |k| Noise::Gaussian(1.0).draw(seed, k);
         let per_interval = interval_s / self.time_s;
-        let spacing = (Self::INDEPENDENT / per_interval).ceil() as u64;
+        let spacing = (Self::INDEPENDENT_TIMES / per_interval).ceil() as u64;
         let spacing = spacing.clamp(1, 1 << 40).next_power_of_two();
         let (mut first, mut half) = (k - k % spacing, spacing / 2);
         let (mut a, mut b) = (unit(first), unit(first + spacing));

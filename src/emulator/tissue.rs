@@ -3,7 +3,7 @@
 use crate::geometry::Pose;
 use crate::needle::{Cut, Increment, InsertedPath, Needle, Play, Torsion};
 
-/// A needle pulled back to here is out of the tissue, mm.
+/// A needle withdrawn to this depth is out of the tissue, mm.
 const OUT_MM: f64 = 0.1;
 
 /// A needle in tissue. The true position of the stage drives it; its true tip pose follows.
@@ -84,8 +84,7 @@ impl Tissue {
         }
     }
 
-    /// The needle is out: nothing holds its tip back from the base's rotation, and its channel is of no
-    /// more use.
+    /// The needle is out: its tip follows the base's rotation, and its channel is dropped.
     fn leave(&mut self, at_mm: f64, rotation_true_rad: f64) {
         self.play = Play::default();
         self.true_now.roll_rad = rotation_true_rad;

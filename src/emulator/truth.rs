@@ -3,10 +3,9 @@
 use crate::geometry::Pose;
 use nalgebra::Vector3;
 
-/// The true tip pose `X_PB`, plane frame, and the true target where that moves.
+/// The true tip pose `X_PB`, plane frame, and the true target if the tracker sees one.
 ///
-/// The emulator makes it, and only telemetry and studies read it. Observers and controllers cannot name
-/// it.
+/// Only telemetry and studies read it. Observers and controllers cannot name it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Truth {
     x_pb: Pose,
@@ -14,12 +13,12 @@ pub struct Truth {
 }
 
 impl Truth {
-    /// The truth `x_pb`.
+    /// The true tip pose, without a target.
     pub(crate) fn new(x_pb: Pose) -> Self {
         Truth { x_pb, target_mm: None }
     }
 
-    /// The same with the target there, plane frame, mm.
+    /// The same with this target, plane frame, mm.
     pub(crate) fn with_target(self, target_mm: Option<Vector3<f64>>) -> Self {
         Truth { target_mm, ..self }
     }
@@ -29,7 +28,7 @@ impl Truth {
         &self.x_pb
     }
 
-    /// The true target, plane frame, mm; `None` where it is no tool of its own.
+    /// The true target, plane frame, mm; `None` if the tracker does not see the target.
     pub fn target_mm(&self) -> Option<&Vector3<f64>> {
         self.target_mm.as_ref()
     }
