@@ -2,7 +2,7 @@
 
 use super::pose::{POSITION, TIP_PITCH};
 use super::{Config, ConfigError, GoalKind, WorkspaceConfig};
-use crate::emulator::counted;
+use crate::emulator::split_mix64;
 use crate::geometry::TURN;
 use crate::keys::{Field, Key, Words, find, over, section, within};
 use crate::math;
@@ -80,7 +80,7 @@ fn array(point: &Vector3<f64>) -> Value {
 
 /// A number from 0 up to 1, drawn for the trial with this seed.
 fn fraction(seed: u64, number: u64) -> f64 {
-    (counted(seed, number) >> 11) as f64 / (1u64 << 53) as f64
+    (split_mix64(seed, number) >> 11) as f64 / (1u64 << 53) as f64
 }
 
 impl Config {

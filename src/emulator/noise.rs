@@ -65,7 +65,7 @@ impl CorrelatedNoise {
     /// Two positions count as independent if they are this many correlation times apart: exp(-40) is under
     /// the rounding of a double.
     const INDEPENDENT_TIMES: f64 = 40.0;
-    /// The number of this noise's seed in the sequence [`counted`], so that it is independent of the white part.
+    /// The number of this noise's seed in the sequence [`split_mix64`], so that it is independent of the white part.
     const STREAM: u64 = 0x434F_4C4F_5552_0000;
 
     /// The noise of position number `k` where positions are `interval_s` apart, mm.
@@ -75,7 +75,7 @@ impl CorrelatedNoise {
     /// both ends a and b, has the mean `(a + b) ρ / (1 + ρ²)` and the variance
     /// `(1 - ρ²) / (1 + ρ²)` with `ρ = exp(-h / time_s)`.
     pub fn draw(self, seed: u64, k: u64, interval_s: f64) -> Vector3<f64> {
-        let seed = counted(seed, Self::STREAM);
+        let seed = split_mix64(seed, Self::STREAM);
         let unit = |k| Noise::Gaussian(1.0).draw(seed, k);
         let per_interval = interval_s / self.time_s;
         let spacing = (Self::INDEPENDENT_TIMES / per_interval).ceil() as u64;
@@ -106,9 +106,9 @@ impl CorrelatedNoise {
     }
 }
 
-/// Number `count` of the SplitMix64 sequence that starts at `seed`.
-pub fn counted(seed: u64, count: u64) -> u64 {
-    let z = seed.wrapping_add(count.wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15));
+/// Number `number` of the SplitMix64 sequence that starts at `seed`.
+pub fn split_mix64(seed: u64, number: u64) -> u64 {
+    let z = seed.wrapping_add(number.wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15));
     let z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
     let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
     z ^ (z >> 31)
@@ -211,8 +211,8 @@ mod tests {
 
     /// The first values of SplitMix64 from seed 1234567, as its reference gives them.
     #[test]
-    fn counted_is_splitmix64() {
-        let values = [0, 1, 2].map(|count| counted(1_234_567, count));
+    fn split_mix64_gives_the_published_numbers() {
+        let values = [0, 1, 2].map(|count| split_mix64(1_234_567, count));
         assert_eq!(
             values,
             [6_457_827_717_110_365_317, 3_203_168_211_198_807_973, 9_817_491_932_198_370_423]

@@ -4,14 +4,14 @@ use super::consistency::{Consistency, Nees};
 use super::figures::{FigureReport, TipError};
 use super::score::TrialResult;
 use super::statistics::{quantile, rms};
-use crate::emulator::counted;
+use crate::emulator::split_mix64;
 use crate::session::Outcome;
 use serde::Serialize;
 
 /// The seed of trial `trial` in the study with this `seed`. It does not depend on the thread, and has
 /// 53 bits, so that every JSON reader reads it exactly.
 pub fn trial_seed(seed: u64, trial: u64) -> u64 {
-    counted(seed, trial) >> 11
+    split_mix64(seed, trial) >> 11
 }
 
 /// Order statistics of a distance, mm. A stopped trial counts as infinitely far off. Without trials they are NaN.
