@@ -1,5 +1,5 @@
-//! The axis behind the node: state machine, stops and faults. It takes its commands from the objects and
-//! puts its state there.
+//! The axis behind the node: state machine, stops and faults. It reads its commands from the objects, and
+//! writes its state to them.
 
 use super::device::Device;
 use super::homing::{self, Homing};
@@ -44,11 +44,10 @@ pub(super) struct Axis {
     pub(super) target_limited: bool,
     /// The state to enter when the axis stands.
     after_stop: Option<DriveState>,
-    /// The last controlword.
-    before: Controlword,
-    pub(super) voltage: bool,
+    last_controlword: Controlword,
+    pub(super) has_voltage: bool,
     /// Something blocks the axis.
-    pub(super) stalled: bool,
+    pub(super) is_stalled: bool,
     /// A supervised node is lost: a fault reset is refused.
     partner_lost: bool,
     /// Position at the last update, in whole counts.
@@ -71,9 +70,9 @@ impl Axis {
             zero: 0,
             target_limited: false,
             after_stop: None,
-            before: Controlword::default(),
-            voltage: true,
-            stalled: false,
+            last_controlword: Controlword::default(),
+            has_voltage: true,
+            is_stalled: false,
             partner_lost: false,
             counts: config.start_counts,
             updated: Time::ZERO,
@@ -88,19 +87,19 @@ impl Axis {
     }
 
     pub(super) fn has_torque(&self) -> bool {
-        self.voltage && !self.inputs.interlocked
+        self.has_voltage && !self.inputs.interlocked
     }
 
-    fn controlword_written(&mut self, now: Time, device: &mut Device) {
+    fn handle_controlword(&mut self, now: Time, device: &mut Device) {
         let controlword = Controlword(device.objects.integer(object::CONTROLWORD) as u16);
-        let before = std::mem::replace(&mut self.before, controlword);
+        let before = std::mem::replace(&mut self.last_controlword, controlword);
         if self.state == DriveState::Fault {
             let reset = Controlword::FAULT_RESET_BIT;
             let rising = controlword.has(reset) && !before.has(reset);
             if rising && self.has_torque() && !self.partner_lost {
                 device.clear_all();
                 device.objects.set(object::ERROR_CODE, 0);
-                self.power_off(now); // 15
+                self.power_off(now); // transition 15
             }
             return;
         }
@@ -116,11 +115,11 @@ impl Axis {
             self.brake(now, halt_deceleration(&device.objects));
         }
         if self.may_move(device) {
-            self.homing_commanded(now, controlword, before, device);
+            self.handle_homing_bit(now, controlword, before, device);
         }
     }
 
-    /// Power needs voltage, and operation needs the nodes that this drive supervises (0x1016).
+    /// Switched On needs torque, and Operation Enabled also the nodes that this drive supervises (0x1016).
     fn may_enter(&self, next: DriveState) -> bool {
         match next {
             DriveState::SwitchedOn => self.has_torque(),
@@ -139,7 +138,7 @@ impl Axis {
                 self.homing = Homing::default();
             }
             _ => {
-                self.stand(now);
+                self.stop_at_once(now);
                 self.state = next;
             }
         }
@@ -169,13 +168,13 @@ impl Axis {
             1 => device.objects.integer(object::PROFILE_DECELERATION),
             2 => device.objects.integer(object::QUICK_STOP_DECELERATION),
             _ => {
-                self.stand(now);
+                self.stop_at_once(now);
                 0
             }
         };
-        self.state = DriveState::FaultReactionActive; // 13
+        self.state = DriveState::FaultReactionActive; // transition 13
         self.brake(now, deceleration);
-        self.after_stop = Some(DriveState::Fault); // 14
+        self.after_stop = Some(DriveState::Fault); // transition 14
     }
 
     /// Communication failed. Object 0x6007 selects the reaction: 0 no action, 1 fault signal,
@@ -194,12 +193,12 @@ impl Axis {
     }
 
     fn power_off(&mut self, now: Time) {
-        self.stand(now);
+        self.stop_at_once(now);
         self.state = DriveState::SwitchOnDisabled;
     }
 
-    /// Stops at once: without power a lead screw or a high gear ratio does not coast.
-    pub(super) fn stand(&mut self, now: Time) {
+    /// Stops without a ramp: without power a lead screw or a high gear ratio does not coast.
+    pub(super) fn stop_at_once(&mut self, now: Time) {
         self.motion = Motion::Hold { at: self.motion.position_at(now) };
         self.after_stop = None;
         self.stop_following();
@@ -261,10 +260,11 @@ impl Axis {
         }
     }
 
-    /// A change of mode ends the motion of the old mode. Writing the active mode again changes nothing.
-    fn mode_written(&mut self, now: Time, device: &Device) {
-        let in_force = device.objects.integer(object::MODES_OF_OPERATION_DISPLAY);
-        if device.objects.integer(object::MODES_OF_OPERATION) == in_force {
+    /// Handles a mode that was written. A change of mode ends the motion of the old mode; writing the active
+    /// mode again changes nothing.
+    fn handle_mode(&mut self, now: Time, device: &Device) {
+        let active = device.objects.integer(object::MODES_OF_OPERATION_DISPLAY);
+        if device.objects.integer(object::MODES_OF_OPERATION) == active {
             return;
         }
         self.homing = Homing::default();
@@ -276,30 +276,30 @@ impl Axis {
 
     /// Object 0x6041.
     fn statusword(&self, now: Time, device: &Device) -> u16 {
-        let follows = self.follows(device);
+        let follows = self.follows_targets(device);
         let powered =
             matches!(self.state, DriveState::OperationEnabled | DriveState::QuickStopActive);
-        let stands = self.motion.end().is_none_or(|end| now >= end);
+        let is_standing = self.motion.end().is_none_or(|end| now >= end);
         let limited = self.target_limited || self.lag != 0;
         let on_switch = [End::Negative, End::Positive]
             .into_iter()
             .any(|end| self.inputs.is_closed(end, self.counts));
         // The meaning of bits 10, 12 and 13 depends on the mode. In CSP bit 10 is reserved; this drive
-        // sets it when a halt or quick stop is over.
+        // sets it when a halt or quick stop has ended.
         let following_error = device.is_active(EmcyCode::FOLLOWING_ERROR);
         let (reached, bit_12, bit_13) = match self.mode(&device.objects) {
             Mode::HOMING => {
                 let failed = self.homing == Homing::Failed;
-                (powered && stands, self.referenced && !failed, failed)
+                (powered && is_standing, self.referenced && !failed, failed)
             }
-            _ => (powered && stands && !follows, follows && !limited, following_error),
+            _ => (powered && is_standing && !follows, follows && !limited, following_error),
         };
         let flags = [
-            (Statusword::VOLTAGE_ENABLED, self.voltage),
+            (Statusword::VOLTAGE_ENABLED, self.has_voltage),
             (Statusword::REMOTE, device.nmt_state == NmtState::Operational),
             (Statusword::TARGET_REACHED, reached),
-            (Statusword::INTERNAL_LIMIT, follows && limited || powered && on_switch),
-            // These two bits have other names in homing.
+            (Statusword::INTERNAL_LIMIT, (follows && limited) || (powered && on_switch)),
+            // In homing these two bits are "homing attained" and "homing error".
             (Statusword::FOLLOWS_COMMAND, bit_12),
             (Statusword::FOLLOWING_ERROR, bit_13),
             (REFERENCED, self.referenced && self.config.model == Model::Epos4),
@@ -359,34 +359,34 @@ impl Axis {
     /// # Errors
     /// The abort code to refuse with.
     pub(super) fn check_write(&self, address: ObjectAddress, value: i64) -> Result<(), AbortCode> {
-        let known = match address {
+        let is_supported = match address {
             object::MODES_OF_OPERATION => MODES.contains(&Mode(value as i8)),
             object::HOMING_METHOD => homing::is_supported(value, &self.inputs.switches),
             object::QUICK_STOP_OPTION => matches!(value, 0 | 1 | 2 | 5 | 6),
             _ => true,
         };
-        if known { Ok(()) } else { Err(AbortCode::INVALID_VALUE) }
+        if is_supported { Ok(()) } else { Err(AbortCode::INVALID_VALUE) }
     }
 
-    /// The object at `address` was written over the bus.
-    pub(super) fn written(&mut self, now: Time, address: ObjectAddress, device: &mut Device) {
+    /// Handles an object that was written over the bus.
+    pub(super) fn handle_write(&mut self, now: Time, address: ObjectAddress, device: &mut Device) {
         match address {
-            object::CONTROLWORD => self.controlword_written(now, device),
-            object::MODES_OF_OPERATION => self.mode_written(now, device),
+            object::CONTROLWORD => self.handle_controlword(now, device),
+            object::MODES_OF_OPERATION => self.handle_mode(now, device),
             _ => {}
         }
     }
 
-    /// SYNC came while the node is Operational: brings the objects to what this SYNC samples.
+    /// Handles the first half of a SYNC in Operational: updates the objects that the TPDOs sample.
     pub(super) fn sample(&mut self, now: Time, device: &mut Device) {
-        self.motion.settle(now);
+        self.motion.align_to_sync(now);
         self.update(now, device);
     }
 
     /// The NMT state is no longer `before`; the new one is in `device`.
     pub(super) fn nmt_state_changed(&mut self, now: Time, before: NmtState, device: &mut Device) {
-        let left = before == NmtState::Operational;
-        if left && self.state == DriveState::OperationEnabled {
+        let was_operational = before == NmtState::Operational;
+        if was_operational && self.state == DriveState::OperationEnabled {
             self.abort_connection(now, EmcyCode::COMMUNICATION, device);
         }
     }
@@ -406,11 +406,11 @@ impl Axis {
         }
     }
 
-    /// All objects have their power-on values again and no error is active.
+    /// Resets the axis after its objects and errors were reset.
     pub(super) fn reset(&mut self, now: Time) {
         self.power_off(now);
         self.demand = whole(self.motion.position_at(now));
-        self.before = Controlword::default();
+        self.last_controlword = Controlword::default();
         self.partner_lost = false;
         self.homing = Homing::default();
         self.referenced = false;

@@ -17,25 +17,25 @@ const WINDOW_OFF: i64 = u32::MAX as i64;
 
 impl Axis {
     /// True while the axis takes targets.
-    pub(super) fn follows(&self, device: &Device) -> bool {
+    pub(super) fn follows_targets(&self, device: &Device) -> bool {
         self.may_move(device) && self.mode(&device.objects) == Mode::CSP
     }
 
-    /// The same SYNC, after its TPDOs were sampled and the RPDOs that waited for it were written: an axis
-    /// that follows takes the target for the next interpolation period.
+    /// Handles the second half of a SYNC, after its TPDOs were sampled and its RPDOs written: an axis that
+    /// follows takes the target for the next interpolation period.
     ///
     /// The axis reaches it exactly at the end of the period, unless its maximum speed or acceleration is
     /// too low. Then it lags. When it would lag by more than 0x6065 for longer than 0x6066, it faults
     /// instead of moving.
     pub(super) fn take_target(&mut self, now: Time, device: &mut Device) {
-        if !self.follows(device) {
+        if !self.follows_targets(device) {
             return;
         }
         let objects = &device.objects;
         let target = objects.integer(object::TARGET_POSITION) as i32;
         let allowed = within_limits(target, objects);
         self.target_limited = allowed != target;
-        // Positions wrap at 32 bits: the nearest one with this value is meant.
+        // Positions wrap at 32 bits: this takes the nearest one with the target's value.
         let step = allowed.wrapping_sub(self.demand.wrapping_sub(self.zero) as i32);
         self.demand = self.demand.saturating_add(step.into());
 
@@ -58,22 +58,25 @@ impl Axis {
     /// The position nearest to the demand that the axis reaches in `period`.
     fn reachable(&self, now: Time, period: Duration, objects: &ObjectDictionary) -> f64 {
         let from = self.motion.position_at(now);
-        if self.stalled {
+        if self.is_stalled {
             return from.round();
         }
         let seconds = period.as_secs_f64();
         let distance = self.demand as f64 - from;
         let reach = self.speed_limit(objects) * seconds;
-        let set = objects.integer(MAX_ACCELERATION) as f64;
-        let change = set.min(ACCELERATION_MAX_COUNTS_PER_S2) * seconds * seconds;
-        let unchanged = self.motion.velocity_at(now) * seconds;
-        let travel = distance.clamp(-reach, reach).clamp(unchanged - change, unchanged + change);
+        let acceleration_limit =
+            (objects.integer(MAX_ACCELERATION) as f64).min(ACCELERATION_MAX_COUNTS_PER_S2);
+        let change = acceleration_limit * seconds * seconds;
+        let at_present_speed = self.motion.velocity_at(now) * seconds;
+        let travel = distance
+            .clamp(-reach, reach)
+            .clamp(at_present_speed - change, at_present_speed + change);
         if travel == distance { self.demand as f64 } else { (from + travel).round() }
     }
 
     pub(super) fn speed_limit(&self, objects: &ObjectDictionary) -> f64 {
-        let set = objects.integer(object::MAX_PROFILE_VELOCITY) as f64;
-        set.min(self.config.speed_max_counts_per_s.into())
+        let configured = objects.integer(object::MAX_PROFILE_VELOCITY) as f64;
+        configured.min(self.config.speed_max_counts_per_s.into())
     }
 }
 
@@ -84,7 +87,7 @@ fn interpolation_period(objects: &ObjectDictionary) -> Duration {
     Duration::from_secs_f64(value * 10f64.powi(exponent))
 }
 
-/// `target` cut to 0x607D, which is off while both limits are 0.
+/// `target` clamped to 0x607D, which is off while both limits are 0.
 fn within_limits(target: i32, objects: &ObjectDictionary) -> i32 {
     let min = objects.integer(object::SOFTWARE_LIMIT_MIN) as i32;
     let max = objects.integer(object::SOFTWARE_LIMIT_MAX) as i32;

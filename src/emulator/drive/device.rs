@@ -1,4 +1,4 @@
-//! What the drive's communication and its axis share: objects, NMT state and errors.
+//! What the node and its axis share: objects, NMT state and errors.
 
 use std::collections::VecDeque;
 

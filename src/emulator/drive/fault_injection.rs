@@ -23,7 +23,7 @@ impl Axis {
     ) {
         match fault.kind {
             FaultKind::Stall => {
-                self.stalled = begins;
+                self.is_stalled = begins;
                 if begins {
                     let ramped = matches!(self.motion, Motion::Ramped(_));
                     self.motion = Motion::Hold { at: self.motion.position_at(now) };
@@ -43,18 +43,18 @@ impl Axis {
             }
             FaultKind::EmergencyStop => {
                 self.inputs.interlocked = begins;
-                self.without_torque(now, INTERLOCK, device);
+                self.handle_torque_loss(now, INTERLOCK, device);
             }
             FaultKind::NoVoltage => {
-                self.voltage = !begins;
-                self.without_torque(now, EmcyCode::UNDERVOLTAGE, device);
+                self.has_voltage = !begins;
+                self.handle_torque_loss(now, EmcyCode::UNDERVOLTAGE, device);
             }
             _ => {}
         }
     }
 
-    /// An axis that has lost its torque stands at once, also in its fault reaction.
-    fn without_torque(&mut self, now: Time, code: EmcyCode, device: &mut Device) {
+    /// Stops an axis that has lost its torque at once, also in its fault reaction, and raises `code`.
+    fn handle_torque_loss(&mut self, now: Time, code: EmcyCode, device: &mut Device) {
         let powered = matches!(
             self.state(),
             DriveState::SwitchedOn

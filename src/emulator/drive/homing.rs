@@ -31,9 +31,13 @@ pub(super) enum Homing {
     /// Not started, interrupted, or finished.
     #[default]
     Idle,
-    /// The remaining legs, the next one first, the limit switch that the present leg moves onto, and the home
-    /// position.
-    InProgress { legs: Vec<Leg>, onto: Option<End>, home_counts: i64 },
+    InProgress {
+        /// The legs after the present one.
+        legs: Vec<Leg>,
+        /// The limit switch that the present leg moves onto.
+        onto: Option<End>,
+        home_counts: i64,
+    },
     /// Homing error: bit 13.
     Failed,
 }
@@ -49,7 +53,7 @@ pub(super) fn is_supported(method: i64, switches: &Switches) -> bool {
 ///
 /// The emulator knows the positions of its switches. The axis moves onto a switch, brakes `overrun_counts`
 /// beyond it, and moves back. The encoder has an index pulse every `index_counts`. `None` for a method that
-/// is not supported, or whose switch there is not.
+/// is not supported, or whose switch does not exist.
 fn plan(
     method: i64,
     at_counts: i64,
@@ -74,7 +78,7 @@ fn plan(
             let home = if method == 2 { below(closes) } else { closes - 1 };
             (vec![onto, Leg { onto: Some(End::Positive), ..slow(home) }], home)
         }
-        // From a closed switch first off it, then onto it from below.
+        // From a closed switch the axis first moves off it. It moves onto the switch from below.
         24 => {
             let closes = switches.home_counts?;
             let off = (at_counts >= closes).then(|| seek(closes - overrun_counts, None));
@@ -89,9 +93,9 @@ fn plan(
 }
 
 impl Axis {
-    /// Takes a controlword in homing mode and the one before it. The rising edge of bit 4 starts
-    /// homing, its falling edge stops it.
-    pub(super) fn homing_commanded(
+    /// Handles a controlword in homing mode. The rising edge of bit 4 since the one `before` starts homing,
+    /// its falling edge stops it.
+    pub(super) fn handle_homing_bit(
         &mut self,
         now: Time,
         word: Controlword,
@@ -120,7 +124,7 @@ impl Axis {
 
     /// Starts a move of an axis at rest. A blocked axis faults with a following error.
     fn begin_move(&mut self, now: Time, leg: Leg, device: &mut Device) {
-        if self.stalled {
+        if self.is_stalled {
             return self.fault(now, EmcyCode::FOLLOWING_ERROR, device);
         }
         let (speed, acceleration) = self.limits(leg.fast, &device.objects);

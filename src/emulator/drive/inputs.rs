@@ -9,7 +9,7 @@ pub(super) enum End {
     Positive,
 }
 
-/// Positions of the switches in encoder counts; `None`: there is no such switch.
+/// Positions of the switches in encoder counts; `None` for a switch that does not exist.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Switches {
     /// The negative limit switch closes at and below this position: bit 0 of 0x60FD.

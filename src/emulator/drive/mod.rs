@@ -43,19 +43,19 @@ pub struct DriveConfig {
     pub speed_max_counts_per_s: u32,
     /// Limit and home switches.
     pub switches: Switches,
-    /// The make that it imitates.
+    /// The make that the drive imitates.
     pub model: Model,
     /// It was homed since power-on.
     pub homed: bool,
-    /// Objects of its own besides those of the data sheet, and their bits.
+    /// Objects besides those of the data sheet, and their bits.
     pub more_objects: Vec<(ObjectAddress, u8)>,
 }
 
 choice! {
     /// The make that a drive imitates, where the profile leaves a choice.
     ///
-    /// The generic drive has all objects of the data sheet, and a limit switch causes a quick stop. Of an
-    /// EPOS4 TPDOs have no event timer; the unit is the increment (no 0x6091, 0x6092); 0x1006, 0x1007, 0x1019
+    /// The generic drive has all objects of the data sheet, and a limit switch causes a quick stop. On an
+    /// EPOS4, TPDOs have no event timer; the unit is the increment (no 0x6091, 0x6092); 0x1006, 0x1007, 0x1019
     /// and 0x6066 are missing; a limit switch is a fault; bit 15 of the statusword says that the axis was
     /// homed.
     pub enum Model {

@@ -115,15 +115,15 @@ impl Motion {
         Motion::Brake(Profile::braking(now, from, speed, to, seconds))
     }
 
-    /// Ends a linear piece that is more than half over: the drive's clock follows a SYNC that comes a
-    /// little early.
-    pub(super) fn settle(&mut self, now: Time) {
+    /// Shifts a linear piece that is more than half over so that it ends at `now`: the drive's clock follows
+    /// a SYNC that comes a little early.
+    pub(super) fn align_to_sync(&mut self, now: Time) {
         if let Motion::Linear { start, end, .. } = self
             && *start < now
             && now < *end
             && Self::progress(now, *start, *end) > 0.5
         {
-            // Shifted, not shortened: the speed at which a stop would begin does not change.
+            // Not shortened: the speed at which a stop would begin does not change.
             *start = now - end.since(*start);
             *end = now;
         }
@@ -183,9 +183,9 @@ mod tests {
     #[test]
     fn an_early_beat_ends_a_piece_and_a_stray_one_does_not() {
         let mut motion = Motion::linear(at(0), 0.0, 100.0, PERIOD);
-        motion.settle(at(2));
+        motion.align_to_sync(at(2));
         assert_eq!(motion.position_at(at(2)), 20.0);
-        motion.settle(at(9));
+        motion.align_to_sync(at(9));
         assert_eq!(motion.position_at(at(9)), 100.0);
         assert_eq!(motion.velocity_at(at(9)), 10_000.0);
     }

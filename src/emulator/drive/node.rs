@@ -28,7 +28,7 @@ const SDO_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// An emulated CiA 402 drive, sans-IO.
 ///
-/// Hand in every frame of the bus, call [`handle_timeout`](Self::handle_timeout) at
+/// Pass in every frame of the bus, call [`handle_timeout`](Self::handle_timeout) at
 /// [`deadline`](Self::deadline), and after either drain [`poll_transmit`](Self::poll_transmit).
 /// A receive PDO of a synchronous type acts at the next SYNC; transmit PDOs are sampled at SYNC
 /// before that, so the effect of a command shows one SYNC later, as with real devices.
@@ -101,10 +101,10 @@ impl Drive {
         self.axis.motion.position_at(now)
     }
 
-    /// A fault of the drive or its axis begins or ends; faults of frames and of the bus do nothing here.
+    /// Begins or ends a fault of the drive or its axis; faults of frames and of the bus do nothing here.
     pub fn apply_fault(&mut self, now: Time, fault: &Fault, begins: bool) {
         match fault.kind {
-            // It restarts again at the end, so that its boot-up message is received.
+            // The drive also restarts at the end of the fault: only then does its boot-up message reach the bus.
             FaultKind::Restart => {
                 self.handle_frame(now, &nmt_frame(NmtCommand::ResetNode, Some(self.id)));
             }
@@ -187,7 +187,7 @@ impl Drive {
             return;
         }
         self.device.nmt_state = state;
-        self.rpdos.iter_mut().for_each(Rpdo::stop);
+        self.rpdos.iter_mut().for_each(Rpdo::discard_latched);
         if state == NmtState::Operational {
             self.tpdos.iter_mut().for_each(|tpdo| tpdo.start(now));
         }
@@ -250,14 +250,14 @@ impl Drive {
         server.handle_frame(now, frame, &mut access);
         match access.written {
             Some(object @ ObjectAddress { index: 0x1000..=0x1fff, .. }) => {
-                self.communication_written(now, object);
+                self.handle_communication_object(now, object);
             }
-            Some(object) => self.axis.written(now, object, &mut self.device),
+            Some(object) => self.axis.handle_write(now, object, &mut self.device),
             None => {}
         }
     }
 
-    fn communication_written(&mut self, now: Time, object: ObjectAddress) {
+    fn handle_communication_object(&mut self, now: Time, object: ObjectAddress) {
         match (object.index, parameters::pdo_of(object.index)) {
             (_, Some((PdoDirection::Receive, offset))) => {
                 self.rpdos[usize::from(offset)] = Rpdo::load(&self.device.objects, offset);
@@ -287,7 +287,9 @@ impl Drive {
         self.supervised.retain(|supervised| supervised.subindex != subindex);
         let entry = self.device.objects.integer(consumer_heartbeat(subindex));
         let timeout = Duration::from_millis(entry as u64 & 0xffff);
-        if let (Some(node), false) = (NodeId::new((entry >> 16) as u8), timeout.is_zero()) {
+        if let Some(node) = NodeId::new((entry >> 16) as u8)
+            && !timeout.is_zero()
+        {
             let consumer = HeartbeatConsumer::new(node, timeout);
             self.supervised.push(Supervised { subindex, consumer, lost: false });
         }
@@ -303,7 +305,7 @@ impl Drive {
             let samples = self.tpdos.iter_mut().filter_map(|tpdo| tpdo.sync(&self.device.objects));
             self.outgoing.extend(samples);
             for n in 0..self.rpdos.len() {
-                let values = self.rpdos[n].sync();
+                let values = self.rpdos[n].take_latched();
                 self.write_values(now, values);
             }
             self.axis.take_target(now, &mut self.device);
@@ -331,7 +333,7 @@ impl Drive {
             }
         }
         for object in written {
-            self.axis.written(now, object, &mut self.device);
+            self.axis.handle_write(now, object, &mut self.device);
         }
     }
 
@@ -342,9 +344,9 @@ impl Drive {
         if self.nmt_state() == NmtState::Stopped {
             return;
         }
-        let emcy_off = self.device.objects.integer(communication::EMCY_COB_ID) >> 31 & 1 != 0;
+        let emcy_enabled = self.device.objects.integer(communication::EMCY_COB_ID) >> 31 & 1 == 0;
         while let Some(emcy) = self.device.poll_emcy() {
-            if !emcy_off {
+            if emcy_enabled {
                 self.outgoing.push_back(emcy.to_frame(self.id));
             }
         }

@@ -1,4 +1,4 @@
-//! The drive's objects: its electronic data sheet, with what the configuration says of this drive.
+//! The drive's objects: its electronic data sheet, with the values of the configuration.
 
 use std::fmt::Display;
 
@@ -13,8 +13,8 @@ pub(super) const MAX_ACCELERATION: ObjectAddress = ObjectAddress::new(0x60c5, 0)
 /// The maximum acceleration of the motor: the power-on value of [`MAX_ACCELERATION`].
 pub(super) const ACCELERATION_MAX_COUNTS_PER_S2: f64 = 100_000_000.0;
 
-/// The data sheet of a generic drive. PDOs come as real drives have them: event-driven, and without
-/// the mapping that a master under SYNC needs.
+/// The data sheet of a generic drive. The PDOs are as on real drives: event-driven, and without the mapping
+/// that a master under SYNC needs.
 const GENERIC: &str = include_str!("drive.eds");
 
 /// Objects of CiA 301 and 402 that an EPOS4 does not have: communication cycle, window and
@@ -45,7 +45,7 @@ pub(super) fn data_sheet(config: &DriveConfig) -> Eds {
     eds
 }
 
-/// Leaves the subindices 0 to 3 of a TPDO's communication parameters.
+/// Removes subindex 5 of a TPDO's communication parameters, which leaves the subindices 0 to 3.
 fn remove_event_timer(eds: &mut Eds, index: u16) {
     eds.remove_section(&format!("{index:04X}sub5"));
     eds.set(&format!("{index:04X}"), "SubNumber", 4);

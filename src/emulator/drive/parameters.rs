@@ -41,7 +41,7 @@ fn mapping_entries(objects: &ObjectDictionary, index: u16, count: i64) -> Vec<Ma
         .collect()
 }
 
-/// Whether the communication object `object` may become `value`.
+/// Checks that the communication object `object` may become `value`.
 ///
 /// # Errors
 /// The abort code to refuse with.
@@ -54,7 +54,7 @@ pub(super) fn check_write(
         (0x1600..=0x17ff | 0x1a00.., Some((direction, _))) => {
             return check_mapping(objects, object, direction, value);
         }
-        (_, Some(_)) => may_communicate(objects, object, value),
+        (_, Some(_)) => may_set_pdo_parameter(objects, object, value),
         // The error history can only be erased.
         (0x1003, _) => value == 0,
         // No SYNC producer, no 29-bit identifiers.
@@ -77,16 +77,17 @@ fn check_supervision(
     if time != 0 && (entry >> 24 != 0 || node > 127) {
         return Err(AbortCode::INVALID_VALUE);
     }
-    let twice = (1..=SUPERVISED_LEN).filter(|other| *other != subindex).any(|other| {
-        let other = objects.integer(consumer_heartbeat(other)) as u32;
-        let (other_node, other_time) = node_and_time(other);
-        time != 0 && node != 0 && other_time != 0 && other_node == node
-    });
-    if twice { Err(AbortCode::PARAMETER_INCOMPATIBLE) } else { Ok(()) }
+    let is_supervised_already =
+        (1..=SUPERVISED_LEN).filter(|other| *other != subindex).any(|other| {
+            let other = objects.integer(consumer_heartbeat(other)) as u32;
+            let (other_node, other_time) = node_and_time(other);
+            time != 0 && node != 0 && other_time != 0 && other_node == node
+        });
+    if is_supervised_already { Err(AbortCode::PARAMETER_INCOMPATIBLE) } else { Ok(()) }
 }
 
-/// Whether a communication parameter of a PDO may become `value`.
-fn may_communicate(objects: &ObjectDictionary, object: ObjectAddress, value: i64) -> bool {
+/// True if a communication parameter of a PDO may become `value`.
+fn may_set_pdo_parameter(objects: &ObjectDictionary, object: ObjectAddress, value: i64) -> bool {
     let current = PdoCobId(objects.integer(ObjectAddress::new(object.index, 1)) as u32);
     match object.subindex {
         1 => {

@@ -35,9 +35,9 @@ impl Settings {
         let index = direction.communication_index(offset);
         let cob_id = PdoCobId(objects.integer(ObjectAddress::new(index, 1)) as u32);
         let mapping = mapping_of(objects, direction, offset);
-        let exists = cob_id.is_valid() && !mapping.objects().is_empty();
+        let is_active = cob_id.is_valid() && !mapping.objects().is_empty();
         Settings {
-            cob_id: cob_id.cob_id().filter(|_| exists),
+            cob_id: cob_id.cob_id().filter(|_| is_active),
             transmission: objects.integer(ObjectAddress::new(index, 2)) as u8,
             mapping,
         }
@@ -57,7 +57,7 @@ impl Rpdo {
         Rpdo { settings: Settings::load(objects, PdoDirection::Receive, offset), latched: None }
     }
 
-    pub(super) fn stop(&mut self) {
+    pub(super) fn discard_latched(&mut self) {
         self.latched = None;
     }
 
@@ -65,8 +65,8 @@ impl Rpdo {
         self.settings.cob_id.is_some_and(|cob_id| frame.cob_id() == Some(cob_id))
     }
 
-    /// The values to act on now, which are none when they wait for SYNC. `None` when the frame is
-    /// shorter than the mapping.
+    /// The values to act on now: none if they wait for SYNC. Returns `None` if the frame is shorter than the
+    /// mapping.
     pub(super) fn receive(&mut self, frame: &Frame) -> Option<Values> {
         let values = self.settings.mapping.unpack(frame.data())?;
         if self.settings.transmission <= SYNC_EVERY_MAX {
@@ -78,7 +78,7 @@ impl Rpdo {
     }
 
     /// The values that waited for this SYNC.
-    pub(super) fn sync(&mut self) -> Values {
+    pub(super) fn take_latched(&mut self) -> Values {
         self.latched.take().unwrap_or_default()
     }
 }
@@ -90,8 +90,8 @@ pub(super) struct Tpdo {
     inhibit: Duration,
     event_timer: Duration,
     /// Payload of the last event-driven PDO; `None` before the first one in Operational.
-    last: Option<Vec<u8>>,
-    /// SYNCs since it was sent.
+    last_payload: Option<Vec<u8>>,
+    /// SYNCs since the last SYNC-driven PDO.
     syncs: u8,
     not_before: Time,
     event_due: Time,
@@ -108,7 +108,7 @@ impl Tpdo {
             settings: Settings::load(objects, PdoDirection::Transmit, offset),
             inhibit: inhibit.max(EVENT_SPACING_MIN),
             event_timer: Duration::from_millis(time(5)),
-            last: None,
+            last_payload: None,
             syncs: 0,
             not_before: Time::ZERO,
             event_due: Time::NEVER,
@@ -118,7 +118,7 @@ impl Tpdo {
 
     /// The node became Operational, or the PDO's parameters changed while it was.
     pub(super) fn start(&mut self, now: Time) {
-        self.last = None;
+        self.last_payload = None;
         self.syncs = 0;
         self.not_before = now;
         self.rearm(now);
@@ -144,7 +144,7 @@ impl Tpdo {
             return None;
         }
         let payload = payload(&self.settings.mapping, objects);
-        let due = now >= self.event_due || self.last.as_ref() != Some(&payload);
+        let due = now >= self.event_due || self.last_payload.as_ref() != Some(&payload);
         self.pending = due && now < self.not_before;
         if !due || self.pending {
             return None;
@@ -152,7 +152,7 @@ impl Tpdo {
         self.not_before = now + self.inhibit;
         self.rearm(now);
         let frame = self.frame(&payload);
-        self.last = Some(payload);
+        self.last_payload = Some(payload);
         frame
     }
 

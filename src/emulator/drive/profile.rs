@@ -18,7 +18,7 @@ pub(super) struct Profile {
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Phase {
     seconds: f64,
-    /// At its beginning, counts/s.
+    /// Speed at its beginning, counts/s.
     speed: f64,
     acceleration: f64,
 }
@@ -36,7 +36,7 @@ impl Profile {
         let distance = (to - from).abs();
         let top = (distance * acceleration).sqrt().min(speed_max);
         let ramp_s = top / acceleration;
-        let along_s = if top > 0.0 { (distance / top - ramp_s).max(0.0) } else { 0.0 };
+        let cruise_s = if top > 0.0 { (distance / top - ramp_s).max(0.0) } else { 0.0 };
         let direction = if to < from { -1.0 } else { 1.0 };
         let phase = |seconds, speed: f64, acceleration: f64| Phase {
             seconds,
@@ -44,11 +44,11 @@ impl Profile {
             acceleration: direction * acceleration,
         };
         let up = phase(ramp_s, 0.0, acceleration);
-        let phases = [up, phase(along_s, top, 0.0), phase(ramp_s, top, -acceleration)];
+        let phases = [up, phase(cruise_s, top, 0.0), phase(ramp_s, top, -acceleration)];
         Profile { start: now, from, to, phases }
     }
 
-    /// Uniform braking from `speed`, to stand at `to` after this time.
+    /// Uniform braking from `speed` to a stop at `to` after `seconds`.
     pub(super) fn braking(now: Time, from: f64, speed: f64, to: f64, seconds: f64) -> Self {
         let brake = Phase { seconds, speed, acceleration: -speed / seconds };
         Profile { start: now, from, to, phases: [brake, Phase::default(), Phase::default()] }
@@ -70,24 +70,24 @@ impl Profile {
         if now >= self.end() {
             return self.to;
         }
-        let mut left = now.seconds_after(self.start).max(0.0);
+        let mut remaining_s = now.seconds_after(self.start).max(0.0);
         let mut position = self.from;
         for phase in &self.phases {
-            let seconds = left.min(phase.seconds);
+            let seconds = remaining_s.min(phase.seconds);
             position += phase.distance(seconds);
-            left -= seconds;
+            remaining_s -= seconds;
         }
         position
     }
 
     /// Velocity in counts per second.
     pub(super) fn velocity_at(&self, now: Time) -> f64 {
-        let mut left = now.seconds_after(self.start).max(0.0);
+        let mut remaining_s = now.seconds_after(self.start).max(0.0);
         for phase in &self.phases {
-            if left < phase.seconds {
-                return phase.speed + phase.acceleration * left;
+            if remaining_s < phase.seconds {
+                return phase.speed + phase.acceleration * remaining_s;
             }
-            left -= phase.seconds;
+            remaining_s -= phase.seconds;
         }
         0.0
     }
