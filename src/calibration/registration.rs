@@ -81,7 +81,7 @@ const SCALE_SDS: f64 = 5.0;
 const SCALE_ERROR_MIN: f64 = 0.002;
 const FLAT: &str = "the points lie in a plane, and so cannot show a mirrored axis of the tracker: touch one off it";
 const SCATTERED: &str =
-    "measure that one again, and see that both frames have the points in the same order";
+    "measure that one again, and check that both frames have the points in the same order";
 
 impl RegistrationFit {
     /// The rigid motion with the smallest sum of squared distances `|p_W − X_WT p_T|²` (Umeyama

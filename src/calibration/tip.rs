@@ -115,7 +115,7 @@ impl TipFit {
         if rms_mm > rms_max_mm || rms_max_mm.is_nan() {
             return refused(format!(
                 "{points} positions, {rms_mm:.2} mm RMS off a circle (limit {rms_max_mm:.2}), {:.2} mm \
-                 of it out of its plane; turn the base alone, in air, the needle standing",
+                 of it out of its plane; turn only the base, in air, with the insertion axis at rest",
                 circle.out_of_plane_rms_mm
             ));
         }
@@ -139,14 +139,14 @@ impl TipFit {
         }
         // The angle increases with the base's rotation if the normal points along the insertion, and
         // decreases if it points the other way.
-        let coherence = |sign: f64| {
+        let coherence_with = |sign: f64| {
             let differences =
                 angles.iter().zip(samples).map(|(a, sample)| a - sign * sample.rotation_meas_rad);
             let sum: Vector2<f64> =
                 differences.map(|d| Vector2::new(math::cos(d), math::sin(d))).sum();
             sum.norm() / points as f64
         };
-        let (along, against) = (coherence(1.0), coherence(-1.0));
+        let (along, against) = (coherence_with(1.0), coherence_with(-1.0));
         if against > along {
             circle.normal = -circle.normal;
         }

@@ -69,7 +69,7 @@ impl Gate {
     pub fn admit(&self, sample: &Sample) -> Result<Vector3<f64>, Refusal> {
         if !is_same_tool(&sample.tool, &self.tool) {
             let sent = clipped(&sample.tool, SHOWN_MAX);
-            let why = format!("\"{sent}\" is not the tool steered by");
+            let why = format!("\"{sent}\" is not the tracked tool");
             return Err(Refusal::new(GateName::Tool, why));
         }
         if !is_finite(&sample.position_mm) {
@@ -212,7 +212,7 @@ mod tests {
         assert_eq!(
             texts,
             [
-                "tool: \"StylusToTracker\" is not the tool steered by",
+                "tool: \"StylusToTracker\" is not the tracked tool",
                 "finite: position (NaN, 0.0, 0.0) mm",
                 "finite: position (0.0, -inf, 0.0) mm",
                 "rotation: the orientation sent is not a rotation",

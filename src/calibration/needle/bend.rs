@@ -66,8 +66,8 @@ struct Information {
 
 fn no_bend() -> CalibrationError {
     needle_error(
-        "the positions show no clear bend of the path; let the tip keep its roll over some mm now and \
-         then, or insert deeper",
+        "the positions show no clear bend of the path; hold the base still over some mm from time \
+         to time, or insert deeper",
     )
 }
 

@@ -65,7 +65,7 @@ pub(super) fn shaft_axis(insertions: &[Vec<PosedRow>]) -> Result<Vector3<f64>, C
     let Some(inverse) = inverse else {
         return Err(needle_error(format!(
             "the tip turns back and forth by {rms_rad_per_mm:.3} rad/mm RMS, at least \
-             {TURN_MIN_RAD_PER_MM} needed to tell its axis; turn the base both ways while inserting"
+             {TURN_MIN_RAD_PER_MM} needed to find its axis; turn the base both ways while inserting"
         )));
     };
     Ok(Vector3::new((inverse * sum_x).y, (inverse * sum_y).y, 1.0).normalize())

@@ -45,8 +45,8 @@ impl NeedleFit {
     pub fn of(insertions: &[Vec<PosedRow>], noise: &PathNoise) -> Result<Self, CalibrationError> {
         if insertions.len() < INSERTIONS_MIN {
             return Err(needle_error(format!(
-                "{} insertions, at least {INSERTIONS_MIN} needed: how they differ says how sure the \
-                 result is",
+                "{} insertions, at least {INSERTIONS_MIN} needed: their scatter gives the \
+                 standard errors",
                 insertions.len()
             )));
         }

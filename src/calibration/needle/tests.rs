@@ -104,7 +104,7 @@ fn what_says_too_little_is_refused() {
     let message = |rows: &[Vec<PosedRow>]| NeedleFit::of(rows, &NOISE).unwrap_err().to_string();
     assert_eq!(
         message(&rows[..2]),
-        "needle: 2 insertions, at least 3 needed: how they differ says how sure the result is"
+        "needle: 2 insertions, at least 3 needed: their scatter gives the standard errors"
     );
     rows[1].truncate(100);
     assert_eq!(

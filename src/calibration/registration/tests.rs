@@ -245,7 +245,7 @@ fn the_worst_point_is_named() {
     assert_eq!(
         refusal(&pairs),
         "registration: 8 points, 2.45 mm RMS (limit 1.00); worst is point 3, 6.0 mm; measure that \
-         one again, and see that both frames have the points in the same order"
+         one again, and check that both frames have the points in the same order"
     );
     let fit = RegistrationFit::of(&pairs, 3.0).expect("under that limit");
     assert_eq!((fit.points, fit.worst_point), (8, 3));

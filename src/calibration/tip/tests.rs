@@ -196,7 +196,10 @@ fn what_determines_nothing_is_refused() {
         .for_each(|(k, sample)| sample.position_meas_mm += axis * (0.05 * f64::from(k)));
     let said = refusal(&inserted);
     assert!(said.contains("mm RMS off a circle (limit 0.50)"), "{said}");
-    assert!(said.ends_with("turn the base alone, in air, the needle standing"), "{said}");
+    assert!(
+        said.ends_with("turn only the base, in air, with the insertion axis at rest"),
+        "{said}"
+    );
 
     let coaxial = noisy(turned(&standing(), &Pose::identity(), TAU, 100), 0.05, 2);
     let said = refusal(&coaxial);

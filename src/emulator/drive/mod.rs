@@ -59,9 +59,9 @@ choice! {
     /// and 0x6066 are missing; a limit switch is a fault; bit 15 of the statusword says that the axis was
     /// homed.
     pub enum Model {
-        /// All that the emulator has.
+        /// A drive with all objects of the emulator.
         Generic = "generic",
-        /// As an EPOS4.
+        /// A maxon EPOS4.
         Epos4 = "epos4",
     }
 }
