@@ -61,21 +61,21 @@ fn plan(
     index_counts: i64,
     overrun_counts: i64,
 ) -> Option<(Vec<Leg>, i64)> {
-    let above = |counts: i64| (counts.div_euclid(index_counts) + 1) * index_counts;
-    let below = |counts: i64| (counts - 1).div_euclid(index_counts) * index_counts;
+    let index_above = |counts: i64| (counts.div_euclid(index_counts) + 1) * index_counts;
+    let index_below = |counts: i64| (counts - 1).div_euclid(index_counts) * index_counts;
     let slow = |to_counts| Leg { to_counts, fast: false, onto: None };
     let seek = |to_counts, onto| Leg { to_counts, fast: true, onto };
     let plan = match method {
         1 | 17 => {
             let closes = switches.negative_counts?;
             let onto = seek(closes - overrun_counts, Some(End::Negative));
-            let home = if method == 1 { above(closes) } else { closes + 1 };
+            let home = if method == 1 { index_above(closes) } else { closes + 1 };
             (vec![onto, Leg { onto: Some(End::Negative), ..slow(home) }], home)
         }
         2 | 18 => {
             let closes = switches.positive_counts?;
             let onto = seek(closes + overrun_counts, Some(End::Positive));
-            let home = if method == 2 { below(closes) } else { closes - 1 };
+            let home = if method == 2 { index_below(closes) } else { closes - 1 };
             (vec![onto, Leg { onto: Some(End::Positive), ..slow(home) }], home)
         }
         // From a closed switch the axis first moves off it. It moves onto the switch from below.
@@ -84,8 +84,8 @@ fn plan(
             let off = (at_counts >= closes).then(|| seek(closes - overrun_counts, None));
             (off.into_iter().chain([slow(closes)]).collect(), closes)
         }
-        33 => (vec![slow(below(at_counts))], below(at_counts)),
-        34 => (vec![slow(above(at_counts))], above(at_counts)),
+        33 => (vec![slow(index_below(at_counts))], index_below(at_counts)),
+        34 => (vec![slow(index_above(at_counts))], index_above(at_counts)),
         35 | 37 => (vec![], at_counts),
         _ => return None,
     };
