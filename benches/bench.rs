@@ -10,7 +10,7 @@ use needle_bench::canopen::sdo::{SdoClient, SdoRequest};
 use needle_bench::canopen::{NodeId, ObjectAddress};
 use needle_bench::config::{Config, Source};
 use needle_bench::emulator::drive::{Drive, DriveConfig};
-use needle_bench::emulator::{Noise, StageOutput, VirtualStage};
+use needle_bench::emulator::{StageOutput, VirtualStage, WhiteNoise};
 use needle_bench::geometry::{FixedAngles, Pose};
 use needle_bench::needle::{Increment, Needle, TipPosition};
 use needle_bench::runtime::Study;
@@ -85,7 +85,7 @@ fn steps(_: &mut Criterion) {
         let ns: Vec<u128> = (0..40u32)
             .flat_map(|start| {
                 let mut insertion = Insertion::new(&session, 0.157 * f64::from(start));
-                let noise = Noise::Uniform(1.0);
+                let noise = WhiteNoise::Uniform(1.0);
                 (0..300).map(move |mm| insertion.insert_mm(noise.draw(start.into(), mm)).as_nanos())
             })
             .collect();
@@ -144,7 +144,7 @@ fn commands(c: &mut Criterion) {
         let session = session("control", kind);
         let mut insertion = Insertion::new(&session, 0.0);
         for mm in 0..100 {
-            insertion.insert_mm(Noise::Uniform(0.1).draw(1, mm));
+            insertion.insert_mm(WhiteNoise::Uniform(0.1).draw(1, mm));
         }
         let estimate = insertion.steering.decide(&[], true).estimate.expect("an estimate");
         let mut law = session.control.build(session.needle);

@@ -6,7 +6,7 @@
 
 use nalgebra::Vector3;
 use needle_bench::config::Config;
-use needle_bench::emulator::Noise;
+use needle_bench::emulator::WhiteNoise;
 use needle_bench::geometry::{FixedAngles, Pose};
 use needle_bench::needle::{Increment, TipPosition};
 use needle_bench::session::{SessionConfig, Steering};
@@ -69,7 +69,7 @@ fn insert(session: &SessionConfig, start: u32) {
         let increment = Increment::new(1.0, rotation_rad_per_mm).expect("finite");
         tip = session.needle.step(&tip, increment);
         steering.predict(increment);
-        let noise = Noise::Uniform(1.0).draw(u64::from(start), mm);
+        let noise = WhiteNoise::Uniform(1.0).draw(u64::from(start), mm);
         steering.correct(&TipPosition::new(tip.translation + noise).expect("finite"), 1, 0.025);
         let decision = steering.decide(&[], false);
         rotation_rad_per_mm = decision.rotation_cmd_rad_per_mm.unwrap_or(0.0);

@@ -155,9 +155,9 @@ impl EmulatorConfig {
         let correlated = correlated_sd_mm.zip(correlation_time);
         TrackerModel {
             noise: match (uniform_mm, sd_mm) {
-                (_, Some(sd_mm)) => emulator::Noise::Gaussian(sd_mm),
-                (Some(uniform_mm), None) => emulator::Noise::Uniform(uniform_mm),
-                (None, None) => emulator::Noise::None,
+                (_, Some(sd_mm)) => emulator::WhiteNoise::Gaussian(sd_mm),
+                (Some(uniform_mm), None) => emulator::WhiteNoise::Uniform(uniform_mm),
+                (None, None) => emulator::WhiteNoise::None,
             },
             correlated: correlated
                 .filter(|(sd_mm, _)| *sd_mm > 0.0)

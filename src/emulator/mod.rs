@@ -8,7 +8,7 @@ mod tracker;
 mod truth;
 mod virtual_stage;
 
-pub use noise::{CorrelatedNoise, Noise, split_mix64};
+pub use noise::{CorrelatedNoise, WhiteNoise, split_mix64};
 pub(crate) use tissue::Tissue;
 pub use tracker::{TargetModel, TrackedTip, TrackerModel};
 pub use truth::Truth;

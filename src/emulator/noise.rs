@@ -10,7 +10,7 @@ use rand_pcg::Pcg64;
 
 /// Noise added to each coordinate of a tracked position, independent from one to the next.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Noise {
+pub enum WhiteNoise {
     /// None: the position is exact.
     None,
     /// Uniform between minus and plus this value, mm.
@@ -19,7 +19,7 @@ pub enum Noise {
     Gaussian(f64),
 }
 
-impl Noise {
+impl WhiteNoise {
     /// The noise of position number `k`, mm. It depends only on `self`, the seed and `k`, so the positions
     /// before need not be drawn.
     pub fn draw(self, seed: u64, k: u64) -> Vector3<f64> {
@@ -29,12 +29,12 @@ impl Noise {
             rng
         };
         match self {
-            Noise::None => Vector3::zeros(),
-            Noise::Uniform(half_mm) => {
+            WhiteNoise::None => Vector3::zeros(),
+            WhiteNoise::Uniform(half_mm) => {
                 let mut rng = rng_at_k(3);
                 Vector3::from_fn(|_, _| half_mm * (2.0 * rng.random::<f64>() - 1.0))
             }
-            Noise::Gaussian(sd_mm) => {
+            WhiteNoise::Gaussian(sd_mm) => {
                 let mut rng = rng_at_k(6);
                 Vector3::from_fn(|_, _| sd_mm * standard_normal(rng.random(), rng.random()))
             }
@@ -44,9 +44,9 @@ impl Noise {
     /// Variance of each coordinate, mm².
     pub fn variance_mm2(self) -> f64 {
         match self {
-            Noise::None => 0.0,
-            Noise::Uniform(half_mm) => half_mm * half_mm / 3.0,
-            Noise::Gaussian(sd_mm) => sd_mm * sd_mm,
+            WhiteNoise::None => 0.0,
+            WhiteNoise::Uniform(half_mm) => half_mm * half_mm / 3.0,
+            WhiteNoise::Gaussian(sd_mm) => sd_mm * sd_mm,
         }
     }
 }
@@ -76,7 +76,7 @@ impl CorrelatedNoise {
     /// `(1 - ρ²) / (1 + ρ²)` with `ρ = exp(-h / time_s)`.
     pub fn draw(self, seed: u64, k: u64, interval_s: f64) -> Vector3<f64> {
         let seed = split_mix64(seed, Self::STREAM);
-        let unit = |k| Noise::Gaussian(1.0).draw(seed, k);
+        let unit = |k| WhiteNoise::Gaussian(1.0).draw(seed, k);
         let per_interval = interval_s / self.time_s;
         let spacing = (Self::INDEPENDENT_TIMES / per_interval).ceil() as u64;
         let spacing = spacing.clamp(1, 1 << 40).next_power_of_two();
@@ -125,11 +125,13 @@ mod tests {
 
     #[test]
     fn noise_has_the_spread_it_is_told() {
-        for (noise, variance) in [(Noise::Uniform(1.0), 1.0 / 3.0), (Noise::Gaussian(0.5), 0.25)] {
+        for (noise, variance) in
+            [(WhiteNoise::Uniform(1.0), 1.0 / 3.0), (WhiteNoise::Gaussian(0.5), 0.25)]
+        {
             let (mut sum, mut squares) = (0.0, 0.0);
             for k in 0..20_000 {
                 let p = noise.draw(7, k);
-                assert!(!matches!(noise, Noise::Uniform(half) if p.amax() > half));
+                assert!(!matches!(noise, WhiteNoise::Uniform(half) if p.amax() > half));
                 sum += p.sum();
                 squares += p.norm_squared();
             }
@@ -140,7 +142,7 @@ mod tests {
     /// Neighbours in number and in seed have nothing to do with one another.
     #[test]
     fn noise_is_white() {
-        let noise = Noise::Gaussian(1.0);
+        let noise = WhiteNoise::Gaussian(1.0);
         let correlation = |next: fn(u64) -> (u64, u64)| {
             let products = (0..20_000).map(|k| {
                 let (seed, k_next) = next(k);

@@ -1,6 +1,6 @@
 //! The emulated tracker: noisy tip positions at a fixed rate. It may repeat a position as if it were new.
 
-use super::noise::{CorrelatedNoise, Noise};
+use super::noise::{CorrelatedNoise, WhiteNoise};
 use super::truth::Truth;
 use crate::geometry::Pose;
 use crate::units::Time;
@@ -12,7 +12,7 @@ use std::time::Duration;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackerModel {
     /// Noise of each position, independent of that of all others.
-    pub noise: Noise,
+    pub noise: WhiteNoise,
     /// Noise that is correlated in time, added to it.
     pub correlated: Option<CorrelatedNoise>,
     /// Seed of the noise.
@@ -168,7 +168,7 @@ fn without_roll(rotation: &Rotation3<f64>) -> Rotation3<f64> {
 mod tests {
     use super::*;
 
-    fn tracker(noise: Noise, latency_ms: u64, repeats: u32) -> EmulatedTracker {
+    fn tracker(noise: WhiteNoise, latency_ms: u64, repeats: u32) -> EmulatedTracker {
         let model = TrackerModel {
             noise,
             correlated: None,
@@ -182,7 +182,7 @@ mod tests {
 
     #[test]
     fn samples_arrive_after_their_latency_with_their_own_time() {
-        let mut tracker = tracker(Noise::None, 40, 0);
+        let mut tracker = tracker(WhiteNoise::None, 40, 0);
         let pose = |z_mm| Pose { translation: Vector3::z() * z_mm, ..Pose::identity() };
         tracker.acquire(&pose(1.0));
         assert_eq!(tracker.deadline(), Time::from_secs_f64(0.025));
@@ -196,7 +196,7 @@ mod tests {
     /// The tracker's k-th position carries the k-th noise, whoever asked for others before.
     #[test]
     fn a_position_has_the_noise_of_its_number() {
-        for noise in [Noise::Uniform(1.0), Noise::Gaussian(0.5)] {
+        for noise in [WhiteNoise::Uniform(1.0), WhiteNoise::Gaussian(0.5)] {
             let mut tracker = tracker(noise, 0, 0);
             for k in 0..50 {
                 tracker.acquire(&Pose::identity());
@@ -208,7 +208,7 @@ mod tests {
 
     #[test]
     fn a_repeated_position_has_a_new_stamp_and_an_old_value() {
-        let mut tracker = tracker(Noise::Uniform(1.0), 0, 4);
+        let mut tracker = tracker(WhiteNoise::Uniform(1.0), 0, 4);
         let samples: Vec<(TrackedTip, Truth)> = (0..10u32)
             .map(|n| {
                 let translation = Vector3::z() * f64::from(n);

@@ -1,7 +1,7 @@
 //! A study's trials, on all threads.
 
 use super::virtual_time::{TipSource, run_unwatched};
-use crate::emulator::{Noise, TrackerModel, Truth, VirtualStage, VirtualStageConfig};
+use crate::emulator::{TrackerModel, Truth, VirtualStage, VirtualStageConfig, WhiteNoise};
 use crate::geometry::Pose;
 use crate::session::{Goal, Outcome, Record, Session, SessionConfig};
 use crate::study::{Prior, Timetable, TimetableBuilder, TrialResult, TrialScorer, insert};
@@ -11,7 +11,7 @@ use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
 
 /// Noise of the insertion that makes the timetable: negligible, but no two positions are equal, since the
 /// bench refuses positions that repeat.
-const TIMETABLE_NOISE: Noise = Noise::Gaussian(1e-6);
+const TIMETABLE_NOISE: WhiteNoise = WhiteNoise::Gaussian(1e-6);
 
 /// A Monte Carlo study of insertions.
 pub struct Study<'a> {

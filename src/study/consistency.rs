@@ -139,7 +139,7 @@ fn student_95(freedom: usize) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::emulator::Noise;
+    use crate::emulator::WhiteNoise;
     use crate::geometry::Twist;
     use crate::observer::{Belief, Shaft, Slack};
     use nalgebra::{Matrix6, Vector6};
@@ -195,7 +195,7 @@ mod tests {
         let x_pb = Pose::exp(&Twist::from_vector(&Vector6::new(1.0, 2.0, 3.0, 0.1, 0.2, 0.3)));
         let estimate = Estimate::of_belief(x_pb, belief);
         let trials = (0..500).filter_map(|trial| {
-            let [a, b] = [0, 1].map(|half| Noise::Gaussian(scale).draw(trial, half));
+            let [a, b] = [0, 1].map(|half| WhiteNoise::Gaussian(scale).draw(trial, half));
             let error = factor * Vector6::new(a.x, a.y, a.z, b.x, b.y, b.z);
             let truth = x_pb * Pose::exp(&Twist::from_vector(&error));
             TrialNees::of(nees(&estimate, &truth).into_iter())

@@ -3,7 +3,7 @@
 use crate::support::peers::peer;
 use crate::support::program::{Said, Scratch, needle_bench};
 use crate::support::programs::{Program, beside_others};
-use needle_bench::emulator::Noise;
+use needle_bench::emulator::WhiteNoise;
 use needle_bench::tracker::openigtlink::{Body, IgtlStamp, Message};
 use needle_bench::transport::tcp::TransformServer;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
@@ -43,7 +43,8 @@ impl Server {
                     let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap();
                     let stamp = IgtlStamp::from_unix_ns(i64::try_from(now.as_nanos()).unwrap());
                     for (n, tool) in (0u16..).zip(["NeedleToTracker", "StylusToTracker"]) {
-                        let noise = Noise::Gaussian(0.1).draw(u64::from(n), k).map(|mm| mm as f32);
+                        let noise =
+                            WhiteNoise::Gaussian(0.1).draw(u64::from(n), k).map(|mm| mm as f32);
                         let [x, y, z] = *carried.lock().unwrap();
                         let (x, y, z) = (x + noise.x, y + noise.y, z + noise.z);
                         let x = x + 10.0 * f32::from(n) + 10.0;

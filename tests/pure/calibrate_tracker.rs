@@ -3,13 +3,13 @@
 use crate::support::needed::data;
 use crate::support::program::{Scratch, needle_bench};
 use nalgebra::Vector3;
-use needle_bench::emulator::{CorrelatedNoise, Noise, TrackerModel};
+use needle_bench::emulator::{CorrelatedNoise, TrackerModel, WhiteNoise};
 use std::time::Duration;
 
 /// A tracker at rest for a minute, half of whose variance is correlated over 0.2 s.
 fn model() -> TrackerModel {
     TrackerModel {
-        noise: Noise::Gaussian(0.4),
+        noise: WhiteNoise::Gaussian(0.4),
         correlated: Some(CorrelatedNoise { sd_mm: 0.4, time_s: 0.2 }),
         seed: 11,
         period: Duration::from_millis(25),

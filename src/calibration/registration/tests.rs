@@ -1,5 +1,5 @@
 use super::*;
-use crate::emulator::Noise;
+use crate::emulator::WhiteNoise;
 use crate::geometry::so3;
 use proptest::prelude::*;
 
@@ -89,7 +89,7 @@ proptest! {
 /// Flat sets with noise: without the choice of sign half of them would be reflections.
 #[test]
 fn flat_sets_give_no_reflection() {
-    let noise = Noise::Gaussian(0.2);
+    let noise = WhiteNoise::Gaussian(0.2);
     let mut mirrored = 0;
     for set in 0..200u64 {
         let mut pairs = pairs(&Pose::identity(), &square(100.0));
@@ -113,13 +113,14 @@ fn flat_sets_give_no_reflection() {
 fn noise_gives_the_errors_that_are_predicted() {
     let (sd_mm, sets) = (0.3, 400u32);
     let x_wt = Pose { rotation: so3::exp(&Vector3::new(0.3, -1.2, 0.4)), ..Pose::identity() };
-    let points_mm: Vec<_> = (0..8u64).map(|point| Noise::Uniform(60.0).draw(5, point)).collect();
+    let points_mm: Vec<_> =
+        (0..8u64).map(|point| WhiteNoise::Uniform(60.0).draw(5, point)).collect();
     let target_mm = Vector3::new(150.0, 20.0, -40.0);
     let (mut fre2, mut error2, mut predicted2) = (0.0, 0.0, 0.0);
     for set in 0..sets {
         let mut pairs = pairs(&x_wt, &points_mm);
         for (point, pair) in pairs.iter_mut().enumerate() {
-            pair.tracker_mm += Noise::Gaussian(sd_mm).draw(u64::from(set), point as u64);
+            pair.tracker_mm += WhiteNoise::Gaussian(sd_mm).draw(u64::from(set), point as u64);
         }
         let fit = RegistrationFit::of(&pairs, 1.0).expect("fits");
         fre2 += fit.rms_mm.powi(2) / f64::from(sets);
@@ -135,12 +136,13 @@ fn noise_gives_the_errors_that_are_predicted() {
 /// A tracker whose millimetre is 1% too long, among points that are located to 0.3 mm.
 #[test]
 fn a_wrong_scale_is_named_and_chance_is_not() {
-    let points_mm: Vec<_> = (0..12u64).map(|point| Noise::Uniform(80.0).draw(5, point)).collect();
+    let points_mm: Vec<_> =
+        (0..12u64).map(|point| WhiteNoise::Uniform(80.0).draw(5, point)).collect();
     let fit = |set: u64, scale: f64| {
         let mut pairs = pairs(&Pose::identity(), &points_mm);
         for (point, pair) in pairs.iter_mut().enumerate() {
             pair.tracker_mm =
-                pair.tracker_mm * scale + Noise::Gaussian(0.3).draw(set, point as u64);
+                pair.tracker_mm * scale + WhiteNoise::Gaussian(0.3).draw(set, point as u64);
         }
         RegistrationFit::of(&pairs, 3.0).expect("fits")
     };
@@ -169,7 +171,7 @@ fn the_error_at_a_target_grows_with_its_distance() {
     let noisy: Vec<_> = (0..)
         .zip(&noisy)
         .map(|(point, pair)| FiducialPair {
-            tracker_mm: pair.tracker_mm + Noise::Gaussian(0.2).draw(1, point),
+            tracker_mm: pair.tracker_mm + WhiteNoise::Gaussian(0.2).draw(1, point),
             ..*pair
         })
         .collect();
@@ -228,9 +230,9 @@ fn noise_does_not_pass_for_breadth() {
     let line: Vec<_> = (0..8).map(|n| Vector3::new(5.0 * f64::from(n), 0.0, 0.0)).collect();
     let mut pairs = pairs(&Pose::identity(), &line);
     for (point, pair) in pairs.iter_mut().enumerate() {
-        let beside_mm = 0.9 * Noise::Gaussian(1.0).draw(3, point as u64);
+        let beside_mm = 0.9 * WhiteNoise::Gaussian(1.0).draw(3, point as u64);
         pair.tracker_mm += Vector3::new(0.0, beside_mm.y, beside_mm.z);
-        pair.bench_mm += 1.5 * Noise::Uniform(1.0).draw(4, point as u64);
+        pair.bench_mm += 1.5 * WhiteNoise::Uniform(1.0).draw(4, point as u64);
     }
     let error = RegistrationFit::of(&pairs, 3.0).expect_err("no turn to be known");
     assert!(error.to_string().contains(" RMS off a line "), "{error}");

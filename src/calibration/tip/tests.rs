@@ -1,5 +1,5 @@
 use super::*;
-use crate::emulator::Noise;
+use crate::emulator::WhiteNoise;
 use crate::geometry::so3;
 use proptest::prelude::*;
 use std::f64::consts::TAU;
@@ -32,7 +32,7 @@ fn turned(x_tw: &Pose, x_sb: &Pose, turn_rad: f64, n: u32) -> Vec<TurnSample> {
 
 fn noisy(mut samples: Vec<TurnSample>, sd_mm: f64, seed: u64) -> Vec<TurnSample> {
     for (k, sample) in samples.iter_mut().enumerate() {
-        sample.position_meas_mm += Noise::Gaussian(sd_mm).draw(seed, k as u64);
+        sample.position_meas_mm += WhiteNoise::Gaussian(sd_mm).draw(seed, k as u64);
     }
     samples
 }

@@ -1,16 +1,16 @@
 use super::*;
-use crate::emulator::{CorrelatedNoise, Noise, TrackerModel};
+use crate::emulator::{CorrelatedNoise, TrackerModel, WhiteNoise};
 use std::time::Duration;
 
 /// Half of the variance of ±1 mm is correlated over 0.2 s.
-const HALF_COLOURED: (Noise, Option<CorrelatedNoise>) =
-    (Noise::Uniform(0.707), Some(CorrelatedNoise { sd_mm: 0.408, time_s: 0.2 }));
-const NEAR: (Noise, Option<CorrelatedNoise>) = (Noise::Gaussian(0.026), None);
+const HALF_COLOURED: (WhiteNoise, Option<CorrelatedNoise>) =
+    (WhiteNoise::Uniform(0.707), Some(CorrelatedNoise { sd_mm: 0.408, time_s: 0.2 }));
+const NEAR: (WhiteNoise, Option<CorrelatedNoise>) = (WhiteNoise::Gaussian(0.026), None);
 
 /// `count` samples of an emulated tracker at rest, 40 a second, each received 5 to 10 ms after it was
 /// measured; `offset_mm` is added at each time, s.
 fn rest(
-    (noise, correlated): (Noise, Option<CorrelatedNoise>),
+    (noise, correlated): (WhiteNoise, Option<CorrelatedNoise>),
     seed: u64,
     count: u64,
     offset_mm: impl Fn(f64) -> Vector3<f64>,
@@ -91,7 +91,7 @@ fn white_noise_is_white() {
 /// A recording of positions that are seldom correlated for long, at another rate.
 #[test]
 fn a_slow_tracker_and_a_longer_correlation_are_recovered() {
-    let noise = (Noise::Gaussian(0.1), Some(CorrelatedNoise { sd_mm: 0.3, time_s: 1.5 }));
+    let noise = (WhiteNoise::Gaussian(0.1), Some(CorrelatedNoise { sd_mm: 0.3, time_s: 1.5 }));
     let fit = TrackerFit::of(&rest(noise, 3, 8000, still)).unwrap();
     assert!(off(fit.together.correlation_time_s, 1.5).abs() < 4.0, "{fit:?}");
     assert!(off(fit.together.correlated_sd_mm, 0.3).abs() < 4.0, "{fit:?}");
@@ -192,6 +192,6 @@ fn a_recording_that_is_too_short_is_refused() {
     let metres = rest(NEAR, 1, 400, |_| Vector3::x() * 1e5);
     assert!(refusal(&metres).ends_with("give positions in mm"));
     // The correlation is over a fifth of the recording.
-    let slow = (Noise::Gaussian(0.01), Some(CorrelatedNoise { sd_mm: 0.3, time_s: 6.0 }));
+    let slow = (WhiteNoise::Gaussian(0.01), Some(CorrelatedNoise { sd_mm: 0.3, time_s: 6.0 }));
     assert!(refusal(&rest(slow, 2, 1200, still)).contains("or record longer"));
 }

@@ -105,7 +105,7 @@ fn correlated_noise_is_taken_beside_the_white() {
     let noise =
         "emulator.noise={ uniform_mm = 0.7, correlated_sd_mm = 0.4, correlation_time_s = 0.2 }";
     let tracker = tracker(noise);
-    assert_eq!(tracker.noise, emulator::Noise::Uniform(0.7));
+    assert_eq!(tracker.noise, emulator::WhiteNoise::Uniform(0.7));
     assert_eq!(tracker.correlated, Some(CorrelatedNoise { sd_mm: 0.4, time_s: 0.2 }));
 }
 

@@ -7,7 +7,7 @@ use crate::support::bench::{Bench, configured_with};
 use crate::support::stop::is_row;
 use nalgebra::Vector3;
 use needle_bench::config::{Config, Source};
-use needle_bench::emulator::{Noise, VirtualStageConfig};
+use needle_bench::emulator::{VirtualStageConfig, WhiteNoise};
 use needle_bench::runtime::Study;
 use needle_bench::session::{Lane, Outcome, PlaneOutOfReach, Record, SessionConfig};
 use needle_bench::stage::Sign;
@@ -247,13 +247,13 @@ fn a_scale_that_is_wrong() {
 #[test]
 fn a_frozen_position_with_noise() {
     let run = |speed: &str| {
-        contradicted(steered(&[speed]), 20.0, frozen_with_noise(Noise::Uniform(1.0), 1))
+        contradicted(steered(&[speed]), 20.0, frozen_with_noise(WhiteNoise::Uniform(1.0), 1))
     };
     is_documented("a_frozen_position_with_noise", 3.0, run);
 }
 
 /// Positions frozen where the first was, with the noise that `seed` draws.
-fn frozen_with_noise(noise: Noise, seed: u64) -> impl FnMut(&mut Sample) + 'static {
+fn frozen_with_noise(noise: WhiteNoise, seed: u64) -> impl FnMut(&mut Sample) + 'static {
     let (mut frozen, mut k) = (None, 0);
     move |sample| {
         let at = *frozen.get_or_insert(sample.position_mm);
@@ -295,7 +295,7 @@ fn a_frozen_position_is_held_whatever_the_noise() {
                 format!("emulator.seed={seed}"),
             ];
             let run = steered(&sets.each_ref().map(String::as_str));
-            let noise = frozen_with_noise(Noise::Gaussian(0.6), seed);
+            let noise = frozen_with_noise(WhiteNoise::Gaussian(0.6), seed);
             let (bench, held_mm) = contradicted(run, struck_mm, noise);
             assert!(bench.reason().contains("; held and stopped; "), "{}", bench.reason());
             named += usize::from(bench.reason().contains(": frozen for the last "));
@@ -316,7 +316,7 @@ fn a_frozen_position_goes_no_further_by_holds_that_end_by_themselves() {
         let seed_set = format!("emulator.seed={seed}");
         let run = steered(&[&seed_set, "tracker.resume=\"automatic\""]);
         let (bench, _) =
-            contradicted(run, struck_mm, frozen_with_noise(Noise::Gaussian(0.6), seed));
+            contradicted(run, struck_mm, frozen_with_noise(WhiteNoise::Gaussian(0.6), seed));
         let is_one_of = ["; held for 5.0 s", "tracker: over the last "];
         assert!(is_one_of.iter().any(|text| bench.reason().contains(text)), "{}", bench.reason());
         bench.stage.position_true(bench.now).0 - struck_mm
