@@ -6,7 +6,7 @@
 //! (v_x, v_y)` per mm in the shaft frame A, `ξ = (S_x, S_y, 1; K_x, K_y, ω)`. The information of
 //! all insertions is summed, and the nearest bicycle model is fitted to it: `S = a (K_y, −K_x)`.
 
-use super::insertion::Insertion;
+use super::insertion::RecordedInsertion;
 use super::{CalibrationError, needle_error, sandwich_covariance};
 use crate::geometry::{Pose, Twist};
 use crate::math;
@@ -79,7 +79,7 @@ fn prior() -> Covariance {
 
 /// Runs the filter over one insertion, with bend and slip starting at `start`.
 fn run_filter(
-    insertion: &Insertion,
+    insertion: &RecordedInsertion,
     start: &Vector4<f64>,
     noise: &PathNoise,
 ) -> Option<Information> {
@@ -149,7 +149,7 @@ fn bicycle(p: &Vector3<f64>) -> (Vector4<f64>, SMatrix<f64, 4, 3>) {
 impl BendFit {
     /// The bicycle that fits the insertions best; `r_sa` is the shaft frame in the sensor's.
     pub(super) fn of(
-        insertions: &[Insertion],
+        insertions: &[RecordedInsertion],
         r_sa: &Rotation3<f64>,
         noise: &PathNoise,
     ) -> Result<Self, CalibrationError> {

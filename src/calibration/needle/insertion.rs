@@ -84,11 +84,11 @@ pub(super) struct Step {
 
 /// An insertion in the shaft frame.
 #[derive(Debug, Clone)]
-pub(super) struct Insertion {
+pub(super) struct RecordedInsertion {
     pub(super) steps: Vec<Step>,
 }
 
-impl Insertion {
+impl RecordedInsertion {
     /// The insertion with these rows; `number` counts from 1, `r_sa` is the shaft frame A in the sensor
     /// frame.
     pub(super) fn of(
@@ -122,7 +122,11 @@ impl Insertion {
             });
             last = row;
         }
-        if depth_mm >= DEPTH_MIN_MM { Ok(Insertion { steps }) } else { Err(too_short(depth_mm)) }
+        if depth_mm >= DEPTH_MIN_MM {
+            Ok(RecordedInsertion { steps })
+        } else {
+            Err(too_short(depth_mm))
+        }
     }
 }
 

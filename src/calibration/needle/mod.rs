@@ -9,7 +9,7 @@ pub use insertion::PosedRow;
 pub use torsion::TorsionFit;
 
 use super::CalibrationError;
-use insertion::Insertion;
+use insertion::RecordedInsertion;
 use nalgebra::{SMatrix, SVector, Vector3};
 use std::fmt::Display;
 
@@ -55,7 +55,7 @@ impl NeedleFit {
         let tracks = insertions
             .iter()
             .enumerate()
-            .map(|(index, rows)| Insertion::of(index + 1, rows, &r_sa))
+            .map(|(index, rows)| RecordedInsertion::of(index + 1, rows, &r_sa))
             .collect::<Result<Vec<_>, _>>()?;
         Ok(NeedleFit {
             insertions: insertions.len(),

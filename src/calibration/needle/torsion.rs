@@ -1,6 +1,6 @@
 //! Fits the torsion from the recorded rotations of base and tip.
 
-use super::insertion::{ENTRY_MM, Insertion};
+use super::insertion::{ENTRY_MM, RecordedInsertion};
 use super::{CalibrationError, needle_error, sandwich_covariance};
 use crate::needle::{NeedleError, Play, Torsion, TorsionConfig};
 use nalgebra::{SMatrix, SVector};
@@ -52,7 +52,7 @@ fn config(p: &Parameters) -> TorsionConfig {
 }
 
 /// Roll predicted by the torsion `p` minus the recorded roll, at each row of `insertion`.
-fn residuals(insertion: &Insertion, p: &Parameters) -> Result<Vec<f64>, NeedleError> {
+fn residuals(insertion: &RecordedInsertion, p: &Parameters) -> Result<Vec<f64>, NeedleError> {
     let torsion = Torsion::new(config(p))?;
     let (mut play, mut base_rad, mut tip_rad) = (Play::default(), 0.0, 0.0);
     let mut residuals = Vec::with_capacity(insertion.steps.len());
@@ -75,7 +75,7 @@ struct Linearised {
 }
 
 impl Linearised {
-    fn at(p: &Parameters, insertion: &Insertion) -> Result<Self, NeedleError> {
+    fn at(p: &Parameters, insertion: &RecordedInsertion) -> Result<Self, NeedleError> {
         let residuals_at_p = residuals(insertion, p)?;
         let mut columns = Vec::with_capacity(PARAMETERS);
         for (k, &step) in DERIVATIVE_STEP.iter().enumerate() {
@@ -104,7 +104,7 @@ fn exclude(hessian: &mut Hessian, k: usize) {
 
 impl TorsionFit {
     /// Least squares of the tip's roll; without a band if none is clear.
-    pub(super) fn of(insertions: &[Insertion]) -> Result<Self, CalibrationError> {
+    pub(super) fn of(insertions: &[RecordedInsertion]) -> Result<Self, CalibrationError> {
         let fit = Self::fit(insertions, true)?;
         let is_clear = |width: f64, sd: f64| width > CLEAR_SD * sd;
         let TorsionConfig { half_width_rad, half_width_rad_per_mm, .. } = fit.torsion;
@@ -114,7 +114,7 @@ impl TorsionFit {
     }
 
     /// Levenberg-Marquardt iteration within the bounds of the parameters, with or without a band.
-    fn fit(insertions: &[Insertion], has_band: bool) -> Result<Self, CalibrationError> {
+    fn fit(insertions: &[RecordedInsertion], has_band: bool) -> Result<Self, CalibrationError> {
         let linearise = |p: &Parameters| {
             let parts = insertions.iter().map(|insertion| Linearised::at(p, insertion));
             parts.collect::<Result<Vec<_>, _>>().map_err(needle_error)
