@@ -9,7 +9,7 @@ use crate::emulator::fault::{Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
 use crate::geometry::so3;
 use crate::session::{Input, Lane, Machine, Outcome, Record, Severity, State};
-use crate::tracker::{Event, Replay, Sample, Validity};
+use crate::tracker::{Event, Sample, StreamReplay, Validity};
 use crate::transport::can::{BusError, CanError};
 use crate::transport::unconfirmed::Unconfirmed;
 use crate::units::Time;
@@ -27,7 +27,7 @@ pub enum TipSource {
         target: Option<String>,
     },
     /// A recording, which replaces that tracker.
-    Recorded(Replay),
+    Recorded(StreamReplay),
 }
 
 /// Runs `session`, an insertion or an operation, against `stage` until it ends. Frames and samples
@@ -110,7 +110,7 @@ impl<'a, W: Witness> VirtualRun<'a, W> {
     }
 
     /// The recording that replaces the emulated tracker, if there is one.
-    fn replay(&mut self) -> Option<&mut Replay> {
+    fn replay(&mut self) -> Option<&mut StreamReplay> {
         match &mut self.tips {
             Some(TipSource::Recorded(replay)) => Some(replay),
             _ => None,

@@ -32,7 +32,7 @@ pub use pairing::{StageHistory, StageIncrement, StagePoint};
 pub use reader::{Protocol, Reader};
 pub use refusal::{Effect, GateCounts, GateName, Refusal};
 pub use registration::Registration;
-pub use replay::Replay;
+pub use replay::StreamReplay;
 pub use sample::{Sample, Validity};
 pub use sieve::Sieve;
 pub use timing::{AcquisitionClock, StampPolicy};

@@ -6,15 +6,15 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 /// Gives the events of a recording as if they came now, at the pace they were recorded with: poll
-/// at or after [`Replay::deadline`], until `None`.
+/// at or after [`StreamReplay::deadline`], until `None`.
 #[derive(Debug, Clone)]
-pub struct Replay {
+pub struct StreamReplay {
     /// The events, each with its time after the start.
     events: VecDeque<(Duration, Event)>,
     start: Time,
 }
 
-impl Replay {
+impl StreamReplay {
     /// A replay of the recording `name`, its first event at `start`. The recording's times are its
     /// own and do not go back. The replay begins with [`Event::Connected`] and ends with
     /// [`Event::Disconnected`].
@@ -28,7 +28,7 @@ impl Replay {
         let recorded = recording.into_iter().map(|(time, event)| (time.since(first), event));
         let disconnected = (end, Event::Disconnected { reason });
         let events = [connected].into_iter().chain(recorded).chain([disconnected]).collect();
-        Replay { events, start }
+        StreamReplay { events, start }
     }
 
     /// The next event that is due by `now`. A sample is received when it is due.
@@ -72,7 +72,8 @@ mod tests {
     #[test]
     fn events_come_when_they_are_due() {
         let start = Time::from_secs_f64(2.0);
-        let mut replay = Replay::new("tip.csv", vec![sample(100), sample(125), sample(225)], start);
+        let mut replay =
+            StreamReplay::new("tip.csv", vec![sample(100), sample(125), sample(225)], start);
         let mut told = Vec::new();
         while replay.deadline() < Time::NEVER {
             let now = replay.deadline();
@@ -102,7 +103,7 @@ mod tests {
 
     #[test]
     fn one_that_is_late_is_given_with_the_time_it_was_due() {
-        let mut replay = Replay::new("tip.csv", vec![sample(0), sample(10)], Time::ZERO);
+        let mut replay = StreamReplay::new("tip.csv", vec![sample(0), sample(10)], Time::ZERO);
         let late = Time::from_secs_f64(1.0);
         let due: Vec<Time> = std::iter::from_fn(|| replay.poll(late))
             .filter_map(|event| match event {

@@ -1,7 +1,7 @@
 //! A tracker's stream: a queue of events that a reader task or thread fills.
 
 use crate::tracker::openigtlink::ToolStream;
-use crate::tracker::{Event, Protocol, Reader, Replay, Sieve};
+use crate::tracker::{Event, Protocol, Reader, Sieve, StreamReplay};
 use crate::units::Time;
 use rtrb::{Consumer, Producer, RingBuffer};
 use std::io::{ErrorKind, Read};
@@ -232,7 +232,7 @@ impl Link {
     ///
     /// # Panics
     /// Outside a tokio runtime.
-    pub fn replay<C>(mut replay: Replay, settings: &LinkSettings, clock: C) -> Self
+    pub fn replay<C>(mut replay: StreamReplay, settings: &LinkSettings, clock: C) -> Self
     where
         C: Fn() -> Time + Send + 'static,
     {
@@ -381,7 +381,7 @@ mod tests {
         let recording = ndjson::recording(&[line(1_000_000), line(3_000_000)].join("\n")).unwrap();
         let start = std::time::Instant::now();
         let clock = move || Time::ZERO + start.elapsed();
-        let replay = Replay::new("tip.ndjson", recording, Time::ZERO);
+        let replay = StreamReplay::new("tip.ndjson", recording, Time::ZERO);
         let mut link = Link::replay(replay, &LinkSettings::default(), clock);
         let mut samples = Vec::new();
         while let Some(event) = link.next().await {

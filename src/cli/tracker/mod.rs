@@ -10,7 +10,7 @@ use super::output::print_stderr;
 use super::{Failure, io_runtime};
 use crate::config::{Config, TrackerConfig, TrackerMode, TrackerSource};
 use crate::runtime::{Clock, Interrupt};
-use crate::tracker::{Census, Event, Replay, Sample, csv, ndjson};
+use crate::tracker::{Census, Event, Sample, StreamReplay, csv, ndjson};
 use crate::transport::link::{Link, LinkSettings};
 use crate::units::Time;
 use std::path::Path;
@@ -68,7 +68,7 @@ fn open(
 }
 
 /// Loads the recording that replaces a tracker, to begin at `start`; `None` if the configuration names none.
-pub(super) fn load_replay(tracker: &TrackerConfig, start: Time) -> Result<Option<Replay>, Failure> {
+pub(super) fn load_replay(tracker: &TrackerConfig, start: Time) -> Result<Option<StreamReplay>, Failure> {
     let Some(file) = &tracker.file else { return Ok(None) };
     let text = text_of(Path::new(file))?;
     let recording = match tracker.source {
@@ -76,7 +76,7 @@ pub(super) fn load_replay(tracker: &TrackerConfig, start: Time) -> Result<Option
             .map_err(|error| format!("{file}: {error}; see [tracker.csv]")),
         _ => ndjson::recording(&text).map_err(|error| format!("{file}: {error}")),
     };
-    Ok(Some(Replay::new(file, recording.map_err(Failure::configuration)?, start)))
+    Ok(Some(StreamReplay::new(file, recording.map_err(Failure::configuration)?, start)))
 }
 
 /// The source in a few words, for the manifest.
