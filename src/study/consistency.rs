@@ -157,7 +157,7 @@ mod tests {
     fn bounds_hold_for_few_trials() {
         for trials in [2, 5, 15] {
             let is_consistent = |study: u64| {
-                let draw = |trial| 3.0 + Noise::Gaussian(1.0).draw(study, trial).x;
+                let draw = |trial| 3.0 + WhiteNoise::Gaussian(1.0).draw(study, trial).x;
                 let values: Vec<f64> = (0..trials).map(draw).collect();
                 let judged = Consistency::of_innovations(&values).unwrap();
                 judged.verdict == Verdict::Consistent

@@ -68,7 +68,10 @@ fn open(
 }
 
 /// Loads the recording that replaces a tracker, to begin at `start`; `None` if the configuration names none.
-pub(super) fn load_replay(tracker: &TrackerConfig, start: Time) -> Result<Option<StreamReplay>, Failure> {
+pub(super) fn load_replay(
+    tracker: &TrackerConfig,
+    start: Time,
+) -> Result<Option<StreamReplay>, Failure> {
     let Some(file) = &tracker.file else { return Ok(None) };
     let text = text_of(Path::new(file))?;
     let recording = match tracker.source {
