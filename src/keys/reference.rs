@@ -41,24 +41,35 @@ fn write_table(text: &mut String, keys: &'static [Key], path: &str, narrowed: &[
 fn write_key(text: &mut String, key: &Key, path: &str) {
     text.push('\n');
     comment(text, "# ", &explanation(key));
-    let inner = tables(&key.kind);
-    let choices = match key.kind {
-        Kind::OneOf(names) => names,
-        Kind::Array(&Kind::OneOf(names), _) => names,
-        _ => &[],
-    };
-    for (name, meaning) in choices {
-        comment(text, "#   ", &format!("\"{name}\": {meaning}"));
-    }
-    for inner in inner.iter().flat_map(|keys| expanded(keys, key.narrowed)) {
-        comment(text, "#   ", &format!("{}: {}", inner.name, explanation(&inner)));
-    }
+    write_contents(text, key, "#   ");
     let name = key.name;
     text.push_str(&match (key.default, &key.kind) {
         (Some("[]"), Kind::Array(Kind::Table(_), _)) => format!("# [[{path}.{name}]]\n"),
         (Some(default), _) => format!("{name} = {default}\n"),
         (None, _) => format!("# {name} = …\n"),
     });
+}
+
+/// Explains what a key may hold, in lines that begin with `start`: the words of a choice, or the keys of a
+/// table and what each of these may hold.
+fn write_contents(text: &mut String, key: &Key, start: &str) {
+    for (word, meaning) in words(&key.kind) {
+        comment(text, start, &format!("\"{word}\": {meaning}"));
+    }
+    for inner in tables(&key.kind).into_iter().flat_map(|keys| expanded(keys, key.narrowed)) {
+        let default = inner.default.map(|toml| format!(" Default: {toml}.")).unwrap_or_default();
+        comment(text, start, &format!("{}: {}{default}", inner.name, explanation(&inner)));
+        write_contents(text, &inner, &format!("{start}  "));
+    }
+}
+
+/// The words of a choice, or of an array of choices, each with its meaning.
+fn words(kind: &Kind) -> &'static [(&'static str, &'static str)] {
+    match *kind {
+        Kind::OneOf(words) => words,
+        Kind::Array(element, _) => words(element),
+        _ => &[],
+    }
 }
 
 /// The documentation of a key, its allowed values, and whether hardware must give it.

@@ -260,6 +260,21 @@ fn the_shipped_reference_and_schema_are_current() {
     }
 }
 
+#[test]
+fn the_reference_lists_the_words_of_nested_keys() {
+    let reference = Config::reference();
+    let nested = [
+        ("emulator.fault.kind", "drop"),
+        ("emulator.fault.axis", "rotation"),
+        ("emulator.fault.frames", "sync"),
+        ("emulator.fault.toward", "drives"),
+        ("goal.obstacle.shape", "mask"),
+    ];
+    for (key, word) in nested {
+        assert!(reference.contains(&format!("\n#     \"{word}\": ")), "{word} of {key}");
+    }
+}
+
 /// What is drawn lies in its range, is drawn again by the same seed, and does not depend on what
 /// else is drawn.
 #[test]
