@@ -5,7 +5,7 @@ use super::reader::Reader;
 use super::tracker::FILE;
 use super::{Config, ConfigError, TrackerSource};
 use crate::control::ControlKind;
-use crate::keys::{Rule, choice, named, over, section, within};
+use crate::keys::{Rule, choice, not_blank, over, section, within};
 use crate::plan::{Obstacle, Problem, Tip, Workspace, World};
 use crate::session::{Goal, TargetTool};
 use crate::tracker::{Gate, Registration};
@@ -22,7 +22,7 @@ section! {
         position_mm: Option<Vector3<f64>> [POSITION];
         /// The name of the target's own tool on the tracker's stream; then `position_mm` is where the target
         /// is expected.
-        tool: Option<String> [named("the name of a tool")];
+        tool: Option<String> [not_blank("the name of a tool")];
         /// How far from `position_mm` that tool may be, mm.
         tool_range_mm: f64 [over(0.0, 1000.0)] = 10.0;
         /// The target is the mean of that tool's positions over this long.

@@ -2,22 +2,22 @@
 //! recorded insertions are scored.
 
 use super::{Config, ConfigError};
-use crate::keys::{Rule, choice, named, over, section, within};
+use crate::keys::{Rule, choice, not_blank, over, section, within};
 use crate::study::{Scoring, mount};
 
 section! {
     /// `[record]`.
     pub struct RecordConfig {
         /// The folder in which run folders are made.
-        dir: String [named("the path of a folder")] = "runs";
+        dir: String [not_blank("the path of a folder")] = "runs";
         /// What a run does when its record can no longer be written.
         on_failure: OnFailure = "stop";
         /// A run is refused when `dir` has less free space than this, MB.
         free_mb_min: u32 [within(0.0, u32::MAX as f64)] = 100;
         /// Who runs the bench. It goes into each manifest; `run --operator` replaces it.
-        operator: Option<String> [named("a name")];
+        operator: Option<String> [not_blank("a name")];
         /// The phantom that needles are inserted into. It goes into each manifest; `run --phantom` replaces it.
-        phantom: Option<String> [named("a description")];
+        phantom: Option<String> [not_blank("a description")];
     }
 }
 

@@ -7,7 +7,7 @@ use super::pose::IDENTITY;
 use super::registration::RegistrationConfig;
 use crate::calibration::TipRecord;
 use crate::geometry::{FixedAngles, Pose};
-use crate::keys::{Rule, choice, named, section, within};
+use crate::keys::{Rule, choice, not_blank, section, within};
 use crate::observer::PositionNoise;
 use crate::session::{self, HoldConfig};
 use crate::tracker::openigtlink::ToolStream;
@@ -16,7 +16,7 @@ use crate::tracker::{
     TrackSettings, TrackerKind, Workspace,
 };
 
-pub(super) const FILE: Rule = named("the path of a file");
+pub(super) const FILE: Rule = not_blank("the path of a file");
 const ADDRESS: Rule =
     Rule::Text("host:port, such as \"127.0.0.1:18944\", or \"-\" for standard input", |address| {
         address == STANDARD_INPUT || is_address(address)
@@ -38,7 +38,7 @@ section! {
         /// Shortest time between two messages of that stream, ms; 0 is as fast as the server can.
         request_period_ms: i32 [within(0.0, 60_000.0)] = 25;
         /// The name of the tool that is the needle's tip.
-        tool: String [named("the name of a tool")] = "NeedleToTracker";
+        tool: String [not_blank("the name of a tool")] = "NeedleToTracker";
         /// Longest wait for the tool, without power.
         timeout as "timeout_s": Duration [within(0.1, 3600.0)] = 5.0;
         /// The kind of tracker, which says what a repeated value means.

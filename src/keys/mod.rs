@@ -17,7 +17,7 @@ pub(crate) use words::Words;
 use toml::{Table, Value};
 use units::converted;
 
-/// A key as it is declared.
+/// The declaration of a key.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Key {
     pub(crate) name: &'static str,
@@ -25,18 +25,18 @@ pub(crate) struct Key {
     pub(crate) text: &'static str,
     pub(crate) kind: Kind,
     pub(crate) rule: Rule,
-    /// True where the key may be left out although it has no default.
+    /// True if the key may be left out although it has no default.
     pub(crate) is_optional: bool,
-    /// In TOML.
+    /// The default, in TOML.
     pub(crate) default: Option<&'static str>,
     pub(crate) default_holds: DefaultHolds,
-    /// In the file it has the unit of its name, inside mm, rad and s.
+    /// The file has the value in the unit of the key's name; the program has it in mm, rad or s.
     pub(crate) is_converted: bool,
-    /// A table whose keys stand in the table around it.
+    /// A table whose keys are written in the enclosing table.
     pub(crate) is_flat: bool,
     /// A table that is replaced as a whole when it is given.
     pub(crate) is_whole: bool,
-    /// The key beside this one that it takes the place of.
+    /// The key of the same table that this one can replace.
     pub(crate) instead_of: Option<&'static str>,
     /// The dotted key whose value is the upper limit of this one.
     pub(crate) at_most: Option<&'static str>,
@@ -44,7 +44,7 @@ pub(crate) struct Key {
     pub(crate) narrowed: &'static [(&'static str, Rule)],
 }
 
-/// When a default holds. A key of a drive has this decided, or does not compile.
+/// When a default holds. A key of a drive whose default is `Undecided` does not compile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum DefaultHolds {
     /// Always; whether hardware must give the key is not decided.
@@ -63,16 +63,16 @@ pub(crate) enum DefaultHolds {
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Kind {
     Number,
-    /// From, to.
+    /// A whole number from the first to the second.
     Integer(f64, f64),
     Boolean,
     Text,
-    /// Names, each with what it means.
+    /// One of these words, each with its meaning.
     OneOf(&'static [(&'static str, &'static str)]),
-    /// Elements of one type, and their number if it is fixed.
+    /// The type of the elements, and their number if it is fixed.
     Array(&'static Kind, Option<usize>),
     Table(&'static [Key]),
-    /// Either of two tables: the first where this key of it is given.
+    /// One of two tables: the first if it has this key, else the second.
     Either(&'static str, [&'static [Key]; 2]),
 }
 
@@ -83,11 +83,11 @@ pub(crate) enum Rule {
     Range(Range),
     /// One of these whole numbers.
     Integers(&'static [i64]),
-    /// Text that the function accepts; in words.
+    /// Text that the function accepts, described in words.
     Text(&'static str, fn(&str) -> bool),
-    /// This word, which stands for none, or a whole number, in words.
+    /// This word, which stands for no value, or a value, described in words.
     Or(&'static str, &'static str),
-    /// Tables of these keys, in words.
+    /// Tables with the keys that this text lists.
     Fields(&'static str),
 }
 
@@ -109,8 +109,8 @@ pub(crate) const fn over(low: f64, high: f64) -> Rule {
     Rule::Range(Range { low, low_is_allowed: false, high })
 }
 
-/// Text that is not blank: `what` in words.
-pub(crate) const fn named(what: &'static str) -> Rule {
+/// Text that is not blank; `what` describes it.
+pub(crate) const fn not_blank(what: &'static str) -> Rule {
     Rule::Text(what, |text| !text.trim().is_empty())
 }
 
@@ -215,8 +215,9 @@ impl Key {
         }
     }
 
-    /// The value of `table` at this key, in the units used inside; none for the word that stands for none.
-    pub(crate) fn part(&self, table: Option<&Value>) -> Option<Value> {
+    /// The value of this key in `table`, converted to mm, rad or s if it `is_converted`; `None` for the word
+    /// that stands for no value.
+    pub(crate) fn value_in(&self, table: Option<&Value>) -> Option<Value> {
         let value = if self.is_flat { table? } else { table?.get(self.name)? };
         match (self.rule, value) {
             (Rule::Or(word, _), Value::String(text)) if text == word => None,
@@ -225,16 +226,16 @@ impl Key {
         }
     }
 
-    /// True where either of the two stands for the other.
+    /// True if one of the two keys can replace the other.
     pub(crate) fn is_alternative_to(&self, other: &Key) -> bool {
         self.instead_of == Some(other.name) || other.instead_of == Some(self.name)
     }
 }
 
-/// The name where a table does not have the key.
+/// The name of a key that this axis does not have.
 pub(crate) const NO_KEY: &str = "";
 
-/// True where each of `keys` says whether hardware must give it.
+/// True if each of `keys` says whether hardware must give it.
 pub(crate) const fn hardware_is_decided(keys: &[Key]) -> bool {
     match keys {
         [] => true,
@@ -248,7 +249,7 @@ pub(crate) const fn hardware_is_decided(keys: &[Key]) -> bool {
     }
 }
 
-/// The keys of a table, with those of the flat tables in it. Rules in `narrowed` replace theirs.
+/// The keys of a table, with those of the flat tables in it. The rules in `narrowed` replace the declared ones.
 pub(crate) fn expanded(keys: &[Key], narrowed: &[(&str, Rule)]) -> Vec<Key> {
     let mut all = Vec::new();
     for key in keys.iter().filter(|key| key.name != NO_KEY) {
@@ -262,7 +263,7 @@ pub(crate) fn expanded(keys: &[Key], narrowed: &[(&str, Rule)]) -> Vec<Key> {
     all
 }
 
-/// The key `path`, dotted, of a table with these `keys`.
+/// The key at the dotted `path` in a table with these `keys`.
 pub(crate) fn find(keys: &[Key], path: &str) -> Option<Key> {
     let (name, rest) = path.split_once('.').unwrap_or((path, ""));
     let name = name.split('[').next().unwrap_or(name);

@@ -8,13 +8,13 @@
 use super::event::Event;
 use super::orientation::Orientation;
 use super::sample::{Sample, Validity};
-use crate::keys::{Rule, named, over, section, within};
+use crate::keys::{Rule, not_blank, over, section, within};
 use crate::table::{Column, Row, Table, TableError};
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::time::Duration;
 
-const COLUMN: Rule = named("the name of a column");
+const COLUMN: Rule = not_blank("the name of a column");
 
 section! {
     /// `[tracker.csv]`: which columns of a CSV file hold what, named as in the file's header.
