@@ -2,13 +2,13 @@
 
 /// Declares a table of the configuration: a struct, and the keys that fill it. A key is
 /// `name: type [rule] = default, more;` with the default as a literal, or as `=> "TOML"`. Further
-/// properties are the methods of [`Key`]. With `field as "key"` the field has another name, and the
-/// value is converted from the unit of the key to mm, rad or s. Fields under `beside` have no key,
-/// and a value to begin with.
+/// properties are the methods of [`Key`]. With `field as "key"` the key has another name than the
+/// field, and its value is converted from the unit of the key to mm, rad or s. Fields under `beside`
+/// have no key: they start with the value given there, and the caller sets them.
 ///
-/// The table of an axis is `struct NAME of AXIS`: its keys may depend on the axis, which is 0 or 1. The key
-/// that holds such a table says which keys are allowed: `table(NAME::keys_of::<1>())`. A field is then read
-/// from the key of either axis, whichever is there.
+/// The table of an axis is declared as `struct NAME of AXIS`: its keys may depend on the axis, which is 0 or
+/// 1. The key that holds such a table says which keys are allowed: `table(NAME::keys_of::<1>())`. A field is
+/// read from whichever axis's key is given.
 macro_rules! section {
     (
         $(#[$attribute:meta])*
@@ -42,7 +42,9 @@ macro_rules! section {
                 let others = Self::keys_of $(::<{ const $axis: usize = 1; $axis }>)? ();
                 let mut parts = Self::KEYS.iter().zip(others);
                 let mut part = || {
-                    parts.next().and_then(|(key, other)| key.part(table).or_else(|| other.part(table)))
+                    parts.next().and_then(|(key, other)| {
+                        key.value_in(table).or_else(|| other.value_in(table))
+                    })
                 };
                 $section {
                     $($field: $crate::keys::Field::take(part().as_ref()),)*
@@ -60,7 +62,7 @@ macro_rules! section {
 }
 pub(crate) use section;
 
-/// Declares an enumeration: the names that its variants have in TOML, and what they mean.
+/// Declares an enumeration: its variants, the words that stand for them in TOML, and their meanings.
 macro_rules! choice {
     (
         $(#[$doc:meta])*

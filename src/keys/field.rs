@@ -7,11 +7,11 @@ use toml::Value;
 
 /// A type that a key may have.
 pub(crate) trait Field: Sized {
-    /// How it is written.
+    /// How it is written in TOML.
     const KIND: Kind;
-    /// True where it may be absent.
+    /// True if it may be absent.
     const IS_OPTIONAL: bool = false;
-    /// From a value that was checked; something harmless from one that is wrong.
+    /// Converts a value that was checked; a wrong or missing value gives a placeholder such as NaN or 0.
     fn take(value: Option<&Value>) -> Self;
 }
 

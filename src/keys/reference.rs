@@ -16,7 +16,7 @@ pub(crate) fn toml_reference(keys: &'static [Key]) -> String {
 
 /// A JSON Schema of a configuration of these `keys`, for editors that complete and check TOML.
 pub(crate) fn json_schema(keys: &'static [Key], title: &str) -> Json {
-    let mut schema = object(keys, &[], false);
+    let mut schema = table_schema(keys, &[], false);
     schema["$schema"] = "http://json-schema.org/draft-07/schema#".into();
     schema["title"] = title.into();
     schema
@@ -98,7 +98,7 @@ fn explanation(key: &Key) -> String {
     text
 }
 
-/// `explanation` in lines that begin with `start`.
+/// Adds `explanation` as lines that begin with `start`.
 fn comment(text: &mut String, start: &str, explanation: &str) {
     let mut line = String::new();
     for word in explanation.split_whitespace() {
@@ -114,11 +114,11 @@ fn comment(text: &mut String, start: &str, explanation: &str) {
     text.push_str(&format!("{start}{line}\n"));
 }
 
-/// The schema of a table; where it `is_whole`, the keys without a default are required.
-fn object(keys: &'static [Key], narrowed: &[(&str, Rule)], is_whole: bool) -> Json {
+/// The schema of a table. If it `is_whole`, the keys without a default are required.
+fn table_schema(keys: &'static [Key], narrowed: &[(&str, Rule)], is_whole: bool) -> Json {
     let keys = expanded(keys, narrowed);
-    let properties = keys.iter().map(|key| (key.name.to_owned(), property(key)));
-    let mut object = json!({
+    let properties = keys.iter().map(|key| (key.name.to_owned(), key_schema(key)));
+    let mut schema = json!({
         "type": "object",
         "additionalProperties": false,
         "properties": properties.collect::<Map<_, _>>(),
@@ -126,18 +126,18 @@ fn object(keys: &'static [Key], narrowed: &[(&str, Rule)], is_whole: bool) -> Js
     let is_required = |key: &&Key| !key.is_optional && key.default.is_none();
     let required: Vec<&str> = keys.iter().filter(is_required).map(|key| key.name).collect();
     if is_whole && !required.is_empty() {
-        object["required"] = json!(required);
+        schema["required"] = json!(required);
     }
     for key in &keys {
         if let Some(other) = key.instead_of {
-            object["not"] = json!({ "required": [key.name, other] });
+            schema["not"] = json!({ "required": [key.name, other] });
         }
     }
-    object
+    schema
 }
 
-fn property(key: &Key) -> Json {
-    let mut schema = kind(&key.kind, &key.rule, key);
+fn key_schema(key: &Key) -> Json {
+    let mut schema = value_schema(&key.kind, &key.rule, key);
     schema["description"] = json!(explanation(key));
     if let Some(default) = key.default_value() {
         schema["default"] = json!(default);
@@ -145,22 +145,23 @@ fn property(key: &Key) -> Json {
     schema
 }
 
-fn kind(of: &Kind, rule: &Rule, key: &Key) -> Json {
-    match (of, *rule) {
+/// The schema of a value of this `kind` and `rule`: that of `key`, or of an element of it.
+fn value_schema(kind: &Kind, rule: &Rule, key: &Key) -> Json {
+    match (kind, *rule) {
         (_, Rule::Integers(values)) => json!({ "enum": values }),
         (_, Rule::Or(word, _)) => {
-            json!({ "anyOf": [{ "const": word }, kind(of, &Rule::Any, key)] })
+            json!({ "anyOf": [{ "const": word }, value_schema(kind, &Rule::Any, key)] })
         }
         (Kind::Number | Kind::Integer(..), _) => {
-            let mut number = match of.range(rule) {
+            let mut number = match kind.range(rule) {
                 Some(Range { low, low_is_allowed, high }) => {
                     let minimum = if low_is_allowed { "minimum" } else { "exclusiveMinimum" };
                     json!({ minimum: low, "maximum": high })
                 }
                 None => json!({}),
             };
-            let is_whole = matches!(of, Kind::Integer(..));
-            number["type"] = json!(if is_whole { "integer" } else { "number" });
+            let is_integer = matches!(kind, Kind::Integer(..));
+            number["type"] = json!(if is_integer { "integer" } else { "number" });
             number
         }
         (Kind::Boolean, _) => json!({ "type": "boolean" }),
@@ -171,7 +172,7 @@ fn kind(of: &Kind, rule: &Rule, key: &Key) -> Json {
             json!({ "enum": names, "x-taplo": { "docs": { "enumValues": meanings } } })
         }
         (Kind::Array(inner, count), _) => {
-            let mut array = json!({ "type": "array", "items": kind(inner, rule, key) });
+            let mut array = json!({ "type": "array", "items": value_schema(inner, rule, key) });
             if let Some(count) = count {
                 array["minItems"] = json!(count);
                 array["maxItems"] = json!(count);
@@ -179,10 +180,10 @@ fn kind(of: &Kind, rule: &Rule, key: &Key) -> Json {
             array
         }
         (Kind::Table(keys), _) => {
-            object(keys, key.narrowed, key.is_whole || matches!(key.kind, Kind::Array(..)))
+            table_schema(keys, key.narrowed, key.is_whole || matches!(key.kind, Kind::Array(..)))
         }
         (Kind::Either(_, tables), _) => {
-            json!({ "anyOf": tables.map(|keys| object(keys, &[], true)) })
+            json!({ "anyOf": tables.map(|keys| table_schema(keys, &[], true)) })
         }
     }
 }

@@ -2,11 +2,11 @@
 
 use toml::Value;
 
-/// From the unit of a key to the one used inside.
-type Inside = fn(f64) -> f64;
+/// Converts a number from the unit of its key to mm, rad or s.
+type Conversion = fn(f64) -> f64;
 
-/// The units that names of keys end in, the longest first: (suffix, in words, to mm, rad or s).
-static UNITS: [(&str, &str, Inside); 11] = [
+/// The units, the longest suffix first: (suffix, unit in words, conversion).
+static UNITS: [(&str, &str, Conversion); 11] = [
     ("_mm_per_s2", "mm/s²", |mm_per_s2| mm_per_s2),
     ("_deg_per_s2", "deg/s²", f64::to_radians),
     ("_mm_per_s", "mm/s", |mm_per_s| mm_per_s),
@@ -29,8 +29,8 @@ pub(crate) fn unit_of(name: &str) -> Option<&'static str> {
 pub(super) fn converted(name: &str, value: &Value) -> Value {
     let unit = UNITS.iter().find(|(suffix, ..)| name.ends_with(suffix));
     match (unit, value) {
-        (Some((.., inside)), Value::Integer(integer)) => Value::Float(inside(*integer as f64)),
-        (Some((.., inside)), Value::Float(number)) => Value::Float(inside(*number)),
+        (Some((.., convert)), Value::Integer(integer)) => Value::Float(convert(*integer as f64)),
+        (Some((.., convert)), Value::Float(number)) => Value::Float(convert(*number)),
         (Some(_), Value::Array(values)) => {
             Value::Array(values.iter().map(|value| converted(name, value)).collect())
         }

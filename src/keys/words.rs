@@ -13,24 +13,26 @@ pub(crate) struct Words {
 impl Words {
     /// The allowed values of this kind and rule, in the unit that `name` ends in.
     pub(crate) fn of(kind: &Kind, rule: &Rule, name: &str) -> Self {
-        let any = |expected: String| Words { allowed: expected.clone(), expected };
+        let both = |expected: String| Words { allowed: expected.clone(), expected };
         match (kind, *rule) {
             (Kind::Array(of, Some(count)), _) => {
                 let each = Words::of(of, rule, name).allowed;
-                any(format!("{count} {}, each {each}", plural(of)))
+                both(format!("{count} {}, each {each}", plural(of)))
             }
             (Kind::Array(Kind::Table(_), None), Rule::Fields(fields)) => {
-                any(format!("tables of {fields}"))
+                both(format!("tables of {fields}"))
             }
             (Kind::Array(of, None), _) => {
                 let each = Words::of(of, rule, name).allowed;
-                any(format!("an array of {}, each {each}", plural(of)))
+                both(format!("an array of {}, each {each}", plural(of)))
             }
-            (_, Rule::Or(word, number)) => any(format!("{number} or \"{word}\"")),
-            (_, Rule::Integers(values)) => any(or(values.iter().map(i64::to_string))),
+            (_, Rule::Or(word, number)) => both(format!("{number} or \"{word}\"")),
+            (_, Rule::Integers(values)) => both(joined_by_or(values.iter().map(i64::to_string))),
             (_, Rule::Text(what, _)) => Words { expected: "a string".into(), allowed: what.into() },
-            (Kind::OneOf(names), _) => any(or(names.iter().map(|(name, _)| format!("\"{name}\"")))),
-            (Kind::Boolean, _) => any("true or false".into()),
+            (Kind::OneOf(words), _) => {
+                both(joined_by_or(words.iter().map(|(word, _)| format!("\"{word}\""))))
+            }
+            (Kind::Boolean, _) => both("true or false".into()),
             (Kind::Text, _) => Words { expected: "a string".into(), allowed: "any text".into() },
             (Kind::Number | Kind::Integer(..), _) => {
                 let whole = if matches!(kind, Kind::Number) { "" } else { "whole " };
@@ -38,11 +40,11 @@ impl Words {
                 let range = kind.range(rule).map(|range| with_unit(range, name));
                 Words { allowed: range.unwrap_or_else(|| expected.clone()), expected }
             }
-            (Kind::Table(_) | Kind::Either(..), _) => any("a table".into()),
+            (Kind::Table(_) | Kind::Either(..), _) => both("a table".into()),
         }
     }
 
-    /// The same of a key.
+    /// The allowed values of `key`.
     pub(crate) fn of_key(key: &Key) -> Self {
         Words::of(&key.kind, &key.rule, key.name)
     }
@@ -59,7 +61,7 @@ fn plural(kind: &Kind) -> &'static str {
     }
 }
 
-fn or(names: impl Iterator<Item = String>) -> String {
+fn joined_by_or(names: impl Iterator<Item = String>) -> String {
     names.collect::<Vec<_>>().join(" or ")
 }
 
