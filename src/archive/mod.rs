@@ -6,25 +6,25 @@
 mod candump;
 mod events;
 mod inputs;
+mod lines;
 mod manifest;
 mod steps_csv;
 mod steps_table;
-mod text;
 mod tracker_ndjson;
 mod utc;
 
 pub use candump::{CandumpLine, interface_name, unix_us};
 pub use events::{EventKind, EventLine, proof};
 pub use inputs::{Inputs, RecordedInput, input_line, inputs_header};
+pub use lines::Lines;
 pub use manifest::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,
     VerdictKind, hex, sha256_hex,
 };
 pub use steps_csv::{
-    RecordedColumns, STEP_COLUMNS, StepColumn, StepRow, is_of_truth, steps_csv_header,
+    RecordedColumns, STEP_COLUMNS, StepColumn, StepRow, is_truth_column, steps_csv_header,
 };
 pub use steps_table::StepsTable;
-pub use text::Lines;
 pub use tracker_ndjson::{TrackerTimes, line as tracker_line};
 pub use utc::{compact, rfc3339, unix_us_of};
 

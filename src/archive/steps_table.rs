@@ -1,6 +1,6 @@
 //! `steps.csv` as numbers, by the names of its columns.
 
-use super::text::whole;
+use super::lines::without_partial_line;
 use crate::table::{Table, TableError};
 use std::collections::BTreeMap;
 
@@ -12,13 +12,13 @@ pub struct StepsTable {
 }
 
 impl StepsTable {
-    /// Reads `text`. A last line without an end, which a kill leaves, is left out; empty fields are
-    /// unknown, and so are those that a short line lacks.
+    /// Reads `text`. A partial last line, as a killed bench leaves it, is left out. Empty and missing fields
+    /// are unknown.
     ///
     /// # Errors
     /// A field that is not a number.
     pub fn parse(text: &str) -> Result<Self, TableError> {
-        let table = Table::parse(whole(text));
+        let table = Table::parse(without_partial_line(text));
         let columns = table.columns().map(|column| {
             let numbers = table.rows().iter().map(|row| match row.text(&column) {
                 "" => Ok(None),
@@ -29,8 +29,7 @@ impl StepsTable {
         Ok(StepsTable { rows: table.rows().len(), columns: columns.collect::<Result<_, _>>()? })
     }
 
-    /// The column `name` from the first row to the last; unknown in every row where there is no such
-    /// column.
+    /// The column `name` from the first row to the last; unknown in every row if there is no such column.
     pub fn column(&self, name: &str) -> Vec<Option<f64>> {
         self.columns.get(name).cloned().unwrap_or_else(|| vec![None; self.rows])
     }

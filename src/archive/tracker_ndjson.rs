@@ -39,19 +39,19 @@ struct Line<'a> {
     refused: Option<String>,
 }
 
-/// When a sample of `tracker.ndjson` came, and what became of it.
+/// When a sample of `tracker.ndjson` was received, and whether it was accepted.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 pub struct TrackerTimes {
     /// When the bench received it, ns on the run's time line.
     pub receive_time_ns: i64,
-    /// When the tip was there, where the sample was accepted.
+    /// When the tip was at this position, if the sample was accepted.
     pub acquisition_time_ns: Option<i64>,
-    /// Why it was refused; none where it was accepted.
+    /// Why it was refused; `None` if it was accepted.
     pub refused: Option<String>,
 }
 
 impl TrackerTimes {
-    /// Those in `line`; `None` of a line that is no sample.
+    /// The times in `line`; `None` if it is not a sample.
     pub fn parse(line: &str) -> Option<Self> {
         serde_json::from_str(line).ok()
     }
@@ -130,7 +130,7 @@ mod tests {
             refused: refused.map(str::to_owned),
         };
         assert_eq!(
-            Lines::new(text.as_bytes()).read(TrackerTimes::parse).unwrap(),
+            Lines::new(text.as_bytes()).parse(TrackerTimes::parse).unwrap(),
             (vec![times(20, Some(7), None), times(30, None, Some("zero"))], vec![2])
         );
     }

@@ -43,7 +43,7 @@ fn lines<T>(
     unreadable: &mut Vec<String>,
 ) -> Vec<T> {
     let path = folder.dir().join(name);
-    match folder.lines(name).and_then(|lines| lines.read(parse)) {
+    match folder.lines(name).and_then(|lines| lines.parse(parse)) {
         Ok((values, damaged)) => {
             let count = damaged.len();
             unreadable.extend(damaged.first().map(|first| {
