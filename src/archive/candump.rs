@@ -13,7 +13,7 @@ use std::fmt;
 pub struct CandumpLine<'a> {
     /// UTC, µs since 1970.
     pub unix_us: i64,
-    /// Interface.
+    /// Name of the CAN interface.
     pub interface: &'a str,
     /// Sent or received, as seen from the bench.
     pub direction: Direction,
@@ -38,7 +38,7 @@ impl fmt::Display for CandumpLine<'_> {
 }
 
 impl<'a> CandumpLine<'a> {
-    /// When the frame was sent or received in a run that began at `started_unix_us`.
+    /// When the frame was sent or received, on the time line of a run that began at `started_unix_us`.
     pub fn time(&self, started_unix_us: i64) -> Time {
         Time::from_nanos(self.unix_us.saturating_sub(started_unix_us).saturating_mul(1000))
     }

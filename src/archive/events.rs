@@ -1,4 +1,4 @@
-//! `events.log`: states and events, a line each, for people and grep.
+//! `events.log`: one line for each change of state and each event, for people and grep.
 
 use crate::session::{Lane, PROVED, Record, Severity};
 use crate::text::escaped;
@@ -9,7 +9,7 @@ use std::fmt;
 /// The kind of a line of `events.log`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum EventKind {
-    /// A part of the bench entered the state that is the line's text.
+    /// A part of the bench entered a state; the line's text is its name.
     State,
     /// An event of this severity.
     Event(Severity),
@@ -17,14 +17,14 @@ pub enum EventKind {
 
 /// A line of `events.log`, without its line feed: `   12.345 s  tracker   warning  connection lost`.
 ///
-/// Time to the millisecond, the part of the bench, how much it matters (`state`, `info`,
-/// `warning`, `fault`), and the text. Line ends and whatever else a terminal acts upon are
-/// [escaped] in the text, which may come from a tracker.
+/// Its columns: the time to the millisecond, the part of the bench, the kind (`state`, `info`, `warning`,
+/// `fault`), and the text. Newlines and control characters are [escaped] in the text, which may come from a
+/// tracker.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EventLine<'a> {
     /// When, whole milliseconds.
     pub time: Time,
-    /// Which part.
+    /// The part of the bench.
     pub lane: Lane,
     /// The kind of the text.
     pub kind: EventKind,
@@ -33,7 +33,7 @@ pub struct EventLine<'a> {
 }
 
 impl<'a> EventLine<'a> {
-    /// The line that `record` leaves, if it leaves one.
+    /// The line for `record`; `None` for a record that is neither a state nor an event.
     pub fn of(record: &'a Record) -> Option<Self> {
         let (time, lane, kind, text) = match record {
             Record::State { time, state } => (time, state.lane(), EventKind::State, state.as_str()),
@@ -46,7 +46,7 @@ impl<'a> EventLine<'a> {
         Some(EventLine { time, lane, kind, text: escaped(text) })
     }
 
-    /// Reads a line; `None` if it is not an event. The last line of a killed run may be truncated.
+    /// Reads a line; `None` if it is not a whole line of this format.
     pub fn parse(line: &'a str) -> Option<Self> {
         let (time_s, rest) = line.trim_start().split_once(" s  ")?;
         let (lane, rest) = column(rest, LANE_WIDTH)?;
@@ -60,7 +60,7 @@ impl<'a> EventLine<'a> {
     }
 }
 
-/// The result of a `stage prove` with these `events`: its last line of that kind.
+/// The result of a `stage prove`: the text of the last such line in `events`.
 pub fn proof(events: &str) -> Option<String> {
     let lines = events.lines().rev().filter_map(EventLine::parse);
     lines.map(|line| line.text).find(|text| text.starts_with(PROVED)).map(Cow::into_owned)
@@ -85,7 +85,7 @@ impl fmt::Display for EventLine<'_> {
     }
 }
 
-/// A column so many bytes wide without its padding, and what follows it.
+/// Splits `text` after a column of `width` bytes: the column without its padding, and the rest.
 fn column(text: &str, width: usize) -> Option<(&str, &str)> {
     let (column, rest) = text.split_at_checked(width)?;
     Some((column.trim_end(), rest.strip_prefix("  ")?))

@@ -1,9 +1,9 @@
-//! `inputs.log`: what the session was given, in its order and with its times.
+//! `inputs.log`: the inputs of the session, in order, each with its time.
 //!
-//! A session's course is a function of these. The first line names the format and the time at which
-//! the session was made; then, a line an input, the time at which it was given, in ns on the run's
-//! own time line, and what it was. Frames and samples are not written again: `frame` is the next
-//! received frame of `can.log`, `sample` the next line of `tracker.ndjson`. Text is in JSON's quotes.
+//! These determine everything that the session does. The first line has the format and the time at which
+//! the session was created. Each further line is one input: its time, in ns on the run's own time line, its
+//! kind and its values. Frames and samples are not written a second time: `frame` is the next received frame
+//! of `can.log`, `sample` the next line of `tracker.ndjson`. Text is quoted as in JSON.
 //!
 //! ```text
 //! needle-bench inputs 1, begun 0
@@ -27,20 +27,20 @@ use std::io;
 const FORMAT: u32 = 1;
 const TITLE: &str = "needle-bench inputs ";
 
-/// The first line of `inputs.log`, without its end: a session was made at `begun`.
+/// The first line of `inputs.log`, without its newline, for a session that was created at `begun`.
 pub fn inputs_header(begun: Time) -> String {
     format!("{TITLE}{FORMAT}, begun {}", begun.as_nanos())
 }
 
-/// The line of `inputs.log`, without its end, of an `input` that the session was given at `time`.
+/// The line of `inputs.log`, without its newline, for an `input` that the session was given at `time`.
 pub fn input_line(time: Time, input: &Input) -> String {
-    let (word, values) = words(input);
+    let (word, values) = word_and_values(input);
     let start = format!("{} {word}", time.as_nanos());
     values.iter().fold(start, |line, value| format!("{line} {value}"))
 }
 
-/// An input's word, and what follows it.
-fn words(input: &Input) -> (&'static str, Vec<Value>) {
+/// The word for an input's kind, and its values.
+fn word_and_values(input: &Input) -> (&'static str, Vec<Value>) {
     match input {
         Input::Frame(_) => ("frame", vec![]),
         Input::Tick => ("tick", vec![]),
@@ -81,44 +81,44 @@ pub enum RecordedInput {
     Frame,
     /// The next line of `tracker.ndjson`.
     Sample,
-    /// Any other, whole.
+    /// Any other input.
     Input(Input),
 }
 
-/// An `inputs.log` as it is read back: the inputs with their times, which do not go back. They are
-/// read as they are asked for.
+/// Reads an `inputs.log` line by line: the inputs with their times, which never decrease.
 pub struct Inputs {
-    /// The time at which the session was made.
+    /// The time at which the session was created.
     pub begun: Time,
-    newest: Time,
+    /// The time of the last input that was read.
+    last_time: Time,
     /// Lines read so far.
     line: usize,
     lines: Lines,
 }
 
 impl Inputs {
-    /// Begins to read the `lines` of an `inputs.log`.
+    /// Reads the header of an `inputs.log` with these `lines`.
     ///
     /// # Errors
-    /// The file holds nothing, or its first line is no header.
+    /// The file is empty, or its first line is not a header of this format.
     pub fn read(mut lines: Lines) -> Result<Self, String> {
         let header = lines.next().ok_or(
-            "inputs.log holds no input: the bench was killed at once, or an earlier bench recorded a \
-             `needle-bench stage` operation",
+            "inputs.log holds no input: the bench was killed at once, or an earlier version of the bench \
+             recorded a `needle-bench stage` operation",
         )?;
-        let begun = begun(&header.map_err(unreadable)?)?;
-        Ok(Inputs { begun, newest: begun, line: 1, lines })
+        let begun = parse_header(&header.map_err(unreadable)?)?;
+        Ok(Inputs { begun, last_time: begun, line: 1, lines })
     }
 
     fn parse(&mut self, text: &str) -> Result<(Time, RecordedInput), String> {
         let line = self.line;
         let (time, input) = parse_line(text)
             .ok_or_else(|| format!("inputs.log line {line}: {text:?} is no input"))?;
-        if time < self.newest {
-            let by_ns = self.newest.as_nanos().saturating_sub(time.as_nanos());
+        if time < self.last_time {
+            let by_ns = self.last_time.as_nanos().saturating_sub(time.as_nanos());
             return Err(format!("inputs.log line {line}: its time goes back by {by_ns} ns"));
         }
-        self.newest = time;
+        self.last_time = time;
         Ok((time, input))
     }
 }
@@ -137,7 +137,8 @@ fn unreadable(error: io::Error) -> String {
     format!("inputs.log: {error}")
 }
 
-fn begun(header: &str) -> Result<Time, String> {
+/// The time at which the session was created.
+fn parse_header(header: &str) -> Result<Time, String> {
     let not_inputs = || {
         let start: String = header.chars().take(80).collect();
         format!("inputs.log begins with {start:?}: not the inputs of a session")
@@ -158,11 +159,11 @@ fn parse_line(text: &str) -> Option<(Time, RecordedInput)> {
     let (word, values) = rest.split_once(' ').unwrap_or((rest, ""));
     let values = serde_json::Deserializer::from_str(values).into_iter::<Value>();
     let values = values.collect::<Result<Vec<_>, _>>().ok()?;
-    Some((Time::from_nanos(time.parse().ok()?), given(word, &values)?))
+    Some((Time::from_nanos(time.parse().ok()?), parse_input(word, &values)?))
 }
 
-/// The input of which [`words`] makes these.
-fn given(word: &str, values: &[Value]) -> Option<RecordedInput> {
+/// The inverse of [`word_and_values`].
+fn parse_input(word: &str, values: &[Value]) -> Option<RecordedInput> {
     let text = |value: &Value| value.as_str().map(str::to_owned);
     let input = match (word, values) {
         ("frame", []) => return Some(RecordedInput::Frame),

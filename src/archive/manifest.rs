@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use thiserror::Error;
 
-/// Layout of the manifest that this bench writes and reads.
+/// Format of the manifest that this version of the bench writes and reads.
 const FORMAT: u32 = 2;
 /// The key of the seal.
 const SEAL: &str = "seal_sha256";
@@ -47,7 +47,7 @@ pub struct Counts {
 }
 
 impl Counts {
-    /// Those of text files that have so many `lines`, by name.
+    /// The counts of text files; `lines` gives the number of lines of the file of a name.
     pub fn of_lines(lines: impl Fn(&str) -> u64) -> Self {
         Counts {
             can_frames: lines(file::CAN),
@@ -59,7 +59,7 @@ impl Counts {
     }
 }
 
-/// How many records are in no file, whatever became of them: a full queue, a full disk, a dead writer.
+/// Numbers of records that were lost, for whatever reason: a full queue, a full disk, a failed writer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Dropped {
     /// Not in the text files.
@@ -76,9 +76,9 @@ pub struct Dropped {
 #[display(rename_all = "snake_case")]
 #[serde(rename_all = "snake_case")]
 pub enum RunOutcome {
-    /// The configured depth was reached.
+    /// The run or operation went to its end.
     Completed,
-    /// The run was stopped before.
+    /// It was stopped before.
     Stopped,
 }
 
@@ -101,7 +101,7 @@ pub struct FileSeal {
 }
 
 impl FileSeal {
-    /// The seal of a file that holds `bytes`.
+    /// The seal of a file with this content.
     pub fn of(bytes: &[u8]) -> Self {
         FileSeal { bytes: bytes.len() as u64, sha256: sha256_hex(bytes) }
     }
@@ -114,7 +114,7 @@ impl FileSeal {
 pub enum VerdictKind {
     /// It counts.
     Valid,
-    /// It does not: it is left out of a campaign's figures.
+    /// It does not count: it is left out of a campaign's figures.
     Invalid,
 }
 
@@ -129,20 +129,20 @@ pub struct Verdict {
     pub given_utc: String,
 }
 
-/// The manifest. Its outcome is null while the run goes on, and stays so after a kill.
+/// The manifest. Its outcome is null while the run goes on, and stays null if the bench is killed.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
-    /// Layout of this file; raised when a key changes its meaning.
+    /// Format of this file; raised when a key changes its meaning.
     pub format: u32,
     /// Name of the run.
     pub name: String,
-    /// The operation, such as `home` or `jog`; none for an insertion.
+    /// The operation, such as `home` or `jog`; `None` for an insertion.
     pub operation: Option<String>,
     /// The arguments of the operation on its command line:
     /// `--axis`, `insertion`, `--by`, `2mm`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub arguments: Vec<String>,
-    /// The bus of the rig that was rehearsed; none of a run on its own bus.
+    /// The bus of the rig that was rehearsed; `None` if this was no rehearsal.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rehearsal: Option<String>,
     /// Who ran it.
@@ -179,7 +179,7 @@ pub struct Manifest {
     pub stop_reason: Option<String>,
     /// Records in the text files.
     pub counts: Option<Counts>,
-    /// Records that are in neither them nor the recording.
+    /// Records that were lost.
     pub dropped: Option<Dropped>,
     /// Writers that failed, with their reasons.
     pub faults: Vec<String>,
@@ -191,9 +191,9 @@ pub struct Manifest {
     pub timing: Map<String, Value>,
     /// The other files, by name, as they were when the record was closed.
     pub files: BTreeMap<String, FileSeal>,
-    /// When a record that was left open was closed after the run, RFC 3339.
+    /// When a repair closed the record after its bench had ended, RFC 3339.
     pub repaired_utc: Option<String>,
-    /// Judgements of the run, the last of which counts.
+    /// The operator's verdicts; the last one counts.
     #[serde(default)]
     pub verdicts: Vec<Verdict>,
 }
@@ -204,23 +204,23 @@ pub enum ManifestError {
     /// Not JSON, or a key is missing or wrong.
     #[error("not a run's manifest: {0}")]
     NotAManifest(#[from] serde_json::Error),
-    /// Made by another version of the bench.
+    /// Written in the format of another version of the bench.
     #[error(
         "format {found}, this bench reads format {FORMAT}; use the bench it was made by ({version})"
     )]
     Format {
         /// Its format.
         found: u64,
-        /// The version that it says it was made by.
+        /// The version of the bench that wrote it.
         version: String,
     },
-    /// Changed since it was written.
+    /// Edited since it was written.
     #[error("edited since the bench wrote it: its seal does not fit")]
     Edited,
 }
 
 impl Manifest {
-    /// The manifest of a run that begins.
+    /// The manifest of a run that starts at `started_utc`.
     pub fn new(name: &str, started_utc: String) -> Self {
         Manifest { format: FORMAT, name: name.to_owned(), started_utc, ..Manifest::default() }
     }
@@ -236,11 +236,11 @@ impl Manifest {
         self.stop_reason = outcome.stop_reason().map(str::to_owned);
     }
 
-    /// The manifest as text, with a hash over all of it, the seal. It shows a change made by hand; it is
-    /// no signature.
+    /// The manifest as text, with its seal: a hash of all other keys. The seal detects edits by hand; it is
+    /// not a signature.
     ///
     /// # Errors
-    /// The manifest cannot be JSON; none that this program makes.
+    /// The manifest cannot be written as JSON. This does not happen to a manifest of this program.
     pub fn to_text(&self) -> Result<String, serde_json::Error> {
         let mut value = serde_json::to_value(self)?;
         let seal = seal_of(&value);

@@ -10,9 +10,8 @@ use std::fmt;
 
 /// A row of `steps.csv`.
 ///
-/// Its text has no line's end. Numbers are printed with the fewest digits that read back to the same
-/// `f64`; what is unknown is empty; NaN and infinity, which should not be there, are printed as `NaN`,
-/// `inf`, `-inf`.
+/// Its text has no newline. Numbers are printed with the fewest digits that read back to the same `f64`.
+/// Unknown values are empty. NaN and infinity, which should not occur, are printed as `NaN`, `inf`, `-inf`.
 pub struct StepRow<'a> {
     step: &'a StepRecord,
     approach: Option<&'a Approach>,
@@ -23,7 +22,7 @@ pub struct StepRow<'a> {
 }
 
 impl<'a> StepRow<'a> {
-    /// The row of `step`, with the truth at it where the run is emulated.
+    /// The row of `step`; in an emulated run with the truth.
     pub fn new(step: &'a StepRecord, truth: Option<&Truth>) -> Self {
         StepRow {
             step,
@@ -42,8 +41,8 @@ pub type StepColumn = (&'static str, fn(&StepRow<'_>) -> Option<f64>);
 /// Columns of whole numbers.
 const COUNTS: [&str; 2] = ["step", "tip_positions"];
 
-/// The columns of `steps.csv`. Scripts rely on them: a column may be added at the end, none is renamed
-/// or moved. What is added here is in `run.rrd` too, angles in degrees there.
+/// The columns of `steps.csv`. Scripts rely on them: add columns at the end, and never rename or move one.
+/// A column that is added here appears in `run.rrd` too, with angles in degrees.
 pub const STEP_COLUMNS: [StepColumn; 36] = [
     ("step", |c| Some(c.step.step.into())),
     // A quotient, unlike a product with 1e-9, is the f64 nearest to the decimal number.
@@ -103,30 +102,30 @@ impl fmt::Display for StepRow<'_> {
     }
 }
 
-/// The columns of a `steps.csv` that is read back. A row stays text: what was printed is what was
-/// computed.
+/// The columns of a recorded `steps.csv`, to find values in its rows. Rows stay text, so that a replay can
+/// compare them exactly.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct RecordedColumns(pub Vec<String>);
 
 impl RecordedColumns {
-    /// Those of the file's first line.
+    /// The columns that the file's first line names.
     pub fn of(header: &str) -> Self {
         RecordedColumns(header.split(',').map(str::to_owned).collect())
     }
 
-    /// The value of `column` in `row`; `None` where there is none.
+    /// The value of `column` in `row`; `None` if it is missing or not a number.
     pub fn value(&self, row: &str, column: &str) -> Option<f64> {
         let position = self.0.iter().position(|name| name == column)?;
         row.split(',').nth(position)?.parse().ok()
     }
 
-    /// When the step of `row` was.
+    /// The time of the step in `row`.
     pub fn time(&self, row: &str) -> Option<Time> {
         let time_s = self.value(row, "time_s")?;
         Some(Time::from_nanos((time_s * 1e9).round() as i64))
     }
 
-    /// The truth in `row`; `None` where it is empty.
+    /// The truth in `row`; `None` if it is not recorded.
     pub fn truth(&self, row: &str) -> Option<Truth> {
         let value = |name: &str| self.value(row, name);
         let (yaw, pitch, roll) =
@@ -143,8 +142,8 @@ impl RecordedColumns {
     }
 }
 
-/// True of the columns of `steps.csv` that hold the truth of an emulated run.
-pub fn is_of_truth(column: &str) -> bool {
+/// True for a column of `steps.csv` that holds the truth of an emulated run.
+pub fn is_truth_column(column: &str) -> bool {
     column.contains("_true_")
 }
 
@@ -228,6 +227,6 @@ mod tests {
         assert_eq!(read.x_pb().translation, pose.translation);
         assert_eq!(read.target_mm(), truth.target_mm());
         assert_eq!(columns.truth(&rows[1]), None);
-        assert_eq!(columns.0.iter().filter(|column| is_of_truth(column)).count(), 9);
+        assert_eq!(columns.0.iter().filter(|column| is_truth_column(column)).count(), 9);
     }
 }

@@ -12,12 +12,12 @@ pub fn rfc3339(unix_us: i64) -> String {
     formatted(unix_us, "%Y-%m-%dT%H:%M:%S.%6fZ")
 }
 
-/// A time out of range counts as 1970.
+/// Formats a time; one that is out of range counts as 1970.
 fn formatted(unix_us: i64, format: &str) -> String {
     Timestamp::from_microsecond(unix_us).unwrap_or_default().strftime(format).to_string()
 }
 
-/// The microseconds since 1970 of which [`rfc3339`] makes `text`; `None` of anything else.
+/// Reads a time that [`rfc3339`] wrote, as µs since 1970; `None` for any other text.
 pub fn unix_us_of(text: &str) -> Option<i64> {
     let unix_us = text.parse::<Timestamp>().ok()?.as_microsecond();
     Some(unix_us).filter(|unix_us| rfc3339(*unix_us) == text)

@@ -3,7 +3,7 @@
 use super::inputs::unsent_unix_us;
 use super::recorded::{Entries, Logged, Recorded};
 use crate::archive::{
-    CandumpLine, RecordedColumns, StepRow, file, is_of_truth, steps_csv_header, tracker_line,
+    CandumpLine, RecordedColumns, StepRow, file, is_truth_column, steps_csv_header, tracker_line,
     unix_us,
 };
 use crate::canopen::Frame;
@@ -150,7 +150,7 @@ impl<'a> Comparison<'a> {
         let values = recorded.split(',').zip(replayed.split(','));
         let (column, (recorded, replayed)) =
             self.columns.0.iter().zip(values).find(|(column, (recorded, replayed))| {
-                !is_of_truth(column) && recorded != replayed
+                !is_truth_column(column) && recorded != replayed
             })?;
         let more = match (recorded.parse::<f64>(), replayed.parse::<f64>()) {
             (Ok(was), Ok(is)) => format!(" ({:.1e} more)", is - was),

@@ -3,7 +3,7 @@
 use super::comparison::Comparison;
 use super::inputs::{Next, RecordedInputs};
 use super::recorded::Recorded;
-use crate::archive::{STEP_COLUMNS, StepRow, file, is_of_truth, steps_csv_header};
+use crate::archive::{STEP_COLUMNS, StepRow, file, is_truth_column, steps_csv_header};
 use crate::emulator::Truth;
 use crate::operation::Plan;
 use crate::session::{
@@ -260,7 +260,7 @@ fn with_recorded_truth(replayed: &str, recorded: &str) -> String {
     let values =
         replayed.split(',').zip(&STEP_COLUMNS).map(|(replayed, (column, _))| {
             match recorded.next() {
-                Some(recorded) if is_of_truth(column) => recorded,
+                Some(recorded) if is_truth_column(column) => recorded,
                 _ => replayed,
             }
         });

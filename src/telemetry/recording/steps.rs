@@ -1,7 +1,7 @@
 //! The tables of the steps: state, bounds, errors, command and measurement.
 
 use super::{Logged, log_row};
-use crate::archive::{STEP_COLUMNS, StepRow, is_of_truth};
+use crate::archive::{STEP_COLUMNS, StepRow, is_truth_column};
 use crate::emulator::Truth;
 use crate::geometry::coordinates;
 use crate::observer::Estimate;
@@ -73,7 +73,7 @@ impl Steps {
         let cells = StepRow::new(step, known_truth);
         let recorded = STEP_COLUMNS
             .iter()
-            .filter(|(name, _)| !ELSEWHERE.contains(name) && (has_truth || !is_of_truth(name)));
+            .filter(|(name, _)| !ELSEWHERE.contains(name) && (has_truth || !is_truth_column(name)));
         let recorded = recorded.map(|(name, value)| {
             let value = value(&cells).unwrap_or(f64::NAN);
             let shown = match *name {
