@@ -65,7 +65,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
         "rows": replayed.rows,
         "frames_sent": replayed.frames,
         "samples": replayed.samples,
-        "cut": replayed.cut.as_ref().map(|cut| json!({
+        "cut": replayed.truncation.as_ref().map(|cut| json!({
             "end_s": cut.end.as_secs_f64(),
             "first_file": cut.file,
             "first_file_end_s": cut.file_end.as_secs_f64(),

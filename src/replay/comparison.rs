@@ -1,7 +1,7 @@
-//! Compares what leaves a replayed session with what the record holds.
+//! Compares the output of a replayed session with the record.
 
 use super::inputs::unsent_unix_us;
-use super::recorded::{Entries, Logged, Recorded};
+use super::recorded::{Entries, LoggedFrame, Recorded};
 use crate::archive::{
     CandumpLine, RecordedColumns, StepRow, file, is_truth_column, steps_csv_header, tracker_line,
     unix_us,
@@ -10,21 +10,21 @@ use crate::canopen::Frame;
 use crate::session::{Direction, Input, Outcome, SampleRecord, StepRecord};
 use crate::units::Time;
 
-/// Compares frames, samples and steps in the order in which they leave, and keeps the first difference.
+/// Compares frames, samples and steps in the order of the session's output, and keeps the first difference.
 pub(super) struct Comparison<'a> {
     recorded: &'a Recorded<'a>,
     started_unix_us: i64,
-    /// How the run ended; `None` of a record that was cut, which ends before its run did.
+    /// How the run ended; `None` for a truncated record, which ends before its run did.
     outcome: Option<Outcome>,
     unsent_unix_us: Vec<i64>,
-    pub(super) sent: Entries<Logged>,
+    pub(super) sent: Entries<LoggedFrame>,
     pub(super) samples: Entries<String>,
     pub(super) columns: RecordedColumns,
     pub(super) rows: Entries<String>,
     /// The first difference, in words.
     pub(super) difference: Option<String>,
-    /// Of a record that was cut: the first file that ended, and the time of what it lacks.
-    pub(super) ended: Option<(Time, &'static str)>,
+    /// In a truncated record: the first file that ended, and the time of its first missing entry.
+    pub(super) first_end: Option<(Time, &'static str)>,
 }
 
 impl<'a> Comparison<'a> {
@@ -52,100 +52,112 @@ impl<'a> Comparison<'a> {
             columns,
             rows: Entries::new(rows)?,
             difference: None,
-            ended: None,
+            first_end: None,
         })
     }
 
-    /// Of a record that was cut, what the replay has beyond it is no difference.
-    pub(super) fn is_cut(&self) -> bool {
+    /// True for a truncated record: output of the replay after its end is no difference.
+    pub(super) fn is_truncated(&self) -> bool {
         self.outcome.is_none()
     }
 
-    /// `file`, of a record that was cut, holds nothing from `time` on.
-    pub(super) fn ends(&mut self, file: &'static str, time: Time) {
-        self.ended.get_or_insert((time, file));
+    /// Notes that `file` of a truncated record holds nothing from `time` on.
+    pub(super) fn note_end(&mut self, file: &'static str, time: Time) {
+        self.first_end.get_or_insert((time, file));
     }
 
-    /// `file` holds another line, from 1, than was replayed; `None` where one side has no more.
-    fn differs(&mut self, file: &str, line: usize, recorded: Option<&str>, replayed: Option<&str>) {
+    /// Notes that a line of `file`, numbered from 1, differs from the replayed one. A side that has no such
+    /// line is `None`.
+    fn note_difference(
+        &mut self,
+        file: &str,
+        line: usize,
+        recorded: Option<&str>,
+        replayed: Option<&str>,
+    ) {
         let [recorded, replayed] = [recorded, replayed].map(|text| text.unwrap_or("nothing more"));
         let words = format!("{file} line {line}: recorded {recorded}, replayed {replayed}");
         self.difference.get_or_insert(words);
     }
 
-    /// A frame that the session sends, in answer to `input`.
-    pub(super) fn sent(
+    /// Compares a frame that the session sends in answer to `input`.
+    pub(super) fn check_sent(
         &mut self,
         time: Time,
         frame: &Frame,
         input: Option<&Input>,
     ) -> Result<(), String> {
-        let recorded = self.sent.next();
+        let recorded = self.sent.peek();
         let logged = recorded.and_then(|logged| CandumpLine::parse(&logged.text));
         let interface = logged.map_or("can", |logged| logged.interface);
         let (unix_us, direction) = (unix_us(self.started_unix_us, time), Direction::Sent);
         let line = CandumpLine { unix_us, interface, direction, frame: *frame }.to_string();
         match recorded {
             Some(logged) if logged.text == line => drop(self.sent.take()?),
-            _ if self.was_refused(time, input) => {}
-            None if self.is_cut() => self.ends(file::CAN, time),
+            _ if self.may_be_unsent(time, input) => {}
+            None if self.is_truncated() => self.note_end(file::CAN, time),
             _ => {
-                let (at, recorded) = match self.sent.take()? {
+                let (number, recorded) = match self.sent.take()? {
                     Some(logged) => (logged.line, Some(logged.text)),
                     None => (self.recorded.lines(file::CAN)?.count() + 1, None),
                 };
-                self.differs(file::CAN, at, recorded.as_deref(), Some(&line));
+                self.note_difference(file::CAN, number, recorded.as_deref(), Some(&line));
             }
         }
         Ok(())
     }
 
-    /// A frame that the bus refuses, or that was made before the bench was held up, is in no log; the
-    /// session is then told of it before anything else is sent. Of what it answers to a fault of the
-    /// bus, any may be refused as well.
-    fn was_refused(&self, time: Time, input: Option<&Input>) -> bool {
+    /// True if a frame that the session made at `time` in answer to `input` need not be in `can.log`. The log
+    /// lacks frames that the bus refused and frames that were discarded because the bench was held up; the
+    /// session is told of either before anything else is sent. Any frame in answer to a fault of the bus may
+    /// be refused too.
+    fn may_be_unsent(&self, time: Time, input: Option<&Input>) -> bool {
         let sent_us = unix_us(self.started_unix_us, time);
-        let next_us = self.sent.next().map_or(i64::MAX, |logged| logged.unix_us);
+        let next_us = self.sent.peek().map_or(i64::MAX, |logged| logged.unix_us);
         let mut faults = self.unsent_unix_us.iter();
         matches!(input, Some(Input::BusFault(_)))
             || faults.any(|fault_us| (sent_us..=next_us).contains(fault_us))
     }
 
-    /// A sample that the session is done with.
-    pub(super) fn sample(&mut self, sample: &SampleRecord) -> Result<(), String> {
+    /// Compares a sample as the session records it.
+    pub(super) fn check_sample(&mut self, sample: &SampleRecord) -> Result<(), String> {
         // A sample that JSON cannot hold could not have been recorded either.
         let line = tracker_line(sample).unwrap_or_default();
         let number = self.samples.taken + 1;
         match self.samples.take()? {
             Some(recorded) if recorded == line => {}
-            None if self.is_cut() => self.ends(file::TRACKER, sample.received.receive_time),
-            recorded => self.differs(file::TRACKER, number, recorded.as_deref(), Some(&line)),
+            None if self.is_truncated() => {
+                self.note_end(file::TRACKER, sample.received.receive_time);
+            }
+            recorded => {
+                self.note_difference(file::TRACKER, number, recorded.as_deref(), Some(&line))
+            }
         }
         Ok(())
     }
 
-    /// A step that the session takes; gives its row, as recorded.
-    pub(super) fn step(&mut self, step: &StepRecord) -> Result<Option<String>, String> {
+    /// Compares a step of the session; returns its recorded row.
+    pub(super) fn check_step(&mut self, step: &StepRecord) -> Result<Option<String>, String> {
         let replayed = StepRow::new(step, None).to_string();
         // The header is line 1.
         let line = self.rows.taken + 2;
         let Some(recorded) = self.rows.take()? else {
-            match self.is_cut() {
-                true => self.ends(file::STEPS, step.time),
-                false => self.differs(file::STEPS, line, None, Some(&replayed)),
+            match self.is_truncated() {
+                true => self.note_end(file::STEPS, step.time),
+                false => self.note_difference(file::STEPS, line, None, Some(&replayed)),
             }
             return Ok(None);
         };
         if recorded.split(',').count() != self.columns.0.len() {
-            self.differs(file::STEPS, line, Some(&recorded), Some(&replayed));
-        } else if let Some(difference) = self.first_value(line, &recorded, &replayed) {
+            self.note_difference(file::STEPS, line, Some(&recorded), Some(&replayed));
+        } else if let Some(difference) = self.differing_value(line, &recorded, &replayed) {
             self.difference.get_or_insert(difference);
         }
         Ok(Some(recorded))
     }
 
     /// The first value in which two rows differ, in words.
-    fn first_value(&self, line: usize, recorded: &str, replayed: &str) -> Option<String> {
+    fn differing_value(&self, line: usize, recorded: &str, replayed: &str) -> Option<String> {
         let step = recorded.split(',').next().unwrap_or_default();
         let values = recorded.split(',').zip(replayed.split(','));
         let (column, (recorded, replayed)) =
@@ -158,12 +170,12 @@ impl<'a> Comparison<'a> {
         };
         let [recorded, replayed] =
             [recorded, replayed].map(|value| if value.is_empty() { "nothing" } else { value });
-        let at = format!("{} line {line}, step {step}, {column}", file::STEPS);
-        Some(format!("{at}: recorded {recorded}, replayed {replayed}{more}"))
+        let place = format!("{} line {line}, step {step}, {column}", file::STEPS);
+        Some(format!("{place}: recorded {recorded}, replayed {replayed}{more}"))
     }
 
-    /// The session has been given everything and has ended as `outcome`; what the record holds
-    /// beyond that is a difference.
+    /// Compares the end: the session was given all inputs and ended as `outcome`. Further recorded entries
+    /// are a difference.
     pub(super) fn close(&mut self, outcome: Option<&Outcome>) -> Result<(), String> {
         let Some(recorded) = self.outcome.take() else { return Ok(()) };
         for (file, line, text) in [
@@ -171,11 +183,11 @@ impl<'a> Comparison<'a> {
             (file::TRACKER, self.samples.taken + 1, self.samples.take()?),
         ] {
             if text.is_some() {
-                self.differs(file, line, text.as_deref(), None);
+                self.note_difference(file, line, text.as_deref(), None);
             }
         }
-        if let Some(Logged { line, text, .. }) = self.sent.take()? {
-            self.differs(file::CAN, line, Some(&text), None);
+        if let Some(LoggedFrame { line, text, .. }) = self.sent.take()? {
+            self.note_difference(file::CAN, line, Some(&text), None);
         }
         if outcome != Some(&recorded) {
             let words = |outcome: &Outcome| match outcome {

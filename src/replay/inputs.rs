@@ -1,28 +1,28 @@
-//! What a session was given, from `inputs.log` and the files that it refers to.
+//! The inputs of a recorded session, from `inputs.log` and the files that it refers to.
 
-use super::recorded::{Entries, Logged, Recorded};
+use super::recorded::{Entries, LoggedFrame, Recorded};
 use crate::archive::{Inputs, RecordedInput, file, unix_us};
 use crate::session::{Direction, Input, STALLED};
 use crate::tracker::ndjson;
 use crate::tracker::{Event, Sample};
 use crate::units::Time;
 
-/// The inputs of a recorded session, read as they are asked for.
+/// The inputs of a recorded session, read one by one.
 pub(super) struct RecordedInputs {
     started_unix_us: i64,
     inputs: Inputs,
     /// Lines of `inputs.log` read so far.
     line: usize,
-    received: Entries<Logged>,
+    received: Entries<LoggedFrame>,
     samples: Entries<Sample>,
 }
 
-/// What comes next.
+/// The next entry of `inputs.log`.
 pub(super) enum Next {
-    /// This input, at this time.
+    /// An input at this time.
     Input(Time, Input),
-    /// One that this file does not hold.
-    Lacking(Time, &'static str),
+    /// An input at this time that is missing in this file.
+    Missing(Time, &'static str),
 }
 
 impl RecordedInputs {
@@ -41,65 +41,67 @@ impl RecordedInputs {
         })
     }
 
-    /// When the session was made.
+    /// When the session was created.
     pub(super) fn begun(&self) -> Time {
         self.inputs.begun
     }
 
     /// The next input; `None` after the last.
     pub(super) fn next(&mut self) -> Result<Option<Next>, String> {
-        let Some((time, given)) = self.inputs.next().transpose()? else { return Ok(None) };
+        let Some((time, recorded)) = self.inputs.next().transpose()? else { return Ok(None) };
         self.line += 1;
-        Ok(Some(match given {
+        Ok(Some(match recorded {
             RecordedInput::Input(input) => Next::Input(time, input),
             RecordedInput::Frame => match self.received.take()? {
                 Some(logged) => Next::Input(time, self.frame(time, &logged)?),
-                None => Next::Lacking(time, file::CAN),
+                None => Next::Missing(time, file::CAN),
             },
             RecordedInput::Sample => match self.samples.take()? {
                 Some(sample) => Next::Input(time, self.sample(time, sample)?),
-                None => Next::Lacking(time, file::TRACKER),
+                None => Next::Missing(time, file::TRACKER),
             },
         }))
     }
 
-    fn frame(&self, time: Time, logged: &Logged) -> Result<Input, String> {
-        let apart_us = logged.unix_us.abs_diff(unix_us(self.started_unix_us, time));
-        if apart_us > 0 {
+    fn frame(&self, time: Time, logged: &LoggedFrame) -> Result<Input, String> {
+        let difference_us = logged.unix_us.abs_diff(unix_us(self.started_unix_us, time));
+        if difference_us > 0 {
             let (name, line) = (file::CAN, logged.line);
-            return Err(self.mixed(&format!("and {name} line {line} are {apart_us} us apart")));
+            return Err(
+                self.mismatch(&format!("and {name} line {line} are {difference_us} us apart"))
+            );
         }
         Ok(Input::Frame(logged.frame))
     }
 
     fn sample(&self, time: Time, sample: Sample) -> Result<Input, String> {
         if sample.receive_time > time {
-            let late_s = sample.receive_time.seconds_after(time);
+            let early_s = sample.receive_time.seconds_after(time);
             let (name, line) = (file::TRACKER, self.samples.taken);
-            return Err(self.mixed(&format!("was given {late_s} s before {name} line {line}")));
+            return Err(self.mismatch(&format!("was given {early_s} s before {name} line {line}")));
         }
         Ok(Input::Tracker(Event::Sample(sample)))
     }
 
-    /// The refusal of files that do not fit together, at the input read last.
-    pub(super) fn mixed(&self, what: &str) -> String {
+    /// The error for files that do not belong together; `what` says how the last input does not fit.
+    pub(super) fn mismatch(&self, what: &str) -> String {
         format!("the files are not of one run: {} line {} {what}", file::INPUTS, self.line)
     }
 
-    /// A received frame that was given to no session.
-    pub(super) fn left_over(&self) -> Option<&Logged> {
-        self.received.next()
+    /// The next received frame that `inputs.log` does not refer to.
+    pub(super) fn unused_frame(&self) -> Option<&LoggedFrame> {
+        self.received.peek()
     }
 }
 
-/// When frames that were made may have been left unsent, UTC µs: the bus failed, or the bench was held
-/// up.
+/// The times at which frames of the session may have remained unsent, UTC µs: the bus failed, or the bench
+/// was held up.
 pub(super) fn unsent_unix_us(recorded: &Recorded<'_>) -> Result<Vec<i64>, String> {
     let started_unix_us = recorded.started_unix_us()?;
     let mut unsent = Vec::new();
     for input in recorded.inputs()? {
-        let (time, given) = input?;
-        let is_fault = match given {
+        let (time, recorded) = input?;
+        let is_fault = match recorded {
             RecordedInput::Input(Input::BusFault(_)) => true,
             RecordedInput::Input(Input::Stop(reason)) => reason.starts_with(STALLED),
             _ => false,

@@ -1,4 +1,4 @@
-//! The session of a recorded run, given what it was given.
+//! Runs the session of a recorded run again, with the recorded inputs.
 
 use super::comparison::Comparison;
 use super::inputs::{Next, RecordedInputs};
@@ -12,32 +12,32 @@ use crate::session::{
 use crate::study::{FigureReport, RunFigures};
 use crate::units::Time;
 
-/// The files of a record that was cut end at different times: those of a killed bench within 0.2 s,
-/// those of a machine that lost power within a second and a quarter more, in which each is put on
-/// the disk in its turn. One that ends earlier than this was not cut with the others.
+/// The files of a truncated record end at different times: within 0.2 s if the bench was killed, within
+/// 1.25 s more if the machine lost power, since they are synced in turn. A file that ends earlier than this
+/// lost its end in another way.
 const APART_MAX_S: f64 = 1.5;
 
-/// Where a record ends that was cut.
+/// Where a truncated record ends.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Cut {
-    /// Its last entry, in whichever file.
+pub struct Truncation {
+    /// The time of its last entry, in any of its files.
     pub end: Time,
     /// The file that ends first.
     pub file: &'static str,
-    /// The time of what that file does not hold any more.
+    /// The time of the first entry that this file lacks.
     pub file_end: Time,
-    /// Rows of `steps.csv` that come after what the session could be given.
+    /// Rows of `steps.csv` after the last input that could be replayed.
     pub rows_beyond: usize,
 }
 
-impl Cut {
-    /// The difference, if a file lacks more than a cut takes.
+impl Truncation {
+    /// The difference, if a file ends earlier than a kill or a loss of power explains.
     fn difference(&self) -> Option<String> {
         let (file, apart_s) = (self.file, self.end.seconds_after(self.file_end));
         (apart_s > APART_MAX_S).then(|| {
             format!(
-                "{file} ends {apart_s:.3} s before the record does: a cut leaves its files within \
-                 {APART_MAX_S:.1} s of each other"
+                "{file} ends {apart_s:.3} s before the record does: after a kill or a loss of power \
+                 the files end within {APART_MAX_S:.1} s of each other"
             )
         })
     }
@@ -46,7 +46,7 @@ impl Cut {
 /// The result of a replay.
 #[derive(Debug, Clone)]
 pub struct Replayed {
-    /// The first difference from the record; `None` where there is none.
+    /// The first difference from the record, if there is one.
     pub difference: Option<String>,
     /// Rows of `steps.csv` compared.
     pub rows: usize,
@@ -54,17 +54,17 @@ pub struct Replayed {
     pub frames: usize,
     /// Samples compared.
     pub samples: usize,
-    /// Of a record that was cut: where it ends.
-    pub cut: Option<Cut>,
-    /// How the session ended; `None` where a record that was cut ends before it.
+    /// Where a truncated record ends.
+    pub truncation: Option<Truncation>,
+    /// How the session ended; `None` if a truncated record ends before it.
     pub outcome: Option<Outcome>,
     /// The time line from its first input to its last.
     pub span: (Time, Time),
-    /// The replayed rows of `steps.csv`, the truth in them as recorded.
+    /// The replayed rows of `steps.csv`, with the recorded truth.
     pub steps: Vec<String>,
     /// The figures of the recorded observer.
     pub figures: FigureReport,
-    /// The figures of the observer that was asked about, where one was.
+    /// The figures of the what-if observer, if there is one.
     pub what_if: Option<FigureReport>,
 }
 
@@ -76,21 +76,20 @@ impl Replayed {
         rows.flat_map(|row| [row, "\n"]).collect()
     }
 
-    /// How long the session's own time line is, s.
+    /// Length of the session's own time line, s.
     pub fn duration_s(&self) -> f64 {
         self.span.1.seconds_after(self.span.0)
     }
 }
 
-/// Gives `recorded`'s session what it was given, and compares what leaves it with the record.
+/// Runs the session of `recorded` with the recorded inputs, and compares its output with the record.
 ///
-/// With `what_if` that observer runs alongside on the same believed measurements, as a shadow of the
-/// one that steered, and its estimates take the place of that one's in the steps that are given
-/// back; what is compared is the recorded observer's all the same.
+/// A `what_if` observer runs alongside as a shadow, on the same accepted measurements. [`Replayed::steps`]
+/// then holds its estimates instead of those of the recorded observer. The comparison still uses the
+/// recorded observer.
 ///
 /// # Errors
-/// Where records were dropped, the session refuses its configuration or the files do
-/// not fit together.
+/// Records were dropped, the session refuses its configuration, or the files do not belong together.
 pub fn replay(
     recorded: &Recorded<'_>,
     what_if: Option<ObserverConfig>,
@@ -99,20 +98,20 @@ pub fn replay(
         0 => replay_to(recorded, what_if, &mut |_, _| {}),
         dropped => Err(format!(
             "{dropped} records were dropped while this run was recorded (manifest.json, \
-             dropped.text_files): what the session was given is not whole, and no replay of it can \
-             be exact"
+             dropped.text_files): so inputs of the session may be missing, and no replay can be \
+             exact"
         )),
     }
 }
 
-/// Takes the records that leave a replayed session, steps with their truth as recorded.
+/// Takes a record of the replayed session; that of a step comes with the recorded truth.
 type TakeRecord<'a> = &'a mut dyn FnMut(Record, Option<Truth>);
 
-/// As [`replay`], with every record that leaves the session handed to `take`, up to the first
-/// difference. Where records were dropped that is as far as the replay is the run.
+/// Like [`replay`], but accepts dropped records, and passes every record of the session to `take`, up to the
+/// first difference. After a dropped record the replay equals the run only up to there.
 ///
 /// # Errors
-/// Where the session refuses its configuration or the files do not fit together.
+/// The session refuses its configuration, or the files do not belong together.
 pub fn replay_to(
     recorded: &Recorded<'_>,
     what_if: Option<ObserverConfig>,
@@ -132,7 +131,7 @@ pub fn replay_to(
         session: plan.begin(end).map_err(|error| format!("{}: {error}", file::CONFIG))?,
         comparison: Comparison::open(recorded)?,
         take,
-        asks: what_if.is_some(),
+        has_what_if: what_if.is_some(),
         steps: Vec::new(),
         figures: RunFigures::default(),
         what_if: RunFigures::default(),
@@ -145,17 +144,17 @@ pub fn replay_to(
                 replay.drain(Some(&input))?;
                 end = time;
             }
-            Next::Lacking(time, file) if replay.comparison.is_cut() => {
-                replay.comparison.ends(file, time);
+            Next::Missing(time, file) if replay.comparison.is_truncated() => {
+                replay.comparison.note_end(file, time);
                 break;
             }
-            Next::Lacking(_, file) => {
-                return Err(inputs.mixed(&format!("has one more than {file}")));
+            Next::Missing(_, file) => {
+                return Err(inputs.mismatch(&format!("has one more than {file}")));
             }
         }
     }
-    if let Some(logged) = inputs.left_over()
-        && !replay.comparison.is_cut()
+    if let Some(logged) = inputs.unused_frame()
+        && !replay.comparison.is_truncated()
     {
         return Err(format!(
             "the files are not of one run: {} line {} was given to no session",
@@ -170,19 +169,21 @@ struct Replay<'a> {
     session: Session,
     comparison: Comparison<'a>,
     take: TakeRecord<'a>,
-    /// The last shadow is the observer that is asked about.
-    asks: bool,
+    /// The last shadow is the what-if observer.
+    has_what_if: bool,
     steps: Vec<String>,
     figures: RunFigures,
     what_if: RunFigures,
 }
 
 impl Replay<'_> {
-    /// Takes what leaves the session in answer to `input`.
+    /// Takes the output of the session in answer to `input`.
     fn drain(&mut self, input: Option<&Input>) -> Result<(), String> {
         while let Some(output) = self.session.poll() {
             match output {
-                Output::Transmit { time, frame } => self.comparison.sent(time, &frame, input)?,
+                Output::Transmit { time, frame } => {
+                    self.comparison.check_sent(time, &frame, input)?
+                }
                 Output::Record(record) => self.record(record)?,
             }
         }
@@ -192,7 +193,7 @@ impl Replay<'_> {
     fn record(&mut self, record: Record) -> Result<(), String> {
         let truth = match &record {
             Record::Sample(sample) | Record::Target(sample) => {
-                self.comparison.sample(sample)?;
+                self.comparison.check_sample(sample)?;
                 None
             }
             Record::Stage(stage) => {
@@ -209,13 +210,13 @@ impl Replay<'_> {
         Ok(())
     }
 
-    /// The truth at `step`, as recorded.
+    /// Compares `step` and adds its row and figures; returns the recorded truth at it.
     fn step(&mut self, mut step: StepRecord) -> Result<Option<Truth>, String> {
-        let asked = if self.asks { step.decision.shadows.pop() } else { None };
-        let recorded = self.comparison.step(&step)?.unwrap_or_default();
+        let what_if = if self.has_what_if { step.decision.shadows.pop() } else { None };
+        let recorded = self.comparison.check_step(&step)?.unwrap_or_default();
         let truth = self.comparison.columns.truth(&recorded);
         self.figures.take_step(&step, truth.as_ref());
-        if let Some((_, estimate)) = asked {
+        if let Some((_, estimate)) = what_if {
             step.decision.estimate = estimate;
             self.what_if.take_step(&step, truth.as_ref());
         }
@@ -226,35 +227,37 @@ impl Replay<'_> {
 
     fn finish(mut self, recorded: &Recorded<'_>, span: (Time, Time)) -> Result<Replayed, String> {
         let outcome = self.session.outcome().cloned();
-        let is_cut = self.comparison.is_cut();
+        let is_truncated = self.comparison.is_truncated();
         let Comparison { rows, samples, sent, .. } = &self.comparison;
         let (rows, frames, samples) = (rows.taken, sent.taken, samples.taken);
         self.comparison.close(outcome.as_ref())?;
-        let Comparison { difference, rows: mut beyond, columns, ended, .. } = self.comparison;
-        let mut cut = None;
-        if is_cut {
-            let (file_end, file) = ended.unwrap_or((span.1, file::INPUTS));
+        let Comparison { difference, rows: mut beyond, columns, first_end, .. } = self.comparison;
+        let mut truncation = None;
+        if is_truncated {
+            let (file_end, file) = first_end.unwrap_or((span.1, file::INPUTS));
             while beyond.take()?.is_some() {}
             let rows_beyond = beyond.taken - rows;
-            cut = Some(Cut { end: recorded.end(&columns)?, file, file_end, rows_beyond });
+            let end = recorded.end(&columns)?;
+            truncation = Some(Truncation { end, file, file_end, rows_beyond });
         }
-        let difference = difference.or_else(|| cut.as_ref().and_then(Cut::difference));
+        let difference =
+            difference.or_else(|| truncation.as_ref().and_then(Truncation::difference));
         Ok(Replayed {
             difference,
             rows,
             frames,
             samples,
-            cut,
+            truncation,
             outcome,
             span,
             steps: self.steps,
             figures: self.figures.report(),
-            what_if: self.asks.then(|| self.what_if.report()),
+            what_if: self.has_what_if.then(|| self.what_if.report()),
         })
     }
 }
 
-/// The row `replayed` with the truth as text from `recorded`: it is not made anew.
+/// The row `replayed` with the truth copied as text from `recorded`: a replay does not compute it.
 fn with_recorded_truth(replayed: &str, recorded: &str) -> String {
     let mut recorded = recorded.split(',');
     let values =

@@ -1,18 +1,17 @@
-//! A recorded run, run again.
+//! Replays a recorded run.
 //!
-//! A session's course is a function of its configuration and of what it was given. [`replay`] gives
-//! the same session the same inputs, out of `inputs.log`, `can.log` and `tracker.ndjson`, and
-//! compares what leaves it with the record, as text: every row of `steps.csv`, every frame sent,
-//! every sample with what became of it, and the outcome. The truth alone is carried over: it is the
-//! emulator's.
+//! The configuration and the inputs determine everything that a session does. [`replay`] gives a new session
+//! the recorded inputs, from `inputs.log`, `can.log` and `tracker.ndjson`, and compares its output with the
+//! record, as text: every row of `steps.csv`, every frame sent, every sample with its acceptance or refusal,
+//! and the outcome. Only the truth is not compared but copied: the emulator computed it.
 //!
-//! Asked what another observer would have estimated, it runs that one as a shadow of the recorded
-//! one, which steers and gates as it did.
+//! A what-if observer shows what another observer would have estimated. It runs as a shadow of the recorded
+//! one, which steers and gates as it did in the run.
 
 mod comparison;
 mod inputs;
 mod machine;
 mod recorded;
 
-pub use machine::{Cut, Replayed, replay, replay_to};
+pub use machine::{Replayed, Truncation, replay, replay_to};
 pub use recorded::Recorded;

@@ -1,4 +1,4 @@
-//! What a run folder holds of a run, read along with its replay.
+//! The record of a run, read while it is replayed.
 
 use crate::archive::{
     CandumpLine, Inputs, Lines, Manifest, RecordedColumns, RunOutcome, file, unix_us_of,
@@ -10,8 +10,8 @@ use crate::tracker::ndjson;
 use crate::units::Time;
 use std::io;
 
-/// A recorded run. Its text files are read from their beginning to their end along with the replay, so
-/// that a long run takes no more memory than a short one.
+/// A recorded run. Its text files are read line by line during the replay, so that a long run takes no more
+/// memory than a short one.
 pub struct Recorded<'a> {
     /// Its manifest.
     pub manifest: &'a Manifest,
@@ -26,7 +26,7 @@ impl Recorded<'_> {
         (self.open)(name).map_err(|error| format!("{name}: {error}"))
     }
 
-    /// What the session was given.
+    /// The inputs of the session.
     pub(super) fn inputs(&self) -> Result<Inputs, String> {
         Inputs::read(self.lines(file::INPUTS)?)
     }
@@ -45,13 +45,13 @@ impl Recorded<'_> {
             .ok_or_else(|| format!("{}: started_utc is {started_utc:?}, no time", file::MANIFEST))
     }
 
-    /// The frames of `can.log` that went this way.
-    pub(super) fn frames(&self, way: Direction) -> Result<Entries<Logged>, String> {
+    /// The frames of `can.log` in this direction.
+    pub(super) fn frames(&self, wanted: Direction) -> Result<Entries<LoggedFrame>, String> {
         let frames = self.numbered(file::CAN)?.map(|numbered| {
             let (line, text) = numbered?;
             match CandumpLine::parse(&text) {
                 Some(CandumpLine { unix_us, direction, frame, .. }) => {
-                    Ok((direction, Logged { line, unix_us, frame, text }))
+                    Ok((direction, LoggedFrame { line, unix_us, frame, text }))
                 }
                 None => Err(format!(
                     "{} line {line}: {text:?} is not a frame as candump -L -x writes it",
@@ -59,15 +59,13 @@ impl Recorded<'_> {
                 )),
             }
         });
-        let of_this_way = frames.filter_map(move |logged| match logged {
-            Ok((direction, logged)) => (direction == way).then_some(Ok(logged)),
+        Entries::new(frames.filter_map(move |logged| match logged {
+            Ok((direction, logged)) => (direction == wanted).then_some(Ok(logged)),
             Err(error) => Some(Err(error)),
-        });
-        Entries::new(of_this_way)
+        }))
     }
 
-    /// How the run ended, where its record holds it to its end: one that was closed afterwards, or
-    /// whose writer failed, does not.
+    /// How the run ended; `None` for a truncated record: one that a repair closed, or whose writer failed.
     pub(super) fn outcome(&self) -> Option<Outcome> {
         let Manifest { outcome, stop_reason, repaired_utc, counts, .. } = self.manifest;
         let is_whole = repaired_utc.is_none() && counts.is_some();
@@ -77,7 +75,7 @@ impl Recorded<'_> {
         })
     }
 
-    /// The time of the last entry of the record, in whichever file.
+    /// The time of the last entry of the record, in any of its files.
     pub(super) fn end(&self, columns: &RecordedColumns) -> Result<Time, String> {
         let started_unix_us = self.started_unix_us()?;
         let last = |name| -> Result<Option<String>, String> {
@@ -99,15 +97,15 @@ impl Recorded<'_> {
 type NumberedLines = Box<dyn Iterator<Item = Result<(usize, String), String>>>;
 
 /// A frame of `can.log` with its line.
-pub(super) struct Logged {
-    /// From 1.
+pub(super) struct LoggedFrame {
+    /// Number of the line, from 1.
     pub(super) line: usize,
     pub(super) text: String,
     pub(super) unix_us: i64,
     pub(super) frame: Frame,
 }
 
-/// The entries of a file in their order, of which the next one is known.
+/// The entries of a file in order, with a look at the next one.
 pub(super) struct Entries<T> {
     entries: Box<dyn Iterator<Item = Result<T, String>>>,
     next: Option<T>,
@@ -123,10 +121,12 @@ impl<T> Entries<T> {
         Ok(Entries { entries: Box::new(entries), next, taken: 0 })
     }
 
-    pub(super) fn next(&self) -> Option<&T> {
+    /// The next entry, which stays.
+    pub(super) fn peek(&self) -> Option<&T> {
         self.next.as_ref()
     }
 
+    /// Takes the next entry; `None` at the end of the file.
     pub(super) fn take(&mut self) -> Result<Option<T>, String> {
         let taken = self.next.take();
         if taken.is_some() {

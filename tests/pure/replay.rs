@@ -329,10 +329,14 @@ fn a_cut_record_is_replayed_as_far_as_it_goes() {
             assert!(rest.contains(" s before the record does"), "{parts:?}: {difference}");
             file
         });
-        let said = format!("{parts:?}: {:?} {:?}", replayed.difference, replayed.cut);
+        let said = format!("{parts:?}: {:?} {:?}", replayed.difference, replayed.truncation);
         assert_eq!(named, ends, "{said}");
         let rows = run.steps.matches('\n').count().saturating_sub(1);
-        assert_eq!(replayed.cut.map(|cut| cut.rows_beyond + replayed.rows), Some(rows), "{said}");
+        assert_eq!(
+            replayed.truncation.map(|end| end.rows_beyond + replayed.rows),
+            Some(rows),
+            "{said}"
+        );
         assert_eq!(replayed.outcome, None);
     }
     run.inputs = whole.inputs[..10].to_owned();
