@@ -5,8 +5,8 @@ use super::{CanInterface, Config, ConfigError, ReadMask, TrackerSource, rehearsa
 use crate::canopen::ObjectAddress;
 use crate::emulator::fault::Fault;
 use crate::emulator::{TargetModel, VirtualStageConfig, drive};
-use crate::observer::InvariantConfig;
-use crate::session::{InsertionConfig, ObserverConfig, SessionConfig};
+use crate::observer::{InvariantConfig, ObserverConfig};
+use crate::session::{InsertionConfig, SessionConfig};
 use crate::stage::{AxisConfig, Sign};
 use std::f64::consts::TAU;
 

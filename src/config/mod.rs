@@ -52,14 +52,14 @@ pub use error::{ConfigError, nearest_key};
 pub use goal::{GoalConfig, GoalKind, ReadMask, WorkspaceConfig};
 pub use include::ReadFile;
 pub use needle::NeedleConfig;
-pub use observer::{ObserverConfig, ObserverKind};
+pub use observer::{ObserverKind, ObserverSection};
 pub use pose::PoseConfig;
 pub use record::{CalibrationConfig, EvaluationConfig, OnFailure, RecordConfig};
 pub use registration::RegistrationConfig;
-pub use stage::StageConfig;
+pub use stage::StageSection;
 pub use stop::StopConfig;
 pub use study::StudyConfig;
-pub use tracker::{TrackerConfig, TrackerMode, TrackerSource};
+pub use tracker::{TrackerMode, TrackerSection, TrackerSource};
 
 use crate::control::ControlConfig;
 use crate::keys::{self, Field, Rule, section};
@@ -109,15 +109,15 @@ section! {
         /// The needle as the bench believes it to be.
         needle: NeedleConfig;
         /// The observers.
-        observer: ObserverConfig;
+        observer: ObserverSection;
         /// The control law.
         control: ControlConfig;
         /// The bus, and the times of CANopen on it.
         can: CanConfig;
         /// The two drives.
-        stage: StageConfig;
+        stage: StageSection;
         /// Where tip positions come from.
-        tracker: TrackerConfig;
+        tracker: TrackerSection;
         /// The emulated needle and tracker: their own truth, apart from what the bench believes.
         emulator: EmulatorConfig;
         /// How long calibrations count.

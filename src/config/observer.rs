@@ -5,14 +5,14 @@
 use super::Config;
 use crate::geometry::FixedAngles;
 use crate::keys::{Rule, choice, section, within};
-use crate::observer::{CoupledConfig, FiniteDifferenceConfig, InvariantConfig};
-use crate::session::{self, Samples};
+use crate::observer::{self, CoupledConfig, FiniteDifferenceConfig, InvariantConfig};
+use crate::session::Samples;
 
 const START_PITCH: Rule = within(-80.0, 80.0);
 
 section! {
     /// `[observer]`.
-    pub struct ObserverConfig {
+    pub struct ObserverSection {
         /// The observer that steers.
         kind: ObserverKind = "invariant";
         /// Observers that run alongside on the same stream: logged, never steering.
@@ -43,7 +43,7 @@ choice! {
     }
 }
 
-impl ObserverConfig {
+impl ObserverSection {
     /// The observer that steers, then its shadows: each once, in the order given.
     pub(super) fn kinds(&self) -> Vec<ObserverKind> {
         let mut kinds = vec![self.kind];
@@ -63,20 +63,20 @@ impl ObserverConfig {
 
 impl Config {
     /// The observer that steers, then its shadows.
-    pub fn observers(&self) -> impl Iterator<Item = session::ObserverConfig> + '_ {
+    pub fn observers(&self) -> impl Iterator<Item = observer::ObserverConfig> + '_ {
         self.observer.kinds().into_iter().map(|kind| match kind {
-            ObserverKind::Invariant => session::ObserverConfig::Invariant(InvariantConfig {
+            ObserverKind::Invariant => observer::ObserverConfig::Invariant(InvariantConfig {
                 // Recordings are evaluated without a registration.
                 registration_sd_mm: self.registration_sd_mm().unwrap_or_default(),
                 ..self.observer.to_invariant()
             }),
-            ObserverKind::Coupled => session::ObserverConfig::Coupled(CoupledConfig {
+            ObserverKind::Coupled => observer::ObserverConfig::Coupled(CoupledConfig {
                 start: self.observer.start,
                 position_sd_mm: self.observer.invariant.position_sd_mm,
                 ..self.observer.coupled
             }),
             ObserverKind::FiniteDifference => {
-                session::ObserverConfig::FiniteDifference(self.observer.finite_difference)
+                observer::ObserverConfig::FiniteDifference(self.observer.finite_difference)
             }
         })
     }

@@ -7,7 +7,7 @@ use crate::stage::{self, Axis, AxisConfig, PowerConfig};
 
 section! {
     /// `[stage]`: the two drives.
-    pub struct StageConfig {
+    pub struct StageSection {
         /// True for a real stage: it refuses buses made for tests, and its drives' node, identity, scale
         /// and limits have no defaults. False is for "memory", "udp" and interfaces named vcan... or
         /// vxcan... alone.
@@ -21,7 +21,7 @@ section! {
     }
 }
 
-impl StageConfig {
+impl StageSection {
     /// The settings of an axis.
     pub fn axis(&self, axis: Axis) -> &AxisConfig {
         match axis {

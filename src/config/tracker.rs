@@ -24,7 +24,7 @@ const ADDRESS: Rule =
 
 section! {
     /// `[tracker]`: where tip positions come from.
-    pub struct TrackerConfig {
+    pub struct TrackerSection {
         /// The source of tip positions.
         source: TrackerSource = "emulated";
         /// host:port of the server, or to listen at; "-" is standard input, for "ndjson".
@@ -128,11 +128,11 @@ choice! {
     }
 }
 
-impl TrackerConfig {
+impl TrackerSection {
     /// The tracker settings of a session.
     ///
     /// # Errors
-    /// Those of [`TrackerConfig::to_registration`].
+    /// Those of [`TrackerSection::to_registration`].
     pub(super) fn to_session(&self) -> Result<session::TrackerConfig, ConfigError> {
         Ok(session::TrackerConfig {
             gate: self.to_gate()?,
@@ -169,7 +169,7 @@ impl TrackerConfig {
     /// The gate that a sample must pass by itself.
     ///
     /// # Errors
-    /// Those of [`TrackerConfig::to_registration`].
+    /// Those of [`TrackerSection::to_registration`].
     pub fn to_gate(&self) -> Result<Gate, ConfigError> {
         Ok(Gate {
             registration: self.to_registration()?,

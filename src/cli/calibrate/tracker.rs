@@ -4,7 +4,7 @@ use super::{Output, fit_table};
 use crate::calibration::{RestSample, TrackerFit};
 use crate::cli::Failure;
 use crate::cli::arguments::{Configured, text_of};
-use crate::config::TrackerConfig;
+use crate::config::TrackerSection;
 use crate::table::Table;
 use crate::text::{escaped, screen};
 use crate::tracker::{CsvMapping, Event, Gate, Sample, TimeColumns, csv, gate, ndjson};
@@ -82,7 +82,7 @@ pub(in crate::cli) fn rest_sample(sample: &Sample) -> RestSample {
 }
 
 /// The samples of the tool in the recording `text`.
-fn recorded(text: &str, tracker: &TrackerConfig) -> Result<Vec<RestSample>, String> {
+fn recorded(text: &str, tracker: &TrackerSection) -> Result<Vec<RestSample>, String> {
     let events = match text.trim_start().starts_with('{') {
         true => ndjson::recording(text).map_err(|error| error.to_string())?,
         false => csv::recording(text, &mapping(text, &tracker.csv), &tracker.tool)

@@ -9,7 +9,7 @@ use crate::cli::calibrate::tracker::{
     POSITION, QUATERNION, RECEIVED, STAMP, fit_and_write, rest_sample,
 };
 use crate::cli::output::{has_no_reader, print_stderr, print_stdout, refuse_existing};
-use crate::config::TrackerConfig;
+use crate::config::TrackerSection;
 use crate::session::SampleRecord;
 use crate::text::{clipped, table};
 use crate::tracker::gate::is_same_tool;
@@ -197,7 +197,7 @@ struct Watch {
 
 impl Watch {
     /// Positions are in the bench frame if the tracker is registered, else in the tracker's own frame.
-    fn new(tracker: &TrackerConfig) -> Self {
+    fn new(tracker: &TrackerSection) -> Self {
         let registered = tracker.to_gate().ok();
         let frame = if registered.is_some() { "bench" } else { "tracker, not registered" };
         let gate = registered.unwrap_or_else(|| tracker.to_unregistered_gate());

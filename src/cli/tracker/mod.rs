@@ -8,7 +8,7 @@ pub(super) use self::commands::{TrackerCommand, tracker};
 use super::arguments::{Configured, text_of};
 use super::output::print_stderr;
 use super::{Failure, io_runtime};
-use crate::config::{Config, TrackerConfig, TrackerMode, TrackerSource};
+use crate::config::{Config, TrackerMode, TrackerSection, TrackerSource};
 use crate::runtime::{Clock, Interrupt};
 use crate::tracker::{Census, Event, Sample, StreamReplay, csv, ndjson};
 use crate::transport::link::{Link, LinkSettings};
@@ -69,7 +69,7 @@ fn open(
 
 /// Loads the recording that replaces a tracker, to begin at `start`; `None` if the configuration names none.
 pub(super) fn load_replay(
-    tracker: &TrackerConfig,
+    tracker: &TrackerSection,
     start: Time,
 ) -> Result<Option<StreamReplay>, Failure> {
     let Some(file) = &tracker.file else { return Ok(None) };
@@ -85,7 +85,7 @@ pub(super) fn load_replay(
 /// The source in a few words, for the manifest.
 pub(super) fn source_label(config: &Config) -> String {
     let tracker = &config.tracker;
-    let TrackerConfig { mode, address, .. } = tracker;
+    let TrackerSection { mode, address, .. } = tracker;
     let source = config.tip_source();
     match (source, &tracker.file) {
         (TrackerSource::Emulated, _) => source.to_string(),
