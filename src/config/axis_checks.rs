@@ -118,10 +118,10 @@ impl Checks<'_> {
         let axis = self.axis;
         let [reference, homing, zero] = ["reference", "homing", "zero"].map(|key| self.key(key));
         let homed = axis.reference == Reference::Homing;
-        reader.check(&[&reference, &homing], homed && axis.homing.is_none(), || {
+        reader.refuse_if(&[&reference, &homing], homed && axis.homing.is_none(), || {
             format!("{reference} is \"homing\", and there is no [{homing}] that says how")
         });
-        reader.check(&[&zero, &reference], homed && axis.zero.is_none(), || {
+        reader.refuse_if(&[&zero, &reference], homed && axis.zero.is_none(), || {
             format!(
                 "{zero} is \"start\", but {reference} is \"homing\": give the counts, 0 for the drive's \
                  zero"
@@ -131,7 +131,7 @@ impl Checks<'_> {
         // from where each command begins protect nothing: three jogs go three times as far.
         let ([_, high], [min, max]) = self.limits();
         let drifts = self.config.stage.hardware && axis.zero.is_none() && !axis.wraps;
-        reader.check(&[&zero, &high, "stage.hardware"], drifts, || {
+        reader.refuse_if(&[&zero, &high, "stage.hardware"], drifts, || {
             let unit = self.which.unit();
             format!(
                 "{zero} is \"start\": its limits of {min} to {max} {unit} would count anew from each start; \
@@ -165,7 +165,7 @@ impl Checks<'_> {
         let (zero, offset_key) = (self.key("zero"), self.key(&self.offset_key()));
         let offset = self.config.number(&offset_key);
         let home = self.home_at(offset);
-        reader.check(&[&low, &high, &zero, &offset_key], home < min || home > max, || {
+        reader.refuse_if(&[&low, &high, &zero, &offset_key], home < min || home > max, || {
             let (unit, zero_counts) = (self.which.unit(), self.axis.zero.unwrap_or_default());
             format!(
                 "{offset_key} is {offset}, which puts home at {home:.3} {unit} with {zero} = \
@@ -195,7 +195,7 @@ impl Checks<'_> {
         };
         let [method_key, sign_key, zero] =
             ["homing.method", "sign", "zero"].map(|key| self.key(key));
-        reader.check(&[&method_key, &sign_key, &zero, &low, &high], beyond > before, || {
+        reader.refuse_if(&[&method_key, &sign_key, &zero, &low, &high], beyond > before, || {
             let unit = self.which.unit();
             format!(
                 "{method_key} is {method}, which with sign = {sign} seeks the switch at the {end} end: home \
@@ -210,9 +210,11 @@ impl Checks<'_> {
             let key = self.key(name);
             let value = self.config.number(&key);
             let stops = stopping.iter().any(|&option| f64::from(option) == value);
-            reader.check(&["stage.hardware", &key], self.config.stage.hardware && !stops, || {
-                format!("{key} is {value}, allowed with stage.hardware = true: {allowed}")
-            });
+            reader.refuse_if(
+                &["stage.hardware", &key],
+                self.config.stage.hardware && !stops,
+                || format!("{key} is {value}, allowed with stage.hardware = true: {allowed}"),
+            );
         }
     }
 
@@ -221,7 +223,7 @@ impl Checks<'_> {
             let needed = NEEDED.iter().find(|(indexes, _)| indexes.contains(index));
             let Some((_, why)) = needed else { continue };
             let key = self.key(&format!("optional_objects[{n}]"));
-            reader.check(&[&key], *index != SOFTWARE_LIMITS || !self.axis.wraps, || {
+            reader.refuse_if(&[&key], *index != SOFTWARE_LIMITS || !self.axis.wraps, || {
                 format!("{key} is 0x{index:04X}, which is not optional; remove it: {why}")
             });
         }
@@ -233,7 +235,7 @@ impl Checks<'_> {
         let key = self.key("following_error_timeout_ms");
         let timeout_ms = self.axis.following_error_timeout_ms.unwrap_or_default();
         let max_ms = 2 * self.config.can.bus.sync_ms;
-        reader.check(&["can.sync_ms", &key], timeout_ms > max_ms, || {
+        reader.refuse_if(&["can.sync_ms", &key], timeout_ms > max_ms, || {
             format!(
                 "{key} is {timeout_ms}, allowed: up to {max_ms} (twice can.sync_ms), so that the drive \
                  notices no later than the bench"
@@ -248,7 +250,7 @@ impl Checks<'_> {
                 ["index", "value", "bits"].map(|name| self.key(&format!("sdo[{n}].{name}")));
             let (low, high) = (-(1i64 << (sdo.bits.max(1) - 1)), (1i64 << sdo.bits) - 1);
             let (index, value) = (sdo.index, sdo.value);
-            reader.check(&[&bits_key, &value_key], !(low..=high).contains(&value), || {
+            reader.refuse_if(&[&bits_key, &value_key], !(low..=high).contains(&value), || {
                 format!("{value_key} is {value}, allowed: {low} to {high}")
             });
             let object = (index, sdo.subindex);
@@ -258,7 +260,7 @@ impl Checks<'_> {
                 is_given.then(|| format!("{key} sets it: give one of the two"))
             });
             if let Some(why) = reserved(index).map(str::to_owned).or(set_by) {
-                reader.check(&[&index_key], true, || {
+                reader.refuse_if(&[&index_key], true, || {
                     format!("{index_key} is 0x{index:04X}, not for raw SDOs: {why}")
                 });
             }
@@ -300,7 +302,7 @@ fn accelerations(config: &Config, reader: &mut Reader) {
         ("stage.rotation.jog_acceleration_deg_per_s2", ROTATION_ACCELERATION_MAX),
     ] {
         let [acceleration, max] = [key, max_key].map(|key| config.number(key));
-        reader.check(&[key, max_key], PROFILE_PEAK * acceleration > max, || {
+        reader.refuse_if(&[key, max_key], PROFILE_PEAK * acceleration > max, || {
             format!(
                 "{key} is {acceleration}, allowed: up to {:.3}: the last set-point brakes {PROFILE_PEAK} \
                  times as hard, and {max_key} is {max}",

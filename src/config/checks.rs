@@ -38,7 +38,7 @@ fn limits(config: &Config, reader: &mut Reader) {
     let limited = std::mem::take(&mut reader.limited);
     let mut limit = |key: &str, allowed: &str, other: &str, is_wrong: fn(f64, f64) -> bool| {
         let [value, limit] = [key, other].map(|key| config.number(key));
-        reader.check(&[key, other], is_wrong(value, limit), || {
+        reader.refuse_if(&[key, other], is_wrong(value, limit), || {
             format!("{key} is {value}, allowed: {allowed} {other}, which is {limit}")
         });
     };
@@ -59,7 +59,7 @@ fn step(config: &Config, reader: &mut Reader) {
     let [step, speed, sync_ms] = keys.map(|key| config.number(key));
     let per_sync = speed * sync_ms / 1e3;
     let [step_key, speed_key, sync_key] = keys;
-    reader.check(&keys, per_sync > step, || {
+    reader.refuse_if(&keys, per_sync > step, || {
         format!(
             "{step_key} is {step}, allowed: at least what {speed_key} = {speed} moves in {sync_key} = \
              {sync_ms}, which is {per_sync}"
@@ -75,7 +75,7 @@ fn rotation(config: &Config, reader: &mut Reader) {
     let (speed_key, sync_key) = ("insertion.speed_mm_per_s", "can.sync_ms");
     let max_key = "stage.rotation.speed_max_deg_per_s";
     let (deg_per_s, max) = (per_mm * speed, config.number(max_key));
-    reader.check(&[key, speed_key, max_key], deg_per_s > max, || {
+    reader.refuse_if(&[key, speed_key, max_key], deg_per_s > max, || {
         format!(
             "{key} is {per_mm}: at {speed} mm/s that is {deg_per_s} deg/s, over {max_key} = {max}; turn \
              by {:.4} deg/mm or insert at {:.4} mm/s",
@@ -85,7 +85,7 @@ fn rotation(config: &Config, reader: &mut Reader) {
     });
     let (max_key, max) = (ROTATION_ACCELERATION_MAX, config.number(ROTATION_ACCELERATION_MAX));
     let peak = rotation_peak(per_mm, speed, config.can.bus.sync_period());
-    reader.check(&[key, speed_key, sync_key, max_key], peak > max, || {
+    reader.refuse_if(&[key, speed_key, sync_key, max_key], peak > max, || {
         format!(
             "{key} is {per_mm}: reversed from one SYNC to the next at {speed} mm/s, that is {peak:.0} \
              deg/s², over {max_key} = {max}; turn or insert more slowly, or raise the limit"
@@ -103,7 +103,7 @@ fn torsion(section: &str, torsion: TorsionConfig, reader: &mut Reader) {
     let keys = TorsionConfig::KEYS.iter().map(|key| format!("{section}.torsion.{}", key.name));
     let keys: Vec<String> = keys.collect();
     let keys: Vec<&str> = keys.iter().map(String::as_str).collect();
-    reader.check_made(&keys, needle::torsion(torsion, section));
+    reader.check_result(&keys, needle::torsion(torsion, section));
 }
 
 /// Each range has its lower end first, and no trial may draw an offset outside the band that it draws.
@@ -111,14 +111,14 @@ fn study(config: &Config, reader: &mut Reader) {
     for key in StudyConfig::KEYS {
         let Some([low, high]) = config.range(key) else { continue };
         let key = format!("study.{}", key.name);
-        reader.check(&[&key], low > high, || {
+        reader.refuse_if(&[&key], low > high, || {
             format!("{key} is [{low}, {high}], allowed: the lower number first")
         });
     }
     let study = &config.study;
     let [moves, tool] = ["study.target_move_mm", "goal.tool"];
     let is_still = study.target_move_mm.is_some() && config.goal.tool.is_none();
-    reader.check(&[moves, tool], is_still, || {
+    reader.refuse_if(&[moves, tool], is_still, || {
         format!("{moves} has no effect without {tool}: name the tool that is the target")
     });
     let least_mm = match study.target_depth_mm {
@@ -126,7 +126,7 @@ fn study(config: &Config, reader: &mut Reader) {
         None => config.goal.position_mm.map_or(f64::INFINITY, |target_mm| target_mm.norm()),
     };
     let [_, move_mm] = study.target_move_mm.unwrap_or_default();
-    reader.check(&[moves, "study.target_depth_mm", "goal.position_mm"], move_mm > least_mm, || {
+    reader.refuse_if(&[moves, "study.target_depth_mm", "goal.position_mm"], move_mm > least_mm, || {
         format!(
             "{moves} reaches {move_mm}, allowed: up to the least distance of the target from the start, \
              {least_mm} mm; it would move faster than the needle"
@@ -142,7 +142,7 @@ fn study(config: &Config, reader: &mut Reader) {
     let offset = low.abs().max(high.abs());
     let outside = is_drawn && config.emulator.torsion.creep_mm == 0.0 && offset > half_width;
     let [key, band] = ["study.torsion_offset_deg", "study.torsion_half_width_deg"];
-    reader.check(&[key, band], outside, || {
+    reader.refuse_if(&[key, band], outside, || {
         format!(
             "{key} reaches {offset}, allowed without emulator.torsion.creep_mm: up to the least of \
              {band}, which is {half_width}: the tip would start outside its own band"
@@ -157,7 +157,7 @@ fn noise(config: &Config, reader: &mut Reader) {
     let run_s = config.insertion.depth_mm / config.insertion.speed_mm_per_s;
     let told = "tracker.noise.correlation_time_s";
     let keys = [told, "insertion.depth_mm", "insertion.speed_mm_per_s"];
-    reader.check(&keys, time_s > run_s, || {
+    reader.refuse_if(&keys, time_s > run_s, || {
         format!(
             "{told} is {time_s}, allowed: up to the {:.3} s of the insertion; noise that lasts longer \
              is an error of the registration, tracker.registration.sd_mm",
@@ -168,7 +168,7 @@ fn noise(config: &Config, reader: &mut Reader) {
     let keys = ["emulator.noise.correlated_sd_mm", "emulator.noise.correlation_time_s"];
     let is_given = [noise.correlated_sd_mm.is_some(), noise.correlation_time.is_some()];
     for (given, other) in [(0, 1), (1, 0)] {
-        reader.check(&keys, is_given[given] && !is_given[other], || {
+        reader.refuse_if(&keys, is_given[given] && !is_given[other], || {
             format!("{} is given without {}: give both", keys[given], keys[other])
         });
     }
@@ -182,27 +182,27 @@ fn bus(config: &Config, reader: &mut Reader) {
     ];
     for [first, second] in [[0, 1], [0, 2], [1, 2]] {
         let ((first, node), (second, other)) = (nodes[first], nodes[second]);
-        reader.check(&[first, second], node == other, || {
+        reader.refuse_if(&[first, second], node == other, || {
             format!("{second} is {other}, the same as {first}: each node needs its own number")
         });
     }
 
     let interface = &config.can.interface;
     let wrong_bus = config.stage.hardware && interface.is_for_tests();
-    reader.check(&["stage.hardware", "can.interface"], wrong_bus, || {
+    reader.refuse_if(&["stage.hardware", "can.interface"], wrong_bus, || {
         format!(
             "can.interface is \"{interface}\", a bus made for tests, but stage.hardware is true: \
              name the interface of the real stage, such as \"can0\""
         )
     });
     let unjudged = config.stage.hardware && !config.tracker.gates.stream;
-    reader.check(&["stage.hardware", "tracker.gates.stream"], unjudged, || {
+    reader.refuse_if(&["stage.hardware", "tracker.gates.stream"], unjudged, || {
         "tracker.gates.stream is false, but stage.hardware is true: with a real needle a stream that \
          contradicts the insertion must end the run; set it to true"
             .to_owned()
     });
     let unprotected = !config.stage.hardware && !interface.is_virtual();
-    reader.check(&["stage.hardware", "can.interface"], unprotected, || {
+    reader.refuse_if(&["stage.hardware", "can.interface"], unprotected, || {
         format!(
             "can.interface is \"{interface}\", which may have real drives on it, but stage.hardware \
              is false: start from bench-config/rig-epos4.toml, or name \"vcan0\" or \"udp\" for \
@@ -217,14 +217,14 @@ fn tracker(config: &Config, reader: &mut Reader) {
     let is_emulated = source == TrackerSource::Emulated;
     let is_in_memory = *interface == CanInterface::Memory;
     let keys = ["tracker.source", "can.interface"];
-    reader.check(&keys, is_emulated && !is_in_memory, || {
+    reader.refuse_if(&keys, is_emulated && !is_in_memory, || {
         format!(
             "tracker.source is \"emulated\", allowed only with can.interface = \"memory\", which is \
              \"{interface}\": it sees the emulated needle alone. Set tracker.source = \"openigtlink\""
         )
     });
     let is_recorded = config.tracker.file.is_some() || source == TrackerSource::Csv;
-    reader.check(&keys, is_in_memory && !is_emulated && !is_recorded, || {
+    reader.refuse_if(&keys, is_in_memory && !is_emulated && !is_recorded, || {
         let recording = match source {
             TrackerSource::Ndjson => ", or a recording as tracker.file",
             _ => "",
@@ -237,7 +237,7 @@ fn tracker(config: &Config, reader: &mut Reader) {
 
     let keys = ["tracker.latency_ms", "tracker.hold_after_s"];
     let ([latency, after], [latency_ms, after_s]) = (keys, keys.map(|key| config.number(key)));
-    reader.check(&keys, latency_ms * 1e-3 >= after_s, || {
+    reader.refuse_if(&keys, latency_ms * 1e-3 >= after_s, || {
         format!(
             "{latency} is {latency_ms}, allowed: under {after}, which is {after_s} s: no position would \
              be young enough to steer by"
@@ -253,7 +253,7 @@ fn tracker(config: &Config, reader: &mut Reader) {
     let least_mm = speed * noticed_s + 0.5 * speed * speed / braking;
     let [key, brake] = ["tracker.hold_after_mm", "tracker.hold_braking_mm_per_s2"];
     let keys = [key, "insertion.speed_mm_per_s", brake, latency];
-    reader.check(&keys, hold_mm <= least_mm, || {
+    reader.refuse_if(&keys, hold_mm <= least_mm, || {
         format!(
             "{key} is {hold_mm}, allowed: over the {:.3} mm to standstill from {speed} mm/s \
              with {brake} = {braking} and {latency} = {latency_ms}: insert slower or brake harder",
@@ -264,7 +264,7 @@ fn tracker(config: &Config, reader: &mut Reader) {
     let Some(workspace) = &config.tracker.workspace else { return };
     let [min_mm, max_mm] = [workspace.min_mm, workspace.max_mm].map(<[f64; 3]>::from);
     let is_empty = min_mm.iter().zip(max_mm).any(|(&min, max)| min >= max);
-    reader.check(&["tracker.workspace.min_mm", "tracker.workspace.max_mm"], is_empty, || {
+    reader.refuse_if(&["tracker.workspace.min_mm", "tracker.workspace.max_mm"], is_empty, || {
         format!(
             "tracker.workspace.min_mm is {min_mm:?}, allowed: each under that of \
              tracker.workspace.max_mm, which is {max_mm:?}"
@@ -284,7 +284,7 @@ fn registration(config: &Config, reader: &mut Reader) {
             reader.refuse(REGISTRATION, key, &message);
         }
     }
-    reader.check_made(&[key, REGISTRATION], config.registration_sd_mm());
+    reader.check_result(&[key, REGISTRATION], config.registration_sd_mm());
 }
 
 /// Keys that only some sources of tip positions take.
@@ -293,7 +293,7 @@ fn source(config: &Config, reader: &mut Reader) {
     let source = tracker.source;
     let [key, file, address, request] =
         ["tracker.source", "tracker.file", "tracker.address", "tracker.request"];
-    reader.check(&[key, file], source == TrackerSource::Csv && tracker.file.is_none(), || {
+    reader.refuse_if(&[key, file], source == TrackerSource::Csv && tracker.file.is_none(), || {
         format!("{key} is \"{source}\", and there is no {file} to read")
     });
     let recording = format!("\"{}\"", tracker.file.as_deref().unwrap_or_default());
@@ -307,12 +307,12 @@ fn source(config: &Config, reader: &mut Reader) {
         (address, is_standard_input, "\"-\"", is_ndjson, "\"ndjson\""),
         (request, is_asked, "given", is_openigtlink, "\"openigtlink\""),
     ] {
-        reader.check(&[other, key], is_given && !has_it, || {
+        reader.refuse_if(&[other, key], is_given && !has_it, || {
             format!("{other} is {value}, allowed with {key} = {sources}, which is \"{source}\"")
         });
     }
     let is_real = tracker.file.is_some() && config.stage.hardware;
-    reader.check(&[file, "stage.hardware"], is_real, || {
+    reader.refuse_if(&[file, "stage.hardware"], is_real, || {
         format!(
             "{file} is {recording}, but stage.hardware is true: a recording does not see the needle \
              that would move"
@@ -324,7 +324,7 @@ fn source(config: &Config, reader: &mut Reader) {
     ];
     for (key, columns) in times {
         let is_empty = columns.is_some_and(|columns| columns.named().next().is_none());
-        reader.check(&[key], is_empty, || {
+        reader.refuse_if(&[key], is_empty, || {
             format!("{key} names no column, expected the name of one as s, ms, us or ns")
         });
     }

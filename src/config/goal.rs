@@ -231,11 +231,11 @@ impl Config {
     /// The same as a run records it: with the margin of the curvature, and with the path of each mask complete,
     /// relative to the folder of `file`, the configuration, and with its `crc32` where that can be had.
     pub fn recorded_beside(&self, file: &Path, crc32: impl Fn(&Path) -> Option<u32>) -> Config {
-        let mut written = self.written.clone();
-        if let (GoalKind::Target, Some(goal)) = (self.goal.kind, written["goal"].as_table_mut()) {
+        let mut toml = self.toml.clone();
+        if let (GoalKind::Target, Some(goal)) = (self.goal.kind, toml["goal"].as_table_mut()) {
             goal.insert("curvature_margin".to_owned(), self.goal.curvature_margin().into());
         }
-        let obstacles = written["goal"]["obstacle"].as_array_mut();
+        let obstacles = toml["goal"]["obstacle"].as_array_mut();
         for obstacle in obstacles.into_iter().flatten() {
             let Some(obstacle) = obstacle.as_table_mut() else { continue };
             let Some(mask) = obstacle.get_mut("file") else { continue };
@@ -245,7 +245,7 @@ impl Config {
                 obstacle.insert("crc32".to_owned(), i64::from(crc32).into());
             }
         }
-        Config::of(written)
+        Config::of(toml)
     }
 
     /// The problem of planning, and the obstacles. The path starts at `emulator.start` if the tracker is
@@ -298,7 +298,7 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     let goal = &config.goal;
     let [kind, position, workspace] = ["goal.kind", "goal.position_mm", "goal.workspace_mm"];
     let is_target = goal.kind == GoalKind::Target;
-    reader.check(&[position, kind], is_target && goal.position_mm.is_none(), || {
+    reader.refuse_if(&[position, kind], is_target && goal.position_mm.is_none(), || {
         format!("{kind} is \"target\", and {position} is not given: say where it is")
     });
     let [tool, obstacle] = ["goal.tool", "goal.obstacle"];
@@ -310,36 +310,36 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
         ("study.obstacles", config.study.obstacles.is_some_and(|obstacles| obstacles > 0)),
     ];
     for (key, is_given) in given {
-        reader.check(&[key, kind], !is_target && is_given, || {
+        reader.refuse_if(&[key, kind], !is_target && is_given, || {
             format!("{key} has no effect, since {kind} is \"plane\": set {kind} = \"target\"")
         });
     }
     let is_tip = goal.tool.as_ref() == Some(&config.tracker.tool);
-    reader.check(&[tool, "tracker.tool"], is_tip, || {
+    reader.refuse_if(&[tool, "tracker.tool"], is_tip, || {
         format!("{tool} is tracker.tool, the needle's tip: name the target's own tool")
     });
     let has_one = config.tip_source() == TrackerSource::Csv;
-    reader.check(&[tool, "tracker.source"], goal.tool.is_some() && has_one, || {
+    reader.refuse_if(&[tool, "tracker.source"], goal.tool.is_some() && has_one, || {
         format!("{tool} needs a stream of two tools, and tracker.source = \"csv\" has one")
     });
     let (law, chosen) = ("control.kind", config.control.kind);
     let cannot_follow = is_target && chosen != ControlKind::NestedSaturation;
-    reader.check(&[law, kind], cannot_follow, || {
+    reader.refuse_if(&[law, kind], cannot_follow, || {
         format!("{law} is \"{chosen}\", allowed with {kind} = \"target\": \"nested-saturation\"")
     });
     let WorkspaceConfig { min, max } = goal.workspace_mm;
     let is_workspace = is_box(&min, &max);
-    reader.check(&[workspace], !is_workspace, || {
+    reader.refuse_if(&[workspace], !is_workspace, || {
         format!("{workspace}: each coordinate of max is over that of min")
     });
     let has_plane = min.x <= 0.0 && max.x >= 0.0;
     let in_plane = "goal.in_plane";
-    reader.check(&[workspace, in_plane], is_workspace && goal.in_plane && !has_plane, || {
+    reader.refuse_if(&[workspace, in_plane], is_workspace && goal.in_plane && !has_plane, || {
         format!("{workspace} does not have the plane x = 0 in it, where {in_plane} keeps the path")
     });
     let aside_mm = goal.position_mm.map_or(0.0, |target_mm| target_mm.x);
     let is_aside = is_target && goal.in_plane && aside_mm != 0.0;
-    reader.check(&[position, in_plane], is_aside, || {
+    reader.refuse_if(&[position, in_plane], is_aside, || {
         format!(
             "{position} is {aside_mm} mm off the plane, allowed with {in_plane}: 0; steer in space with \
              {in_plane} = false"

@@ -1,5 +1,4 @@
-//! Layers that a configuration names instead of holding them: calibration files and the emulated
-//! tracker's presets.
+//! The layers that a configuration names: calibration files, and presets of the emulated tracker.
 
 use std::path::Path;
 
@@ -9,7 +8,7 @@ use super::reader::{FIDUCIALS, REGISTRATION, Tree, is_inside};
 use super::value::{self, Entries, Entry, Origin};
 use crate::keys::Field as _;
 
-/// Reads a file that the configuration names; what goes wrong, in words.
+/// Reads a file that the configuration names. The error says in words what went wrong.
 pub type ReadFile<'a> = &'a dyn Fn(&Path) -> Result<String, String>;
 
 /// A key that names a file with calibrated values.
@@ -17,12 +16,12 @@ struct CalibrationFile {
     key: &'static str,
     /// The command that writes such a file.
     made_by: &'static str,
-    /// The keys that such a file holds, and no others.
+    /// The keys in such a file; it has all of them and no others.
     holds: &'static [&'static str],
-    /// Keys that replace the file if a source above the one that names it gives them. Within one source,
-    /// neither they nor what the file holds may stand beside `key`.
+    /// Keys that replace the file if a source of higher precedence gives them. One source may not give `key`
+    /// together with one of these or with a key that the file holds.
     instead_of: &'static [&'static str],
-    /// The key in `holds` that says how the values were measured. The preflight judges it.
+    /// The key in `holds` that says when and from what the values were computed, for the preflight.
     fit: &'static str,
 }
 
@@ -57,28 +56,28 @@ const CALIBRATION_FILES: [CalibrationFile; 3] = [
     },
 ];
 
-/// Keys of calibration files that may be changed without a change of what was measured.
+/// Keys of calibration files that are not measured values: overriding one keeps the `fit`.
 const NOT_MEASURED: [&str; 2] = ["tracker.registration.sd_mm", "evaluation"];
 
-/// The preset that the topmost of `layers` names, as layer number `layer`.
+/// The entries, of layer number `layer`, of the preset that `layers` name.
 pub(super) fn preset(layers: &[Entries], layer: usize) -> Result<Entries, ConfigError> {
-    let named = last(layers, "emulator.tracker").map(|entry| &entry.value);
+    let named = topmost(layers, "emulator.tracker").map(|entry| &entry.value);
     let preset = TrackerPreset::take(named);
     Ok(value::parse_file(&preset.to_string(), preset.toml(), layer)?)
 }
 
-/// Calibration files that cannot be used: the keys that are not known without each, and why.
+/// Calibration files that cannot be used: for each the keys whose values are therefore unknown, and why.
 pub(super) type Unusable = Vec<(Vec<&'static str>, ConfigError)>;
 
-/// Lays what the named calibration files hold into the layers that name them, as if it were
-/// written there; the files with which that fails.
-pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Unusable {
+/// Adds the content of the named calibration files to the layers that name them, as if it were written
+/// there. Returns the files that cannot be used.
+pub(super) fn add_calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Unusable {
     let mut unusable = Vec::new();
     for file in &CALIBRATION_FILES {
-        if let Err(error) = file.lay(layers, read) {
+        if let Err(error) = file.add_to(layers, read) {
             unusable.push(([file.holds, file.instead_of].concat(), error));
         }
-        // What the file holds is in its layer now, or something given above it counts.
+        // From here on the layers hold the file's content, or a higher layer replaces it.
         for layer in layers.iter_mut() {
             layer.retain(|(key, entry)| key != file.key || !entry.value.is_str());
         }
@@ -86,42 +85,44 @@ pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Unusab
     unusable
 }
 
-/// Removes the `fit` of each calibration of which a source above changes a measured value.
+/// Removes the `fit` of each calibration of which a higher layer overrides a measured value.
 pub(super) fn remove_outdated_fits(tree: &mut Tree) {
     for file in &CALIBRATION_FILES {
         let Some(layer) = tree.get(file.fit).map(|fit| fit.layer) else { continue };
         if tree.iter().any(|(key, entry)| entry.layer > layer && file.measures(key)) {
-            tree.retain(|key, _| !is_of(key, &[file.fit]));
+            tree.retain(|key, _| !is_among(key, &[file.fit]));
         }
     }
 }
 
 impl CalibrationFile {
-    /// True for the measured values that the file holds, and for those that say the same.
+    /// True for a measured value that the file holds, and for a key that can replace it.
     fn measures(&self, key: &str) -> bool {
-        (is_of(key, self.holds) || is_of(key, self.instead_of)) && !is_of(key, &NOT_MEASURED)
+        (is_among(key, self.holds) || is_among(key, self.instead_of))
+            && !is_among(key, &NOT_MEASURED)
     }
 
-    fn lay(&self, layers: &mut [Entries], read: ReadFile<'_>) -> Result<(), ConfigError> {
-        let Some(naming) = last(layers, self.key).cloned() else { return Ok(()) };
+    /// Adds the content of the file to the layer that names it, unless a higher layer replaces it.
+    fn add_to(&self, layers: &mut [Entries], read: ReadFile<'_>) -> Result<(), ConfigError> {
+        let Some(naming) = topmost(layers, self.key).cloned() else { return Ok(()) };
         let Some(path) = naming.value.as_str() else { return Ok(()) };
         let refusal = |message: String| {
             ConfigError::from(vec![Problem::at(Some(naming.origin.clone()), message)])
         };
-        let mut others = self.instead_of.iter().filter_map(|key| last(layers, key));
+        let mut others = self.instead_of.iter().filter_map(|key| topmost(layers, key));
         if others.any(|other| other.layer > naming.layer && !other.is_beside(&naming)) {
             return Ok(());
         }
-        // Of what the file only holds, the later `--set` counts.
+        // Several `--set` count as one source, but a `--set` of a key that the file merely holds overrides it.
         let is_twice = |(key, entry): &&(String, Entry)| {
-            is_of(key, self.instead_of) && entry.is_beside(&naming)
-                || is_of(key, self.holds) && entry.layer == naming.layer
+            is_among(key, self.instead_of) && entry.is_beside(&naming)
+                || is_among(key, self.holds) && entry.layer == naming.layer
         };
         if let Some((key, _)) = layers.iter().flatten().find(is_twice) {
             let message = format!("{} is given along with {key}: give one of the two", self.key);
             return Err(refusal(message));
         }
-        // A path is relative to the file that names it, or on the command line to where that is typed.
+        // A path is relative to the file that names it, or for `--set` to the working directory.
         let path = match &naming.origin {
             Origin::File { name, .. } => Path::new(name).with_file_name(path),
             Origin::Set => path.into(),
@@ -139,12 +140,12 @@ impl CalibrationFile {
         Ok(())
     }
 
-    /// A calibration file holds its calibration, whole, and nothing else.
+    /// Checks that a calibration file has all of its keys and no others.
     fn check(&self, name: &str, entries: &Entries) -> Result<(), ConfigError> {
         let mut problems = Vec::new();
         for (key, entry) in entries {
             let is_around = self.holds.iter().any(|table| is_inside(table, key));
-            if !is_around && !is_of(key, self.holds) {
+            if !is_around && !is_among(key, self.holds) {
                 let message = format!("{key} does not belong in a file for {}", self.key);
                 problems.push(Problem::at(Some(entry.origin.clone()), message));
             }
@@ -160,13 +161,13 @@ impl CalibrationFile {
     }
 }
 
-/// True for each of `keys` and what is inside it.
-fn is_of(key: &str, keys: &[&str]) -> bool {
-    keys.iter().any(|of| key == *of || is_inside(key, of))
+/// True for each of `keys` and every key inside it.
+fn is_among(key: &str, keys: &[&str]) -> bool {
+    keys.iter().any(|outer| key == *outer || is_inside(key, outer))
 }
 
-/// The topmost value of `key`.
-fn last<'a>(layers: &'a [Entries], key: &str) -> Option<&'a Entry> {
+/// The value of `key` in the highest layer that has it.
+fn topmost<'a>(layers: &'a [Entries], key: &str) -> Option<&'a Entry> {
     let mut entries = layers.iter().rev().flat_map(|layer| layer.iter().rev());
     entries.find(|(name, _)| name == key).map(|(_, entry)| entry)
 }

@@ -2,21 +2,27 @@
 //!
 //! Each key is declared once, by `keys::section`: its type, range, default and text, and whether
 //! hardware must give it. A user's file is read by these declarations, and each `--set key=value`
-//! replaces a key of it. All that is wrong is reported together.
+//! replaces one of its keys. All errors are reported together.
 //!
-//! Two layers are named by a key: `emulator.tracker` a preset, laid under the files, and
-//! `tracker.registration_file`, `tracker.tip_file` and `needle.needle_file` calibrated values, which
-//! count as written where the file is named. The configuration as used has their content, and needs them no more.
-//! `emulator.rehearse` lays what a rehearsal implies beside the preset.
-//! A calibrated value that is given over its calibration leaves out where that came from (`fit`).
+//! The sources are layers; a higher layer overrides a lower one key by key. From the lowest:
+//! - the declared defaults;
+//! - the preset that `emulator.tracker` names, and with `emulator.rehearse` the values that a rehearsal
+//!   derives from the rest;
+//! - the files, in order;
+//! - each `--set`.
 //!
-//! Three things are not laid key by key:
-//! - of two alternatives (`needle.radius_mm` and `needle.curvature_per_mm`, `emulator.noise`'s two)
-//!   one given above replaces the other below;
-//! - `emulator.noise`, the counts per mm or turn and `tracker.registration` are replaced whole:
+//! `tracker.registration_file`, `tracker.tip_file` and `needle.needle_file` name files with calibrated values.
+//! Their content counts as if it were written in place of that key; the configuration of a run folder has
+//! the content and not the key. If a higher layer overrides a calibrated value, the origin of the
+//! calibration (`fit`) is left out.
+//!
+//! Three things are not overridden key by key:
+//! - of two alternatives (`needle.radius_mm` and `needle.curvature_per_mm`, `emulator.noise`'s two) the one
+//!   in a higher layer removes the one in a lower layer;
+//! - `emulator.noise`, the counts per mm or turn and `tracker.registration` are replaced as a whole:
 //!   `noise = {}` means none;
-//! - the virtual rig is no default for a real one. With `stage.hardware = true` the drives' nodes,
-//!   identities, scales, signs and limits have no defaults, and with any `tracker.source` but
+//! - a real rig does not get the defaults of the virtual one. With `stage.hardware = true` the drives'
+//!   nodes, identities, scales, signs and limits have no defaults, and with any `tracker.source` but
 //!   `"emulated"` there is no registration unless one is given.
 //!
 //! Units are in the keys and are those of the file, degrees among them; methods convert to mm and
@@ -72,7 +78,7 @@ use toml::{Table, Value};
 #[cfg(test)]
 pub(crate) const DEFAULT_TOML: &str = include_str!("../../bench-config/virtual.toml");
 
-/// The number of the layer under the files.
+/// The number of the layer below the files.
 const PRESET: usize = 1;
 
 const HEAD: &str = "\
@@ -86,7 +92,7 @@ const HEAD: &str = "\
 # A key left out has the value shown here. Unknown keys are refused.
 ";
 
-/// A file laid over the defaults.
+/// The text of a configuration file.
 #[derive(Debug, Clone, Copy)]
 pub struct Source<'a> {
     /// The file's name, for errors.
@@ -131,36 +137,35 @@ section! {
         study: StudyConfig;
     }
     beside {
-        /// As it was read, with all defaults.
-        written: Value = Value::Table(Table::new()),
+        /// The whole configuration as TOML, with all defaults.
+        toml: Value = Value::Table(Table::new()),
     }
 }
 
 impl Config {
-    /// The defaults with `sources` laid over them in order, then `sets` (`key=value`).
+    /// The defaults, overridden by `sources` in order, and then by `sets` (`key=value`).
     ///
     /// # Errors
-    /// All that is wrong: TOML that cannot be read; or unknown keys, wrong kinds, values out of
-    /// range and contradictions. A calibration file that is named, since there is no file to read.
+    /// Everything that is wrong: invalid TOML; or unknown keys, wrong types, values out of range and
+    /// contradictions. A key that names a calibration file is refused too, since no file is read.
     pub fn from_sources(sources: &[Source<'_>], sets: &[String]) -> Result<Self, ConfigError> {
         let read = |path: &Path| Err(format!("{} cannot be read here", path.display()));
         Self::with_warnings(sources, sets, &read).map(|(config, _)| config)
     }
 
-    /// The same, with the calibration files that the configuration names read by `read`, which says in
-    /// words what goes wrong; a path in a source is relative to that source's folder. And a warning for
-    /// each section of a law or an observer that is given and not chosen, since it has no effect, and for
-    /// an observer that does not hold with the law.
+    /// Like [`Config::from_sources`], but reads the calibration files that the configuration names with `read`.
+    /// A path in a source is relative to that source's folder. Also returns the warnings, for example for a
+    /// section that has no effect because its control law or observer is not chosen.
     ///
     /// # Errors
-    /// Those of [`Config::from_sources`]; a calibration file that cannot be read or is none.
+    /// Those of [`Config::from_sources`]; a calibration file that cannot be read or has other content.
     pub fn with_warnings(
         sources: &[Source<'_>],
         sets: &[String],
         read: ReadFile<'_>,
     ) -> Result<(Self, Vec<String>), ConfigError> {
         let mut layers = layers(sources, sets)?;
-        let unusable = include::calibrations(&mut layers, read);
+        let unusable = include::add_calibrations(&mut layers, read);
         let (mut config, mut tree) = Config::checked(reader::merge(layers.clone()), unusable)?;
         if config.emulator.rehearse {
             let implied = rehearsal::layer(&config);
@@ -171,8 +176,8 @@ impl Config {
         Ok((config, warnings))
     }
 
-    /// The configuration that `tree` gives, and the tree with all defaults. The files in `unusable` were
-    /// to be laid into it.
+    /// The configuration in `tree`, and the tree with all defaults. `unusable` are the calibration files that
+    /// could not be merged into it.
     fn checked(mut tree: Tree, unusable: include::Unusable) -> Result<(Self, Tree), ConfigError> {
         include::remove_outdated_fits(&mut tree);
         let mut reader = Reader::new(tree);
@@ -182,19 +187,19 @@ impl Config {
         Ok((config, reader.finish()?))
     }
 
-    /// The configuration that is written so: every key of it checked, with all defaults.
-    fn of(written: Value) -> Self {
-        Config { written: written.clone(), ..Config::take(Some(&written)) }
+    /// The configuration in `toml`, which was checked and has all defaults.
+    fn of(toml: Value) -> Self {
+        Config { toml: toml.clone(), ..Config::take(Some(&toml)) }
     }
 
-    /// The value written at `key`.
-    fn at(&self, key: &str) -> Option<&Value> {
-        key.split('.').try_fold(&self.written, |table, name| table.get(name))
+    /// The value at the dotted `key`.
+    fn value_at(&self, key: &str) -> Option<&Value> {
+        key.split('.').try_fold(&self.toml, |table, name| table.get(name))
     }
 
-    /// The number at `key` in the key's own unit; NaN where there is none.
+    /// The number at the dotted `key`, in the key's own unit; NaN if it is not given.
     fn number(&self, key: &str) -> f64 {
-        match self.at(key) {
+        match self.value_at(key) {
             Some(Value::Integer(integer)) => *integer as f64,
             value => f64::take(value),
         }
@@ -213,14 +218,13 @@ impl Config {
     /// The whole configuration as TOML, which reads back to the same.
     ///
     /// # Errors
-    /// None for a configuration that was read.
+    /// Not for a configuration that was read.
     pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
-        toml::to_string(&self.written)
+        toml::to_string(&self.toml)
     }
 }
 
-/// The preset that the others name, the files, then the command line, each a layer over the one
-/// before.
+/// The layers, from the lowest: the preset that the others name, the files, the command line.
 fn layers(sources: &[Source<'_>], sets: &[String]) -> Result<Vec<value::Entries>, ConfigError> {
     let files = sources.iter().zip(PRESET + 1..);
     let files = files.map(|(s, layer)| value::parse_file(s.name, s.text, layer));
@@ -230,7 +234,7 @@ fn layers(sources: &[Source<'_>], sets: &[String]) -> Result<Vec<value::Entries>
     for layer in files.chain(sets) {
         match layer {
             Ok(layer) => layers.push(layer),
-            Err(wrong) => problems.extend(wrong),
+            Err(more) => problems.extend(more),
         }
     }
     ConfigError::unless_empty(problems)?;
@@ -238,7 +242,7 @@ fn layers(sources: &[Source<'_>], sets: &[String]) -> Result<Vec<value::Entries>
     Ok(layers)
 }
 
-/// It becomes part of a folder's name.
+/// True if `name` can be part of a folder's name.
 fn is_run_name(name: &str) -> bool {
     (1..=64).contains(&name.len())
         && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"._-".contains(&byte))

@@ -1,4 +1,4 @@
-//! Reads the merged configuration by its declared keys, and notes all that is wrong with it.
+//! Reads the merged configuration by its declared keys, and collects everything that is wrong with it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,29 +9,28 @@ use super::error::{ConfigError, Problem, nearest_key};
 use super::value::{self, Entries, Entry, Origin, element, join};
 use crate::keys::{DefaultHolds, Key, Kind, Rule, Words, expanded, find, tables};
 
-/// All sources laid over each other, by dotted key.
+/// The merged sources: the entry of the highest layer, by dotted key.
 pub(super) type Tree = BTreeMap<String, Entry>;
 
 pub(super) const REGISTRATION: &str = "tracker.registration";
 pub(super) const FIDUCIALS: &str = "tracker.registration.fiducials";
 
-/// Keys shown of the form of a table.
+/// A message shows at most this many keys of a table.
 const FORM_KEYS_MAX: usize = 4;
 
 /// The merged configuration while it is read.
 pub(super) struct Reader {
-    /// The given keys; while they are read, the defaults of the others are laid under them.
+    /// The given keys; reading adds the defaults of the others.
     pub(super) tree: Tree,
     hardware: bool,
     emulated_tracker: bool,
-    /// The keys of the configuration, each with its allowed values in words; none for tables and arrays of
-    /// tables.
+    /// The keys that exist, each with its allowed values in words; `None` for tables and arrays of tables.
     known: BTreeMap<String, Option<String>>,
-    /// Keys, each with another whose value is its upper limit.
+    /// Pairs of keys: the value of the second is the upper limit of the first.
     pub(super) limited: Vec<(String, &'static str)>,
-    /// Keys that were found wrong or missing.
+    /// The keys that were found wrong or missing.
     failed: BTreeSet<String>,
-    /// By key.
+    /// Each problem with its key, in the order found.
     problems: Vec<(String, Problem)>,
 }
 
@@ -52,13 +51,13 @@ impl Reader {
         }
     }
 
-    /// The configuration as `keys` declare it. What is wrong in it is noted, and left out.
+    /// Reads the configuration as `keys` declare it. A wrong value is reported, and left out of the result.
     pub(super) fn read(&mut self, keys: &'static [Key]) -> Value {
         self.table(&Kind::Table(keys), &[], "", true)
     }
 
-    /// The table at `path`, with narrower rules for some keys. Where it `has_defaults`, the keys that are not
-    /// given have theirs.
+    /// Reads the table at `path`; `narrowed` has narrower rules for some keys. If it `has_defaults`, keys that
+    /// are not given get theirs.
     fn table(
         &mut self,
         kind: &Kind,
@@ -67,13 +66,14 @@ impl Reader {
         has_defaults: bool,
     ) -> Value {
         let keys = match *kind {
-            Kind::Either(key, [with, _]) if self.is_there(&join(path, key)) => with,
+            Kind::Either(key, [keys, _]) if self.is_present(&join(path, key)) => keys,
             Kind::Either(_, [_, keys]) | Kind::Table(keys) => keys,
             _ => &[],
         };
         let keys = expanded(keys, narrowed);
         if let Some(entry) = self.tree.get(path).filter(|entry| !entry.value.is_table()) {
-            let message = format!("{path} is {}, expected a table{}", entry.written, form(&keys));
+            let message =
+                format!("{path} is {}, expected a table{}", entry.source_text, form(&keys));
             self.fail(path, Some(entry.origin.clone()), message);
         }
         let mut table = Table::new();
@@ -86,14 +86,14 @@ impl Reader {
                 .find(|other| self.is_given(other));
             let has_default = has_defaults || key.default_holds == DefaultHolds::Everywhere;
             match alternative {
-                None if has_default => self.lay_default(key, &at),
+                None if has_default => self.add_default(key, &at),
                 None => {}
                 Some(other) if self.is_beside(&at, &other) => {
-                    self.check(&[&other, &at], key.instead_of.is_some(), || {
+                    self.refuse_if(&[&other, &at], key.instead_of.is_some(), || {
                         format!("{at} is given along with {other}: give one of the two")
                     });
                 }
-                // The value of the upper source counts.
+                // The source of higher precedence counts.
                 Some(other) if self.layer(&at) < self.layer(&other) => _ = self.tree.remove(&at),
                 Some(_) => {}
             }
@@ -105,9 +105,9 @@ impl Reader {
         Value::Table(table)
     }
 
-    /// Lays the default of a key, at `at`, under what is given of it.
-    fn lay_default(&mut self, key: &Key, at: &str) {
-        // A table that is given has the defaults of its other keys, unless it is replaced whole.
+    /// Adds the default of `key`, which is at `at`, where nothing is given.
+    fn add_default(&mut self, key: &Key, at: &str) {
+        // The defaults fill a given table, unless it is replaced as a whole.
         let is_merged = !tables(&key.kind).is_empty() && !key.is_whole;
         let is_complete = self.tree.contains_key(at) && !is_merged;
         let holds = match key.default_holds {
@@ -121,13 +121,13 @@ impl Reader {
         }
     }
 
-    /// The value at `at`, which is that of `key` or an element of it; `None` where it is left out or wrong.
+    /// Reads the value at `at`, which is that of `key` or of an element of it; `None` if it is missing or wrong.
     fn value(&mut self, key: &Key, kind: &Kind, at: &str, has_defaults: bool) -> Option<Value> {
         let words = Words::of(kind, &key.rule, key.name);
         let allowed = tables(kind).is_empty().then(|| words.allowed.clone());
         self.known.insert(at.to_owned(), allowed);
         if let Kind::Table(_) | Kind::Either(..) = kind {
-            if key.is_optional && !self.is_there(at) {
+            if key.is_optional && !self.is_present(at) {
                 return None;
             }
             let has_defaults = has_defaults && !(key.is_whole && self.tree.contains_key(at));
@@ -135,7 +135,7 @@ impl Reader {
         }
         let Some(entry) = self.tree.get(at) else {
             if !key.is_optional {
-                self.missing(at, &words.expected);
+                self.refuse_missing(at, &words.expected);
             }
             return None;
         };
@@ -150,7 +150,7 @@ impl Reader {
             (kind, value) => match scalar(kind, &key.rule, value, &words) {
                 Ok(value) => Some(value),
                 Err(why) => {
-                    let message = format!("{at} is {}, {why}", entry.written);
+                    let message = format!("{at} is {}, {why}", entry.source_text);
                     self.fail(at, Some(entry.origin.clone()), message);
                     None
                 }
@@ -158,20 +158,20 @@ impl Reader {
         }
     }
 
-    /// True if there is a key `at`, or any of the table `at`.
-    fn is_there(&self, at: &str) -> bool {
+    /// True if the key `at` or a key inside it is present.
+    fn is_present(&self, at: &str) -> bool {
         self.tree.contains_key(at) || self.tree.keys().any(|key| is_inside(key, at))
     }
 
-    /// Notes a contradiction between `keys` when there is one, at the key given last. Says nothing
-    /// when one of them is wrong already. `message` is asked only if `contradiction`.
-    pub(super) fn check(
+    /// Reports `message` if `is_contradiction`, at the one of `keys` from the source of highest precedence.
+    /// Reports nothing if one of them was found wrong before.
+    pub(super) fn refuse_if(
         &mut self,
         keys: &[&str],
-        contradiction: bool,
+        is_contradiction: bool,
         message: impl FnOnce() -> String,
     ) {
-        if !contradiction || keys.iter().any(|&key| self.failed.contains(key)) {
+        if !is_contradiction || keys.iter().any(|&key| self.failed.contains(key)) {
             return;
         }
         let entries = keys.iter().filter_map(|&key| Some((key, self.tree.get(key)?)));
@@ -187,27 +187,28 @@ impl Reader {
         self.problems.push((keys[0].to_owned(), problem));
     }
 
-    /// Notes why what `keys` describe cannot be `made`, when it cannot.
-    pub(super) fn check_made<T>(&mut self, keys: &[&str], made: Result<T, ConfigError>) {
-        if let Err(error) = made {
-            self.check(keys, true, || error.to_string());
+    /// Reports the error of `result`, which was computed from the values of `keys`.
+    pub(super) fn check_result<T>(&mut self, keys: &[&str], result: Result<T, ConfigError>) {
+        if let Err(error) = result {
+            self.refuse_if(keys, true, || error.to_string());
         }
     }
 
-    /// True where `key`, a part of it or what it is in was found wrong or missing.
+    /// True if `key`, a key inside it or a table around it was found wrong or missing.
     pub(super) fn is_wrong(&self, key: &str) -> bool {
         let is_part = |failed: &String| failed == key || is_inside(failed, key);
         self.failed.iter().any(is_part) || ancestors(key).any(|outer| self.failed.contains(outer))
     }
 
-    /// Notes that the key `at`, or the table that it is in, is wrong, as `message` says.
+    /// Reports that the key `at` is wrong, on the line of `place` or else on its own.
     pub(super) fn refuse(&mut self, at: &str, place: &str, message: &str) {
         let origin = self.origin(place).or_else(|| self.origin(at));
         self.fail(at, origin, format!("{at}: {message}"));
     }
 
-    /// Notes what is wrong with the table `at`, in words `what`: the keys of `all` that are given and that it
-    /// does not have, since it has only those in `known`; else the key that kept it from being `made`, and why.
+    /// Checks a table at `at` that may have only some of the keys in `all`, depending on its kind. `what` is
+    /// its kind in words, and `known` are its keys. Reports given keys that are not among these; if there are
+    /// none, reports the key and the message in `made`, the attempt to use the table.
     pub(super) fn check_own_keys<T>(
         &mut self,
         at: &str,
@@ -224,7 +225,7 @@ impl Reader {
         let is_recorded = defaults.all(|key| self.is_given(&join(at, key.name)));
         for key in all.iter().filter(|key| !known.contains(&key.name)) {
             let path = join(at, key.name);
-            let is_allowed = |entry: &Entry| is_recorded && key.default == Some(&entry.written);
+            let is_allowed = |entry: &Entry| is_recorded && key.default == Some(&entry.source_text);
             if self.given(&path).is_some_and(|entry| !is_allowed(entry)) {
                 let known = known.join(", ");
                 self.refuse(&path, &path, &format!("{what} has no such key, only {known}"));
@@ -235,22 +236,22 @@ impl Reader {
         }
     }
 
-    /// The problems found with these `keys`, or with the tables that they are in.
+    /// Checks that no problem was found with these `keys`, or with the tables around them.
     ///
     /// # Errors
     /// The problems, in the order found.
-    pub(super) fn about(&self, keys: &[&str]) -> Result<(), ConfigError> {
+    pub(super) fn check_found_no_problem_with(&self, keys: &[&str]) -> Result<(), ConfigError> {
         let is_about = |wrong: &str| keys.iter().any(|&key| key == wrong || is_inside(key, wrong));
         let about = self.problems.iter().filter(|(key, _)| is_about(key));
         ConfigError::unless_empty(about.map(|(_, problem)| problem.clone()).collect())
     }
 
-    /// Ends the reading; gives the tree with all defaults. Keys that are not declared are unknown.
+    /// Reports unknown keys, and returns the tree with all defaults.
     ///
     /// # Errors
     /// Everything found wrong, files first, by line.
     pub(super) fn finish(mut self) -> Result<Tree, ConfigError> {
-        self.find_unknown();
+        self.refuse_unknown();
         self.problems.sort_by_key(|(_, problem)| match problem.origin {
             Some(Origin::File { line, .. }) => (0, line),
             Some(Origin::Set) => (1, 0),
@@ -261,7 +262,7 @@ impl Reader {
         Ok(self.tree)
     }
 
-    fn find_unknown(&mut self) {
+    fn refuse_unknown(&mut self) {
         let is_known = |key: &str| self.known.contains_key(key);
         for (key, entry) in self.tree.iter().filter(|(_, entry)| entry.layer > 0) {
             // Nothing is reported inside a table that is wrong or unknown as a whole.
@@ -286,7 +287,7 @@ impl Reader {
         }
     }
 
-    /// What is given at `key`, not by default.
+    /// The entry of `key`, unless it is a default.
     fn given(&self, key: &str) -> Option<&Entry> {
         self.tree.get(key).filter(|entry| entry.layer > 0)
     }
@@ -301,7 +302,7 @@ impl Reader {
         both.is_some_and(|(one, other)| one.is_beside(other))
     }
 
-    /// The layer that a key is of; 0 for a default, and where there is none.
+    /// The layer of a key; 0 for a default or a missing key.
     fn layer(&self, key: &str) -> usize {
         self.tree.get(key).map_or(0, |entry| entry.layer)
     }
@@ -311,8 +312,8 @@ impl Reader {
         self.given(key).map(|entry| entry.origin.clone())
     }
 
-    /// Notes that a key is not there.
-    fn missing(&mut self, key: &str, expected: &str) {
+    /// Reports that `key` is missing, unless it or a table around it was found wrong before.
+    fn refuse_missing(&mut self, key: &str, expected: &str) {
         if std::iter::once(key).chain(ancestors(key)).any(|key| self.failed.contains(key)) {
             return;
         }
@@ -321,21 +322,24 @@ impl Reader {
         self.fail(key, origin, message);
     }
 
-    /// Notes that what was to give `keys` is wrong.
+    /// Reports that the source of `keys` is unusable.
     pub(super) fn fail_all(&mut self, keys: Vec<&str>, error: ConfigError) {
         self.problems
             .extend(error.problems.into_iter().map(|problem| (keys[0].to_owned(), problem)));
         self.failed.extend(keys.into_iter().map(str::to_owned));
     }
 
-    /// Notes that a key is wrong.
+    /// Reports that a key is wrong.
     fn fail(&mut self, key: &str, origin: Option<Origin>, message: String) {
         self.failed.insert(key.to_owned());
         self.problems.push((key.to_owned(), Problem::at(origin, message)));
     }
 }
 
-/// A value of the kind, if it is allowed, or the word that stands for none; else what was expected.
+/// Checks a value that is neither a table nor an array.
+///
+/// # Errors
+/// What was expected or is allowed, in words.
 fn scalar(kind: &Kind, rule: &Rule, value: &Value, words: &Words) -> Result<Value, String> {
     let is_allowed = match (kind, value) {
         (_, Value::String(text)) if matches!(rule, Rule::Or(word, _) if word == text) => true,
@@ -362,7 +366,7 @@ fn scalar(kind: &Kind, rule: &Rule, value: &Value, words: &Words) -> Result<Valu
     if is_allowed { Ok(value.clone()) } else { Err(format!("allowed: {}", words.allowed)) }
 }
 
-/// How a table of these `keys` is written: `, { a = …, b = … }`.
+/// An example of a table with these `keys`, for a message: `, { a = …, b = … }`.
 fn form(keys: &[Key]) -> String {
     let mut fields: Vec<String> = keys.iter().map(|key| format!("{} = …", key.name)).collect();
     if fields.len() > FORM_KEYS_MAX {
@@ -372,17 +376,18 @@ fn form(keys: &[Key]) -> String {
     format!(", {{ {} }}", fields.join(", "))
 }
 
-/// Lays `layers` over each other, the lowest first.
+/// Merges `layers`, the lowest first: a higher layer overrides a lower one.
 pub(super) fn merge(layers: Vec<Entries>) -> Tree {
     let mut tree = Tree::new();
     for (key, entry) in layers.into_iter().flatten() {
-        lay(&mut tree, key, entry);
+        overlay(&mut tree, key, entry);
     }
     tree
 }
 
-/// Lays an entry over `tree`. A value that is replaced as a whole is removed from the layers below.
-fn lay(tree: &mut Tree, key: String, entry: Entry) {
+/// Adds an entry to `tree`, over the layers below. If it replaces an array or a table as a whole, that one is
+/// removed from the layers below.
+fn overlay(tree: &mut Tree, key: String, entry: Entry) {
     let layer = entry.layer;
     let replaced = match entry.value {
         // Fiducials take the place of a pose.
@@ -392,7 +397,7 @@ fn lay(tree: &mut Tree, key: String, entry: Entry) {
     };
     if let Some(replaced) = replaced {
         tree.retain(|other, below| {
-            // Alternatives in one source are both kept, to be refused.
+            // Two alternatives in one source are both kept, so that the reader refuses them.
             let is_alternative = !is_inside(other, &key) && below.is_beside(&entry);
             below.layer >= layer || is_alternative || !is_inside(other, replaced)
         });
@@ -400,16 +405,16 @@ fn lay(tree: &mut Tree, key: String, entry: Entry) {
     tree.insert(key, entry);
 }
 
-/// True for keys of the table `key` and elements of the array `key`.
-pub(super) fn is_inside(other: &str, key: &str) -> bool {
-    other.strip_prefix(key).is_some_and(|rest| rest.starts_with(['.', '[']))
+/// True if `key` is a key of the table `outer` or an element of the array `outer`, at any depth.
+pub(super) fn is_inside(key: &str, outer: &str) -> bool {
+    key.strip_prefix(outer).is_some_and(|rest| rest.starts_with(['.', '[']))
 }
 
 /// The keys around `key`, nearest first: of `a.b[0].c`: `a.b[0]`, `a.b`, `a`.
 pub(super) fn ancestors(key: &str) -> impl Iterator<Item = &str> {
-    std::iter::successors(outer(key), |key| outer(key))
+    std::iter::successors(parent(key), |key| parent(key))
 }
 
-fn outer(key: &str) -> Option<&str> {
+fn parent(key: &str) -> Option<&str> {
     key.rfind(['.', '[']).and_then(|end| key.get(..end))
 }

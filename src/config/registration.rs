@@ -114,13 +114,13 @@ impl Config {
     /// As [`Config::to_toml`].
     pub fn calibration_toml(&self) -> Result<String, toml::ser::Error> {
         let tip = ["offset_mm", "tilt", "fit"].into_iter().filter_map(|key| {
-            Some((key.to_owned(), self.at(&format!("tracker.tip_{key}"))?.clone()))
+            Some((key.to_owned(), self.value_at(&format!("tracker.tip_{key}"))?.clone()))
         });
         let tip = Value::Table(tip.collect());
         let parts = [
-            ("registration", self.at("tracker.registration")),
+            ("registration", self.value_at("tracker.registration")),
             ("tip", Some(&tip)),
-            ("needle", self.at("needle")),
+            ("needle", self.value_at("needle")),
         ];
         let given =
             parts.into_iter().filter_map(|(key, part)| Some((key.to_owned(), part?.clone())));

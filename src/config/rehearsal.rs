@@ -32,7 +32,7 @@ pub(super) fn layer(config: &Config) -> String {
         config.stage.insertion.vendor_id == maxon || config.stage.rotation.vendor_id == maxon;
     let drives = if is_epos4 { "epos4" } else { "generic" };
     // With the same keys in both sections.
-    let torsion = config.at("needle.torsion").map(ToString::to_string).unwrap_or_default();
+    let torsion = config.value_at("needle.torsion").map(ToString::to_string).unwrap_or_default();
     let mut keys = format!(
         "[emulator]\n\
          drives = \"{drives}\"\n\

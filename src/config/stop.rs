@@ -78,19 +78,19 @@ impl StopConfig {
         let [insertion, rotation] = [config.stage.insertion.node, config.stage.rotation.node];
         let not_given = |key: &str| format!("{key} is not given, and a stop needs it");
         let is_named = reader.is_given(INTERFACE);
-        reader.check(&[INTERFACE], !is_named, || not_given(INTERFACE));
-        reader.check(&[INTERFACE], is_named && interface == CanInterface::Memory, || {
+        reader.refuse_if(&[INTERFACE], !is_named, || not_given(INTERFACE));
+        reader.refuse_if(&[INTERFACE], is_named && interface == CanInterface::Memory, || {
             format!("{INTERFACE} is \"memory\", where there is no drive to stop")
         });
         let has_defaults = is_named && interface.is_virtual();
         for key in NODES {
-            reader.check(&[key], !has_defaults && !reader.is_given(key), || not_given(key));
+            reader.refuse_if(&[key], !has_defaults && !reader.is_given(key), || not_given(key));
         }
-        reader.check(&NODES, insertion == rotation, || {
+        reader.refuse_if(&NODES, insertion == rotation, || {
             let [first, second] = NODES;
             format!("{second} is {rotation}, the same as {first}: each node needs its own number")
         });
-        reader.about(&NEEDED)?;
+        reader.check_found_no_problem_with(&NEEDED)?;
         tree.retain(|key, _| {
             let used = USED.iter().find(|used| key == *used || is_inside(key, used));
             used.is_some_and(|used| !reader.is_wrong(used))

@@ -92,8 +92,8 @@ impl Config {
     /// allow.
     pub fn drawn(&self, seed: u64) -> Result<Config, ConfigError> {
         self.check_relative()?;
-        let mut written = self.written.clone();
-        let emulator = &mut written["emulator"];
+        let mut toml = self.toml.clone();
+        let emulator = &mut toml["emulator"];
         // Each range has its own number, so a range that is declared after the others changes none of them.
         for (number, key) in (DRAWS..).zip(StudyConfig::KEYS) {
             if key.name.starts_with("target") || key.name.starts_with("obstacle") {
@@ -120,13 +120,13 @@ impl Config {
         }
         emulator["seed"] = i64::try_from(seed).unwrap_or(i64::MAX).into();
         if self.goal.kind == GoalKind::Target {
-            let target_mm = self.draw_goal(seed, &mut written["goal"])?;
+            let target_mm = self.draw_goal(seed, &mut toml["goal"])?;
             if let Some([low, high]) = self.study.target_move_mm {
                 let drift = self.draw_drift(seed, [low, high], &target_mm);
-                written["emulator"]["target_drift_mm_per_mm"] = array(&drift);
+                toml["emulator"]["target_drift_mm_per_mm"] = array(&drift);
             }
         }
-        Ok(Config::of(written))
+        Ok(Config::of(toml))
     }
 
     /// Checks that no relative error takes a value out of the range of its key: the record of such a run could
@@ -244,7 +244,7 @@ impl Config {
 
     /// The range given at this `key` of `[study]`, in its unit.
     pub(super) fn range(&self, key: &Key) -> Option<[f64; 2]> {
-        let range = self.at(&format!("study.{}", key.name));
+        let range = self.value_at(&format!("study.{}", key.name));
         range.filter(|range| range.is_array()).map(|range| Field::take(Some(range)))
     }
 

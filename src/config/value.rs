@@ -1,4 +1,4 @@
-//! TOML text as a flat list of dotted keys, each with its value and where that was written.
+//! TOML text as a flat list of dotted keys, each with its value and its line.
 
 use std::fmt;
 
@@ -13,9 +13,9 @@ use super::reader::is_inside;
 pub enum Origin {
     /// A line of a file, from 1.
     File {
-        /// As the user named it.
+        /// The file's name, as the user gave it.
         name: String,
-        /// From 1.
+        /// Number of the line, from 1.
         line: usize,
     },
     /// `--set` on the command line.
@@ -26,12 +26,12 @@ pub enum Origin {
 /// entries of their own.
 #[derive(Debug, Clone)]
 pub(super) struct Entry {
-    /// Empty for a table; an array has the number of its elements and not their values.
+    /// A table is empty here. An array has the right number of elements, but not their values.
     pub(super) value: Value,
-    /// As the user wrote it, on one line.
-    pub(super) written: String,
+    /// The value as the user wrote it, on one line.
+    pub(super) source_text: String,
     pub(super) origin: Origin,
-    /// Precedence of its source; 0 is the defaults. A higher layer overrides a lower one.
+    /// Precedence of its source: a higher layer overrides a lower one; 0 is the defaults.
     pub(super) layer: usize,
 }
 
@@ -84,11 +84,11 @@ pub(super) fn recover_file(
     (flat.entries, errors)
 }
 
-/// The message for a key or table `found` on `line` of `text` that was given before: which, and where it was
-/// first among `entries`.
+/// The message for a key or table `found` on `line` of `text` that an earlier line, one of `entries`, gave
+/// already.
 fn duplicate_key(entries: &Entries, text: &str, line: usize, found: &str) -> String {
-    let written = text.lines().nth(line - 1).unwrap_or_default().trim_start();
-    let table = written.strip_prefix('[').and_then(|header| header.split(']').next());
+    let source_line = text.lines().nth(line - 1).unwrap_or_default().trim_start();
+    let table = source_line.strip_prefix('[').and_then(|header| header.split(']').next());
     let name = found.trim_matches(['"', '\'']);
     let before = entries.iter().filter_map(|(key, entry)| match entry.origin {
         Origin::File { line: first, .. } if first < line => Some((key, first)),
@@ -162,13 +162,13 @@ pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, Vec<Problem
         }
         Err(_) => {
             let value = Value::String(written.to_owned());
-            let written = format!("{written:?}");
-            Ok(vec![(key.to_owned(), Entry { value, written, origin: Origin::Set, layer })])
+            let source_text = format!("{written:?}");
+            Ok(vec![(key.to_owned(), Entry { value, source_text, origin: Origin::Set, layer })])
         }
     }
 }
 
-/// The default of a key, as it is declared.
+/// The entries of a default, which is declared as `toml`.
 pub(super) fn parse_default(key: &str, toml: &str) -> Entries {
     // A default has no origin; any will do, since layer 0 marks it as a default.
     let origin = |_| Origin::Set;
@@ -201,6 +201,7 @@ fn position(text: &str, offset: usize) -> (usize, usize) {
     (before.matches('\n').count() + 1, column)
 }
 
+/// Turns the tables of one source into entries.
 struct Flattener<'a> {
     text: &'a str,
     layer: usize,
@@ -230,8 +231,8 @@ impl Flattener<'_> {
             DeValue::Table(_) => Value::from(Table::new()),
         };
         let origin = (self.origin)(spanned.span().start);
-        let written = self.written(&value, spanned);
-        let entry = Entry { value, written, origin, layer: self.layer };
+        let source_text = self.source_text(&value, spanned);
+        let entry = Entry { value, source_text, origin, layer: self.layer };
         self.entries.push((key.clone(), entry));
         match spanned.get_ref() {
             DeValue::Table(table) => self.table(&key, table),
@@ -242,8 +243,8 @@ impl Flattener<'_> {
         }
     }
 
-    /// The value as it is written, on one line and shortened to 60 characters.
-    fn written(&self, value: &Value, spanned: &Spanned<DeValue<'_>>) -> String {
+    /// The value as the user wrote it, on one line and shortened to 60 characters.
+    fn source_text(&self, value: &Value, spanned: &Spanned<DeValue<'_>>) -> String {
         if value.is_table() {
             return "a table".to_owned();
         }

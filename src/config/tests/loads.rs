@@ -27,7 +27,7 @@ fn the_defaults_are_the_file() {
 fn one_key_changes_that_key_alone() {
     let mut expected = loaded("", &[]);
     expected.insertion.depth_mm = 80.0;
-    expected.written["insertion"]["depth_mm"] = 80.0.into();
+    expected.toml["insertion"]["depth_mm"] = 80.0.into();
     assert_eq!(loaded("insertion.depth_mm = 80", &[]), expected);
     assert_eq!(loaded("[insertion]\ndepth_mm = 80.0", &[]), expected);
     assert_eq!(loaded("insertion = { depth_mm = 80 }", &[]), expected);
