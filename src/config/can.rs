@@ -16,15 +16,15 @@ section! {
         /// python-can's udp_multicast, for machines without CAN; "udp:239.74.163.2:43113" names its
         /// group. Anything else is a network interface of Linux.
         interface: CanInterface [BUS] = "memory";
-        /// What the bench receives, where the kernel can choose.
+        /// The frames that the bench receives, if the kernel can filter.
         listen: Listen = "all";
-        /// What the drives are told, and how long they are waited for.
+        /// Periods, timeouts and the bench's node number.
         bus: BusConfig, flat;
     }
 }
 
 choice! {
-    /// What is received of the bus, where the kernel can choose.
+    /// The frames that the bench receives, if the kernel can filter.
     pub enum Listen {
         /// Everything: the record holds all traffic, and foreign nodes are counted.
         All = "all",
@@ -54,7 +54,7 @@ pub enum CanInterface {
 }
 
 impl CanInterface {
-    /// True for a bus made for tests, which never drives a real stage.
+    /// True for a bus that exists only for tests and never reaches a real stage.
     pub fn is_for_tests(&self) -> bool {
         matches!(self, CanInterface::Memory | CanInterface::Udp(_))
     }
@@ -66,7 +66,7 @@ impl CanInterface {
         self.is_for_tests() || matches!(self, CanInterface::Socket(name) if is_virtual(name))
     }
 
-    /// The bus of this name; `None` where no bus can have it.
+    /// The bus of this name; `None` if no bus can have it.
     pub(super) fn named(name: &str) -> Option<Self> {
         match name.split_once(':') {
             None if name == "memory" => Some(CanInterface::Memory),
@@ -106,8 +106,8 @@ impl Field for NodeId {
     }
 }
 
-/// What Linux takes for the name of a network interface: under 16 bytes (IFNAMSIZ), no space, slash or colon, and
-/// no folder.
+/// True if Linux accepts this name for a network interface: under 16 bytes (IFNAMSIZ), no space, slash or
+/// colon, and neither `.` nor `..`.
 fn is_interface(name: &str) -> bool {
     (1..16).contains(&name.len())
         && name.bytes().all(|byte| byte.is_ascii_graphic() && !b"/:".contains(&byte))

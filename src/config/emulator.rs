@@ -11,7 +11,7 @@ use crate::keys::{Rule, choice, over, section, within};
 use crate::needle::TorsionConfig;
 use nalgebra::Vector3;
 
-/// The largest seed: a number that any reader of JSON takes exactly.
+/// The largest seed that every JSON reader represents exactly.
 pub const SEED_MAX: u64 = (1 << 53) - 1;
 
 const SWITCH: Rule = within(-1e6, 1e6);
@@ -22,35 +22,35 @@ section! {
     pub struct EmulatorConfig {
         /// The arc that the needle really cuts.
         arc: Arc, flat;
-        /// As in `[needle]`, but how it really is, mm.
+        /// The real value of what `[needle]` assumes under this name, mm.
         tip_ahead_mm: f64 [TIP_AHEAD] = 0.0;
-        /// Seed of all that is random.
+        /// Seed of all random numbers.
         seed: u64 [within(0.0, SEED_MAX as f64)] = 1;
-        /// Presets the noise, rate, latency and repeats of the emulated tracker, each of which can
-        /// still be given.
+        /// A preset of the noise, rate, latency and repeats of the emulated tracker. Keys that are given
+        /// override it.
         tracker: TrackerPreset = "plain";
-        /// Positions a second, Hz.
+        /// Positions per second, Hz.
         tracker_rate_hz: f64 [within(0.1, 1000.0)] = 40.0;
         /// From acquisition to arrival.
         tracker_latency as "tracker_latency_ms": Duration [within(0.0, 5000.0)] = 0.0;
-        /// Each position is sent so many times again, stamped as if it were new.
+        /// How often each position is repeated, stamped as if it were new.
         tracker_repeats: u32 [within(0.0, 1000.0)] = 0;
         /// The tip's true pose at the start, in the plane frame.
         start: PoseConfig => "{ x_mm = 5.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 5.0, pitch_deg = 5.0, \
             roll_deg = 30.0 }", narrowed(&[("pitch_deg", TIP_PITCH)]);
         /// How far the target moves with each millimetre that is inserted, mm. With `goal.tool` the emulated
-        /// tracker sees it, at `goal.position_mm` before the insertion.
+        /// tracker sees it; before the insertion it is at `goal.position_mm`.
         target_drift_mm_per_mm: Vector3<f64> [within(-1.0, 1.0)] = [0.0, 0.0, 0.0];
-        /// The play that the shaft really has, as in `[needle.torsion]`.
+        /// The real play of the shaft; the keys are those of `[needle.torsion]`.
         torsion: TorsionConfig;
-        /// Noise of each coordinate of a position, zero in the mean; {} is none.
+        /// Zero-mean noise of each coordinate of a position; {} is none.
         noise: Noise => "{ uniform_mm = 1.0 }", whole;
-        /// Rehearsal, as `--rehearse` asks for it: the drives and the tracker of this configuration are
-        /// emulated in memory, whatever `can.interface` and `tracker.source` say.
+        /// A rehearsal, like `--rehearse`: the drives and the tracker of this configuration are emulated in
+        /// memory, whatever `can.interface` and `tracker.source` say.
         rehearse: bool = false;
         /// The pose of the tracked sensor in the frame of the tip.
         sensor: PoseConfig => IDENTITY;
-        /// True where both drives were homed before the start.
+        /// True if both drives were homed before the start.
         homed: bool = false;
         /// The make of drive that is emulated.
         drives: Model = "generic";
@@ -60,27 +60,27 @@ section! {
         insertion_switches_mm: SwitchesConfig => "{}";
         /// Where the switches of the rotation axis close, degrees, likewise.
         rotation_switches_deg: SwitchesConfig => "{}";
-        /// Faults to try the bench with, as many as needed.
+        /// A fault to test the bench with; repeat the table for each.
         fault: Vec<Fault> [Rule::Fields("kind, at_mm or at_s, axis and more")] = [];
     }
 }
 
 section! {
-    /// Where the switches of an axis close, in its unit; left out, there is none.
+    /// Where the switches of an axis close, in its unit. A switch that is not given does not exist.
     #[derive(Copy)]
     pub struct SwitchesConfig {
-        /// The negative limit switch: at and below.
+        /// The negative limit switch closes at and below this position.
         negative: Option<f64> [SWITCH];
-        /// The positive limit switch: at and above.
+        /// The positive limit switch closes at and above this position.
         positive: Option<f64> [SWITCH];
-        /// The home switch: at and above.
+        /// The home switch closes at and above this position.
         home: Option<f64> [SWITCH];
     }
 }
 
 section! {
-    /// Noise of each coordinate of a position, zero in the mean: a part that is independent from one
-    /// position to the next, and a part that is correlated in time.
+    /// Zero-mean noise of each coordinate of a position: a part that is independent from one position to the
+    /// next, and a part that is correlated in time.
     #[derive(Copy)]
     pub struct Noise {
         /// Independent, uniform within ± this, mm.
@@ -89,7 +89,7 @@ section! {
         sd_mm: Option<f64> [NOISE], instead_of("uniform_mm");
         /// Correlated in time, added to it: Gaussian of this standard deviation, mm.
         correlated_sd_mm: Option<f64> [NOISE];
-        /// Its correlation time: after so long the correlation is 1/e.
+        /// Its correlation time, after which the correlation is 1/e.
         correlation_time as "correlation_time_s": Option<Duration> [over(0.0, 3600.0)];
     }
 }
@@ -132,8 +132,8 @@ impl TrackerPreset {
 }
 
 impl SwitchesConfig {
-    /// In counts of an axis that reads 0 at `zero_counts` and has `counts_per_unit`, negative where it
-    /// counts the other way: then what is the negative end to the bench is the drive's positive end.
+    /// The switches in counts, for an axis that reads 0 at `zero_counts`. If `counts_per_unit` is negative the
+    /// drive counts in the opposite direction, and the bench's negative end is the drive's positive end.
     pub(super) fn to_counts(self, zero_counts: i64, counts_per_unit: f64) -> Switches {
         let counts = |at: f64| zero_counts + (at * counts_per_unit).round() as i64;
         let (low, high) = match counts_per_unit < 0.0 {

@@ -33,20 +33,20 @@ section! {
         in_plane: bool = true;
         /// How near the path may come to an obstacle, mm.
         clearance_mm: f64 [within(0.0, 100.0)] = 2.0;
-        /// The path with which a run begins keeps so much more from every obstacle, mm. A needle may lose a
-        /// path that keeps less, to the noise of the tracker and while it turns.
+        /// Additional clearance of the path with which a run begins, mm. With less, the tracker's noise or a
+        /// turn of the needle may leave no path.
         reserve_mm: f64 [within(0.0, 100.0)] = 0.5;
-        /// The tip never leaves it; no clearance to its walls, mm.
+        /// The box that the tip must not leave, without a clearance to its walls, mm.
         workspace_mm: WorkspaceConfig =>
             "{ min = [-50.0, -75.0, 0.0], max = [50.0, 75.0, 150.0] }";
-        /// The share of the needle's curvature that a plan leaves unused, for what is not known of it. If it
-        /// is not given, it is 0.15 with obstacles and 0 without.
+        /// The share of the needle's curvature that a plan leaves unused, as a reserve for what the model does
+        /// not know. If it is not given, it is 0.15 with obstacles and 0 without.
         curvature_margin: Option<f64> [within(0.0, 0.9)];
         /// How many steps of the search a plan may take.
         expansions_max: u32 [within(1.0, 1e8)] = 2000000;
         /// How many steps of the search each step of a run may take, all searches together.
         step_expansions_max: u32 [within(1.0, 1e8)] = 2000;
-        /// Obstacles that the path keeps clear of, as many as needed.
+        /// An obstacle that the path avoids; repeat the table for each.
         obstacle: Vec<ObstacleConfig> [Rule::Fields("shape and its measures")] = [];
     }
 }
@@ -84,7 +84,7 @@ section! {
         /// Mask: a NIfTI image, `.nii` or `.nii.gz`; a voxel that is not 0 is part of the obstacle.
         /// The path is relative to the configuration's folder.
         file: Option<String> [FILE];
-        /// CRC-32 of the mask's file; a file with another is refused. A run records it.
+        /// CRC-32 of the mask's file: a file with another CRC is refused. A run records it.
         crc32: Option<u32> [CRC32];
         /// Pose of the mask's voxels. Voxel (i, j, k) has its centre at i, j, k times the spacing
         /// in the image's header; the header's own origin is not used.
@@ -128,16 +128,15 @@ impl ObstacleShape {
     }
 }
 
-/// Makes an obstacle of the image in a file that has this CRC-32, if one is given, placed by a pose; what goes
-/// wrong, in words.
+/// Reads the mask in a file, which must have this CRC-32 if one is given, and places it by a pose. The error
+/// says in words what went wrong.
 pub type ReadMask<'a> = &'a dyn Fn(&str, Option<u32>, &PoseConfig) -> Result<Obstacle, String>;
 
 impl ObstacleConfig {
-    /// The obstacle.
+    /// Builds the obstacle.
     ///
     /// # Errors
-    /// The key that is wrong, and why: one that is missing, a shape without size, a mask that cannot be
-    /// read.
+    /// The key that is wrong, and why: a missing key, a shape without size, a mask that cannot be read.
     fn to_obstacle(&self, read_mask: ReadMask<'_>) -> Result<Obstacle, (&'static str, String)> {
         let shape = self.shape;
         let needs = |key: &'static str| (key, format!("a {shape} needs {key}"));
@@ -178,15 +177,15 @@ fn is_box(min_mm: &Vector3<f64>, max_mm: &Vector3<f64>) -> bool {
 }
 
 impl GoalConfig {
-    /// The share of the needle's curvature that a plan leaves unused. Around obstacles a path that needs all of
-    /// it cannot be mended: without a margin 6% of the runs are lost (docs/targets.md).
+    /// The share of the needle's curvature that a plan leaves unused. A path around obstacles that needs the
+    /// full curvature cannot be corrected: without a margin 6% of the runs fail (docs/targets.md).
     pub(crate) fn curvature_margin(&self) -> f64 {
-        let usual = if self.obstacle.is_empty() { 0.0 } else { 0.15 };
-        self.curvature_margin.unwrap_or(usual)
+        let default = if self.obstacle.is_empty() { 0.0 } else { 0.15 };
+        self.curvature_margin.unwrap_or(default)
     }
 
-    /// What a refusal adds where some of the curvature is left unused.
-    fn unused(&self) -> String {
+    /// The end of a message, if some of the curvature is left unused.
+    fn margin_hint(&self) -> String {
         match self.curvature_margin() {
             0.0 => String::new(),
             margin => {
@@ -200,7 +199,7 @@ impl Config {
     /// The target of a run, with the path planned to it; `None` if the needle is steered into the plane.
     ///
     /// # Errors
-    /// As [`Config::to_plan`]; The text inside says why there is no path.
+    /// Those of [`Config::to_plan`]. The inner error says why there is no path.
     pub fn to_goal(
         &self,
         read_mask: ReadMask<'_>,
@@ -213,23 +212,24 @@ impl Config {
         let curvature_margin = self.goal.curvature_margin();
         let tool = self.target_tool(problem.target_mm)?;
         let goal = Goal::new(world, problem, reserve_mm, curvature_margin, step_expansions_max);
-        let goal = goal.map_err(|reason| reason + &self.goal.unused());
+        let goal = goal.map_err(|reason| reason + &self.goal.margin_hint());
         Ok(goal.map(|goal| Some(Goal { tool, ..goal })))
     }
 
-    /// The tool that is the target, where that is one.
+    /// The tool that marks the target, if one is configured.
     fn target_tool(&self, expected_mm: Vector3<f64>) -> Result<Option<TargetTool>, ConfigError> {
         let Some(tool) = self.goal.tool.clone() else { return Ok(None) };
         let gate = self.tracker.to_gate()?;
-        // The tip's offset is that of another sensor.
+        // The offset of the tip belongs to the needle's sensor, not to this one.
         let registration = Registration::new(*gate.registration.x_wt());
         let GoalConfig { tool_range_mm: range_mm, tool_average: average, .. } = self.goal;
         let gate = Gate { tool, registration, ..gate };
         Ok(Some(TargetTool { gate, expected_mm, range_mm, average }))
     }
 
-    /// The same as a run records it: with the margin of the curvature, and with the path of each mask complete,
-    /// relative to the folder of `file`, the configuration, and with its `crc32` where that can be had.
+    /// The configuration as a run records it: with the curvature margin, and for each mask with its CRC-32 (if
+    /// `crc32` can compute it) and with its path, which is relative to the folder of the configuration `file`,
+    /// completed.
     pub fn recorded_beside(&self, file: &Path, crc32: impl Fn(&Path) -> Option<u32>) -> Config {
         let mut toml = self.toml.clone();
         if let (GoalKind::Target, Some(goal)) = (self.goal.kind, toml["goal"].as_table_mut()) {
@@ -248,9 +248,9 @@ impl Config {
         Config::of(toml)
     }
 
-    /// The problem of planning, and the obstacles. The path starts at `emulator.start` if the tracker is
-    /// emulated, else at the origin of the plane, with the angles of `observer.start`; in the plane, at
-    /// x = 0 and without pitch.
+    /// The obstacles and the planning problem. The path starts at `emulator.start` if the tracker is emulated,
+    /// else at the origin of the plane frame, with the angles of `observer.start`. With `in_plane` it starts
+    /// at x = 0 and without pitch.
     ///
     /// # Errors
     /// No target; a mask that cannot be read.
@@ -293,7 +293,7 @@ impl Config {
     }
 }
 
-/// Notes what contradicts itself in `[goal]`.
+/// Reports contradictions in `[goal]`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
     let goal = &config.goal;
     let [kind, position, workspace] = ["goal.kind", "goal.position_mm", "goal.workspace_mm"];

@@ -113,7 +113,7 @@ impl CalibrationFile {
         if others.any(|other| other.layer > naming.layer && !other.is_beside(&naming)) {
             return Ok(());
         }
-        // Several `--set` count as one source, but a `--set` of a key that the file merely holds overrides it.
+        // Several `--set` are one source. But of a key that the file merely holds, the later `--set` counts.
         let is_twice = |(key, entry): &&(String, Entry)| {
             is_among(key, self.instead_of) && entry.is_beside(&naming)
                 || is_among(key, self.holds) && entry.layer == naming.layer

@@ -112,7 +112,7 @@ section! {
         goal: GoalConfig;
         /// How far the needle is inserted, and how.
         insertion: InsertionConfig;
-        /// The needle as the bench believes it to be.
+        /// The bench's model of the needle.
         needle: NeedleConfig;
         /// The observers.
         observer: ObserverSection;
@@ -124,16 +124,16 @@ section! {
         stage: StageSection;
         /// Where tip positions come from.
         tracker: TrackerSection;
-        /// The emulated needle and tracker: their own truth, apart from what the bench believes.
+        /// The emulated drives, needle and tracker: how they really are, whatever the bench assumes.
         emulator: EmulatorConfig;
-        /// How long calibrations count.
+        /// How long calibrations are valid.
         calibration: CalibrationConfig;
         /// Where runs are kept.
         record: RecordConfig;
         /// `needle-bench evaluate`, over recorded insertions.
         evaluation: EvaluationConfig;
-        /// `needle-bench study`, and `run --seed`: each trial is drawn from [lowest, highest], in place
-        /// of what `[emulator]` says.
+        /// `needle-bench study`, and `run --seed`: the values of each trial are drawn from [lowest, highest], and
+        /// replace those of `[emulator]`.
         study: StudyConfig;
     }
     beside {

@@ -1,4 +1,4 @@
-//! `[needle]`: what the bench believes of the needle, and how it was calibrated.
+//! `[needle]`: the bench's model of the needle, and how it was calibrated.
 
 use super::tracker::FILE;
 use super::{Config, ConfigError};
@@ -10,7 +10,7 @@ use crate::session::Samples;
 pub(super) const TIP_AHEAD: Rule = within(-100.0, 100.0);
 
 section! {
-    /// `[needle]`: what the bench believes of the needle.
+    /// `[needle]`: the bench's model of the needle.
     pub struct NeedleConfig {
         /// The arc that it cuts unturned.
         arc: Arc, flat;
@@ -27,7 +27,7 @@ section! {
 }
 
 section! {
-    /// The arc that a needle cuts when it is not turned, as it is given.
+    /// The arc that a needle cuts when it is not turned, given by radius or curvature.
     #[derive(Copy)]
     pub struct Arc {
         /// Radius of the arc that the needle cuts unturned, mm.
@@ -44,7 +44,7 @@ impl Arc {
         self.curvature_per_mm.unwrap_or_else(of_radius)
     }
 
-    /// A needle that cuts it, whose tip is `tip_ahead_mm` ahead; an error names the `section`.
+    /// A needle that cuts this arc, with its tip `tip_ahead_mm` ahead. An error names the `section`.
     pub(super) fn to_needle(self, tip_ahead_mm: f64, section: &str) -> Result<Needle, ConfigError> {
         Needle::new(self.curvature_per_mm())
             .and_then(|needle| needle.with_tip_ahead(tip_ahead_mm))
@@ -58,7 +58,7 @@ pub(super) fn torsion(config: TorsionConfig, section: &str) -> Result<Torsion, C
 }
 
 impl Config {
-    /// The needle as the bench believes it to be.
+    /// The bench's model of the needle.
     ///
     /// # Errors
     /// Those of [`Needle::new`] and [`Needle::with_tip_ahead`].
@@ -66,7 +66,7 @@ impl Config {
         self.needle.arc.to_needle(self.needle.tip_ahead_mm, "needle")
     }
 
-    /// The torsion of its shaft as the bench believes it to be.
+    /// The bench's model of the torsion of the shaft.
     ///
     /// # Errors
     /// Those of [`Torsion::new`].
@@ -74,7 +74,7 @@ impl Config {
         torsion(self.needle.torsion, "needle")
     }
 
-    /// How tracker and tissue disturb a path, by the settings of the invariant observer.
+    /// The disturbance of a path by tracker and tissue, from the settings of the invariant observer.
     pub fn path_noise(&self) -> PathNoise {
         let observer = &self.observer.invariant;
         PathNoise {

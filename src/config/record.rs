@@ -1,4 +1,4 @@
-//! `[record]`, `[calibration]` and `[evaluation]`: where runs are kept, how long calibrations count, and how
+//! `[record]`, `[calibration]` and `[evaluation]`: where runs are kept, how long calibrations are valid, and how
 //! recorded insertions are scored.
 
 use super::{Config, ConfigError};
@@ -36,7 +36,7 @@ section! {
     /// `[calibration]`.
     #[derive(Copy)]
     pub struct CalibrationConfig {
-        /// After so many days the preflight asks for a calibration, or `stage prove`, to be done again.
+        /// The preflight asks to repeat a calibration, or `stage prove`, that is older than this many days.
         max_age_days: f64 [over(0.0, 10_000.0)] = 90.0;
     }
 }
@@ -51,16 +51,16 @@ section! {
         axis: [f64; 3] [COORDINATE] = [0.0, 0.0, 1.0];
         /// The axis about which the unturned path bends, in the sensor's frame; any length.
         bend_axis: [f64; 3] [COORDINATE] = [1.0, 0.0, 0.0];
-        /// Roll and position count from this depth on, mm.
+        /// Roll and position are scored from this depth on, mm.
         score_after_mm: f64 [within(0.0, 1000.0)] = 8.0;
     }
 }
 
 impl Config {
-    /// How an evaluation goes through recordings.
+    /// The settings of an evaluation of recordings.
     ///
     /// # Errors
-    /// A mount that spans no plane.
+    /// The two axes are parallel.
     pub fn scoring(&self) -> Result<Scoring, ConfigError> {
         let EvaluationConfig { axis, bend_axis, score_after_mm } = self.evaluation;
         let r_sb = mount(axis.into(), bend_axis.into()).map_err(|error| {

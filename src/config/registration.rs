@@ -1,5 +1,4 @@
-//! `[tracker.registration]`: the tracker's pose on the bench, given or solved from fiducials; and what two
-//! runs must share to be of one calibration.
+//! `[tracker.registration]`: the tracker's pose on the bench, given or solved from fiducials.
 
 use super::Config;
 use super::error::ConfigError;
@@ -13,7 +12,7 @@ use toml::{Table, Value};
 /// `[tracker.registration]`.
 #[derive(Debug, Clone, PartialEq)]
 pub enum RegistrationConfig {
-    /// A pose, measured somehow.
+    /// A pose that was measured or computed before.
     Given(GivenRegistration),
     /// Points known in both frames, from which the pose is solved.
     Fiducials(Fiducials),
@@ -24,7 +23,7 @@ section! {
     pub struct GivenRegistration {
         /// `X_WT`.
         x_wt: PoseConfig, flat;
-        /// Standard deviation of each coordinate that the pose's error gives the tip, mm.
+        /// Standard deviation of each coordinate of the tip due to the error of this pose, mm.
         sd_mm: f64 [within(0.0, 100.0)] = 0.0, everywhere;
         /// How it was computed, as `needle-bench calibrate registration` wrote it.
         fit: Option<RegistrationRecord>;
@@ -34,7 +33,7 @@ section! {
 section! {
     /// Fiducials in the configuration itself.
     pub struct Fiducials {
-        /// The most that the distances left may be, RMS, mm.
+        /// Upper limit of the residual distances of the fiducials, RMS, mm.
         rms_max_mm: f64 [over(0.0, 100.0)] = 1.0, everywhere;
         /// Points known in both frames: at least three, not on a line.
         fiducials: Vec<FiducialPair> [Rule::Fields("tracker_mm, bench_mm")];
@@ -61,7 +60,7 @@ impl RegistrationConfig {
     /// `X_WT`: the tracker's pose on the bench.
     ///
     /// # Errors
-    /// Fiducials that determine none.
+    /// The fiducials determine no pose.
     pub fn x_wt(&self) -> Result<Pose, ConfigError> {
         match self {
             RegistrationConfig::Given(given) => Ok(given.x_wt.to_pose()),
@@ -82,9 +81,9 @@ impl Fiducials {
 }
 
 impl Config {
-    /// Standard deviation of each coordinate, mm, that the registration's error gives a tip on the
-    /// planned path: as configured, or with fiducials the larger of those at the path's two ends,
-    /// between which it is never larger. Zero where nothing is known of it.
+    /// Standard deviation, mm, of each coordinate of a tip on the planned path, due to the error of the
+    /// registration: as configured, or computed from the fiducials at both ends of the path, whichever is
+    /// larger; in between it is never larger. Zero if it is unknown.
     ///
     /// # Errors
     /// Fiducials that determine no registration.
@@ -98,7 +97,7 @@ impl Config {
         }
     }
 
-    /// The same for a fit.
+    /// That standard deviation, mm, for the registration `fit`.
     pub fn registration_sd_of_mm(&self, fit: &RegistrationFit) -> f64 {
         let x_wp = self.plane.to_pose();
         let ends = [0.0, self.insertion.depth_mm].map(|depth_mm| Vector3::z() * depth_mm);
@@ -107,11 +106,11 @@ impl Config {
             .fold(0.0, f64::max)
     }
 
-    /// The tracker's registration, the tip on its sensor and the needle, as TOML of one form: equal
-    /// texts are equal calibrations.
+    /// The calibrated values, as TOML in a canonical form, so that equal texts mean equal calibrations: the
+    /// tracker's registration, the tip on its sensor, and the needle.
     ///
     /// # Errors
-    /// As [`Config::to_toml`].
+    /// Those of [`Config::to_toml`].
     pub fn calibration_toml(&self) -> Result<String, toml::ser::Error> {
         let tip = ["offset_mm", "tilt", "fit"].into_iter().filter_map(|key| {
             Some((key.to_owned(), self.value_at(&format!("tracker.tip_{key}"))?.clone()))

@@ -1,4 +1,4 @@
-//! `[study]`: from where the trials of a study are drawn.
+//! `[study]`: the ranges from which the trials of a study are drawn.
 
 use super::pose::{POSITION, TIP_PITCH};
 use super::{Config, ConfigError, GoalKind, WorkspaceConfig};
@@ -12,23 +12,22 @@ use nalgebra::{Vector3, Vector4};
 use std::f64::consts::TAU;
 use toml::{Table, Value};
 
-/// The coordinates of the draws of a trial are numbered from here, apart from its noise.
+/// The numbers of the random draws of a trial start here, away from those of its noise.
 const DRAWS: u64 = 0x5354_5544_5900_0000;
-/// Those of targets and obstacles, which are drawn until they are allowed.
+/// The numbers of the draws of targets and obstacles start here; an obstacle is drawn until it has room.
 const GOAL_DRAWS: u64 = DRAWS + 0x1000_0000;
-/// Those of how a target moves.
+/// The numbers of the draws of a target's motion start here.
 const DRIFT_DRAWS: u64 = DRAWS + 0x2000_0000;
-/// The one of how a shaft's creep grows.
+/// The number of the draw of the growth of a shaft's creep.
 const GROWTH_DRAW: u64 = DRAWS + 0x3000_0000;
-/// An obstacle is drawn anew so often at most.
+/// An obstacle is drawn at most this often.
 const TRIES_MAX: u32 = 1000;
-/// Variance, mm², of a position about which nothing is known: observers are not told where they
-/// start, but measure it.
+/// Variance, mm², of an unknown start position: observers measure it.
 const POSITION_UNKNOWN_MM2: f64 = 1e6;
 
 section! {
-    /// `[study]`: each a lowest and a highest value, drawn evenly between them; left out, it is as in
-    /// `[emulator]`.
+    /// `[study]`: each key is a lowest and a highest value, between which a value is drawn uniformly. Without
+    /// a key the value of `[emulator]` holds.
     pub struct StudyConfig {
         /// Start of the tip, plane frame, mm.
         x_mm: Option<[f64; 2]> [POSITION] = [-8.0, 8.0];
@@ -44,33 +43,34 @@ section! {
         roll_deg: Option<[f64; 2]> [TURN] = [-180.0, 180.0];
         /// Error of the emulated needle's curvature, relative to `[emulator]`.
         curvature_error: Option<[f64; 2]> [within(-0.9, 9.0)] = [0.0, 0.0];
-        /// Of the emulated needle's torsion, degrees.
+        /// Half-width of the band of the emulated needle's torsion, degrees.
         torsion_half_width_deg: Option<[f64; 2]> [HALF_WIDTH];
-        /// Of the emulated needle's torsion, degrees per mm.
+        /// Growth of that half-width with depth, degrees per mm.
         torsion_half_width_deg_per_mm: Option<[f64; 2]> [HALF_WIDTH_PER_MM];
-        /// Of the emulated needle's torsion, degrees.
+        /// Offset of that band, degrees.
         torsion_offset_deg: Option<[f64; 2]> [OFFSET];
         /// Creep length of the emulated needle's shaft and its growth with depth, each relative to `[emulator]`.
         creep_error: Option<[f64; 2]> [within(-0.9, 9.0)];
         /// With `goal.kind = "target"`: depth of the target, mm.
         target_depth_mm: Option<[f64; 2]> [over(0.0, 1000.0)];
-        /// How far aside the target is, as a share of what one arc of the needle reaches at that depth
-        /// within the workspace; to either side in the plane, to any in space.
+        /// Distance of the target from the axis, as a share of what one arc of the needle reaches at that depth
+        /// within the workspace; to either side in the plane, in any direction in space.
         target_share: Option<[f64; 2]> [within(0.0, 1.0)] = [0.0, 0.9];
         /// With `goal.tool`: how far the target moves, in any direction that the goal allows, until the needle
-        /// is as deep as it was, mm.
+        /// reaches the depth at which the target was drawn, mm.
         target_move_mm: Option<[f64; 2]> [within(0.0, 100.0)];
-        /// Spheres drawn between start and target, beside `goal.obstacle`. In the plane their centres are in
-        /// it. None is nearer to start or target than `goal.clearance_mm`.
+        /// Number of spheres drawn between start and target, in addition to `goal.obstacle`. With
+        /// `goal.in_plane` their centres are in the plane. None is nearer to start or target than
+        /// `goal.clearance_mm`.
         obstacles: Option<u32> [within(0.0, 100.0)] = 0;
         /// Radius of those spheres, mm.
         obstacle_radius_mm: Option<[f64; 2]> [over(0.0, 1000.0)] = [5.0, 20.0];
     }
 }
 
-/// Where the centres of drawn obstacles are: this far from the straight line to the target, mm.
+/// The centres of drawn obstacles are at most this far from the straight line to the target, mm, along x and y.
 const ASIDE_MM: f64 = 30.0;
-/// Start and target keep at least this distance from them beside the clearance, mm.
+/// Distance of start and target from drawn obstacles, in addition to the clearance, mm.
 const ROOM_MM: f64 = 1.0;
 
 /// A point as a value of the configuration.
@@ -94,7 +94,7 @@ impl Config {
         self.check_relative()?;
         let mut toml = self.toml.clone();
         let emulator = &mut toml["emulator"];
-        // Each range has its own number, so a range that is declared after the others changes none of them.
+        // Each range has its own number, so adding a range at the end does not change the draws of the others.
         for (number, key) in (DRAWS..).zip(StudyConfig::KEYS) {
             if key.name.starts_with("target") || key.name.starts_with("obstacle") {
                 continue;
@@ -177,7 +177,7 @@ impl Config {
         Vector3::new(along, across * sin, across * cos) * (move_mm / target_mm.norm())
     }
 
-    /// Draws target and obstacles of the trial with this seed; gives the target, mm.
+    /// Draws target and obstacles of the trial with this seed; returns the target, mm.
     fn draw_goal(&self, seed: u64, goal: &mut Value) -> Result<Vector3<f64>, ConfigError> {
         let study = &self.study;
         let mut number = GOAL_DRAWS;
@@ -211,7 +211,7 @@ impl Config {
         let [low, high] = study.obstacle_radius_mm.unwrap_or_default();
         let obstacles = study.obstacles.unwrap_or_default();
         let mut drawn = goal["obstacle"].as_array().cloned().unwrap_or_default();
-        for number in 1..=obstacles {
+        for obstacle in 1..=obstacles {
             let mut tries = (0..TRIES_MAX).map(|_| {
                 let radius_mm = draw(low, high);
                 let mut centre_mm = target_mm * draw(0.0, 1.0);
@@ -229,7 +229,7 @@ impl Config {
             let (centre_mm, radius_mm) = tries.find(has_room).ok_or_else(|| {
                 ConfigError::of(format!(
                     "study.obstacle_radius_mm = [{low}, {high}]: of {TRIES_MAX} spheres drawn for obstacle \
-                     {number} of study.obstacles, each came within goal.clearance_mm and {ROOM_MM} mm of \
+                     {obstacle} of study.obstacles, each came within goal.clearance_mm and {ROOM_MM} mm of \
                      start or target; draw smaller ones"
                 ))
             })?;
@@ -242,15 +242,15 @@ impl Config {
         Ok(target_mm)
     }
 
-    /// The range given at this `key` of `[study]`, in its unit.
+    /// The range at this `key` of `[study]`, in the key's unit; `None` if it is not given.
     pub(super) fn range(&self, key: &Key) -> Option<[f64; 2]> {
         let range = self.value_at(&format!("study.{}", key.name));
         range.filter(|range| range.is_array()).map(|range| Field::take(Some(range)))
     }
 
-    /// What is not known of a trial before it begins, for the information bound: what the study
-    /// draws, and what the observer that steers is told it does not know, whichever is wider. No
-    /// estimate can do better than what it starts from allows.
+    /// The prior uncertainty of a trial, for the information bound: the spread of what the study draws, or
+    /// the standard deviations configured for the steering observer, whichever is larger. The bound depends
+    /// on it, since no estimate can be better than its prior allows.
     pub fn prior(&self) -> Prior {
         let study = &self.study;
         let variance = |range: Option<[f64; 2]>| {
@@ -258,17 +258,17 @@ impl Config {
         };
         let deg2 = |range| variance(range) * 1f64.to_radians().powi(2);
         let curvature_per_mm = self.emulator.arc.curvature_per_mm();
-        let (start_sd, curvature_told) =
+        let (start_sd, curvature_sd) =
             self.observers().next().map_or_else(Default::default, |steers| steers.start_sd());
-        let angles_told_rad2 =
+        let configured_rad2 =
             Vector3::new(start_sd.yaw, start_sd.pitch, start_sd.roll).map(|sd| sd * sd);
         let angles_rad2 =
             Vector3::new(deg2(study.yaw_deg), deg2(study.pitch_deg), deg2(study.roll_deg));
         Prior {
             position_mm2: POSITION_UNKNOWN_MM2,
-            angles_rad2: angles_rad2.sup(&angles_told_rad2),
+            angles_rad2: angles_rad2.sup(&configured_rad2),
             parameters: Vector4::new(
-                variance(study.curvature_error).max(curvature_told.powi(2))
+                variance(study.curvature_error).max(curvature_sd.powi(2))
                     * curvature_per_mm.powi(2),
                 deg2(study.torsion_half_width_deg),
                 deg2(study.torsion_half_width_deg_per_mm),

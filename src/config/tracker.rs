@@ -29,7 +29,7 @@ section! {
         source: TrackerSource = "emulated";
         /// host:port of the server, or to listen at; "-" is standard input, for "ndjson".
         address: String [ADDRESS] = "127.0.0.1:18944";
-        /// Who opens the connection.
+        /// The side that opens the connection.
         mode: TrackerMode = "connect";
         /// For "ndjson" and "csv": a recording in place of a connection, replayed at its own pace.
         file: Option<String> [FILE];
@@ -45,12 +45,12 @@ section! {
         kind: TrackerKind = "electromagnetic";
         /// When the insertion is held.
         hold: HoldConfig, flat;
-        /// Shortest delay from the measurement of a position to its receipt. The clock of a sender is learnt
-        /// from its soonest samples, so stamps show only delays beyond this one.
+        /// Shortest delay from the measurement of a position to its receipt. The bench estimates a sender's clock
+        /// from the samples with the least delay, so stamps show only delays beyond this one.
         latency as "latency_ms": Duration [within(0.0, 5000.0)] = 0.0;
         /// The stamp that dates a position.
         stamp: StampPolicy = "receive";
-        /// Tip in the sensor's frame, mm. Any but zero needs a source that sends orientations.
+        /// Tip in the sensor's frame, mm. A value other than zero needs a source that sends orientations.
         tip_offset_mm: [f64; 3] [within(-1000.0, 1000.0)] = [0.0, 0.0, 0.0];
         /// Orientation of the tip in the sensor's frame.
         tip_tilt: FixedAngles => "{ yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }";
@@ -58,7 +58,7 @@ section! {
         tip_fit: Option<TipRecord>;
         /// In place of `tip_offset_mm`, `tip_tilt` and `tip_fit`: the file that `needle-bench calibrate tip` wrote.
         tip_file: Option<String> [FILE];
-        /// A box in the bench frame outside of which no tip position is believed.
+        /// A box in the bench frame: tip positions outside it are refused.
         workspace: Option<Workspace>;
         /// Pose of the tracker frame T in the bench frame W, or fiducials to solve it from. Without
         /// one the bench does not move; only the emulated tracker has a default.
@@ -68,7 +68,7 @@ section! {
         /// The columns of a CSV file; the defaults are those of a run's steps.csv.
         csv: CsvMapping;
         /// The noise of the positions, as `needle-bench calibrate tracker` measures it. Without it the
-        /// observers measure on line how much a position is worth.
+        /// observers estimate during the run how correlated the noise is, and weight positions accordingly.
         noise: Option<PositionNoise>;
         /// Gates that a tip position must pass to be accepted, in this order.
         gates: GatesConfig;
@@ -76,7 +76,7 @@ section! {
 }
 
 section! {
-    /// `[tracker.gates]`. That a position is finite is always required.
+    /// `[tracker.gates]`. A position that is not finite is always refused.
     pub struct GatesConfig {
         /// Refuse an orientation that is not a rotation; false uses the position alone.
         rotation: bool = true;
@@ -119,7 +119,7 @@ choice! {
 }
 
 choice! {
-    /// Who opens the connection.
+    /// The side that opens the connection.
     pub enum TrackerMode {
         /// The bench connects to a server.
         Connect = "connect",
@@ -145,7 +145,7 @@ impl TrackerSection {
         })
     }
 
-    /// Where the tracker stands on the bench and the tip on the sensor; without it nothing moves.
+    /// The poses of the tracker on the bench and of the tip on the sensor. Without them nothing moves.
     ///
     /// # Errors
     /// No registration is configured (the error names the key to set), or its fiducials determine none.
@@ -178,7 +178,7 @@ impl TrackerSection {
         })
     }
 
-    /// The same without a registration and a workspace: positions stay in the tracker's frame.
+    /// That gate without a registration and a workspace: positions stay in the tracker's frame.
     pub fn to_unregistered_gate(&self) -> Gate {
         Gate {
             tool: self.tool.clone(),
@@ -192,15 +192,15 @@ impl TrackerSection {
         }
     }
 
-    /// The gate against the other positions and the model. Configured noise that is larger than that of the
-    /// gates counts there too.
+    /// The gate that compares a position with the others and with the model. It uses the larger of
+    /// `tracker.noise` and `tracker.gates.noise_sd_mm`.
     pub fn to_track(&self) -> TrackSettings {
-        let told_mm = self.noise.map_or(0.0, |noise| noise.sd_mm());
-        let noise_sd_mm = self.gates.track.noise_sd_mm.max(told_mm);
+        let configured_mm = self.noise.map_or(0.0, |noise| noise.sd_mm());
+        let noise_sd_mm = self.gates.track.noise_sd_mm.max(configured_mm);
         TrackSettings { kind: self.kind, noise_sd_mm, ..self.gates.track }
     }
 
-    /// The protocol of the tracker's connection; without meaning for a source that has none.
+    /// The protocol of the tracker's connection; meaningless for a source without a connection.
     pub fn to_protocol(&self) -> Protocol {
         match self.source {
             TrackerSource::Ndjson => Protocol::Ndjson,
@@ -208,7 +208,7 @@ impl TrackerSection {
         }
     }
 
-    /// What a server is asked for, if anything.
+    /// The stream to request from the server, if any.
     pub fn to_request(&self) -> Option<ToolStream> {
         let name = match self.request {
             TrackerRequest::None => return None,
@@ -218,7 +218,7 @@ impl TrackerSection {
         Some(ToolStream { name, period_ms: self.request_period_ms })
     }
 
-    /// True where positions come by standard input.
+    /// True if positions are read from standard input.
     pub fn is_standard_input(&self) -> bool {
         self.source == TrackerSource::Ndjson && self.address == STANDARD_INPUT
     }
