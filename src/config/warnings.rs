@@ -1,5 +1,5 @@
-//! Settings that may not do what the operator expects: sections that are not chosen, pairs of an observer
-//! and a control law that do not hold together, a rehearsal without a registration.
+//! Warnings of settings that may not do what the operator expects: unused sections, an observer that does
+//! not converge with the control law, a rehearsal without a registration.
 
 use super::reader::{REGISTRATION, Tree, is_inside};
 use super::{Config, ObserverKind, TrackerSource};
@@ -7,52 +7,61 @@ use crate::control::ControlKind;
 use crate::keys::{Field as _, Kind};
 use crate::observer::Gains;
 
-/// All warnings about `config`, which `tree` gives.
+/// All warnings about `config`, which was read from `tree`.
 pub(super) fn all(config: &Config, tree: &Tree) -> Vec<String> {
-    let mut warnings = unchosen(config, tree);
-    warnings.extend(unregistered(config, tree));
-    warnings.extend(pair(config));
+    let mut warnings = unused_sections(config, tree);
+    warnings.extend(missing_registration(config, tree));
+    warnings.extend(unsuitable_pair(config));
     warnings
 }
 
-/// Always used, by the check of handedness.
+/// The check of handedness always uses this section.
 const ALWAYS_USED: &str = "observer.invariant";
 
 /// A warning for each section of `tree` that is given and that `config` does not use. A configuration
-/// printed in full, as in a run folder, gives them all and gets none.
-fn unchosen(config: &Config, tree: &Tree) -> Vec<String> {
+/// printed in full, as in a run folder, gives all sections and gets no warning.
+fn unused_sections(config: &Config, tree: &Tree) -> Vec<String> {
     let (law, observer) = (config.control.kind.to_string(), config.observer.kind.to_string());
     let observers: Vec<String> = config.observer.kinds().iter().map(ToString::to_string).collect();
     let mut warnings = Vec::new();
-    for (table, kind, names, used, otherwise) in [
-        ("control", &law, ControlKind::KIND, std::slice::from_ref(&law), ""),
-        ("observer", &observer, ObserverKind::KIND, &observers, ", or add to observer.shadows"),
+    for (table, chosen, kinds, used) in [
+        ("control", &law, ControlKind::KIND, std::slice::from_ref(&law)),
+        ("observer", &observer, ObserverKind::KIND, &observers),
     ] {
-        let Kind::OneOf(names) = names else { continue };
-        let mut printed = tree.iter().filter(|(key, _)| is_inside(key, table));
-        if printed.all(|(_, entry)| entry.layer > 0) {
+        let Kind::OneOf(kinds) = kinds else { continue };
+        let mut in_table = tree.iter().filter(|(key, _)| is_inside(key, table));
+        let is_printed_in_full = in_table.all(|(_, entry)| entry.layer > 0);
+        if is_printed_in_full {
             continue;
         }
-        for (name, _) in names.iter().filter(|(name, _)| !used.iter().any(|used| used == name)) {
-            // A section is named as its kind.
-            let section = format!("{table}.{}", name.replace('-', "_"));
+        for (kind, _) in kinds.iter().filter(|(kind, _)| !used.iter().any(|used| used == kind)) {
+            let section = format!("{table}.{}", section_name(kind));
             let given = tree.iter().find(|(key, entry)| {
                 entry.layer > 0 && is_inside(key, &section) && !entry.value.is_table()
             });
-            warnings.extend(given.filter(|_| section != ALWAYS_USED).map(|(key, entry)| {
-                format!(
-                    "{}{key} has no effect, since {table}.kind is \"{kind}\": set its section\
-                     {otherwise}, or choose the other kind",
-                    entry.origin
-                )
-            }));
+            let Some((key, entry)) = given.filter(|_| section != ALWAYS_USED) else { continue };
+            let or_shadow = match table {
+                "observer" => format!(", or add \"{kind}\" to observer.shadows"),
+                _ => String::new(),
+            };
+            warnings.push(format!(
+                "{}{key} has no effect, since {table}.kind is \"{chosen}\": choose {table}.kind = \
+                 \"{kind}\"{or_shadow}",
+                entry.origin
+            ));
         }
     }
     warnings
 }
 
-/// Without a registration a rehearsal takes the tracker's frame for the bench's; a run does not.
-fn unregistered(config: &Config, tree: &Tree) -> Option<String> {
+/// The name of the section with the keys of an observer or a control law of this `kind`.
+pub(super) fn section_name(kind: &str) -> String {
+    kind.replace('-', "_")
+}
+
+/// A warning for a rehearsal without a registration, which uses the tracker's frame as the bench's. A run
+/// would be refused.
+fn missing_registration(config: &Config, tree: &Tree) -> Option<String> {
     let is_real = config.tracker.source != TrackerSource::Emulated;
     let is_given = tree.iter().any(|(key, entry)| is_inside(key, REGISTRATION) && entry.layer > 0);
     (config.emulator.rehearse && is_real && !is_given).then(|| {
@@ -63,9 +72,9 @@ fn unregistered(config: &Config, tree: &Tree) -> Option<String> {
     })
 }
 
-/// A warning if the observer that steers does not hold with the law, as measured
+/// A warning if the steering observer and the control law do not work together, as measured
 /// (`docs/steering.md`).
-fn pair(config: &Config) -> Option<String> {
+fn unsuitable_pair(config: &Config) -> Option<String> {
     let (observer, law) = (&config.observer, config.control.kind);
     match (observer.kind, observer.coupled.gains, law) {
         (ObserverKind::FiniteDifference, ..) => Some(

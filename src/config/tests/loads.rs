@@ -2,7 +2,10 @@
 
 use super::*;
 use crate::config::needle::Arc;
+use crate::config::warnings::section_name;
+use crate::control::ControlKind;
 use crate::emulator::{self, CorrelatedNoise};
+use crate::keys::{Kind, find};
 use crate::stage::RawSdo;
 
 #[test]
@@ -109,6 +112,18 @@ fn correlated_noise_is_taken_beside_the_white() {
     assert_eq!(tracker.correlated, Some(CorrelatedNoise { sd_mm: 0.4, time_s: 0.2 }));
 }
 
+/// The warning of a section without effect finds the section by its kind.
+#[test]
+fn each_observer_and_each_law_has_its_section() {
+    for (table, kinds) in [("observer", ObserverKind::KIND), ("control", ControlKind::KIND)] {
+        let Kind::OneOf(kinds) = kinds else { panic!("{table}") };
+        for (kind, _) in kinds {
+            let section = format!("{table}.{}", section_name(kind));
+            assert!(find(Config::KEYS, &section).is_some(), "{section}");
+        }
+    }
+}
+
 /// A limit in the section of a law that is not chosen limits nothing.
 #[test]
 fn what_is_set_in_a_shipped_file_has_an_effect() {
@@ -126,7 +141,8 @@ fn what_is_set_in_a_shipped_file_has_an_effect() {
     assert_eq!(
         warnings("a.toml", "[observer]\nshadows = []\nfinite_difference.baseline_mm = 3\n"),
         ["a.toml:3: observer.finite_difference.baseline_mm has no effect, since observer.kind is \
-             \"invariant\": set its section, or add to observer.shadows, or choose the other kind"]
+             \"invariant\": choose observer.kind = \"finite-difference\", or add \"finite-difference\" to \
+             observer.shadows"]
     );
     for text in [
         "observer.shadows = [\"finite-difference\"]\nobserver.finite_difference.baseline_mm = 3",
