@@ -1,4 +1,4 @@
-//! From sections of the configuration to settings of the pure parts of the bench, in mm, rad and per mm.
+//! Converts sections of the configuration to the settings of other folders, in mm, rad and per mm.
 
 use super::needle::torsion;
 use super::{CanInterface, Config, ConfigError, ReadMask, TrackerSource, rehearsal};
@@ -10,12 +10,12 @@ use crate::session::{InsertionConfig, SessionConfig};
 use crate::stage::{AxisConfig, Sign};
 use std::f64::consts::TAU;
 
-/// Identity of an emulated drive if the configuration expects none: not a vendor's number.
+/// Identity of an emulated drive if the configuration accepts any; no vendor has this number.
 const EMULATED_VENDOR_ID: u32 = 0;
 const EMULATED_PRODUCT_CODE: u32 = 0x402;
 
 impl Config {
-    /// The bus that a run is on: in a rehearsal, memory.
+    /// The bus of a run; that of a rehearsal is memory.
     pub fn bus(&self) -> &CanInterface {
         match self.emulator.rehearse {
             true => &CanInterface::Memory,
@@ -23,12 +23,12 @@ impl Config {
         }
     }
 
-    /// True where the drives, the needle and the tracker are emulated in this process.
+    /// True if the drives, the needle and the tracker are emulated in this process.
     pub fn is_emulated(&self) -> bool {
         *self.bus() == CanInterface::Memory
     }
 
-    /// Where a run has its tip positions from: in a rehearsal, from the emulated tracker.
+    /// The source of a run's tip positions; that of a rehearsal is the emulated tracker.
     pub fn tip_source(&self) -> TrackerSource {
         match self.emulator.rehearse {
             true => TrackerSource::Emulated,
@@ -36,18 +36,19 @@ impl Config {
         }
     }
 
-    /// The settings of a session, with the path to its target planned. The files of masks are not read.
+    /// The settings of a session, including the planned path to its target. Fails if an obstacle is a mask.
     ///
     /// # Errors
-    /// As [`Config::session_reading`].
+    /// Those of [`Config::session_reading`].
     pub fn session(&self) -> Result<SessionConfig, ConfigError> {
         self.session_reading(&|_, _, _| Err("masks are not read here".to_owned()))
     }
 
-    /// The same with masks, which `read_mask` reads.
+    /// Like [`Config::session`], but reads masks with `read_mask`.
     ///
     /// # Errors
-    /// No registration, or numbers that the parts themselves refuse; a target that cannot be reached.
+    /// No registration; values that the needle, the stage or the observers refuse; a target that cannot be
+    /// reached.
     pub fn session_reading(&self, read_mask: ReadMask<'_>) -> Result<SessionConfig, ConfigError> {
         let goal = self.to_goal(read_mask)?.map_err(ConfigError::of)?;
         Ok(SessionConfig { goal, ..self.session_without_goal()? })
@@ -56,7 +57,7 @@ impl Config {
     /// The settings of a session that steers into the plane, whatever the goal.
     ///
     /// # Errors
-    /// No registration, or numbers that the parts themselves refuse.
+    /// No registration; values that the needle, the stage or the observers refuse.
     pub fn session_without_goal(&self) -> Result<SessionConfig, ConfigError> {
         let invariant = self.observer.to_invariant();
         let mut observers = self.observers();
@@ -67,7 +68,7 @@ impl Config {
             needle_torsion: self.believed_torsion()?,
             handedness: InvariantConfig {
                 registration_sd_mm: self.registration_sd_mm()?,
-                // The noise may be given in one place only.
+                // Only one of the two places may have the real noise.
                 position_sd_mm: invariant.position_sd_mm.max(self.tracker.to_track().noise_sd_mm),
                 ..invariant
             },
@@ -81,11 +82,10 @@ impl Config {
         })
     }
 
-    /// The parts of the virtual stage: the drives that the bench expects, and the emulator's
-    /// own needle.
+    /// The settings of the virtual stage: the drives that the bench expects, and the emulator's needle.
     ///
     /// # Errors
-    /// No registration, or a curvature that no needle has.
+    /// No registration; a needle or a torsion that cannot exist.
     pub fn virtual_stage(&self) -> Result<VirtualStageConfig, ConfigError> {
         let emulator = &self.emulator;
         let turns_per_s = self.number("stage.rotation.speed_max_deg_per_s") / 360.0;
@@ -119,7 +119,8 @@ impl Config {
         })
     }
 
-    /// The drive of `axis`, which moves by so many mm or turns a second, and its counts per mm or turn.
+    /// The drive of `axis`, which reaches `units_per_s` mm or turns per second, and its counts per mm or turn,
+    /// negative if it counts in the opposite direction.
     fn emulated_drive(&self, axis: &AxisConfig, units_per_s: f64) -> (drive::DriveConfig, f64) {
         let counts_per_unit = axis.ratio.to_f64();
         let vendor = axis.vendor_id.unwrap_or(EMULATED_VENDOR_ID);

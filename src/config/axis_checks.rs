@@ -1,4 +1,4 @@
-//! Contradictions within `[stage]`: settings of an axis, its drive and its operations.
+//! Checks for contradictions within `[stage]`: settings of an axis, its drive and its operations.
 
 use super::Config;
 use super::checks::{ROTATION_ACCELERATION_MAX, rounded_down};
@@ -6,15 +6,15 @@ use super::reader::Reader;
 use crate::session::PROFILE_PEAK;
 use crate::stage::{Axis, AxisConfig, Reference};
 
-/// Objects that a drive of the bench must have, and why. Of the others that the bring-up writes, a
-/// drive may lack:
+/// Objects that `optional_objects` may not name, each with the reason. Of the objects that the bring-up writes,
+/// a drive may lack:
 ///
-/// - 605A: by CiA 402 it then brakes on its quick-stop ramp, as by 2
+/// - 605A: by CiA 402 the drive then brakes on its quick-stop ramp, as with option 2
 /// - 6065 and 6066: the bench compares target and position itself
-/// - 60C2: it takes the period from SYNC, and what it makes of that shows as a following error
-/// - 6099 and 609A: it homes at a speed of its own, as without the keys
-/// - 6502: the mode that it takes is read back (6061)
-/// - 1029: by CiA 301 it then goes to Pre-operational, as by 0
+/// - 60C2: the drive takes the period from SYNC; if it gets the period wrong, a following error shows it
+/// - 6099 and 609A: the drive homes at a speed of its own, as it does without the keys
+/// - 6502: the bench reads back the mode (6061)
+/// - 1029: by CiA 301 the drive then goes to Pre-operational, as with option 0
 ///
 /// The bring-up never insists on 1005, 1018:3, 1018:4, 605E, and PDOs beyond the first.
 const NEEDED: [(&[u16], &str); 7] = [
@@ -38,7 +38,8 @@ const NEEDED: [(&[u16], &str); 7] = [
 /// The drive's own position limits.
 const SOFTWARE_LIMITS: u16 = 0x607D;
 
-/// Settings that make a real drive brake on quick stop, on its own faults and when the bench dies.
+/// Settings that make a real drive brake on quick stop, on its own faults and when the bench dies: key, allowed
+/// values, and these in words.
 const STOPPING: [(&str, &[i16], &str); 4] = [
     (
         "abort_connection_option",
@@ -65,8 +66,8 @@ const STOPPING: [(&str, &[i16], &str); 4] = [
     ),
 ];
 
-/// Objects that the bench writes where the key of the axis is given. Where it is not, a raw SDO may write them,
-/// in the drive's own unit.
+/// Objects that the bench writes if a key of the axis is given. If not, a raw SDO may write them, in the
+/// drive's own unit.
 const SET_BY: [((u16, u8), &str); 6] = [
     ((0x607C, 0), "homing.offset_UNIT"),
     ((0x6085, 0), "quick_stop_deceleration_UNIT_per_s2"),
@@ -76,7 +77,7 @@ const SET_BY: [((u16, u8), &str); 6] = [
     ((0x609A, 0), "homing.acceleration_UNIT_per_s2"),
 ];
 
-/// Notes every contradiction.
+/// Reports every contradiction.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
     for which in Axis::BOTH {
         let checks = Checks { config, which, axis: config.stage.axis(which) };
@@ -127,11 +128,11 @@ impl Checks<'_> {
                  zero"
             )
         });
-        // The limits of a real axis protect its screw, its needle or the sensor's cable. Limits that count
-        // from where each command begins protect nothing: three jogs go three times as far.
+        // The limits of a real axis protect its screw, its needle or the sensor's cable. Limits that count from
+        // the start of each command do not: three jogs can go three times as far.
         let ([_, high], [min, max]) = self.limits();
-        let drifts = self.config.stage.hardware && axis.zero.is_none() && !axis.wraps;
-        reader.refuse_if(&[&zero, &high, "stage.hardware"], drifts, || {
+        let has_moving_limits = self.config.stage.hardware && axis.zero.is_none() && !axis.wraps;
+        reader.refuse_if(&[&zero, &high, "stage.hardware"], has_moving_limits, || {
             let unit = self.which.unit();
             format!(
                 "{zero} is \"start\": its limits of {min} to {max} {unit} would count anew from each start; \
@@ -145,8 +146,8 @@ impl Checks<'_> {
         format!("homing.offset_{}", self.which.unit())
     }
 
-    /// Where an axis that was homed stands, mm or deg: the drive's zero is a home offset (607C) away.
-    fn home_at(&self, offset: f64) -> f64 {
+    /// The home position, mm or deg: the drive's zero is the home offset (607C) away from it.
+    fn home_position(&self, offset: f64) -> f64 {
         let zero_counts = self.axis.zero.map_or(f64::NAN, f64::from);
         let counts_per_unit = match self.which {
             Axis::Insertion => {
@@ -164,7 +165,7 @@ impl Checks<'_> {
         let ([low, high], [min, max]) = self.limits();
         let (zero, offset_key) = (self.key("zero"), self.key(&self.offset_key()));
         let offset = self.config.number(&offset_key);
-        let home = self.home_at(offset);
+        let home = self.home_position(offset);
         reader.refuse_if(&[&low, &high, &zero, &offset_key], home < min || home > max, || {
             let (unit, zero_counts) = (self.which.unit(), self.axis.zero.unwrap_or_default());
             format!(
@@ -174,22 +175,23 @@ impl Checks<'_> {
         });
     }
 
-    /// The insertion axis travels on one side of its end switch, where home is.
+    /// An insertion axis that homes on an end switch moves between that switch and the other end: the limits
+    /// must be on that side of home.
     fn homing_direction(&self, reader: &mut Reader) {
         let Some(homing) = self.axis.homing.filter(|_| self.which == Axis::Insertion) else {
             return;
         };
         let sign = self.number("sign");
         let method = homing.method;
-        let (toward, other) = match method {
+        let (direction, other_method) = match method {
             1 | 17 => (-sign, method + 1),
             2 | 18 => (sign, method - 1),
             _ => return,
         };
         let ([low, high], [min, max]) = self.limits();
         let offset = self.number(&self.offset_key());
-        let home = self.home_at(if offset.is_nan() { 0.0 } else { offset });
-        let (end, beyond, before) = match toward > 0.0 {
+        let home = self.home_position(if offset.is_nan() { 0.0 } else { offset });
+        let (end, beyond, before) = match direction > 0.0 {
             true => ("deep", max - home, home - min),
             false => ("withdrawn", home - min, max - home),
         };
@@ -200,7 +202,7 @@ impl Checks<'_> {
             format!(
                 "{method_key} is {method}, which with sign = {sign} seeks the switch at the {end} end: home \
                  is {home:.3} {unit}, the limits of {min} to {max} {unit} go {beyond:.1} {unit} beyond it; \
-                 is it {other}?"
+                 is it {other_method}?"
             )
         });
     }
@@ -209,10 +211,10 @@ impl Checks<'_> {
         for (name, stopping, allowed) in STOPPING {
             let key = self.key(name);
             let value = self.config.number(&key);
-            let stops = stopping.iter().any(|&option| f64::from(option) == value);
+            let is_stopping = stopping.iter().any(|&option| f64::from(option) == value);
             reader.refuse_if(
                 &["stage.hardware", &key],
-                self.config.stage.hardware && !stops,
+                self.config.stage.hardware && !is_stopping,
                 || format!("{key} is {value}, allowed with stage.hardware = true: {allowed}"),
             );
         }
@@ -229,8 +231,8 @@ impl Checks<'_> {
         }
     }
 
-    /// The bench's own limit is the drive's window plus the travel of two SYNC periods. A drive that waits no
-    /// longer than these notices no later than the bench.
+    /// The bench's own limit is the drive's window plus the travel of two SYNC periods. With a timeout of at
+    /// most two SYNC periods the drive reacts no later than the bench.
     fn following_error_timeout(&self, reader: &mut Reader) {
         let key = self.key("following_error_timeout_ms");
         let timeout_ms = self.axis.following_error_timeout_ms.unwrap_or_default();
@@ -268,8 +270,8 @@ impl Checks<'_> {
     }
 }
 
-/// Why an object is not for raw SDOs: it moves the axis, or the bench writes it by itself; with what
-/// to set instead. `None` where it may be written.
+/// Why a raw SDO may not write an object: it moves the axis, or the bench writes it, from the key named here.
+/// `None` if a raw SDO may write it.
 fn reserved(index: u16) -> Option<&'static str> {
     Some(match index {
         0x1014 | 0x1015 => {
@@ -292,8 +294,7 @@ fn reserved(index: u16) -> Option<&'static str> {
     })
 }
 
-/// Commanded accelerations are under the limits of their axis: a run must not end by a limit that it was
-/// certain to exceed.
+/// The configured accelerations are within the limits of their axis: otherwise a run would be certain to stop.
 fn accelerations(config: &Config, reader: &mut Reader) {
     let along = "stage.insertion.acceleration_max_mm_per_s2";
     for (key, max_key) in [

@@ -1,4 +1,4 @@
-//! Contradictions between keys, each of which is right by itself.
+//! Checks for contradictions between keys, each of which is valid by itself.
 
 use super::axis_checks;
 use super::goal;
@@ -7,6 +7,7 @@ use super::reader::{REGISTRATION, Reader};
 use super::registration::GivenRegistration;
 use super::study::StudyConfig;
 use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
+use super::warnings::section_name;
 use super::{CanInterface, Config};
 use crate::emulator::fault::Fault;
 use crate::keys::{Key, expanded};
@@ -15,26 +16,27 @@ use crate::session::rotation_peak;
 
 pub(super) const ROTATION_ACCELERATION_MAX: &str = "stage.rotation.acceleration_max_deg_per_s2";
 
-/// Notes every contradiction in `config`.
+/// Reports every contradiction in `config`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
-    limits(config, reader);
-    step(config, reader);
+    check_limits(config, reader);
+    check_step(config, reader);
     goal::check(config, reader);
-    rotation(config, reader);
-    torsion("needle", config.needle.torsion, reader);
-    torsion("emulator", config.emulator.torsion, reader);
-    study(config, reader);
-    noise(config, reader);
+    check_rotation(config, reader);
+    check_torsion("needle", config.needle.torsion, reader);
+    check_torsion("emulator", config.emulator.torsion, reader);
+    check_study(config, reader);
+    check_noise(config, reader);
     axis_checks::check(config, reader);
-    bus(config, reader);
-    registration(config, reader);
-    tracker(config, reader);
-    source(config, reader);
-    faults(config, reader);
+    check_bus(config, reader);
+    check_registration(config, reader);
+    check_tracker(config, reader);
+    check_source(config, reader);
+    check_faults(config, reader);
 }
 
-/// Numbers that limit others. Where one is the upper limit of another, the declaration says so.
-fn limits(config: &Config, reader: &mut Reader) {
+/// Numbers that limit other numbers. The declarations say which key is the upper limit of which; the other
+/// limits are here.
+fn check_limits(config: &Config, reader: &mut Reader) {
     let limited = std::mem::take(&mut reader.limited);
     let mut limit = |key: &str, allowed: &str, other: &str, is_wrong: fn(f64, f64) -> bool| {
         let [value, limit] = [key, other].map(|key| config.number(key));
@@ -53,8 +55,8 @@ fn limits(config: &Config, reader: &mut Reader) {
     limit(timeout, "at least twice", period, |timeout, period| timeout < 2.0 * period);
 }
 
-/// A step is taken at a SYNC: at most one a period.
-fn step(config: &Config, reader: &mut Reader) {
+/// At most one step is taken per SYNC period.
+fn check_step(config: &Config, reader: &mut Reader) {
     let keys = ["insertion.step_mm", "insertion.speed_mm_per_s", "can.sync_ms"];
     let [step, speed, sync_ms] = keys.map(|key| config.number(key));
     let per_sync = speed * sync_ms / 1e3;
@@ -67,9 +69,9 @@ fn step(config: &Config, reader: &mut Reader) {
     });
 }
 
-/// The rotation that the law may ask for is within the limits of the axis, and so is its reversal.
-fn rotation(config: &Config, reader: &mut Reader) {
-    let section = config.control.kind.to_string().replace('-', "_");
+/// The axis can follow the fastest rotation that the control law may command, and its reversal.
+fn check_rotation(config: &Config, reader: &mut Reader) {
+    let section = section_name(&config.control.kind.to_string());
     let key = &*format!("control.{section}.rotation_max_deg_per_mm");
     let (per_mm, speed) = (config.number(key), config.insertion.speed_mm_per_s);
     let (speed_key, sync_key) = ("insertion.speed_mm_per_s", "can.sync_ms");
@@ -93,21 +95,21 @@ fn rotation(config: &Config, reader: &mut Reader) {
     });
 }
 
-/// To so many digits, so that what a message advises is allowed.
+/// Rounded down to this many decimals, so that a value that a message suggests is allowed.
 pub(super) fn rounded_down(value: f64, digits: i32) -> f64 {
     let per_one = 10f64.powi(digits);
     (value * per_one).floor() / per_one
 }
 
-fn torsion(section: &str, torsion: TorsionConfig, reader: &mut Reader) {
+fn check_torsion(section: &str, torsion: TorsionConfig, reader: &mut Reader) {
     let keys = TorsionConfig::KEYS.iter().map(|key| format!("{section}.torsion.{}", key.name));
     let keys: Vec<String> = keys.collect();
     let keys: Vec<&str> = keys.iter().map(String::as_str).collect();
     reader.check_result(&keys, needle::torsion(torsion, section));
 }
 
-/// Each range has its lower end first, and no trial may draw an offset outside the band that it draws.
-fn study(config: &Config, reader: &mut Reader) {
+/// Each range has its lower end first, and no trial draws a torsion offset outside its torsion band.
+fn check_study(config: &Config, reader: &mut Reader) {
     for key in StudyConfig::KEYS {
         let Some([low, high]) = config.range(key) else { continue };
         let key = format!("study.{}", key.name);
@@ -136,13 +138,14 @@ fn study(config: &Config, reader: &mut Reader) {
         drawn.unwrap_or_else(|| [config.number(&format!("emulator.torsion.{key}")); 2])
     };
     let (offset, half_width) = (study.torsion_offset_deg, study.torsion_half_width_deg);
-    let is_drawn = offset.is_some() || half_width.is_some();
+    let is_torsion_drawn = offset.is_some() || half_width.is_some();
     let [low, high] = or_emulated(offset, "offset_deg");
     let [half_width, _] = or_emulated(half_width, "half_width_deg");
     let offset = low.abs().max(high.abs());
-    let outside = is_drawn && config.emulator.torsion.creep_mm == 0.0 && offset > half_width;
+    let is_outside =
+        is_torsion_drawn && config.emulator.torsion.creep_mm == 0.0 && offset > half_width;
     let [key, band] = ["study.torsion_offset_deg", "study.torsion_half_width_deg"];
-    reader.refuse_if(&[key, band], outside, || {
+    reader.refuse_if(&[key, band], is_outside, || {
         format!(
             "{key} reaches {offset}, allowed without emulator.torsion.creep_mm: up to the least of \
              {band}, which is {half_width}: the tip would start outside its own band"
@@ -150,16 +153,16 @@ fn study(config: &Config, reader: &mut Reader) {
     });
 }
 
-/// Correlated noise has a size and a time, or there is none. Over a correlation time that is longer
-/// than the run the noise is an offset, which no observer can tell from the tip.
-fn noise(config: &Config, reader: &mut Reader) {
+/// Correlated noise needs both its standard deviation and its correlation time. If the correlation time is
+/// longer than the run, the noise is a constant offset, which no observer can distinguish from the tip.
+fn check_noise(config: &Config, reader: &mut Reader) {
     let time_s = config.tracker.noise.map_or(0.0, |noise| noise.correlation_time.as_secs_f64());
     let run_s = config.insertion.depth_mm / config.insertion.speed_mm_per_s;
-    let told = "tracker.noise.correlation_time_s";
-    let keys = [told, "insertion.depth_mm", "insertion.speed_mm_per_s"];
+    let key = "tracker.noise.correlation_time_s";
+    let keys = [key, "insertion.depth_mm", "insertion.speed_mm_per_s"];
     reader.refuse_if(&keys, time_s > run_s, || {
         format!(
-            "{told} is {time_s}, allowed: up to the {:.3} s of the insertion; noise that lasts longer \
+            "{key} is {time_s}, allowed: up to the {:.3} s of the insertion; noise that lasts longer \
              is an error of the registration, tracker.registration.sd_mm",
             rounded_down(run_s, 3)
         )
@@ -174,7 +177,7 @@ fn noise(config: &Config, reader: &mut Reader) {
     }
 }
 
-fn bus(config: &Config, reader: &mut Reader) {
+fn check_bus(config: &Config, reader: &mut Reader) {
     let nodes = [
         ("can.bench_node", config.can.bus.bench_node),
         ("stage.insertion.node", config.stage.insertion.node),
@@ -211,7 +214,7 @@ fn bus(config: &Config, reader: &mut Reader) {
     });
 }
 
-fn tracker(config: &Config, reader: &mut Reader) {
+fn check_tracker(config: &Config, reader: &mut Reader) {
     let interface = &config.can.interface;
     let source = config.tracker.source;
     let is_emulated = source == TrackerSource::Emulated;
@@ -243,8 +246,7 @@ fn tracker(config: &Config, reader: &mut Reader) {
              be young enough to steer by"
         )
     });
-    // The longest way without a position: its latency, the tracker's period, two SYNCs until the hold begins,
-    // and the braking.
+    // The longest way without a position: latency, tracker period, two SYNCs until the hold begins, braking.
     let (speed, hold_mm) = (config.insertion.speed_mm_per_s, config.tracker.hold.after_mm);
     let braking = config.tracker.hold.braking_mm_per_s2;
     let is_seen_here = config.tip_source() == TrackerSource::Emulated;
@@ -272,8 +274,8 @@ fn tracker(config: &Config, reader: &mut Reader) {
     });
 }
 
-/// Fiducials determine a pose, and stand in place of one.
-fn registration(config: &Config, reader: &mut Reader) {
+/// Fiducials determine a pose, and cannot be given beside one.
+fn check_registration(config: &Config, reader: &mut Reader) {
     let key = "tracker.registration.fiducials";
     if reader.is_given(key) {
         let mut pose = expanded(GivenRegistration::KEYS, &[]).into_iter();
@@ -287,8 +289,8 @@ fn registration(config: &Config, reader: &mut Reader) {
     reader.check_result(&[key, REGISTRATION], config.registration_sd_mm());
 }
 
-/// Keys that only some sources of tip positions take.
-fn source(config: &Config, reader: &mut Reader) {
+/// Keys that only some sources of tip positions allow.
+fn check_source(config: &Config, reader: &mut Reader) {
     let tracker = &config.tracker;
     let source = tracker.source;
     let [key, file, address, request] =
@@ -330,8 +332,8 @@ fn source(config: &Config, reader: &mut Reader) {
     }
 }
 
-/// A kind of fault has keys of its own, and needs some of them.
-fn faults(config: &Config, reader: &mut Reader) {
+/// Each kind of fault allows only some keys, and needs some of them.
+fn check_faults(config: &Config, reader: &mut Reader) {
     for (i, fault) in config.emulator.fault.iter().enumerate() {
         let (at, what) =
             (format!("emulator.fault[{i}]"), format!("a fault of kind \"{}\"", fault.kind));

@@ -1,10 +1,10 @@
-//! The errors of a configuration, one line each, and hints for unknown keys.
+//! The errors of a configuration, one line for each, and hints for unknown keys.
 
 use std::fmt;
 
 use super::value::Origin;
 
-/// How many problems are printed at most.
+/// At most this many problems are printed.
 const SHOWN_MAX: usize = 10;
 
 /// One thing wrong with a configuration: where, which key, which value, what is allowed.
@@ -17,7 +17,7 @@ pub struct Problem {
 }
 
 impl Problem {
-    /// `message` begins with the key it is about.
+    /// A problem at `origin`; `message` begins with its key.
     pub(super) fn at(origin: Option<Origin>, message: impl fmt::Display) -> Self {
         let place = origin.as_ref().map(Origin::to_string).unwrap_or_default();
         Problem { message: format!("{place}{message}"), origin }
@@ -38,12 +38,12 @@ impl From<Vec<Problem>> for ConfigError {
 }
 
 impl ConfigError {
-    /// The problems, if there are any.
+    /// Fails with the `problems`, if there are any.
     pub(super) fn unless_empty(problems: Vec<Problem>) -> Result<(), Self> {
         if problems.is_empty() { Ok(()) } else { Err(ConfigError { problems }) }
     }
 
-    /// One problem that has no place in a file.
+    /// One problem without a place in a file.
     pub(super) fn of(message: impl fmt::Display) -> Self {
         ConfigError { problems: vec![Problem::at(None, message)] }
     }
@@ -62,17 +62,17 @@ impl fmt::Display for ConfigError {
     }
 }
 
-/// Similarity under which a known key is no suggestion.
-const LEAST: f64 = 0.55;
+/// A known key is suggested from this similarity on.
+const SIMILARITY_MIN: f64 = 0.55;
 
-/// Characters of a list of keys.
+/// Length of a list of keys, characters.
 const LISTED_MAX: usize = 110;
 
 /// A hint for the unknown `key`: the nearest of the known `keys`, or those of its section.
 pub fn nearest_key<'a>(key: &str, keys: impl Iterator<Item = &'a str> + Clone) -> String {
     let rated = keys.clone().map(|known| (similarity(key, known), known));
     if let Some((similarity, known)) = rated.max_by(|a, b| a.0.total_cmp(&b.0))
-        && similarity >= LEAST
+        && similarity >= SIMILARITY_MIN
     {
         return format!("did you mean \"{known}\"?");
     }
@@ -80,13 +80,13 @@ pub fn nearest_key<'a>(key: &str, keys: impl Iterator<Item = &'a str> + Clone) -
     let siblings: Vec<&str> =
         keys.map(split).filter(|(of, _)| *of == section).map(|(_, name)| name).collect();
     match (siblings.is_empty(), section) {
-        (true, _) => "nothing known is like it".to_owned(),
+        (true, _) => "no known key is like it".to_owned(),
         (false, "") => format!("known are {}", listed(&siblings)),
         (false, section) => format!("known in [{section}] are {}", listed(&siblings)),
     }
 }
 
-/// As many of `names` as a line has room for.
+/// As many of `names` as a line has room for, and the number of the others.
 fn listed(names: &[&str]) -> String {
     let mut length = 0;
     let fitting = names.iter().take_while(|name| {
@@ -100,7 +100,8 @@ fn listed(names: &[&str]) -> String {
     }
 }
 
-/// Mostly of the last parts, so that a key in the wrong section is found too.
+/// Similarity of two dotted keys, from 0 to 1. The last part counts most, so that a key in the wrong section is
+/// found too.
 fn similarity(key: &str, known: &str) -> f64 {
     let ((section, name), (known_section, known_name)) = (split(key), split(known));
     0.8 * strsim::normalized_damerau_levenshtein(name, known_name)

@@ -1,6 +1,6 @@
-//! `[observer]`: which observer steers, which run alongside, and their settings. An observer needs a
-//! kind, a section and what it is told. The section has the name of the kind, with `_` for `-`; its keys
-//! are declared beside the observer.
+//! `[observer]`: which observer steers, which run alongside, and their settings. To add an observer, add its
+//! kind, its section, and its settings in [`Config::observers`]. The section has the name of the kind, with `_`
+//! for `-`; its keys are declared beside the observer.
 
 use super::Config;
 use crate::geometry::FixedAngles;
@@ -32,7 +32,7 @@ section! {
 }
 
 choice! {
-    /// An observer.
+    /// The kind of an observer.
     pub enum ObserverKind {
         /// The paper's coupled observer.
         Coupled = "coupled",
@@ -55,7 +55,7 @@ impl ObserverSection {
         kinds
     }
 
-    /// The settings of the invariant observer, with a perfect registration.
+    /// The settings of the invariant observer, without the error of the registration.
     pub fn to_invariant(&self) -> InvariantConfig {
         InvariantConfig { start: self.start, ..self.invariant }
     }
@@ -66,7 +66,7 @@ impl Config {
     pub fn observers(&self) -> impl Iterator<Item = observer::ObserverConfig> + '_ {
         self.observer.kinds().into_iter().map(|kind| match kind {
             ObserverKind::Invariant => observer::ObserverConfig::Invariant(InvariantConfig {
-                // Recordings are evaluated without a registration.
+                // Fails without a registration, as in an evaluation of recordings.
                 registration_sd_mm: self.registration_sd_mm().unwrap_or_default(),
                 ..self.observer.to_invariant()
             }),

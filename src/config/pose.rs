@@ -1,4 +1,4 @@
-//! Poses as they are written: mm and degrees.
+//! Poses in the configuration: mm and degrees.
 
 use crate::geometry::{FixedAngles, Pose};
 use crate::keys::{Rule, section, within};

@@ -1,8 +1,8 @@
 //! A rehearsal: the emulator's settings when the configuration is that of a real rig.
 //!
-//! The drives get the make, the objects, the switches and the start that the file implies, the needle is
-//! the one that the bench believes in, and the tracker has the noise that the gates expect. Everything
-//! under `[emulator]` that is given still counts.
+//! The drives get the make, the objects, the switches and the start position that the rig's configuration
+//! implies. The needle is the bench's own model of it, and the tracker has the noise that the gates expect.
+//! Keys under `[emulator]` that are given override all this.
 
 use super::{Config, TrackerPreset};
 use crate::emulator::drive::Switches;
@@ -11,14 +11,14 @@ use crate::stage::AxisConfig;
 use crate::tracker::TrackerKind;
 use std::fmt::Write as _;
 
-/// maxon, whose drives are EPOS4s here.
+/// maxon motor; a drive of this vendor is emulated as an EPOS4.
 const MAXON_VENDOR_ID: u32 = 0xFB;
-/// The start is off the plane by this part of depth² · curvature, which half of the depth can mend.
+/// The start is off the plane by this part of depth² · curvature; half of the depth suffices to correct that.
 const START_PART: f64 = 1.0 / 16.0;
-/// And never further than this, mm.
+/// The start is at most this far off the plane, mm.
 const START_MAX_MM: f64 = 5.0;
 
-/// The keys of `[emulator]` that follow from the rest of `config`, as TOML.
+/// The keys of `[emulator]` that a rehearsal derives from the rest of `config`, as TOML.
 pub(super) fn layer(config: &Config) -> String {
     let (needle, tracker) = (&config.needle, &config.tracker);
     let curvature = needle.arc.curvature_per_mm();
@@ -31,7 +31,7 @@ pub(super) fn layer(config: &Config) -> String {
     let is_epos4 =
         config.stage.insertion.vendor_id == maxon || config.stage.rotation.vendor_id == maxon;
     let drives = if is_epos4 { "epos4" } else { "generic" };
-    // With the same keys in both sections.
+    // Both sections have the same keys.
     let torsion = config.value_at("needle.torsion").map(ToString::to_string).unwrap_or_default();
     let mut keys = format!(
         "[emulator]\n\
@@ -67,11 +67,11 @@ fn pose([x, y, z, yaw, pitch, roll]: [f64; 6]) -> String {
     )
 }
 
-/// The switches of an axis that has `counts_per_unit` of mm or rad: those `given`, and if its homing seeks
-/// another one, that one at the place where homing changes no position.
+/// The switches of an axis with `counts_per_unit` counts per mm or rad: those `given`, and the switch that its
+/// homing seeks, placed so that homing changes no position.
 pub(super) fn switches(given: Switches, axis: &AxisConfig, counts_per_unit: f64) -> Switches {
     let Some(homing) = axis.homing else { return given };
-    // From home the drive's zero is by the offset, and it is 0 now.
+    // The drive's zero is at home plus the offset; the drive reads 0 now.
     let home = -(homing.offset.unwrap_or(0.0) * counts_per_unit).round() as i64;
     let mut switches = given;
     match homing.method {

@@ -12,7 +12,7 @@ section! {
         /// and limits have no defaults. False is for "memory", "udp" and interfaces named vcan... or
         /// vxcan... alone.
         hardware: bool = false;
-        /// How power is switched on and off.
+        /// Timeouts of power on and stop.
         power: PowerConfig, flat;
         /// The axis that pushes the needle.
         insertion: AxisConfig;
@@ -33,14 +33,14 @@ impl StageSection {
     /// The settings of the stage's master, in mm, rad and counts.
     ///
     /// # Errors
-    /// What the stage cannot work with, such as a following-error window of less than a count.
+    /// The stage refuses the settings, for example a following-error window of less than a count.
     pub fn to_stage(&self, can: &CanConfig) -> Result<stage::StageConfig, ConfigError> {
         let config = self.to_unchecked_stage(can);
         config.validate().map_err(ConfigError::of)?;
         Ok(config)
     }
 
-    /// The same, with whatever the stage cannot work with: a stop is sent all the same.
+    /// Those settings unchecked, for a stop, which must be sent even if a run would be refused.
     pub(super) fn to_unchecked_stage(&self, can: &CanConfig) -> stage::StageConfig {
         stage::StageConfig {
             bus: can.bus,

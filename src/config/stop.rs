@@ -11,7 +11,7 @@ use crate::stage;
 const INTERFACE: &str = "can.interface";
 const NODES: [&str; 2] = ["stage.insertion.node", "stage.rotation.node"];
 const NEEDED: [&str; 3] = [INTERFACE, NODES[0], NODES[1]];
-/// Other keys that a stop uses if they are valid.
+/// Other keys that a stop uses, if they are valid.
 const USED: [&str; 5] = [
     "can.sdo_timeout_ms",
     "can.sdo_attempts",
@@ -19,8 +19,8 @@ const USED: [&str; 5] = [
     "stage.insertion.counts_per_mm",
     "stage.rotation.counts_per_turn",
 ];
-/// Coarse scales for axes whose scale is not known: a fine axis is then watched a little longer, and a coarse
-/// axis that still moves does not count as standing.
+/// Coarse scales for axes whose scale is unknown. With them an axis that still moves never counts as standing;
+/// a fine axis is only watched a little longer than necessary.
 const COARSE: [(&str, &str); 2] = [
     (USED[3], "stage.insertion.counts_per_mm={ counts = 100, mm = 1 }"),
     (USED[4], "stage.rotation.counts_per_turn={ counts = 500, turns = 1 }"),
@@ -29,21 +29,21 @@ const COARSE: [(&str, &str); 2] = [
 /// Where a stop is sent, and how long the drives are given.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StopConfig {
-    /// The bus; never `memory`.
+    /// The bus, which is never `memory`.
     pub interface: CanInterface,
-    /// The drives. Nodes, scales, SDO timeout and attempts and the stop timeout are as configured; the
-    /// rest has its default.
+    /// The drives. Nodes, scales, SDO timeout, SDO attempts and stop timeout are as configured; everything else
+    /// has its default.
     pub stage: stage::StageConfig,
 }
 
 impl StopConfig {
-    /// Reads what a stop needs from `source`, where there is one, with `sets` (`key=value`) laid over
-    /// it. A time that is wrong or missing has its default, and a scale is taken for a coarse one. On a
-    /// virtual bus the nodes have defaults as well; on any other they must be given.
+    /// Reads what a stop needs from `source`, if there is one, overridden by `sets` (`key=value`). A wrong or
+    /// missing time gets its default, a wrong or missing scale a coarse one. On a virtual bus the nodes have
+    /// defaults as well; on any other bus they must be given.
     ///
     /// # Errors
-    /// What is wrong with the interface or the nodes. A source that is not TOML counts as empty, and
-    /// its problems are reported if interface or nodes are missing.
+    /// The interface or a node is wrong or missing. Of a source that is not TOML the lines that can be read
+    /// count; its syntax errors are reported only together with such an error.
     pub fn from_source(source: Option<Source<'_>>, sets: &[String]) -> Result<Self, ConfigError> {
         let mut layers = Vec::new();
         let mut problems = Vec::new();
@@ -59,7 +59,7 @@ impl StopConfig {
         for (set, layer) in sets.iter().zip(2..) {
             match value::parse_set(set, layer) {
                 Ok(entries) => layers.push(entries),
-                // It would have named the interface or a node.
+                // It was meant to set the interface or a node.
                 Err(problems) if names_what_a_stop_needs(set) => return Err(problems.into()),
                 Err(_) => {}
             }
@@ -103,21 +103,21 @@ impl StopConfig {
         let rest = Config::of(Reader::new(tree).read(Config::KEYS));
         let mut stage = rest.stage.to_unchecked_stage(&rest.can);
         (stage.insertion.node, stage.rotation.node) = (insertion, rotation);
-        // A coarse axis is seen to stand all the same.
+        // The coarser the scale, the longer it takes to see that an axis stands.
         let windows = stage::Axis::BOTH.map(|axis| 2 * stage.standstill_window(axis));
         stage.power.stop_timeout = stage.power.stop_timeout.max(windows[0]).max(windows[1]);
         Ok(StopConfig { interface, stage })
     }
 }
 
-/// Returns true if `key=value` sets a key that a stop needs, or a table that holds one.
+/// True if `key=value` sets a key that a stop needs, or a table around one.
 fn names_what_a_stop_needs(set: &str) -> bool {
     let key = set.split('=').next().unwrap_or(set).trim();
     NEEDED.iter().any(|needed| *needed == key || is_inside(needed, key))
 }
 
-/// The lines of `text` that are TOML by themselves, if the text as a whole is not: a file that is being edited
-/// still has its bus and nodes. Keys below a broken header belong to no table that is used.
+/// The lines of `text` that are TOML by themselves, for a text that as a whole is not, such as a file that is
+/// being edited: bus and nodes can still be read. Keys below a broken header go to a table that is not used.
 fn salvaged(text: &str) -> String {
     let lines = text.split(['\n', '\r']).map(|line| match value::parse_file("", line, 1) {
         Ok(_) => line,
