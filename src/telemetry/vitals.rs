@@ -7,13 +7,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 /// A thread that is silent for this long is reported to the operator.
-const TELL_AFTER: Duration = Duration::from_millis(700);
+const WARN_AFTER: Duration = Duration::from_millis(700);
 /// A thread that is silent for this long is given up.
 pub(super) const SILENCE_LIMIT: Duration = Duration::from_secs(5);
 /// Minimum interval between two warnings of dropped records.
-const DROPS_EVERY: Duration = Duration::from_secs(1);
+const DROP_WARNING_INTERVAL: Duration = Duration::from_secs(1);
 
-/// The state of a recording thread, shared without a lock.
+/// Whether a recording thread works, shared without a lock.
 #[derive(Debug, Default)]
 pub(super) struct Vitals {
     beats: AtomicU64,
@@ -26,12 +26,12 @@ impl Vitals {
         self.beats.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Rounds so far.
+    /// The number of rounds so far.
     pub(super) fn beats(&self) -> u64 {
         self.beats.load(Ordering::Relaxed)
     }
 
-    /// The thread has failed; the first reason is kept.
+    /// Notes that the thread has failed. Only the first reason is kept.
     pub(super) fn fail(&self, reason: String) {
         let _ = self.fault.set(reason);
     }
@@ -42,26 +42,26 @@ impl Vitals {
     }
 }
 
-/// At most this much of the time between two looks counts: a busy machine or a debugger may have
-/// suspended the watcher itself.
+/// At most this much of the time between two looks counts as silence, since the watcher itself may have been
+/// descheduled or stopped by a debugger.
 const LOOK_MAX: Duration = Duration::from_millis(50);
 
-/// How long a thread, which counts its signs of life, has shown none.
+/// How long a thread has shown no sign of life.
 #[derive(Debug)]
 pub(super) struct Silence {
     beats: u64,
     looked: Instant,
-    /// The time without a sign of life, by the last look.
+    /// The time without a sign of life up to the last look.
     pub(super) lasted: Duration,
 }
 
 impl Silence {
-    /// For a thread that has shown `beats` signs of life by `now`.
+    /// Starts at `now` for a thread that has shown `beats` signs of life.
     pub(super) fn new(beats: u64, now: Instant) -> Self {
         Silence { beats, looked: now, lasted: Duration::ZERO }
     }
 
-    /// A look at `now` at a thread that has shown `beats` signs of life.
+    /// Looks at the thread at `now`, when it has shown `beats` signs of life.
     pub(super) fn look(&mut self, beats: u64, now: Instant) {
         let since = now.saturating_duration_since(mem::replace(&mut self.looked, now));
         match mem::replace(&mut self.beats, beats) == beats {
@@ -80,7 +80,7 @@ pub enum RecordNews {
     Failed(TelemetryError),
 }
 
-/// How a thread is, better first.
+/// The health of a thread, from good to bad.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
 enum Health {
     Alive,
@@ -96,22 +96,22 @@ pub(super) struct Watch {
     /// The items that it takes.
     items: &'static str,
     silence: Silence,
-    /// The health that was reported.
+    /// The last health that was reported.
     health: Health,
-    /// Lost items that were reported, and when.
-    dropped: u64,
-    drops_told: Option<Instant>,
+    /// The number of lost items in the last report, and its time.
+    reported_drops: u64,
+    drops_reported: Option<Instant>,
 }
 
 impl Watch {
     /// Watches `writer`, which takes `items`, from `now` on.
     pub(super) fn new(writer: &'static str, items: &'static str, now: Instant) -> Self {
         let (silence, health) = (Silence::new(0, now), Health::Alive);
-        Watch { writer, items, silence, health, dropped: 0, drops_told: None }
+        Watch { writer, items, silence, health, reported_drops: 0, drops_reported: None }
     }
 
-    /// The next change by `now`, with `dropped` items lost to its queue so far. Call it until it returns
-    /// `None`.
+    /// The next change at `now`, if `dropped` items were lost so far because the queue was full. Call this
+    /// until it returns `None`.
     pub(super) fn look(
         &mut self,
         vitals: &Vitals,
@@ -128,7 +128,7 @@ impl Watch {
         let health = match vitals.fault() {
             Some(_) => Health::Failed,
             None if lasted > SILENCE_LIMIT => Health::GivenUp,
-            None if lasted > TELL_AFTER => Health::Silent,
+            None if lasted > WARN_AFTER => Health::Silent,
             None => Health::Alive,
         };
         if mem::replace(&mut self.health, health) == health {
@@ -149,19 +149,20 @@ impl Watch {
     }
 
     fn drop_news(&mut self, dropped: u64, now: Instant) -> Option<RecordNews> {
-        let waits = |told: Instant| now.saturating_duration_since(told) < DROPS_EVERY;
-        if dropped == self.dropped || self.drops_told.is_some_and(waits) {
+        let is_recent =
+            |reported: Instant| now.saturating_duration_since(reported) < DROP_WARNING_INTERVAL;
+        if dropped == self.reported_drops || self.drops_reported.is_some_and(is_recent) {
             return None;
         }
-        let more = dropped - mem::replace(&mut self.dropped, dropped);
-        let is_first = self.drops_told.replace(now).is_none();
+        let more = dropped - mem::replace(&mut self.reported_drops, dropped);
+        let is_first = self.drops_reported.replace(now).is_none();
         let (writer, items) = (self.writer, self.items);
         if is_first && self.health < Health::GivenUp {
             return Some(RecordNews::Failed(TelemetryError::Recording(format!(
                 "{writer}: {dropped} {items} lost, its queue is full; is the disk too slow for this run?"
             ))));
         }
-        let text = format!("{writer}: {more} {items} more are lost, {dropped} in all");
+        let text = format!("{writer}: {items} lost: {more} more, {dropped} in all");
         Some(RecordNews::Warning(text))
     }
 }
@@ -259,7 +260,7 @@ mod tests {
             watched.vitals.beat();
             heard.extend(watched.hear(100, 4).into_iter().map(|(_, text)| text));
         }
-        assert_eq!(heard, ["text files: 1 records more are lost, 4 in all"]);
+        assert_eq!(heard, ["text files: records lost: 1 more, 4 in all"]);
     }
 
     #[test]
@@ -276,7 +277,7 @@ mod tests {
             [
                 "failed: text files: 1 records lost, its queue is full; is the disk too slow for this \
                  run?",
-                "text files: 10 records more are lost, 11 in all",
+                "text files: records lost: 10 more, 11 in all",
             ]
         );
     }
