@@ -34,15 +34,15 @@ pub mod file {
     pub const CONFIG: &str = "config.toml";
     /// The settings of the run, and how it ended.
     pub const MANIFEST: &str = "manifest.json";
-    /// Room for the next manifest, reserved while the run goes on, so that it can be written on a full disk.
+    /// Space reserved during the run for the final manifest, so that it can be written even on a full disk.
     pub const NEW_MANIFEST: &str = "manifest.json.new";
-    /// One row a step.
+    /// One row for each step.
     pub const STEPS: &str = "steps.csv";
     /// Every CAN frame.
     pub const CAN: &str = "can.log";
     /// Every tracker sample.
     pub const TRACKER: &str = "tracker.ndjson";
-    /// The order and the times in which the session was given its inputs.
+    /// The session's inputs, in order and with their times.
     pub const INPUTS: &str = "inputs.log";
     /// States and events, for people.
     pub const EVENTS: &str = "events.log";
@@ -50,6 +50,6 @@ pub mod file {
     pub const RECORDING: &str = "run.rrd";
     /// The page that a review makes. It is not part of the record.
     pub const REPORT: &str = "report.html";
-    /// The text files that are written while the run goes on, in the order in which they are written.
-    pub const LINES: [&str; 5] = [CAN, TRACKER, INPUTS, STEPS, EVENTS];
+    /// The text files that are filled during the run, in the order in which they are written.
+    pub const TEXT_FILES: [&str; 5] = [CAN, TRACKER, INPUTS, STEPS, EVENTS];
 }

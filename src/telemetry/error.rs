@@ -12,15 +12,15 @@ pub enum TelemetryError {
     /// A file or folder cannot be read or written.
     #[error("{path}: {source}", path = path.display())]
     File {
-        /// Which.
+        /// The file or folder.
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
     },
-    /// A run cannot be recorded or shown, or no longer.
+    /// A run cannot be recorded or shown, or recording it failed.
     #[error("{0}")]
     Recording(String),
-    /// Nothing that looks like a run.
+    /// The path is not a run folder.
     #[error("{path}: not a run folder: {reason}", path = path.display())]
     NotARun {
         /// The path that was named.
@@ -28,12 +28,12 @@ pub enum TelemetryError {
         /// The reason.
         reason: String,
     },
-    /// A record that cannot be used as asked: edited, closed already, or still being written.
+    /// The record cannot be used for this: it was edited, is closed already, or is still being written.
     #[error("{path}: {reason}", path = path.display())]
     Record {
         /// The run folder, or its manifest.
         path: PathBuf,
-        /// Why not.
+        /// The reason.
         reason: String,
     },
 }
@@ -54,12 +54,12 @@ impl TelemetryError {
         }
     }
 
-    /// The record at `path` cannot be used as asked.
+    /// The record at `path` cannot be used, for this `reason`.
     pub(super) fn record(path: &Path, reason: impl Display) -> Self {
         TelemetryError::Record { path: path.to_path_buf(), reason: reason.to_string() }
     }
 
-    /// `writer` failed during the run: what came after is not on disk.
+    /// `writer` failed during the run: later records are not on disk.
     pub(super) fn writer_failed(writer: &str, reason: impl Display) -> Self {
         TelemetryError::Recording(format!("{writer}: {reason}; what follows is not recorded"))
     }

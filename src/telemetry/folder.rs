@@ -1,4 +1,4 @@
-//! The run folder: `<UTC>-<name>`, never one that exists; its lock, its manifest, and room on its disk.
+//! Run folders, named `<UTC>-<name>`: creating a new one, its lock, its manifest, and the space on its disk.
 
 use super::TelemetryError;
 use crate::archive::{Manifest, compact, file};
@@ -15,12 +15,13 @@ use std::path::{Path, PathBuf};
 /// Runs of one name in one second are distinguished by a number, up to this.
 const COLLISIONS_MAX: u32 = 1000;
 
-/// Makes a new folder for the run `name`, as a configuration may name it, in `parent`, which is made too.
+/// Creates a new folder for the run `name` in `parent`, and `parent` itself if it does not exist. `name` must
+/// be valid as a key of the configuration.
 ///
-/// `create_dir` fails on a folder that exists, so two processes cannot be given the same one.
+/// `create_dir` fails on an existing folder, so two processes never get the same one.
 ///
 /// # Errors
-/// It cannot be made.
+/// The folder cannot be created.
 pub(super) fn create(
     parent: &Path,
     started_unix_us: i64,
@@ -41,12 +42,12 @@ pub(super) fn create(
     Err(TelemetryError::folder(&path)(AlreadyExists.into()))
 }
 
-/// Room reserved for the last manifest, which must be written even if the disk is full. It has figures
-/// and faults that the one before does not have.
+/// Space reserved for the final manifest, which must be written even if the disk is full, in addition to the
+/// size of the current one. The final manifest has more figures and faults.
 const RESERVE_BYTES: usize = 16 << 10;
 
-/// Writes the manifest of the run folder `dir`, whole or not at all: a reader, or a run killed in
-/// the middle of it, sees the old one or the new one.
+/// Writes the manifest of the run folder `dir` atomically: a reader sees the old one or the new one, also if
+/// the bench is killed meanwhile.
 ///
 /// # Errors
 /// [`TelemetryError::File`].
@@ -54,14 +55,14 @@ pub fn write_manifest(dir: &Path, manifest: &Manifest) -> Result<(), TelemetryEr
     let path = dir.join(file::MANIFEST);
     let write = || -> io::Result<()> {
         let text = manifest.to_text()?;
-        // It is written into the reserved room.
+        // Writes into the reserved space.
         let new = dir.join(file::NEW_MANIFEST);
         let mut file = OpenOptions::new().write(true).create(true).truncate(false).open(&new)?;
         file.write_all(text.as_bytes())?;
         file.set_len(text.len() as u64)?;
         file.sync_all()?;
         fs::rename(&new, &path)?;
-        // The rename is on the disk after the folder is synced, which some file systems do not support.
+        // The rename reaches the disk when the folder is synced, which some file systems do not support.
         match File::open(dir)?.sync_all() {
             Err(error) if matches!(error.kind(), InvalidInput | Unsupported) => Ok(()),
             synced => synced,
@@ -70,7 +71,7 @@ pub fn write_manifest(dir: &Path, manifest: &Manifest) -> Result<(), TelemetryEr
     write().map_err(TelemetryError::file(&path))
 }
 
-/// Reserves the room that the next manifest of `dir` needs.
+/// Reserves the space that the final manifest of `dir` needs.
 ///
 /// # Errors
 /// [`TelemetryError::File`].
@@ -86,8 +87,8 @@ pub(super) fn reserve_manifest(dir: &Path) -> Result<(), TelemetryError> {
 /// Checks that the open `file` is still at `path`.
 ///
 /// # Errors
-/// The system's, or that another file has taken its place.
-pub(super) fn is_at(file: &File, path: &Path) -> io::Result<()> {
+/// The system's error, or that another file has taken its place.
+pub(super) fn check_is_at(file: &File, path: &Path) -> io::Result<()> {
     let (open, found) = (file.metadata()?, fs::symlink_metadata(path)?);
     if (open.dev(), open.ino()) == (found.dev(), found.ino()) {
         return Ok(());
@@ -125,14 +126,14 @@ pub fn is_being_written(dir: &Path) -> bool {
     looked.is_ok() && i32::from(found.l_type) != F_UNLCK
 }
 
-/// With less than this, some seconds of a run, a disk counts as full.
+/// A disk with less free space than this counts as full: it is enough for some seconds of a run.
 const FULL_KB: u64 = 256;
 
-/// Makes the folder `dir` if there is none, and checks that its file system has `free_mb_min` MB
+/// Creates the folder `dir` if it does not exist, and checks that its file system has `free_mb_min` MB
 /// (10⁶ bytes) free for this user. A run of 250 mm takes about 10 MB.
 ///
 /// # Errors
-/// Too little room, or the check fails.
+/// Too little space, or the check fails.
 pub fn check_room(dir: &Path, free_mb_min: u32) -> Result<(), TelemetryError> {
     let free = fs::create_dir_all(dir).and_then(|()| free_mb(dir));
     match free.map_err(TelemetryError::folder(dir))? {
@@ -147,7 +148,7 @@ pub fn check_room(dir: &Path, free_mb_min: u32) -> Result<(), TelemetryError> {
     }
 }
 
-/// Checks that there is room for what a run writes until the next check.
+/// Checks that there is space for what a run writes until the next check.
 ///
 /// # Errors
 /// The disk is full, or the check fails.
@@ -161,18 +162,18 @@ pub(super) fn check_not_full(dir: &Path) -> Result<(), TelemetryError> {
     }
 }
 
-/// Free space for this user where `dir` is or will be, MB (10⁶ bytes); `None` if the file system does not
-/// count it.
+/// Free space for this user on the file system of `dir`, which need not exist yet, MB (10⁶ bytes). `None` if the
+/// file system does not report it.
 ///
 /// # Errors
-/// The system's.
+/// The system's error.
 pub fn free_mb(dir: &Path) -> io::Result<Option<u64>> {
     let there = dir.ancestors().find(|dir| dir.is_dir()).unwrap_or(Path::new("."));
     Ok(free_bytes(there)?.map(|bytes| bytes / 1_000_000))
 }
 
-/// Free bytes for this user on the file system of `path`; `None` if it does not count its blocks, as some
-/// network file systems.
+/// Free bytes for this user on the file system of `path`; `None` if it does not report them, like some network
+/// file systems.
 fn free_bytes(path: &Path) -> io::Result<Option<u64>> {
     let found = statvfs(path)?;
     let free = found.blocks_available().saturating_mul(found.fragment_size());

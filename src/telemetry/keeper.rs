@@ -1,12 +1,12 @@
 //! The keeper of a run folder: it writes the manifest, syncs the text files to the disk, and checks that
 //! the folder is still there and its disk is not full.
 //!
-//! Lines that a writer handed over survive the end of the bench, but wait in the system's memory for the
-//! disk: a stalled disk is detected only by a sync. The keeper syncs four times a second, on a thread of
-//! its own, which may block.
+//! Written lines survive the end of the bench, but stay in the operating system's memory until they are on the
+//! disk. So only a sync detects a stalled disk. The keeper syncs four times a second, on a thread of its own,
+//! which may block.
 
 use super::TelemetryError;
-use super::folder::{self, check_not_full, is_at};
+use super::folder::{self, check_is_at, check_not_full};
 use super::worker::{Backpressure, Sink, Worker};
 use crate::archive::{Manifest, file};
 use rtrb::{Consumer, Producer, RingBuffer};
@@ -17,98 +17,99 @@ use std::time::Duration;
 
 /// The keeper's name in messages.
 pub(super) const KEEPER: &str = "run folder";
-/// Manifests that wait to be written: one for each drive that is found.
+/// Manifests that wait to be written; there is one for each drive that is found.
 const QUEUE_MANIFESTS: usize = 8;
-const QUEUE_TROUBLES: usize = 64;
+const QUEUE_PROBLEMS: usize = 64;
 
-/// An open file or folder, and its path.
-pub(super) type Kept = (PathBuf, File);
+/// A path, and the file or folder that was opened there.
+pub(super) type OpenPath = (PathBuf, File);
 
-/// Keeps the run folder `dir` and `files` in it, the text files first, on a thread of its own, which writes
-/// each manifest that it is given. Troubles with the folder are reported to the receiver, each once.
+/// Starts the thread that checks the run folder `dir` and `files` in it, the text files first, and that writes
+/// each manifest that it is given. The consumer gets each problem with the folder once.
 ///
 /// # Errors
 /// The folder cannot be opened, or no thread can be started.
 pub(super) fn keep(
     dir: PathBuf,
-    files: Vec<Kept>,
+    files: Vec<OpenPath>,
 ) -> Result<(Worker<Box<Manifest>>, Consumer<String>), TelemetryError> {
-    let (told, troubles) = RingBuffer::new(QUEUE_TROUBLES);
-    let folder = Folder::open(dir, files, told)?;
+    let (reports, problems) = RingBuffer::new(QUEUE_PROBLEMS);
+    let folder = Folder::open(dir, files, reports)?;
     let worker = Worker::start(KEEPER, QUEUE_MANIFESTS, Backpressure::DropAndCount, || Ok(folder))?;
-    Ok((worker, troubles))
+    Ok((worker, problems))
 }
 
 /// A run folder and the files in it that are checked.
 struct Folder {
-    dir: Kept,
-    files: Vec<Kept>,
+    dir: OpenPath,
+    files: Vec<OpenPath>,
     /// The number of checks so far.
     checks: usize,
-    /// Troubles so far.
+    /// The problems so far.
     known: BTreeSet<String>,
-    told: Producer<String>,
+    reports: Producer<String>,
 }
 
 impl Folder {
     fn open(
         dir: PathBuf,
-        files: Vec<Kept>,
-        told: Producer<String>,
+        files: Vec<OpenPath>,
+        reports: Producer<String>,
     ) -> Result<Self, TelemetryError> {
         let opened = File::open(&dir).map_err(TelemetryError::file(&dir))?;
-        Ok(Folder { dir: (dir, opened), files, checks: 0, known: BTreeSet::new(), told })
+        Ok(Folder { dir: (dir, opened), files, checks: 0, known: BTreeSet::new(), reports })
     }
 
-    /// Syncs one of the text files, the next at each check, and checks the folder, its files and the
-    /// free space. Returns the troubles.
-    fn look_after(&mut self) -> Vec<TelemetryError> {
-        let turn = self.files.iter().cycle().nth(self.checks % file::LINES.len());
+    /// Syncs one of the text files in turn, and checks the folder, its files and the free space. Returns the
+    /// problems.
+    fn sync_and_check(&mut self) -> Vec<TelemetryError> {
+        let turn = self.files.iter().cycle().nth(self.checks % file::TEXT_FILES.len());
         self.checks += 1;
         let synced = turn.map(|(path, file)| file.sync_data().map_err(TelemetryError::file(path)));
-        let checked = match is_in_place(&self.dir) {
-            // Without the folder, its files are not checked.
+        let checked = match check_in_place(&self.dir) {
+            // Without the folder its files are not checked.
             Err(gone) => vec![Err(gone)],
             Ok(()) => {
-                let in_place = self.files.iter().map(is_in_place);
+                let in_place = self.files.iter().map(check_in_place);
                 in_place.chain([check_not_full(&self.dir.0)]).collect()
             }
         };
         synced.into_iter().chain(checked).filter_map(Result::err).collect()
     }
 
-    /// Reports the troubles that are new.
-    fn tell(&mut self, troubles: impl IntoIterator<Item = TelemetryError>) {
-        for trouble in troubles.into_iter().map(|trouble| format!("{KEEPER}: {trouble}")) {
-            if self.known.insert(trouble.clone()) {
-                let _ = self.told.push(trouble);
+    /// Reports new problems.
+    fn report(&mut self, problems: impl IntoIterator<Item = TelemetryError>) {
+        for problem in problems.into_iter().map(|problem| format!("{KEEPER}: {problem}")) {
+            if self.known.insert(problem.clone()) {
+                let _ = self.reports.push(problem);
             }
         }
     }
 
     /// Writes `manifest`, and reserves room for the next one.
     fn write_manifest(&self, manifest: &Manifest) -> Result<(), TelemetryError> {
-        is_in_place(&self.dir)?;
+        check_in_place(&self.dir)?;
         folder::write_manifest(&self.dir.0, manifest)?;
         folder::reserve_manifest(&self.dir.0)
     }
 
-    /// Writes the last manifest, but never into another folder that has taken this one's place. It has
-    /// all troubles so far, and those of a last check.
+    /// Writes the final manifest, with all problems so far and those of a last check. Writes nothing if another
+    /// folder has taken this one's place.
     fn write_last(&mut self, mut manifest: Manifest) -> Result<(), TelemetryError> {
-        is_in_place(&self.dir)?;
-        let lost: Vec<_> = self.files.iter().filter_map(|kept| is_in_place(kept).err()).collect();
-        self.tell(lost);
-        let added = self.known.iter().filter(|trouble| !manifest.faults.contains(trouble));
+        check_in_place(&self.dir)?;
+        let lost: Vec<_> =
+            self.files.iter().filter_map(|file| check_in_place(file).err()).collect();
+        self.report(lost);
+        let added = self.known.iter().filter(|problem| !manifest.faults.contains(problem));
         let added: Vec<String> = added.cloned().collect();
         manifest.faults.extend(added);
         folder::write_manifest(&self.dir.0, &manifest)
     }
 }
 
-/// Writing to a file or folder that was removed or renamed does not fail.
-fn is_in_place((path, file): &Kept) -> Result<(), TelemetryError> {
-    is_at(file, path).map_err(TelemetryError::file(path))
+/// Checks that the open file is still at its path: writing to a removed or renamed file does not fail.
+fn check_in_place((path, file): &OpenPath) -> Result<(), TelemetryError> {
+    check_is_at(file, path).map_err(TelemetryError::file(path))
 }
 
 impl Sink for Folder {
@@ -118,14 +119,14 @@ impl Sink for Folder {
     const TICK: Duration = Duration::from_millis(250);
 
     fn take(&mut self, manifest: Box<Manifest>) -> Result<(), String> {
-        let trouble = self.write_manifest(&manifest).err();
-        self.tell(trouble);
+        let problem = self.write_manifest(&manifest).err();
+        self.report(problem);
         Ok(())
     }
 
     fn tick(&mut self) -> Result<(), String> {
-        let troubles = self.look_after();
-        self.tell(troubles);
+        let problems = self.sync_and_check();
+        self.report(problems);
         Ok(())
     }
 
@@ -150,7 +151,7 @@ mod tests {
     }
 
     fn said(folder: &mut Folder) -> Vec<String> {
-        folder.look_after().iter().map(ToString::to_string).collect()
+        folder.sync_and_check().iter().map(ToString::to_string).collect()
     }
 
     #[test]
@@ -171,9 +172,9 @@ mod tests {
         let manifest = Manifest::new("x", String::new());
         folder.write_last(manifest).unwrap();
         let manifest = fs::read_to_string(scratch.0.join(file::MANIFEST)).unwrap();
-        let troubles = Manifest::from_text(&manifest).unwrap().faults;
-        assert!(troubles[0].ends_with(replaced), "{troubles:?}");
-        assert!(troubles.iter().eq(&folder.known), "{troubles:?}");
+        let problems = Manifest::from_text(&manifest).unwrap().faults;
+        assert!(problems[0].ends_with(replaced), "{problems:?}");
+        assert!(problems.iter().eq(&folder.known), "{problems:?}");
     }
 
     /// For example another run's folder.
@@ -216,18 +217,18 @@ mod tests {
 
     #[test]
     fn each_trouble_is_told_once() {
-        let scratch = Scratch::new("keeper-troubles");
+        let scratch = Scratch::new("keeper-problems");
         let dir = scratch.0.join("run");
         fs::create_dir(&dir).unwrap();
         let path = dir.join(file::STEPS);
         let file = File::create(&path).unwrap();
-        let (keeper, mut troubles) = keep(dir.clone(), vec![(path, file)]).unwrap();
+        let (keeper, mut problems) = keep(dir.clone(), vec![(path, file)]).unwrap();
         let mut next = || {
             let end = Instant::now() + Duration::from_secs(60);
             loop {
-                match troubles.pop() {
-                    Ok(trouble) => break trouble,
-                    Err(_) => assert!(Instant::now() < end, "no trouble"),
+                match problems.pop() {
+                    Ok(problem) => break problem,
+                    Err(_) => assert!(Instant::now() < end, "no problem"),
                 }
                 thread::yield_now();
             }
@@ -240,6 +241,6 @@ mod tests {
         while keeper.vitals.beats() < beats + 3 {
             thread::yield_now();
         }
-        assert!(troubles.is_empty());
+        assert!(problems.is_empty());
     }
 }

@@ -1,7 +1,6 @@
-//! The run folder and the recording: everything a run leaves behind.
+//! The run folder and the recording of a run.
 //!
-//! A [`Recorder`] takes [`Entry`]s from the session's thread through a bounded queue and never
-//! answers. One thread appends the text files (`steps.csv`, `can.log`, `tracker.ndjson`,
+//! A [`Recorder`] takes [`Entry`]s from the session's thread through a bounded queue. One thread appends the text files (`steps.csv`, `can.log`, `tracker.ndjson`,
 //! `inputs.log`, `events.log`). A second thread keeps the folder: it syncs the text files, which can take
 //! longer than the 200 ms that a kill may cost, writes the manifest, and checks that the folder is still
 //! there. Records that a full queue refuses are counted and reported. A thread that fails or stalls is
@@ -14,8 +13,8 @@
 //! - if the bench is killed: the last 50 ms of the text files, and at most a part of the last line; the
 //!   manifest has no outcome until [`repair`] closes the record;
 //! - if the machine loses power: 1.25 s more;
-//! - if the disk fills or stalls: what comes after. It is counted in the manifest, for which room is
-//!   reserved.
+//! - if the disk fills or stalls: everything after that. The lost records are counted in the manifest, for
+//!   which space is reserved.
 
 mod error;
 mod folder;
@@ -51,7 +50,7 @@ use std::time::SystemTime;
 pub struct Entry {
     /// The record.
     pub record: Record,
-    /// The true tip pose at that moment, where there is one.
+    /// The truth at that moment, in an emulated run.
     pub truth: Option<Truth>,
 }
 
@@ -62,29 +61,29 @@ impl From<Record> for Entry {
     }
 }
 
-/// `2026-03-01T14:30:00.123456Z` of `time`, as the files of a run have it.
+/// `time` as the files of a run have it: `2026-03-01T14:30:00.123456Z`.
 pub fn utc_text(time: SystemTime) -> String {
     rfc3339(Timestamp::try_from(time).unwrap_or_default().as_microsecond())
 }
 
-/// The part of the recording that is not in the records: the fixed part of the 3-D view, and limits.
+/// The part of the recording that is not in the records: the fixed part of the 3-D view, and the limits.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scene {
     /// `X_WP`: desired plane P in bench frame W.
     pub x_wp: Pose,
-    /// Depth to be inserted, mm: the length of the plane that is drawn.
+    /// Depth of the insertion, mm: the length of the plane that is drawn.
     pub insertion_mm: f64,
-    /// Needle curvature the bench believes, per mm.
+    /// Needle curvature in the bench's model, per mm.
     pub curvature_per_mm: f64,
     /// The obstacles, and the target with its tolerance.
     pub goal: Option<(World, Problem)>,
-    /// Whether steps come with the truth.
+    /// Whether the steps have the truth.
     pub truth: bool,
     /// Observers that run alongside, by name.
     pub shadows: Vec<String>,
     /// The fastest turning that the control law asks for, rad/mm.
     pub rotation_max_rad_per_mm: f64,
-    /// Age of the newest believed tip position from which on the needle is held, s.
+    /// Age of the newest accepted tip position from which on the insertion is held, s.
     pub tip_meas_age_max_s: f64,
     /// The drives, with scales and limits.
     pub stage: StageConfig,

@@ -2,9 +2,9 @@
 
 use super::keeper::keep;
 use super::recording::live;
-use super::text::{TEXT_FILES, TextFiles};
+use super::text::{TextFiles, WRITER};
 use super::vitals::RecordNews;
-use super::worker::{Backpressure, Left, Worker};
+use super::worker::{Backpressure, Worker, WriterResult};
 use super::{Entry, Scene, TelemetryError, folder, utc_text};
 use crate::archive::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex, unix_us_of,
@@ -17,9 +17,9 @@ use std::time::{Duration, Instant, SystemTime};
 
 /// Entries the queue holds: about half a minute of a run at 10 ms SYNC, 3 s at 1 ms.
 const QUEUE_ENTRIES: usize = 32_768;
-/// At the end of a run the writer is given up after this long without a sign of life.
+/// At the end of a run the writer is given up after this long without progress.
 const CLOSING_LIMIT: Duration = Duration::from_secs(15);
-/// The manifest is given this long after it.
+/// After that, writing the manifest is given up after this long without progress.
 const MANIFEST_LIMIT: Duration = Duration::from_secs(5);
 
 /// The record of a finished run.
@@ -29,7 +29,7 @@ pub struct Finished {
     pub run_dir: PathBuf,
     /// Lines of the text files.
     pub counts: Counts,
-    /// Records that are in no file.
+    /// Records that were lost.
     pub dropped: Dropped,
     /// Failures, with the reasons; empty if the record is complete.
     pub faults: Vec<String>,
@@ -43,19 +43,19 @@ pub struct Recorder {
     text: Worker<Entry>,
     live: Option<Worker<Entry>>,
     keeper: Worker<Box<Manifest>>,
-    /// Troubles that the keeper found.
-    troubles: Consumer<String>,
+    /// Problems that the keeper found.
+    problems: Consumer<String>,
     faults: Vec<String>,
-    /// Tells other processes that the folder is being written.
+    /// Shows other processes that the folder is being written.
     lock: Option<File>,
 }
 
 impl Recorder {
-    /// Makes a new folder in `parent` for the run that `manifest` describes, with `config_toml`, the
+    /// Creates a new folder in `parent` for the run that `manifest` describes, with `config_toml`, the
     /// configuration as used, and starts the writer.
     ///
     /// # Errors
-    /// The folder or one of its files cannot be made; then there is no folder.
+    /// The folder or one of its files cannot be created. No folder remains then.
     pub fn create(
         parent: &Path,
         manifest: Manifest,
@@ -72,11 +72,11 @@ impl Recorder {
             let lock = folder::lock(&run_dir)?;
             folder::write_manifest(&run_dir, &manifest)?;
             folder::reserve_manifest(&run_dir)?;
-            let (files, mut kept) = TextFiles::create(&run_dir, &manifest)?;
+            let (files, mut for_keeper) = TextFiles::create(&run_dir, &manifest)?;
             let config = File::open(&path).map_err(TelemetryError::file(&path))?;
-            kept.push((path, config));
-            let text = Worker::start(TEXT_FILES, QUEUE_ENTRIES, backpressure, || Ok(files))?;
-            let (keeper, troubles) = keep(run_dir.clone(), kept)?;
+            for_keeper.push((path, config));
+            let text = Worker::start(WRITER, QUEUE_ENTRIES, backpressure, || Ok(files))?;
+            let (keeper, problems) = keep(run_dir.clone(), for_keeper)?;
             let (live, faults) = (None, Vec::new());
             Ok(Recorder {
                 run_dir,
@@ -85,7 +85,7 @@ impl Recorder {
                 text,
                 live,
                 keeper,
-                troubles,
+                problems,
                 faults,
                 lock,
             })
@@ -93,12 +93,12 @@ impl Recorder {
         fill(run_dir.clone()).inspect_err(|_| discard(&run_dir))
     }
 
-    /// Serves the run to viewers at `address` from now on, with what `scene` shows; call it before the
-    /// first record. Viewers never affect the run or its files: what the live view cannot take at once
-    /// is dropped and counted.
+    /// Serves the run to viewers at `address`, with the fixed part of the view in `scene`. Call this before the
+    /// first record. Viewers never affect the run or its files: records that the live view cannot take at
+    /// once are dropped and counted.
     ///
     /// # Errors
-    /// The address cannot be listened at.
+    /// The bench cannot listen at the address.
     pub fn serve(&mut self, address: SocketAddr, scene: Scene) -> Result<(), TelemetryError> {
         let (manifest, config_toml) = (self.manifest.clone(), self.config_toml.clone());
         self.live = Some(live::serve(address, manifest, config_toml, scene)?);
@@ -115,7 +115,7 @@ impl Recorder {
         &self.run_dir
     }
 
-    /// Records `entry`. It takes some microseconds, most of them to wake the writer; with
+    /// Records `entry`. This takes some microseconds, most of them to wake the writer; with
     /// [`Backpressure::DropAndCount`] it never waits for a disk or a viewer.
     pub fn record(&mut self, entry: Entry) {
         if let Some(live) = &mut self.live {
@@ -126,14 +126,14 @@ impl Recorder {
         }
     }
 
-    /// The next change in the state of the recording. Call it until it returns `None`, at least twenty times
-    /// a second: then a full or stalled disk or a lost folder is reported within a second. Of the time
-    /// between two calls at most 50 ms count as silence of a thread.
+    /// The next change in the state of the recording. Call this at least twenty times a second, each time until
+    /// it returns `None`: then a full or stalled disk or a lost folder is reported within a second. At most
+    /// 50 ms of the time between two calls count as silence of a thread.
     pub fn news(&mut self) -> Option<RecordNews> {
         let now = Instant::now();
         let news = self.text.news(now).or_else(|| self.keeper.news(now)).or_else(|| {
-            let trouble = self.troubles.pop().ok()?;
-            Some(RecordNews::Failed(TelemetryError::Recording(trouble)))
+            let problem = self.problems.pop().ok()?;
+            Some(RecordNews::Failed(TelemetryError::Recording(problem)))
         })?;
         if let RecordNews::Failed(error) = &news {
             self.faults.push(error.to_string());
@@ -148,42 +148,42 @@ impl Recorder {
     }
 
     /// Completes the text files, seals them and writes the final manifest, to which `sum_up` adds the
-    /// outcome and the figures of the run. Takes at most 22 s, even when the disk is stalled, and longer
-    /// only while the writer makes progress. What failed is in the manifest and in the result.
+    /// outcome and the figures of the run. Takes at most 22 s if the disk is stalled, and longer only while
+    /// the writer makes progress. Failures are listed in the manifest and in the result.
     ///
     /// # Errors
-    /// [`TelemetryError`] if the final manifest cannot be written, or if it is unknown what the text
-    /// files hold: the record stays open.
+    /// [`TelemetryError`] if the final manifest cannot be written, or if the content of the text files is
+    /// unknown. The record then stays open.
     pub fn finish(
         mut self,
         sum_up: impl FnOnce(&mut Manifest),
     ) -> Result<Finished, TelemetryError> {
-        // Failures since the last call.
+        // Collects the failures since the last call.
         while self.news().is_some() {}
         let open = self.manifest.clone();
         sum_up(&mut self.manifest);
         self.manifest.ended_utc = Some(utc_text(SystemTime::now()));
         let closed = self.text.close(&self.manifest, CLOSING_LIMIT);
         if let Some(live) = &mut self.live {
-            live.leave(&self.manifest, live::FAREWELL_MAX);
+            live.close_within(&self.manifest, live::FAREWELL_MAX);
         }
-        let (left, fault) = match &closed {
-            Ok((left, fault)) => (Some(left), fault.as_ref()),
+        let (written, fault) = match &closed {
+            Ok((written, fault)) => (Some(written), fault.as_ref()),
             Err(silent) => (None, Some(silent)),
         };
         let fault = fault.map(ToString::to_string).filter(|fault| !self.faults.contains(fault));
         self.faults.extend(fault);
         // An entry that is not in the files is lost, for whatever reason.
-        let lost = left.map(|left| self.text.given.saturating_sub(left.entries));
+        let lost = written.map(|written| self.text.given.saturating_sub(written.entries));
         let dropped = Dropped {
             text_files: lost.unwrap_or(self.text.dropped),
             recording: 0,
             live: self.live.as_ref().map_or(0, |live| live.dropped),
         };
-        // The record stays open if it is unknown what the text files hold.
-        let mut manifest = match left {
+        // The record stays open if the content of the text files is unknown.
+        let mut manifest = match written {
             None => open,
-            Some(Left { counts, files, .. }) => {
+            Some(WriterResult { counts, files, .. }) => {
                 let config = FileSeal::of(self.config_toml.as_bytes());
                 self.manifest.counts = Some(*counts);
                 self.manifest.files.clone_from(files);
@@ -193,18 +193,18 @@ impl Recorder {
         };
         manifest.dropped = Some(dropped);
         manifest.faults.clone_from(&self.faults);
-        let kept = self.keeper.close(&manifest, MANIFEST_LIMIT).map(|(_, fault)| fault);
-        match (closed, kept) {
-            (Ok((left, _)), Ok(None)) => {
-                // What the keeper has added to the manifest.
-                while let Ok(trouble) = self.troubles.pop() {
-                    self.faults.push(trouble);
+        let manifest_written = self.keeper.close(&manifest, MANIFEST_LIMIT).map(|(_, fault)| fault);
+        match (closed, manifest_written) {
+            (Ok((written, _)), Ok(None)) => {
+                // The keeper has added these to the manifest.
+                while let Ok(problem) = self.problems.pop() {
+                    self.faults.push(problem);
                 }
-                let (run_dir, counts, faults) = (self.run_dir, left.counts, self.faults);
+                let (run_dir, counts, faults) = (self.run_dir, written.counts, self.faults);
                 Ok(Finished { run_dir, counts, dropped, faults })
             }
             (Err(error), _) | (_, Err(error) | Ok(Some(error))) => {
-                // A writer that was given up may still write: the folder is locked until the process ends.
+                // A writer that was given up may still write, so the folder stays locked until the process ends.
                 std::mem::forget(self.lock);
                 Err(error)
             }

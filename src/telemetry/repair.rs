@@ -1,4 +1,4 @@
-//! Closes a record that its bench left open, for example because it was killed.
+//! Closes a record that its bench left open, for example because the bench was killed.
 
 use super::run_folder::seal_of;
 use super::{RunFolder, TelemetryError, folder, utc_text};
@@ -62,7 +62,7 @@ pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
     }
     run.verify()?;
     let (mut lines, mut cuts, mut missing) = (BTreeMap::new(), Vec::new(), Vec::new());
-    for name in file::LINES {
+    for name in file::TEXT_FILES {
         let cut = cut_last_line(dir, name).map_err(TelemetryError::file(&dir.join(name)));
         match cut? {
             None => missing.push(name),
@@ -84,7 +84,7 @@ pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
     manifest.faults.extend(cuts.iter().map(|(name, bytes)| cut_text(name, *bytes)));
     manifest.faults.extend(missing.iter().map(|name| format!("{name} is missing")));
     manifest.repaired_utc = Some(utc_text(SystemTime::now()));
-    let names = [file::CONFIG].into_iter().chain(file::LINES);
+    let names = [file::CONFIG].into_iter().chain(file::TEXT_FILES);
     for name in names.map(str::to_owned).chain(cuts.iter().map(|(name, _)| cut_name(name))) {
         manifest.files.extend(seal_of(dir, &name)?.map(|seal| (name, seal)));
     }
@@ -92,8 +92,8 @@ pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
     Ok(Repaired { stop_reason, counts, cuts })
 }
 
-/// Writes the seal of `run.rrd` into the manifest of the closed record in `dir`, and the `fault` if the
-/// file is missing or incomplete. A fault of an earlier `run.rrd` is removed.
+/// Writes the seal of `run.rrd` into the manifest of the closed record in `dir`, and the `fault`, if the file is
+/// missing or incomplete. A fault of an earlier `run.rrd` is removed from the manifest.
 ///
 /// # Errors
 /// [`TelemetryError`] if the manifest cannot be read or written.
@@ -143,7 +143,7 @@ fn cut_last_line(dir: &Path, name: &str) -> io::Result<Option<(u64, u64)>> {
     Ok(Some((lines, partial_line.len() as u64)))
 }
 
-/// True for a file, false where there is nothing. A link may lead to a file outside this record.
+/// True for a regular file, false if there is nothing. A link is refused, since it may lead out of the record.
 fn is_regular(path: &Path) -> io::Result<bool> {
     match fs::symlink_metadata(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),

@@ -15,7 +15,7 @@ pub struct RunFolder {
 }
 
 impl RunFolder {
-    /// Opens `dir` and reads its manifest; the other files are not looked at.
+    /// Opens `dir` and reads only its manifest.
     ///
     /// # Errors
     /// [`TelemetryError::NotARun`], and [`TelemetryError::Record`] if its manifest cannot be used.
@@ -49,8 +49,8 @@ impl RunFolder {
         self.manifest.outcome.is_some()
     }
 
-    /// Checks that the files are those that the manifest has seals of, and that a closed record has a
-    /// seal of each text file. In a record that was never closed only the configuration is checked.
+    /// Checks that the sealed files are unchanged, and that in a closed record every text file has a seal. In a
+    /// record that was never closed only the configuration is checked.
     ///
     /// # Errors
     /// [`TelemetryError::Record`] with every file that differs, and [`TelemetryError::File`].
@@ -61,7 +61,7 @@ impl RunFolder {
             changes.extend(self.change(name, Some(*bytes), sha256)?);
         }
         if self.is_closed() {
-            let unsealed = file::LINES
+            let unsealed = file::TEXT_FILES
                 .into_iter()
                 .filter(|name| !files.contains_key(*name) && self.dir.join(name).exists());
             changes.extend(unsealed.map(|name| format!("{name} has no seal in the closed record")));
@@ -79,7 +79,7 @@ impl RunFolder {
         Err(TelemetryError::record(&self.dir, reason))
     }
 
-    /// How the file `name` differs from its hash and, where it is known, its size; `None` if it does not.
+    /// How the file `name` differs from this hash and, if known, this size; `None` if it is unchanged.
     fn change(
         &self,
         name: &str,
@@ -101,7 +101,7 @@ impl RunFolder {
         })
     }
 
-    /// The lines of the file `name`, read as they are asked for.
+    /// The lines of the file `name`, read one by one.
     ///
     /// # Errors
     /// It cannot be opened.
@@ -109,7 +109,7 @@ impl RunFolder {
         open_regular(&self.dir.join(name)).map(|file| Lines::new(BufReader::new(file)))
     }
 
-    /// The text of the file `name`; bytes that are no UTF-8, which a cut may leave, are replaced.
+    /// The text of the file `name`. Bytes that are not UTF-8, as a truncated file may have, are replaced.
     ///
     /// # Errors
     /// [`TelemetryError::File`].
@@ -127,14 +127,14 @@ fn open_regular(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// The text of `path`; bytes that are no UTF-8 are replaced.
+/// The text of the file `path`; bytes that are not UTF-8 are replaced.
 fn read_text(path: &Path) -> io::Result<String> {
     let mut bytes = Vec::new();
     open_regular(path)?.read_to_end(&mut bytes)?;
     Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
-/// Size and SHA-256 of the file `name` in `dir` as it is now; `None` where there is none.
+/// Size and SHA-256 of the file `name` in `dir` as it is now; `None` if it does not exist.
 ///
 /// # Errors
 /// [`TelemetryError::File`].

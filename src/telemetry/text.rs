@@ -1,8 +1,8 @@
-//! The text files of a run: the writer of `steps.csv`, `can.log`, `tracker.ndjson`, `inputs.log` and
-//! `events.log`. Each gets whole lines or nothing.
+//! The writer of the text files of a run: `steps.csv`, `can.log`, `tracker.ndjson`, `inputs.log` and
+//! `events.log`. It writes whole lines only.
 
-use super::keeper::Kept;
-use super::worker::{Left, Sink};
+use super::keeper::OpenPath;
+use super::worker::{Sink, WriterResult};
 use super::{Entry, TelemetryError};
 use crate::archive::{
     CandumpLine, Counts, EventLine, FileSeal, Manifest, StepRow, file, hex, input_line,
@@ -16,29 +16,28 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// The writer's name in messages.
-pub(super) const TEXT_FILES: &str = "text files";
+pub(super) const WRITER: &str = "text files";
 
-/// Collects lines, hands them to the system at every tick, and syncs them to the disk at the end.
+/// Collects lines, passes them to the system at every tick, and syncs them to the disk at the end.
 pub(super) struct TextFiles {
-    /// In the order of [`file::LINES`], so that a kill between two of them leaves no input without its
-    /// frame.
+    /// In the order of [`file::TEXT_FILES`]: if the bench is killed between two files, every input has its frame.
     files: Vec<TextFile<File>>,
     interface: String,
     started_unix_us: i64,
 }
 
 impl TextFiles {
-    /// Makes the files in `dir`; gives them, and their handles for the keeper.
+    /// Creates the files in `dir`. Returns the writer, and a second handle of each file for the keeper.
     pub(super) fn create(
         dir: &Path,
         manifest: &Manifest,
-    ) -> Result<(Self, Vec<Kept>), TelemetryError> {
-        let (mut files, mut kept) = (Vec::new(), Vec::new());
-        for name in file::LINES {
+    ) -> Result<(Self, Vec<OpenPath>), TelemetryError> {
+        let (mut files, mut for_keeper) = (Vec::new(), Vec::new());
+        for name in file::TEXT_FILES {
             let path = dir.join(name);
             let storage = File::create_new(&path).map_err(TelemetryError::file(&path))?;
-            let same = storage.try_clone().map_err(TelemetryError::file(&path))?;
-            kept.push((path.clone(), same));
+            let second_handle = storage.try_clone().map_err(TelemetryError::file(&path))?;
+            for_keeper.push((path.clone(), second_handle));
             files.push(TextFile::new(name, path, storage));
         }
         let mut files = TextFiles {
@@ -47,11 +46,11 @@ impl TextFiles {
             started_unix_us: unix_us_of(&manifest.started_utc).unwrap_or_default(),
         };
         files.line(file::STEPS, &steps_csv_header());
-        files.tick().map_err(|reason| TelemetryError::writer_failed(TEXT_FILES, reason))?;
-        Ok((files, kept))
+        files.tick().map_err(|reason| TelemetryError::writer_failed(WRITER, reason))?;
+        Ok((files, for_keeper))
     }
 
-    /// Whether `record` leaves a line in a text file.
+    /// True if `record` becomes a line of a text file.
     pub(super) fn wants(record: &Record) -> bool {
         !matches!(record, Record::Stage(_) | Record::Drive { .. })
     }
@@ -66,7 +65,7 @@ impl TextFiles {
 
 impl Sink for TextFiles {
     type Item = Entry;
-    /// A killed bench loses no more than the lines of one interval.
+    /// A killed bench loses at most the lines of one interval.
     const TICK: Duration = Duration::from_millis(50);
 
     fn take(&mut self, entry: Entry) -> Result<(), String> {
@@ -96,7 +95,7 @@ impl Sink for TextFiles {
     }
 
     fn tick(&mut self) -> Result<(), String> {
-        self.files.iter_mut().try_for_each(TextFile::hand_over)
+        self.files.iter_mut().try_for_each(TextFile::write_pending)
     }
 
     fn close(&mut self, _: &Manifest, alive: &dyn Fn()) -> Result<(), String> {
@@ -108,14 +107,14 @@ impl Sink for TextFiles {
         Ok(())
     }
 
-    fn left(&self) -> Left {
+    fn result(&self) -> WriterResult {
         let lines = |name: &str| {
             self.files.iter().filter(|file| file.name == name).map(|file| file.lines).sum()
         };
-        // A line an entry, and the header.
+        // Each entry is one line; the header of `steps.csv` is no entry.
         let entries = self.files.iter().map(|file| file.lines).sum::<u64>().saturating_sub(1);
         let seals = self.files.iter().map(|file| (file.name.to_owned(), file.seal()));
-        Left { counts: Counts::of_lines(lines), files: seals.collect(), entries }
+        WriterResult { counts: Counts::of_lines(lines), files: seals.collect(), entries }
     }
 }
 
@@ -131,39 +130,39 @@ impl Storage for File {
     }
 }
 
-/// Lines that are collected, handed over together, and hashed.
+/// A file whose lines are collected, written together, and hashed.
 struct TextFile<S> {
     name: &'static str,
     path: PathBuf,
     storage: S,
-    /// Whole lines that were not handed over yet.
-    waiting: String,
+    /// Whole lines that were not written yet.
+    pending: String,
     hash: Sha256,
     bytes: u64,
-    /// Lines handed over.
+    /// Number of lines written.
     lines: u64,
 }
 
 impl<S: Storage> TextFile<S> {
-    /// The file `name` at `path`, which is empty and kept in `storage`.
+    /// The file `name` at `path`, with an empty `storage`.
     fn new(name: &'static str, path: PathBuf, storage: S) -> Self {
-        let (waiting, hash) = (String::new(), Sha256::new());
-        TextFile { name, path, storage, waiting, hash, bytes: 0, lines: 0 }
+        let (pending, hash) = (String::new(), Sha256::new());
+        TextFile { name, path, storage, pending, hash, bytes: 0, lines: 0 }
     }
 
-    /// Adds a line, which waits for [`TextFile::hand_over`].
+    /// Adds a line, to be written by [`TextFile::write_pending`].
     fn line(&mut self, line: &str) {
-        self.waiting.push_str(line);
-        self.waiting.push('\n');
+        self.pending.push_str(line);
+        self.pending.push('\n');
     }
 
-    /// Hands every line to the system: from then on they survive the end of this process.
-    /// Partial lines are truncated where possible.
+    /// Writes all pending lines to the operating system: from then on they survive the end of this process. A
+    /// partial line is truncated if possible.
     ///
     /// # Errors
-    /// The system's error, with the file's name; the lines that were not taken are lost.
-    fn hand_over(&mut self) -> Result<(), String> {
-        let bytes = self.waiting.as_bytes();
+    /// The system's error, with the file's path. Lines that were not written are lost.
+    fn write_pending(&mut self) -> Result<(), String> {
+        let bytes = self.pending.as_bytes();
         let (taken, result) = write_until_error(&mut self.storage, bytes);
         let mut kept = &bytes[..taken];
         if result.is_err() {
@@ -175,11 +174,11 @@ impl<S: Storage> TextFile<S> {
         self.hash.update(kept);
         self.bytes += kept.len() as u64;
         self.lines += kept.iter().filter(|byte| **byte == b'\n').count() as u64;
-        self.waiting.clear();
+        self.pending.clear();
         result.map_err(|error| self.explain(&error))
     }
 
-    /// The seal of the bytes that were handed over.
+    /// The seal of the bytes that were written.
     fn seal(&self) -> FileSeal {
         FileSeal { bytes: self.bytes, sha256: hex(&self.hash.clone().finalize()) }
     }
@@ -189,7 +188,7 @@ impl<S: Storage> TextFile<S> {
     }
 }
 
-/// Writes `bytes`; returns how many were taken, and the error that ended it.
+/// Writes `bytes`. Returns how many were written, and the error that stopped it.
 fn write_until_error(storage: &mut impl Write, bytes: &[u8]) -> (usize, io::Result<()>) {
     let mut taken = 0;
     while taken < bytes.len() {
@@ -251,10 +250,10 @@ mod tests {
             let disk = SmallDisk { can_cut, ..SmallDisk::new(16) };
             let mut file = TextFile::new(file::STEPS, "run/steps.csv".into(), disk.clone());
             file.line("first");
-            file.hand_over().unwrap();
+            file.write_pending().unwrap();
             file.line("second");
             file.line("third");
-            assert_eq!(file.hand_over().unwrap_err(), "run/steps.csv: no storage space");
+            assert_eq!(file.write_pending().unwrap_err(), "run/steps.csv: no storage space");
             assert_eq!(*disk.content.lock().unwrap(), left.as_bytes());
             assert_eq!(file.lines, 2);
             let seal = FileSeal { bytes: left.len() as u64, sha256: sha256_hex(left.as_bytes()) };

@@ -12,18 +12,18 @@ use std::sync::mpsc::{Receiver, channel};
 use std::thread::{self, Thread};
 use std::time::{Duration, Instant};
 
-/// The treatment of an item when the queue is full.
+/// What happens to an item while the queue is full.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Backpressure {
     /// The caller waits: for virtual time, where waiting is harmless and nothing may be lost.
     Block,
-    /// The entry is dropped and counted: for live runs, where the control thread must not wait.
+    /// The item is dropped and counted: for live runs, where the control thread must not wait.
     DropAndCount,
 }
 
 /// Retry interval while the queue is full.
 const RETRY: Duration = Duration::from_millis(1);
-/// The operator is told that the writer is still completing its files after this long.
+/// If completing the files takes longer than this, the operator is told.
 const WARN_AFTER: Duration = Duration::from_secs(3);
 
 /// The work of the thread.
@@ -40,23 +40,23 @@ pub(super) trait Sink: 'static {
     fn tick(&mut self) -> Result<(), String> {
         Ok(())
     }
-    /// The run is over, as `manifest` says: complete the files, and call `alive` periodically while this
-    /// takes long.
+    /// Completes the files at the end of the run that `manifest` describes. Must call `alive` periodically
+    /// while this takes long.
     fn close(&mut self, manifest: &Manifest, alive: &dyn Fn()) -> Result<(), String>;
-    /// What it wrote so far, also after a failure.
-    fn left(&self) -> Left {
-        Left::default()
+    /// What the sink has written so far; also called after a failure.
+    fn result(&self) -> WriterResult {
+        WriterResult::default()
     }
 }
 
-/// The result of a writer.
+/// What a writer has written.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Left {
-    /// Lines of its files.
+pub(super) struct WriterResult {
+    /// Numbers of lines in its files.
     pub(super) counts: Counts,
-    /// Its files by name, as it wrote them.
+    /// The seals of its files, by name.
     pub(super) files: BTreeMap<String, FileSeal>,
-    /// Entries that are in its files.
+    /// Number of entries in its files.
     pub(super) entries: u64,
 }
 
@@ -65,24 +65,24 @@ enum Message<T> {
     Close(Box<Manifest>),
 }
 
-/// A handle to the writer's thread, for the session's thread. A preempted writer never makes it wait
+/// The session thread's handle to a writer thread. A preempted writer never makes the session wait
 /// (docs/decisions/0018-tracker-queue.md).
 pub(super) struct Worker<T> {
     writer: &'static str,
     queue: Producer<Message<T>>,
-    /// Dropped after the queue, so that the writer sees at once that the run was abandoned.
-    thread: Waker,
+    /// Dropped after the queue: its last wake-up shows the writer that the run was abandoned.
+    waker: Waker,
     backpressure: Backpressure,
-    /// Items given so far, taken or not.
+    /// Number of items given so far, including dropped ones.
     pub(super) given: u64,
-    /// Items that did not reach the writer.
+    /// Number of items that did not reach the writer.
     pub(super) dropped: u64,
     pub(super) vitals: Arc<Vitals>,
     watch: Watch,
-    done: Receiver<Left>,
+    done: Receiver<WriterResult>,
 }
 
-/// The thread to wake. It is woken a last time when this is dropped.
+/// Wakes a thread, and wakes it a last time when dropped.
 struct Waker(Thread);
 
 impl Drop for Waker {
@@ -95,7 +95,7 @@ impl<T: Send + 'static> Worker<T> {
     /// Starts the thread `writer` with a queue of `capacity` items and the sink that `open` makes there.
     ///
     /// # Errors
-    /// There is no thread, or no sink.
+    /// The thread cannot be started, or `open` fails.
     pub(super) fn start<S: Sink<Item = T>>(
         writer: &'static str,
         capacity: usize,
@@ -120,16 +120,16 @@ impl<T: Send + 'static> Worker<T> {
                 of_thread.fail(reason);
             }
             // Report first: dropping a failed sink may block.
-            let _ = done_tx.send(sink.left());
+            let _ = done_tx.send(sink.result());
         };
         let thread = thread::Builder::new().name(writer.replace(' ', "-")).spawn(run);
-        let thread = Waker(thread.map_err(|e| failed(e.to_string()))?.thread().clone());
+        let waker = Waker(thread.map_err(|e| failed(e.to_string()))?.thread().clone());
         opened.recv().unwrap_or_else(|_| Err("its thread panicked".to_owned())).map_err(failed)?;
         let (given, dropped) = (0, 0);
-        Ok(Worker { writer, queue, thread, backpressure, given, dropped, vitals, watch, done })
+        Ok(Worker { writer, queue, waker, backpressure, given, dropped, vitals, watch, done })
     }
 
-    /// The next change in its health. Call it until it returns `None`.
+    /// The next change in the writer's health. Call this until it returns `None`.
     pub(super) fn news(&mut self, now: Instant) -> Option<RecordNews> {
         self.watch.look(&self.vitals, self.dropped, now)
     }
@@ -144,20 +144,20 @@ impl<T: Send + 'static> Worker<T> {
         self.dropped += u64::from(!taken);
     }
 
-    /// Wakes the writer for `message`, which comes back if the queue is full or the writer has ended.
+    /// Queues `message` and wakes the writer. Returns the message if the queue is full or the writer has ended.
     fn push(&mut self, message: Message<T>) -> Result<(), Message<T>> {
         if self.queue.is_abandoned() {
             return Err(message);
         }
         self.queue.push(message).map_err(|PushError::Full(message)| message)?;
-        self.thread.0.unpark();
+        self.waker.0.unpark();
         Ok(())
     }
 
-    /// Waits for room in the queue, as long as the writer makes progress.
+    /// Waits for room in the queue while the writer makes progress. Returns false if the message is lost.
     fn wait_and_push(&mut self, mut message: Message<T>) -> bool {
         let mut silence = Silence::new(self.vitals.beats(), Instant::now());
-        while let Err(back) = self.push(message) {
+        while let Err(unsent) = self.push(message) {
             if self.queue.is_abandoned() || self.vitals.fault().is_some() {
                 return false;
             }
@@ -167,30 +167,29 @@ impl<T: Send + 'static> Worker<T> {
                 self.vitals.fail(format!("took nothing for {limit_s:.1} s; is the disk stalled?"));
                 return false;
             }
-            message = back;
+            message = unsent;
             thread::sleep(RETRY);
         }
         self.vitals.fault().is_none()
     }
 
-    /// Tells the thread how the run ended, and waits for it no longer than `limit`, whatever it has left to
-    /// take. If the queue is full the thread is not told, and this returns at once.
-    pub(super) fn leave(&mut self, manifest: &Manifest, limit: Duration) {
+    /// Tells the thread how the run ended, and waits for it at most `limit`, even if items are still queued.
+    /// If the queue is full, returns at once without telling it.
+    pub(super) fn close_within(&mut self, manifest: &Manifest, limit: Duration) {
         if self.push(Message::Close(Box::new(manifest.clone()))).is_ok() {
             let _ = self.done.recv_timeout(limit);
         }
     }
 
-    /// Lets the writer complete its files and waits for it. Returns what it wrote, and why something is
-    /// missing.
+    /// Lets the writer complete its files, and waits for it. Returns what it wrote, and its failure, if any.
     ///
     /// # Errors
-    /// The writer makes no progress for `limit`: it is given up, and what it wrote is unknown.
+    /// The writer made no progress for `limit` and was given up. What it wrote is unknown.
     pub(super) fn close(
         &mut self,
         manifest: &Manifest,
         limit: Duration,
-    ) -> Result<(Left, Option<TelemetryError>), TelemetryError> {
+    ) -> Result<(WriterResult, Option<TelemetryError>), TelemetryError> {
         let (mut is_told, mut is_close_sent) = (false, false);
         let mut silence = Silence::new(self.vitals.beats(), Instant::now());
         let writer = self.writer;
@@ -216,8 +215,8 @@ impl<T: Send + 'static> Worker<T> {
     }
 }
 
-/// The thread's loop, until the run is closed or abandoned. The queue closes with it, so that no caller
-/// waits for a writer that has ended.
+/// The thread's loop, until the run is closed or abandoned. It owns the queue, which is abandoned when the
+/// loop ends, so that no caller waits for a writer that has ended.
 fn serve<S: Sink>(
     sink: &mut S,
     mut queue: Consumer<Message<S::Item>>,
@@ -271,8 +270,8 @@ mod tests {
         fn close(&mut self, _: &Manifest, _: &dyn Fn()) -> Result<(), String> {
             Ok(())
         }
-        fn left(&self) -> Left {
-            Left { entries: self.taken, ..Left::default() }
+        fn result(&self) -> WriterResult {
+            WriterResult { entries: self.taken, ..WriterResult::default() }
         }
     }
 
