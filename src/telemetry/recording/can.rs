@@ -18,18 +18,18 @@ use std::collections::HashMap;
 pub(super) struct Selection {
     nodes: PerAxis<NodeId>,
     states: PerAxis<Option<DriveState>>,
-    /// The frame shown last, by COB-ID.
+    /// The last frame that was shown, by COB-ID.
     shown: HashMap<u16, Shown>,
 }
 
-/// The frame of a COB-ID that was shown last.
+/// The last frame of a COB-ID that was shown.
 #[derive(Debug)]
 struct Shown {
     /// The step during which it was shown; always 0 for heartbeats.
     step: u32,
     /// Its first two bytes.
     word: [u8; 2],
-    /// How many frames with this COB-ID were omitted since.
+    /// Number of frames with this COB-ID that were omitted since.
     omitted: u32,
 }
 
@@ -73,7 +73,7 @@ impl Selection {
         let (id, data) = (frame.cob_id().unwrap_or(u16::MAX), frame.data());
         // The control- or statusword of a PDO, the state of a heartbeat, the error code of an EMCY.
         let word = data.first_chunk().copied().unwrap_or([data.first().copied().unwrap_or(0), 0]);
-        // With a step, repetitions of the same word within that step are omitted.
+        // If a step is given, repetitions of the same word within that step are omitted.
         let (level, step) = match (id, data) {
             // SYNC and PDOs.
             (cob::SYNC | 0x181..=0x57F, _) => ("TRACE", Some(step)),

@@ -15,15 +15,15 @@ use crate::units::Time;
 use rerun::time::TimeCell;
 use rerun::{DynamicArchetype, RecordingStream, RecordingStreamBuilder, TextDocument, TextLog};
 
-/// The application under which a viewer files our recordings and keeps their layout.
+/// The application name, by which a viewer groups recordings and keeps their layout.
 pub(super) const APPLICATION: &str = "needle-bench";
 
 /// The run's own time.
 pub(super) const RUN_TIME: &str = "run_time";
 /// Number of the newest step.
 pub(super) const STEP: &str = "step";
-/// Depth reached so far, µm. It stands still while the needle is withdrawn: on a time line that runs
-/// back the rows of a chunk are out of order.
+/// Greatest depth so far, µm. It never decreases, not even when the needle is withdrawn, since the rows of a
+/// chunk must be in order on every time line.
 pub(super) const INSERTION_DEPTH: &str = "insertion_depth";
 
 /// The recording of the run of `manifest`: file and live view have one identity.
@@ -33,23 +33,23 @@ pub(super) fn builder(manifest: &Manifest) -> RecordingStreamBuilder {
         .recording_id(format!("{}-{}", manifest.started_utc, manifest.name))
         .recording_name(manifest.name.as_str())
         .recording_started(rerun::datatypes::TimeInt(started_us.saturating_mul(1000)))
-        // Setting an identity turned the properties off, and RERUN=0 in the environment would turn off all.
+        // Setting an identity turns the properties off, and RERUN=0 in the environment turns everything off.
         .send_properties(true)
         .enabled(true)
 }
 
-/// Logs the records of a run. Bound to the thread that opened it: time lines are thread-local.
+/// Logs the records of a run. Must stay on the thread that opened it, since time lines are thread-local.
 pub(super) struct Content {
     pub(super) stream: RecordingStream,
-    /// The scene, until a step shows where the needle starts.
+    /// The scene, until the first step shows where the needle starts.
     scene_until_start: Option<Scene>,
     step: u32,
     depth_um: i64,
     frames: can::Selection,
     states: States,
     now: Now,
-    /// Time of the newest page.
-    now_at: Time,
+    /// Time of the newest page of states.
+    now_time: Time,
     motion: Motion,
     samples: Samples,
     steps: Steps,
@@ -57,7 +57,7 @@ pub(super) struct Content {
 }
 
 impl Content {
-    /// Logs what stands still: the layout, the scene, the manifest and the configuration.
+    /// Logs what does not change: the layout, the scene, the manifest and the configuration.
     pub(super) fn open(
         stream: RecordingStream,
         manifest: &Manifest,
@@ -79,7 +79,7 @@ impl Content {
             frames: can::Selection::new(&scene.stage),
             states: States::default(),
             now: Now::default(),
-            now_at: Time::ZERO,
+            now_time: Time::ZERO,
             motion: Motion::new(scene),
             samples: Samples::default(),
             steps: Steps::new(scene),
@@ -88,8 +88,8 @@ impl Content {
         })
     }
 
-    /// Everything logged from here on is at `time`, the newest step and the depth reached.
-    fn at(&self, time: Time) {
+    /// Sets the time lines for everything logged from here on: to `time`, the newest step and the depth.
+    fn set_time(&self, time: Time) {
         let nanos = TimeCell::from_duration_nanos(time.as_nanos());
         self.stream.set_time(RUN_TIME, nanos);
         self.stream.set_time(STEP, TimeCell::from_sequence(i64::from(self.step)));
@@ -110,35 +110,35 @@ impl Content {
                 {
                     self.log_now(time)?;
                 }
-                self.at(time);
+                self.set_time(time);
                 match self.frames.line(self.step, direction, &frame) {
                     Some((level, text)) => self.line("can", level, text),
                     None => Ok(()),
                 }
             }
             Record::Sample(sample) => {
-                self.at(sample.received.receive_time);
+                self.set_time(sample.received.receive_time);
                 self.samples.log(&self.stream, &sample, &mut self.states)
             }
             Record::Target(sample) => {
-                self.at(sample.received.receive_time);
+                self.set_time(sample.received.receive_time);
                 log_refused(&self.stream, &sample)
             }
             Record::Stage(stage) => {
-                self.depth_um = reached_um(self.depth_um, stage.measured.insertion_mm);
-                self.at(stage.time);
+                self.depth_um = deepest_um(self.depth_um, stage.measured.insertion_mm);
+                self.set_time(stage.time);
                 self.motion.log(&self.stream, &stage)
             }
             Record::Step(step) => {
                 self.step = step.step;
-                self.depth_um = reached_um(self.depth_um, step.insertion_meas_mm);
-                self.at(step.time);
+                self.depth_um = deepest_um(self.depth_um, step.insertion_meas_mm);
+                self.set_time(step.time);
                 self.move_view_to_needle(&step)?;
                 self.steps.log(&self.stream, &step, truth.as_ref())?;
                 self.space.log(&self.stream, &step, truth.as_ref())
             }
             Record::Drive { time, axis, node, identity } => {
-                self.at(time);
+                self.set_time(time);
                 let text = format!("{axis}: node {node}, {identity}");
                 self.line("events/stage", level(Severity::Info), text)
             }
@@ -146,7 +146,7 @@ impl Content {
                 self.enter(time, &state.lane().to_string(), state.as_str(), Meaning::of(state))
             }
             Record::Event { time, lane, severity, text } => {
-                self.at(time);
+                self.set_time(time);
                 let (path, line) = (format!("events/{lane}"), format!("{lane}: {text}"));
                 self.line(&path, level(severity), line)?;
                 match self.now.explain(time, lane, severity, &text) {
@@ -159,21 +159,21 @@ impl Content {
 
     /// Logs that `lane` enters `state`.
     fn enter(&mut self, time: Time, lane: &str, state: &str, meaning: Meaning) -> Logged {
-        self.at(time);
+        self.set_time(time);
         self.states.log(&self.stream, lane, state, meaning)?;
         self.now.enter(time, lane, state, meaning);
         self.log_now(time)
     }
 
-    /// Logs the page of states. A record may be older than the page before it; its change then appears at
-    /// the time of that page.
+    /// Logs the page of states. If `time` is before the previous page, the change appears at the time of that
+    /// page.
     fn log_now(&mut self, time: Time) -> Logged {
-        self.now_at = self.now_at.max(time);
-        self.at(self.now_at);
+        self.now_time = self.now_time.max(time);
+        self.set_time(self.now_time);
         self.now.log(&self.stream)
     }
 
-    /// Moves the plane and the view to a needle that starts outside of them.
+    /// Moves the plane and the view to the needle, if it starts outside of them.
     fn move_view_to_needle(&mut self, step: &StepRecord) -> Logged {
         let estimated_mm = step.decision.estimate.map(|estimate| estimate.x_pb.translation);
         let Some(start_mm) = step.tip_meas_mm.or(estimated_mm) else { return Ok(()) };
@@ -193,8 +193,8 @@ impl Content {
     }
 }
 
-/// The depth reached, µm, after `insertion_mm` was measured.
-fn reached_um(before_um: i64, insertion_mm: f64) -> i64 {
+/// The greatest depth, µm, after `insertion_mm` was measured.
+fn deepest_um(before_um: i64, insertion_mm: f64) -> i64 {
     match insertion_mm.is_finite() {
         true => before_um.max((insertion_mm * 1e3).round() as i64),
         false => before_um,
@@ -239,7 +239,7 @@ mod tests {
     fn the_depth_never_runs_back() {
         let mut depth_um = 0;
         let depths_um = [1.0, 2.5, 2.499, f64::NAN, -3.0, 3.0].map(|insertion_mm| {
-            depth_um = reached_um(depth_um, insertion_mm);
+            depth_um = deepest_um(depth_um, insertion_mm);
             depth_um
         });
         assert_eq!(depths_um, [1000, 2500, 2500, 2500, 2500, 3000]);

@@ -1,4 +1,4 @@
-//! The manifest with the run's figures as a page of the recording.
+//! The manifest, with the run's figures, as a page of the recording.
 
 use crate::archive::Manifest;
 use serde_json::Value;
@@ -15,21 +15,22 @@ pub(super) fn manifest(manifest: &Manifest) -> String {
     let keys = serde_json::to_value(manifest).unwrap_or_default();
     // The seals are for programs.
     for (key, value) in keys.as_object().into_iter().flatten().filter(|(key, _)| *key != "files") {
-        rows(&mut page, key, value);
+        add_rows(&mut page, key, value);
     }
     page
 }
 
-/// A value as a row, or as one for each of its parts.
-fn rows(page: &mut String, key: &str, value: &Value) {
+/// Adds a row for a value, or a row for each of its parts.
+fn add_rows(page: &mut String, key: &str, value: &Value) {
     let text = match value {
         Value::Object(parts) => {
-            let rows = |(part, value): (&String, _)| rows(page, &format!("{key} {part}"), value);
-            return parts.iter().for_each(rows);
+            let add_part =
+                |(part, value): (&String, _)| add_rows(page, &format!("{key} {part}"), value);
+            return parts.iter().for_each(add_part);
         }
         Value::Array(parts) => {
-            let rows = |(value, n)| rows(page, &format!("{key} {n}"), value);
-            return parts.iter().zip(1..).for_each(rows);
+            let add_element = |(value, n)| add_rows(page, &format!("{key} {n}"), value);
+            return parts.iter().zip(1..).for_each(add_element);
         }
         Value::String(text) => cell(text),
         Value::Number(number) if number.is_f64() => {
@@ -41,7 +42,7 @@ fn rows(page: &mut String, key: &str, value: &Value) {
     let _ = writeln!(page, "| {key} | {text} |");
 }
 
-/// `text` in a cell of a Markdown table, which ends at a bar and at a line's end.
+/// `text` for a cell of a Markdown table, in which a bar or a newline would end the cell.
 pub(super) fn cell(text: &str) -> String {
     text.replace('|', "\\|").replace('\n', " ")
 }

@@ -1,4 +1,4 @@
-//! `run.rrd`, made from the record of a run that is over.
+//! Makes `run.rrd` from the record of a run, after the run.
 
 use super::content::{Content, builder};
 use crate::archive::{Manifest, file};
@@ -29,7 +29,7 @@ const INDEXED_CHUNKS_MAX: usize = 800;
 /// The open file and the number of its chunks, or the first error. rerun's thread writes to it.
 type Written = Arc<Mutex<Result<(Encoder<BufWriter<File>>, usize), EncodeError>>>;
 
-/// The recording of a run that is over, written from its first record to its last.
+/// The recording of a run, made after it from all of its records, in order.
 ///
 /// It is written as `run.rrd.new`, and renamed to `run.rrd` when it is complete and synced to the disk.
 /// It must stay on the thread that created it.

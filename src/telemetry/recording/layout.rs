@@ -36,19 +36,20 @@ struct Part {
     /// `horizontal`, `vertical` or `tabs`; or rerun's class of a view. A plot, with `series`, has none.
     class: String,
     name: String,
-    /// The parts of a container, and their shares of its room.
+    /// The parts inside a container, and their shares of its size.
     inside: Vec<Part>,
     shares: Vec<f32>,
     /// The series of a plot.
     series: Vec<Series>,
-    /// The entities that another view shows.
+    /// The entities shown by a view that is not a plot.
     shows: Vec<String>,
-    /// The entity in whose frame a 3-D view is drawn; the position and the target of its eye, mm.
+    /// The entity in whose frame a 3-D view is drawn.
     origin: String,
+    /// The position of a 3-D view's eye and the point that it looks at, mm.
     eye: [[f32; 3]; 2],
 }
 
-/// A column of a table as it is drawn.
+/// A column of a table, and how it is drawn.
 #[derive(Debug, Deserialize)]
 struct Series {
     table: String,
@@ -60,7 +61,7 @@ struct Series {
     width: Option<f32>,
 }
 
-/// The layout of what `scene` shows, with the needle looked at within `reach`.
+/// The layout for `scene`, with a view of the needle within `reach`.
 fn parts(scene: &Scene, reach: &Reach) -> Result<Part, Box<dyn Error>> {
     let [across, middle] = reach.middle_mm();
     let limits = scene.stage.rotation.limits;
@@ -77,8 +78,8 @@ fn parts(scene: &Scene, reach: &Reach) -> Result<Part, Box<dyn Error>> {
     Ok(toml::from_str(&screen(include_str!("layout.toml"), &values, context! {})?)?)
 }
 
-/// Embeds the layout in the recording and makes it the active one: a layout that the viewer kept
-/// from another recording would win otherwise.
+/// Embeds the layout in the recording and activates it. Otherwise the viewer would use the layout that it
+/// kept from another recording.
 pub(super) fn send(stream: &RecordingStream, scene: &Scene, reach: &Reach) -> Logged {
     let failed = |error| tracing::error!("layout.toml: {error}; the recording has no layout");
     let Ok(parts) = parts(scene, reach).map_err(failed) else { return Ok(()) };
@@ -86,7 +87,7 @@ pub(super) fn send(stream: &RecordingStream, scene: &Scene, reach: &Reach) -> Lo
     let (layout, storage) = builder.memory()?;
     let logged = log(&layout, &parts);
     let messages = storage.take();
-    // Its own storage holds it, so that it would never end.
+    // The stream and its storage refer to each other, so the stream would never end by itself.
     layout.disconnect();
     logged?;
     let Some(first) = messages.first() else { return Ok(()) };
@@ -113,13 +114,13 @@ fn log(layout: &RecordingStream, parts: &Part) -> Logged {
         .with_timeline(RUN_TIME)
         .with_play_state(PlayState::Following);
     layout.log("time_panel", &time_panel)?;
-    // The whole run, not the last minute of it.
+    // Shows the whole run, not only its last minute.
     let whole =
         blueprint::TimeAxis::new().with_view_range(TimeRange(datatypes::TimeRange::EVERYTHING));
     layout.log(format!("{SHARED}/TimeAxis"), &whole)
 }
 
-/// Logs a part under `id`, and the parts inside it; gives its path.
+/// Logs a part under `id`, and the parts inside it; returns its path.
 fn log_part(layout: &RecordingStream, part: &Part, id: Uuid) -> Logged<String> {
     let class = match part.class.as_str() {
         "horizontal" => return log_container(layout, part, ContainerKind::Horizontal, id),
@@ -137,8 +138,8 @@ fn log_part(layout: &RecordingStream, part: &Part, id: Uuid) -> Logged<String> {
     layout.log(path.as_str(), &view)?;
     layout.log(format!("{path}/ViewContents"), &blueprint::ViewContents::new(shows))?;
     if [PLOT, "StateTimeline"].contains(&class) {
-        // Moving the time axis of one moves all. With an axis of its own a view of lanes keeps the time
-        // range with which it was opened, and shows no more of a run that goes on.
+        // All plots and lanes share one time axis. With its own axis, a view of lanes would keep the time
+        // range with which it was opened, and never show the rest of a running insertion.
         let axis = blueprint::TimeAxis::new().with_link(LinkAxis::LinkToGlobal);
         layout.log(format!("{path}/TimeAxis"), &axis)?;
     }
@@ -149,7 +150,7 @@ fn log_part(layout: &RecordingStream, part: &Part, id: Uuid) -> Logged<String> {
             log_series(layout, part, &path)?;
         }
         "TextLog" => {
-            // The lines say themselves where they come from.
+            // Each line names its own source.
             let columns = [TextLogColumnKind::LogLevel, TextLogColumnKind::Body];
             let columns = columns.map(|kind| TextLogColumn { visible: true.into(), kind });
             let columns = blueprint::TextLogColumns::new().with_text_log_columns(columns);

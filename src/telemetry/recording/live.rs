@@ -1,4 +1,4 @@
-//! Shows the run to viewers while it goes on. What its queue cannot take is dropped and counted.
+//! Shows the run to viewers while it goes on. Records that its queue cannot take are dropped and counted.
 
 use super::Logged;
 use super::content::{Content, builder, log_manifest};
@@ -10,22 +10,22 @@ use std::net::{SocketAddr, TcpListener};
 use std::thread;
 use std::time::Duration;
 
-/// Records that wait to be logged; others are dropped and counted.
+/// At most this many records wait to be logged; others are dropped and counted.
 const QUEUE_ENTRIES: usize = 32_768;
-/// The past that a viewer that connects late is given, which is most of the memory. In addition
-/// rerun holds up to 128 MiB for viewers that do not read; then the tap's thread waits, its queue
-/// runs full, and what comes after is dropped and counted.
+/// Memory for the history that a viewer gets when it connects late. In addition rerun holds up to 128 MiB for
+/// viewers that do not read. Beyond that this thread blocks, its queue fills, and further records are dropped
+/// and counted.
 const HISTORY_BYTES: u64 = 64 << 20;
 /// Viewers are given this long to take the end of the run.
 const FAREWELL: Duration = Duration::from_millis(300);
-/// A viewer that is frozen holds up the end of the run no longer than this.
+/// A frozen viewer delays the end of the run at most this long.
 pub(in crate::telemetry) const FAREWELL_MAX: Duration = Duration::from_secs(2);
 
-/// Serves the run of `manifest` to viewers at `address`, from a thread of its own. It has the identity
-/// of the recording in the file, and nothing else to do with it.
+/// Serves the run of `manifest` to viewers at `address`, from a thread of its own. Viewers see it under the same
+/// identity as `run.rrd`.
 ///
 /// # Errors
-/// The address cannot be listened at.
+/// The bench cannot listen at the address.
 pub(in crate::telemetry) fn serve(
     address: SocketAddr,
     manifest: Manifest,
@@ -35,7 +35,7 @@ pub(in crate::telemetry) fn serve(
     let failed = |reason: String| {
         TelemetryError::Recording(format!("--live: {address}: {reason}; is the port free?"))
     };
-    // The server would say so only on its own thread.
+    // The server would report a used port only on its own thread.
     TcpListener::bind(address).map_err(|e| failed(e.to_string()))?;
     let open = move || -> Logged<Content> {
         let memory_limit = MemoryLimit::from_bytes(HISTORY_BYTES);
@@ -60,7 +60,7 @@ impl Sink for Content {
         })
     }
 
-    /// Before the stream is dropped, which waits for viewers that are frozen.
+    /// Gives viewers some time, before the stream is dropped, which would wait for frozen viewers.
     fn close(&mut self, manifest: &Manifest, _: &dyn Fn()) -> Result<(), String> {
         let ended = self.end().and_then(|()| log_manifest(&self.stream, manifest));
         let _ = self.stream.flush_with_timeout(FAREWELL);

@@ -1,10 +1,10 @@
-//! The run for rerun's viewer: `run.rrd`, made when the run is over, and a live view while it goes on.
-//! Nothing outside this module names rerun.
+//! The run for rerun's viewer: `run.rrd`, made after the run, and a live view during the run. No other module
+//! names rerun.
 //!
 //! Both log the same content. Angles are in degrees here: people read this, programs read `steps.csv`.
 //!
-//! A file has 1.2 MB for the layout, and at 10 ms SYNC, with two observers alongside, 3 to 4 MB a
-//! metre of insertion at 2 mm/s, 6 MB at 1 mm/s.
+//! The layout takes 1.2 MB of a file. At 10 ms SYNC, with two observers alongside, each metre of insertion takes
+//! 3 to 4 MB at 2 mm/s, and 6 MB at 1 mm/s.
 
 mod can;
 mod content;
@@ -29,13 +29,13 @@ use rerun::{
     RecordingStreamResult,
 };
 
-/// The result of logging, or of what logs on its way.
+/// The result of a function that logs.
 type Logged<T = ()> = RecordingStreamResult<T>;
 
-/// A value in a row, with the name of its column. The name says the unit; the layout has the colours.
+/// The name of a column with its value in a row. The name has the unit; the layout has the colours.
 type NamedValue<N> = (N, f64);
 
-/// Logs a row of a table at the entity `path`: named columns of numbers whose rows share their moments. An
+/// Logs a row of a table at the entity `path`: a number for each of its columns, all at the current time. An
 /// unknown value is NaN, which a viewer draws as a gap.
 fn log_row<N: AsRef<str>>(
     stream: &RecordingStream,

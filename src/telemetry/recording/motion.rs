@@ -8,17 +8,17 @@ use crate::units::Time;
 use rerun::RecordingStream;
 use std::time::Duration;
 
-/// Positions at every SYNC.
+/// The table of positions at every SYNC.
 pub(super) const STAGE: &str = "stage";
-/// Speeds and lags, ten times a second.
+/// The table of speeds and lags, ten times a second.
 pub(super) const MOTION: &str = "motion";
-/// Limits, once a second.
+/// The table of limits, once a second.
 pub(super) const LIMITS: &str = "limits";
 
-/// The interval of a row: each speed is the mean over it, each lag the one largest in magnitude.
-const MOTION_EVERY: Duration = Duration::from_millis(100);
-/// Limits do not change. They are logged again and again only so that the viewer draws them as lines.
-const LIMITS_EVERY: Duration = Duration::from_secs(1);
+/// The interval of a row: each speed is the mean over it, each lag the largest in magnitude.
+const MOTION_INTERVAL: Duration = Duration::from_millis(100);
+/// Limits do not change. They are logged repeatedly only so that the viewer draws them as lines.
+const LIMITS_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Logs records of the stage as rows.
 pub(super) struct Motion {
@@ -56,17 +56,17 @@ impl Motion {
         log_row(stream, STAGE, columns.into_iter().zip(positions))?;
         if stage.time >= self.limits_due {
             log_row(stream, LIMITS, self.limits.iter().copied())?;
-            self.limits_due = stage.time + LIMITS_EVERY;
+            self.limits_due = stage.time + LIMITS_INTERVAL;
         }
         let lags = [positions[0] - positions[1], positions[2] - positions[3]];
-        let begins = Window { begin: stage.time, positions, worst_lags: lags };
-        let mut window = self.window.unwrap_or(begins);
+        let new_window = Window { begin: stage.time, positions, worst_lags: lags };
+        let mut window = self.window.unwrap_or(new_window);
         for (worst, lag) in window.worst_lags.iter_mut().zip(lags) {
             if lag.abs() > worst.abs() {
                 *worst = lag;
             }
         }
-        if stage.time >= window.begin + MOTION_EVERY {
+        if stage.time >= window.begin + MOTION_INTERVAL {
             let interval_s = stage.time.seconds_after(window.begin);
             let moved = positions.into_iter().zip(window.positions);
             let speeds = moved.map(|(to, from)| (to - from) / interval_s);
@@ -79,13 +79,13 @@ impl Motion {
                 "rotation_lag_deg",
             ];
             log_row(stream, MOTION, columns.into_iter().zip(speeds.chain(window.worst_lags)))?;
-            window = begins;
+            window = new_window;
         }
         self.window = Some(window);
         Ok(())
     }
 
-    /// Call it when the run is over: logs the limits once more, so that their lines reach the end.
+    /// Logs the limits once more at the end of the run, so that their lines reach it.
     pub(super) fn end(&self, stream: &RecordingStream) -> Logged {
         match self.window {
             Some(_) => log_row(stream, LIMITS, self.limits.iter().copied()),

@@ -1,4 +1,4 @@
-//! The states at the time cursor, as a page: the lanes of states show a time range, not the cursor's moment.
+//! A page with the states at the time cursor, since the lanes of states show a time range.
 
 use super::Logged;
 use super::document::cell;
@@ -11,11 +11,11 @@ use rerun::{RecordingStream, TextDocument};
 use std::fmt::Write as _;
 use std::time::Duration;
 
-/// Where the page is.
+/// The entity of the page.
 pub(super) const NOW: &str = "now";
 
-/// An event explains a state only if it came at most this long before it: longer than any stop takes.
-const REASON_MAX: Duration = Duration::from_secs(5);
+/// An event explains a state that follows within this time, which is longer than any stop takes.
+const REASON_AGE_MAX: Duration = Duration::from_secs(5);
 
 /// The state of each part, in the order in which the parts first reported one.
 #[derive(Debug, Default)]
@@ -31,15 +31,16 @@ struct Row {
 }
 
 impl Now {
-    /// `lane` has entered `state`. What was said before explains it, unless the state is as it should be.
+    /// Notes that `lane` has entered `state`. A recent event explains it; a good state needs no earlier event.
     pub(super) fn enter(&mut self, time: Time, lane: &str, state: &str, meaning: Meaning) {
         let row = self.row(lane);
         (row.state, row.since) = (state.to_owned(), time);
         let is_over = |said| meaning == Meaning::Good && said < time;
-        row.why.take_if(|(said, _)| is_over(*said) || time.since(*said) > REASON_MAX);
+        row.why.take_if(|(said, _)| is_over(*said) || time.since(*said) > REASON_AGE_MAX);
     }
 
-    /// Takes an event: a warning, a fault, or what the operator asked for. True where the page has changed.
+    /// Takes an event as the reason of a state: a warning, a fault, or a command of the operator. Returns true
+    /// if the page has changed.
     pub(super) fn explain(
         &mut self,
         time: Time,
@@ -50,16 +51,17 @@ impl Now {
         if severity == Severity::Info && !text.starts_with("operator: ") {
             return false;
         }
-        let holds = lane == Lane::Tracker
+        let explains_hold = lane == Lane::Tracker
             && self.row(&Lane::Session.to_string()).state == State::Holding.as_str();
         let mut is_new = self.explain_row(time, &lane.to_string(), text);
-        if holds {
+        if explains_hold {
             is_new |= self.explain_row(time, &Lane::Session.to_string(), text);
         }
         is_new
     }
 
-    /// The drive of `axis` has said what is wrong. True where the page has changed.
+    /// Takes an emergency message of the drive of `axis` as the reason of its state. Returns true if the page has
+    /// changed.
     pub(super) fn emergency(&mut self, time: Time, axis: Axis, emcy: &Emcy) -> bool {
         self.explain_row(time, &drive_lane(axis), &emcy.to_string())
     }
@@ -72,15 +74,15 @@ impl Now {
     }
 
     fn row(&mut self, lane: &str) -> &mut Row {
-        let at = self.0.iter().position(|row| row.lane == lane).unwrap_or_else(|| {
+        let index = self.0.iter().position(|row| row.lane == lane).unwrap_or_else(|| {
             let (lane, state) = (lane.to_owned(), String::new());
             self.0.push(Row { lane, state, since: Time::ZERO, why: None });
             self.0.len() - 1
         });
-        &mut self.0[at]
+        &mut self.0[index]
     }
 
-    /// Logs the page, as it is from here on.
+    /// Logs the page.
     pub(super) fn log(&self, stream: &RecordingStream) -> Logged {
         stream.log(NOW, &TextDocument::from_markdown(self.page()))
     }

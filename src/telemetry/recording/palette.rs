@@ -8,9 +8,9 @@ pub(super) const ESTIMATE: Color = opaque(0x56B4E9);
 pub(super) const ESTIMATE_BOUND: Color = opaque(0x3F86AD);
 /// The truth, which only the emulator knows.
 pub(super) const TRUTH: Color = opaque(0x009E73);
-/// A measurement.
+/// A measured value.
 pub(super) const MEASURED: Color = opaque(0xE69F00);
-/// A command.
+/// A commanded value.
 pub(super) const COMMANDED: Color = opaque(0xCC79A7);
 /// The first, second and third of three coordinates.
 pub(super) const COORDINATES: [Color; 3] = [opaque(0xD55E00), opaque(0xF0E442), opaque(0x0072B2)];
@@ -33,7 +33,7 @@ pub(super) const PLANE: Color = translucent(0x8A8A8A, 0x28);
 /// The lines on it.
 pub(super) const PLANE_LINES: Color = opaque(0x4A4A4A);
 
-/// The colour that `layout.toml` names so; of any other name the neutral one.
+/// The colour for a name in `layout.toml`; the neutral one for an unknown name.
 pub(super) fn named(name: &str) -> Color {
     match name {
         "estimate" => ESTIMATE,

@@ -8,15 +8,15 @@ use crate::units::Time;
 use rerun::{RecordingStream, TextLog};
 use std::time::Duration;
 
-/// Every sample that has a time of acquisition.
+/// The table of the samples that have an acquisition time.
 pub(super) const SAMPLES: &str = "samples";
-/// Samples a second, accepted and refused.
+/// The table of samples per second, accepted and refused.
 pub(super) const SAMPLE_RATES: &str = "sample_rates";
 /// The lane of the gates.
 pub(super) const GATE_LANE: &str = "gate";
 
-/// Rates are means over this long.
-const RATES_EVERY: Duration = Duration::from_millis(500);
+/// Rates are means over this interval.
+const RATE_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Logs records of samples as rows, lines and states.
 #[derive(Default)]
@@ -24,8 +24,8 @@ pub(super) struct Samples {
     window_begin: Option<Time>,
     accepted: u32,
     refused: u32,
-    /// The gate that refused the last sample; the inner `None` where it was accepted.
-    gate: Option<Option<GateName>>,
+    /// The gate that refused the last sample; the inner `None` if it was accepted.
+    last_gate: Option<Option<GateName>>,
 }
 
 impl Samples {
@@ -48,7 +48,7 @@ impl Samples {
             None => self.accepted += 1,
             Some(_) => self.refused += 1,
         }
-        if self.gate.replace(gate) != Some(gate) {
+        if self.last_gate.replace(gate) != Some(gate) {
             let (state, meaning) = match gate {
                 None => ("accepted".to_owned(), Meaning::Good),
                 Some(gate) => (format!("refused: {gate}"), Meaning::Fault),
@@ -57,12 +57,12 @@ impl Samples {
         }
         let time = sample.received.receive_time;
         let begin = *self.window_begin.get_or_insert(time);
-        if time < begin + RATES_EVERY {
+        if time < begin + RATE_INTERVAL {
             return Ok(());
         }
-        let over_s = time.seconds_after(begin);
+        let interval_s = time.seconds_after(begin);
         let rates = [("accepted_per_s", self.accepted), ("refused_per_s", self.refused)];
-        let rates = rates.map(|(name, n)| (name, f64::from(n) / over_s));
+        let rates = rates.map(|(name, n)| (name, f64::from(n) / interval_s));
         (self.accepted, self.refused) = (0, 0);
         self.window_begin = Some(time);
         log_row(stream, SAMPLE_RATES, rates)

@@ -11,7 +11,7 @@ use rerun::{
 };
 use std::f64::consts::{FRAC_PI_2, PI};
 
-/// The desired plane P, in whose frame everything of the needle is kept.
+/// The entity of the desired plane P. Everything about the needle is logged in its frame.
 pub(super) const PLANE: &str = "bench/plane";
 
 /// The rectangle of the plane that an insertion can reach, with a margin, mm.
@@ -25,8 +25,9 @@ impl Reach {
     const MARGIN_MM: f64 = 10.0;
     /// Least and greatest extent of the plane to one side, without the margin, mm.
     const SIDE_MM: [f64; 2] = [20.0, 1000.0];
-    /// No needle is looked for further away, mm.
+    /// A needle further away than this is not shown, mm.
     const PLACE_MM_MAX: f64 = 10_000.0;
+    /// At most about this many depths have a label.
     const LABELS_MAX: f64 = 6.0;
 
     /// The rectangle around the two arcs that the needle cuts when it is not turned, one to each side.
@@ -36,14 +37,14 @@ impl Reach {
         let angle = curvature_per_mm * length_mm;
         let side_mm = (1.0 - angle.min(PI).cos()) / curvature_per_mm;
         let side_mm = side_mm.clamp(Self::SIDE_MM[0], length_mm) + Self::MARGIN_MM;
-        // The stage keeps the needle near the axis when it turns it, so the straight way counts.
+        // A needle that the stage turns stays near the axis and goes further ahead than the arcs.
         let ahead_mm = angle.min(FRAC_PI_2).sin() / curvature_per_mm;
         let ahead_mm = ahead_mm.max(length_mm) + Self::MARGIN_MM;
         Reach { y_mm: [-side_mm, side_mm], z_mm: [-Self::MARGIN_MM, ahead_mm] }
     }
 
-    /// This rectangle moved to a needle that starts at `start_mm`; `None` if it starts near the origin, or at no
-    /// place (NaN, or over 10 m away).
+    /// This rectangle, moved to a needle that starts at `start_mm`. `None` if the needle starts near the origin,
+    /// or if its position cannot be right (NaN, or over 10 m away).
     pub(super) fn moved_to(&self, start_mm: &Vector3<f64>) -> Option<Self> {
         let (y_mm, z_mm) = (start_mm.y, start_mm.z);
         let is_inside = y_mm.abs() <= 0.5 * self.y_mm[1] && z_mm.abs() <= Self::MARGIN_MM;
@@ -59,16 +60,16 @@ impl Reach {
         [self.y_mm, self.z_mm].map(|[from, to]| 0.5 * (from + to))
     }
 
-    /// Distance between two depths that are labelled: a few, whatever the length.
+    /// Distance between two labelled depths, mm, so that any length has only a few labels.
     fn tick_mm(&self) -> f64 {
         let length_mm = self.z_mm[1] - self.z_mm[0] - 2.0 * Self::MARGIN_MM;
         let ticks_mm = [10.0, 20.0, 50.0, 100.0];
-        let few = ticks_mm.into_iter().find(|tick_mm| length_mm / tick_mm <= Self::LABELS_MAX);
-        few.unwrap_or(200.0)
+        let tick_mm = ticks_mm.into_iter().find(|tick_mm| length_mm / tick_mm <= Self::LABELS_MAX);
+        tick_mm.unwrap_or(200.0)
     }
 }
 
-/// Logs the plane, its axes with their names, and the goal.
+/// Logs the plane, its labelled axes, and the goal.
 pub(super) fn log(stream: &RecordingStream, scene: &Scene) -> Logged {
     // x, the distance from the plane, is up; the needle goes away from the eye.
     stream.log_static(PLANE, &ViewCoordinates::UBR())?;

@@ -24,15 +24,15 @@ const ARROW_MM: f32 = 12.0;
 /// 95 % quantile of the χ² distribution with three degrees of freedom.
 const CHI_SQUARE_95: f64 = 7.815;
 
-/// The entities whose whole history, up to the cursor, is shown.
+/// The entities that are shown with their whole history up to the cursor.
 pub(super) const TRAILS: [&str; 3] =
     ["bench/plane/path/estimate", "bench/plane/path/true", MEASURED_PATH];
 const MEASURED_PATH: &str = "bench/plane/path/measured";
 /// The planned path from the present tip to the target; only the newest is shown.
 const PLANNED_PATH: &str = "bench/plane/planned";
-/// Where the target is, which may move.
+/// The present position of the target, which may move.
 const SEEN_TARGET: &str = "bench/plane/goal/target_seen";
-/// The points around it that the tip can still reach.
+/// Points around the target, and whether the tip can still reach them.
 const REACH: &str = "bench/plane/goal/reach";
 /// Distance between the points of the planned path, mm.
 const PLANNED_STEP_MM: f64 = 2.0;
@@ -46,7 +46,7 @@ pub(super) struct Space {
 }
 
 impl Space {
-    /// Logs the colours and sizes, which do not change.
+    /// Logs the colours and sizes once.
     pub(super) fn open(stream: &RecordingStream, scene: &Scene) -> Logged<Self> {
         let space = Space {
             estimate: Tip::new("estimate", ESTIMATE),
@@ -102,8 +102,8 @@ impl Space {
         }
     }
 
-    /// Logs what one arc from the estimated tip reaches around the target: green clear, red obstructed,
-    /// blue out of reach.
+    /// Logs points around the target, coloured by whether one arc from the estimated tip reaches them: green if
+    /// clear, red if obstructed, blue if out of reach.
     fn log_reach(
         &self,
         stream: &RecordingStream,
@@ -128,13 +128,12 @@ impl Space {
     }
 }
 
-/// A tip and its trail. The tip is drawn as two arrows: along its axis, and towards the side to which it
-/// bends.
+/// A tip and its trail. The tip is drawn as two arrows: along its axis, and in the direction in which it bends.
 struct Tip {
     tip_path: String,
     trail_path: String,
     colour: Color,
-    /// Where the trail ends so far.
+    /// The present end of the trail.
     last_point_mm: Option<[f32; 3]>,
 }
 
@@ -175,7 +174,7 @@ impl Tip {
     }
 }
 
-/// Logs the 95 % ellipsoid of the estimated position, where the estimate has one.
+/// Logs the 95 % ellipsoid of the estimated position, if the estimate has a covariance.
 fn log_ellipsoid(stream: &RecordingStream, estimate: &Estimate) -> Logged {
     let covariance_mm2 = estimate.position_covariance_mm2().filter(|covariance_mm2| {
         estimate.x_pb.is_finite() && covariance_mm2.iter().all(|c| c.is_finite())

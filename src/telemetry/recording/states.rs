@@ -7,12 +7,12 @@ use crate::session::State;
 use rerun::{Color, RecordingStream, StateChange, StateConfiguration};
 use std::collections::BTreeMap;
 
-/// The states that each lane was in so far, with their meanings.
+/// The states of each lane so far, with their meanings.
 #[derive(Debug, Default)]
 pub(super) struct States(BTreeMap<String, Vec<(String, Meaning)>>);
 
 impl States {
-    /// Logs that `lane` enters `state`, and the colours of its states where this one is new.
+    /// Logs that `lane` enters `state`. If the state is new, also logs the colours of the lane's states.
     pub(super) fn log(
         &mut self,
         stream: &RecordingStream,
@@ -39,9 +39,9 @@ impl States {
 pub(super) enum Meaning {
     /// As it should be.
     Good,
-    /// On the way to something, or over.
+    /// A transition, or the end.
     Passing,
-    /// It deserves a look.
+    /// The operator should look.
     Warning,
     /// Something is wrong.
     Fault,
@@ -88,8 +88,7 @@ impl Meaning {
         }
     }
 
-    /// The colour of the `n`-th state of a lane. Passing states have one of three, so that they can be
-    /// distinguished.
+    /// The colour of the `n`-th state of a lane. Passing states use three colours, so that neighbours differ.
     fn colour(self, n: usize) -> Color {
         match self {
             Meaning::Good => GOOD,

@@ -13,10 +13,10 @@ use rerun::RecordingStream;
 
 /// The table of the steps.
 pub(super) const STEPS: &str = "steps";
-/// The tables of the observers that run alongside, by name.
+/// The path of the tables of the observers that run alongside.
 pub(super) const SHADOWS: &str = "shadows";
 
-/// Names of the six coordinates, with the unit in which a reader sees them.
+/// The six coordinates, each with the unit in which it is shown.
 pub(super) const COORDINATES: [(&str, &str); 6] =
     [("x", "mm"), ("y", "mm"), ("z", "mm"), ("yaw", "deg"), ("pitch", "deg"), ("roll", "deg")];
 /// Indices of the reduced coordinates x, pitch and roll: those that matter for the plane.
@@ -30,20 +30,20 @@ pub(super) fn column(n: usize, provenance: &str) -> String {
     format!("{name}_{provenance}_{unit}")
 }
 
-/// Columns of `steps.csv` that the viewer has elsewhere.
+/// Columns of `steps.csv` that are in other tables or time lines.
 const ELSEWHERE: [&str; 4] = ["step", "time_s", "insertion_mm", "rotation_rad"];
 
 /// Logs records of steps as rows.
 pub(super) struct Steps {
-    /// Whether the steps come with the truth.
+    /// Whether the steps have the truth.
     has_truth: bool,
-    /// The roll shown last, without jumps at ±180°.
-    roll_shown_rad: f64,
+    /// The last roll that was shown, without jumps at ±180°.
+    last_roll_rad: f64,
 }
 
 impl Steps {
     pub(super) fn new(scene: &Scene) -> Self {
-        Steps { has_truth: scene.truth, roll_shown_rad: 0.0 }
+        Steps { has_truth: scene.truth, last_roll_rad: 0.0 }
     }
 
     pub(super) fn log(
@@ -65,7 +65,7 @@ impl Steps {
         for (name, shadow) in &step.decision.shadows {
             let estimate = shadow.as_ref().map_or(UNKNOWN, coordinates_of);
             let mut shown = estimate;
-            shown[ROLL] = near(shown[ROLL], self.roll_shown_rad);
+            shown[ROLL] = nearest_turn(shown[ROLL], self.last_roll_rad);
             let shown = in_degrees(shown);
             let row = (0..6).map(|n| (column(n, "est"), shown[n])).chain(errors(estimate));
             log_row(stream, &format!("{SHADOWS}/{name}"), row)?;
@@ -98,20 +98,19 @@ impl Steps {
         log_row(stream, STEPS, row.chain(target_band(step)))
     }
 
-    /// Removes the jumps of the roll at ±180°: shifts it by whole turns to the value nearest to the roll
-    /// that was shown last (the estimate's, or the truth's if there is one), and keeps it as the next
-    /// reference.
+    /// Removes the jumps of the roll at ±180°: shifts it by whole turns to the value nearest to the last roll
+    /// that was shown, and keeps it as the next reference.
     fn unwrap_roll(&mut self, coordinates: &mut [f64; 6]) {
         let roll = &mut coordinates[ROLL];
         if roll.is_finite() {
-            *roll = near(*roll, self.roll_shown_rad);
-            self.roll_shown_rad = *roll;
+            *roll = nearest_turn(*roll, self.last_roll_rad);
+            self.last_roll_rad = *roll;
         }
     }
 }
 
-/// The predicted error at the target less and plus twice its standard deviation, mm: that of the position,
-/// and that of the heading over the rest of the path. What is corrected on the way is not in it.
+/// The predicted error at the target minus and plus two standard deviations, mm. These combine that of the
+/// position and that of the heading over the rest of the path, and ignore later corrections.
 fn target_band(step: &StepRecord) -> Vec<(String, f64)> {
     let Decision { approach, estimate, .. } = &step.decision;
     let known = approach.as_ref().zip(estimate.and_then(|estimate| estimate.sd));
@@ -122,16 +121,16 @@ fn target_band(step: &StepRecord) -> Vec<(String, f64)> {
     vec![("target_error_low_mm".to_owned(), low_mm), ("target_error_high_mm".to_owned(), high_mm)]
 }
 
-/// `angle_rad` plus or minus whole turns, within half a turn of `shown_rad`.
-fn near(angle_rad: f64, shown_rad: f64) -> f64 {
-    shown_rad + wrap_angle(angle_rad - shown_rad)
+/// `angle_rad` plus or minus whole turns, within half a turn of `reference_rad`.
+fn nearest_turn(angle_rad: f64, reference_rad: f64) -> f64 {
+    reference_rad + wrap_angle(angle_rad - reference_rad)
 }
 
 fn coordinates_of(estimate: &Estimate) -> [f64; 6] {
     coordinates(&estimate.x_pb)
 }
 
-/// Coordinates as a reader sees them: mm and degrees.
+/// Coordinates in mm and degrees.
 fn in_degrees(coordinates: [f64; 6]) -> [f64; 6] {
     std::array::from_fn(|n| if n < 3 { coordinates[n] } else { coordinates[n].to_degrees() })
 }
