@@ -9,39 +9,39 @@ use crate::text::fixed;
 use serde_json::Value;
 use std::collections::BTreeMap;
 
-/// Figures of a run: key, name in words, unit and decimals.
+/// The figures of a run: key, label, unit and decimals.
 const FIGURES: [(&str, &str, &str, usize); 14] = [
     (DEPTH, "depth", "mm", 2),
     (OFF_PLANE, "off plane", "mm", 3),
-    ("target_error_mm", "tip from the target at the end", "mm", 3),
-    ("target_error_est_mm", "the same, as estimated", "mm", 3),
-    ("clearance_mm_min", "tip from an obstacle, least, estimated", "mm", 2),
+    ("target_error_mm", "distance from the target at the end", "mm", 3),
+    ("target_error_est_mm", "distance from the target at the end, estimated", "mm", 3),
+    ("clearance_mm_min", "distance from an obstacle, min, estimated", "mm", 2),
     ("settling_mm", "within 1 mm of the plane from", "mm", 1),
     ("steps", "steps", "", 0),
     ("steps_saturated", "steps in which the law saturated", "", 0),
-    (TIP_AGE, "tip position at a step, oldest", "s", 3),
-    ("tip_lag_mm_max", "inserted since it, most", "mm", 3),
-    ("blind_s_max", "newest tip position at any time, oldest", "s", 3),
-    (BLIND_DEPTH, "inserted since that, most", "mm", 3),
-    ("following_error_mm_max", "insertion from its target, most", "mm", 3),
-    ("following_error_deg_max", "rotation from its target, most", "deg", 2),
+    (TIP_AGE, "age of the tip position at a step, max", "s", 3),
+    ("tip_lag_mm_max", "depth past the step's tip position, max", "mm", 3),
+    ("blind_s_max", "age of the newest tip position, max", "s", 3),
+    (BLIND_DEPTH, "depth past the newest tip position, max", "mm", 3),
+    ("following_error_mm_max", "following error of the insertion, max", "mm", 3),
+    ("following_error_deg_max", "following error of the rotation, max", "deg", 2),
 ];
-/// How late SYNCs left the bench; a run in virtual time has no such figures.
+/// How late SYNCs left the bench. A run in virtual time has no such figures.
 const TIMING: [(&str, &str, &str, usize); 3] = [
-    ("sync_late_us_p50", "SYNC late, median", "µs", 0),
-    ("sync_late_us_p99", "SYNC late, 99 %", "µs", 0),
-    ("sync_late_us_max", "SYNC late, most", "µs", 0),
+    ("sync_late_us_p50", "SYNC delay, median", "µs", 0),
+    ("sync_late_us_p99", "SYNC delay, 99 %", "µs", 0),
+    ("sync_late_us_max", "SYNC delay, max", "µs", 0),
 ];
-/// The depth reached. Its limit is a lower one; every other limit is an upper one.
+/// The final depth. Its limit is a lower limit; all other limits are upper limits.
 const DEPTH: &str = "insertion_mm";
 pub(super) const OFF_PLANE: &str = "off_plane_rms_mm";
 pub(super) const TIP_AGE: &str = "tip_age_s_max";
 pub(super) const BLIND_DEPTH: &str = "blind_mm_max";
 
-/// The depth to reach, among the limits.
-pub(super) const GOAL: &str = "depth_mm";
+/// The configured depth, among the limits.
+pub(super) const TARGET_DEPTH: &str = "depth_mm";
 
-/// The limits of figures, by the figures' keys, and the depth to reach.
+/// The limits of the figures, by their keys, and the configured depth.
 pub(super) type Limits = BTreeMap<&'static str, f64>;
 
 /// One figure of a run.
@@ -81,16 +81,16 @@ impl Figure {
     }
 }
 
-/// The limits that a run of `config` was under.
+/// The limits of a run with this `config`.
 ///
 /// # Errors
-/// A stage that this version refuses.
+/// This version of the bench refuses the stage.
 pub(super) fn limits(config: &Config) -> Result<Limits, ConfigError> {
     let stage = config.stage.to_stage(&config.can)?;
     let following = |axis| stage.axis(axis).following_error_limit(stage.bus.sync_period());
     let (insertion, tracker) = (&config.insertion, &config.tracker);
     let mut limits = Limits::from([
-        (GOAL, insertion.depth_mm),
+        (TARGET_DEPTH, insertion.depth_mm),
         (DEPTH, insertion.depth_mm - insertion.arrival_mm),
         (OFF_PLANE, OFF_PLANE_LIMIT_MM),
         (TIP_AGE, tracker.hold.after.as_secs_f64()),
@@ -101,7 +101,7 @@ pub(super) fn limits(config: &Config) -> Result<Limits, ConfigError> {
         ("following_error_deg_max", following(Axis::Rotation).to_degrees()),
     ]);
     if config.goal.kind == GoalKind::Target {
-        limits.retain(|key, _| ![GOAL, DEPTH, OFF_PLANE].contains(key));
+        limits.retain(|key, _| ![TARGET_DEPTH, DEPTH, OFF_PLANE].contains(key));
         limits.extend(
             ["target_error_mm", "target_error_est_mm"].map(|key| (key, config.goal.tolerance_mm)),
         );
@@ -109,7 +109,7 @@ pub(super) fn limits(config: &Config) -> Result<Limits, ConfigError> {
     Ok(limits)
 }
 
-/// The figures of a run with their limits. An operation of the stage without a needle has fewer.
+/// The figures of a run with their limits. An operation of the stage has fewer.
 fn figures(folder: &Folder, report: &FigureReport, limits: &Limits) -> Vec<Figure> {
     let is_insertion = folder.manifest.operation.is_none();
     let values = serde_json::to_value(report).unwrap_or_default();
@@ -122,11 +122,11 @@ fn figures(folder: &Folder, report: &FigureReport, limits: &Limits) -> Vec<Figur
         limit: limits.get(key).copied().filter(|_| is_insertion || key != DEPTH),
     };
     let mut all: Vec<Figure> = FIGURES.iter().map(of_report).collect();
-    // The manifest of a record left open may not name the bus.
+    // An open record's manifest may not name the bus.
     let has_truth = folder.is_emulated() || report.final_error.is_some();
-    let known = if has_truth { "true" } else { "estimated" };
+    let provenance = if has_truth { "true" } else { "estimated" };
     for figure in all.iter_mut().filter(|figure| figure.key == OFF_PLANE) {
-        figure.label = format!("off plane ({known}), RMS over {}", last_third(folder, report));
+        figure.label = format!("off plane ({provenance}), RMS over {}", last_third(folder, report));
     }
     if !limits.contains_key("target_error_mm") {
         all.retain(|figure| !figure.key.starts_with("target") && figure.key != "clearance_mm_min");
@@ -144,8 +144,8 @@ fn figures(folder: &Folder, report: &FigureReport, limits: &Limits) -> Vec<Figur
     all
 }
 
-/// Names the depth that the figures of the last third cover. In a run that was stopped this is the
-/// last third of the depth reached.
+/// The depth that the figures of the last third cover, in words. In a run that was stopped this is the last
+/// third of the depth that it reached.
 pub(super) fn last_third(folder: &Folder, report: &FigureReport) -> String {
     match folder.manifest.outcome {
         Some(RunOutcome::Completed) => "the last third".to_owned(),
@@ -156,7 +156,7 @@ pub(super) fn last_third(folder: &Folder, report: &FigureReport) -> String {
     }
 }
 
-/// The estimate's errors, a figure for each coordinate.
+/// The errors of the estimate: a figure for each coordinate.
 fn errors(folder: &Folder, report: &FigureReport) -> Vec<Figure> {
     let rms = format!("estimate's error, RMS over {},", last_third(folder, report));
     let sets = [
@@ -181,11 +181,11 @@ fn errors(folder: &Folder, report: &FigureReport) -> Vec<Figure> {
     all
 }
 
-/// The figures that `steps.csv` alone gives, for a run that was not closed; `None` if the text is not
-/// such a file.
+/// The figures that can be computed from `steps.csv` alone, for a run that was not closed; `None` if the text is
+/// not such a file.
 pub fn figures_of_steps(steps_csv: &str) -> Option<FigureReport> {
     let steps = StepsTable::parse(steps_csv).ok()?;
-    let six = |provenance: &str| {
+    let coordinates = |provenance: &str| {
         TipError::COORDINATES.map(|name| {
             let (coordinate, unit) = name.split_once('_').unwrap_or((name, ""));
             let unit = if unit == "mm" { "mm" } else { "rad" };
@@ -199,7 +199,8 @@ pub fn figures_of_steps(steps_csv: &str) -> Option<FigureReport> {
         }
         Some(values)
     };
-    let (est, truth, depths) = (six("est"), six("true"), steps.column("insertion_mm"));
+    let (est, truth) = (coordinates("est"), coordinates("true"));
+    let depths = steps.column("insertion_mm");
     let mut figures = RunFigures::default();
     for (row, depth) in depths.into_iter().enumerate() {
         let Some(depth_mm) = depth else { continue };
@@ -216,7 +217,7 @@ impl Run {
         figures(&self.folder, &self.figures(), &self.folder.limits().unwrap_or_default())
     }
 
-    /// These, and the errors of the estimate.
+    /// The run's figures with their limits, and the errors of the estimate.
     pub(super) fn all_figures(&self) -> Vec<Figure> {
         let mut all = self.limited_figures();
         all.extend(errors(&self.folder, &self.figures()));

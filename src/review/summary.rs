@@ -9,8 +9,8 @@ use minijinja::context;
 use minijinja::value::Serde;
 use serde_json::{Map, Value, json};
 
-/// The course of `run`, its figures with their limits, its warnings, and last how it ended.
-/// `report` is the path of its page.
+/// The states of `run`, its figures with their limits, its warnings, and how it ended.
+/// `report` is the path of its HTML report.
 ///
 /// # Errors
 /// A fault in the template `run.txt`.
@@ -29,7 +29,7 @@ pub fn to_text(run: &Run, report: Option<&str>) -> Result<String, minijinja::Err
         started => utc(&manifest.started_utc),
         record => format!("{}: {}", folder.dir, folder.condition_name()),
         report,
-        positions => tracker(&manifest.gates),
+        positions => positions(&manifest.gates),
         states => minijinja::Value::from(Serde(run.states())),
         rows => known.map(row).collect::<Vec<_>>(),
         third => last_third(folder, &figures),
@@ -43,8 +43,8 @@ pub fn to_text(run: &Run, report: Option<&str>) -> Result<String, minijinja::Err
     screen(include_str!("run.txt"), manifest, more)
 }
 
-/// `5015 accepted, 12 refused (8 innovation, 4 status)`.
-pub(super) fn tracker(gates: &Map<String, Value>) -> Option<String> {
+/// The numbers of tip positions, such as `5015 accepted, 12 refused (8 innovation, 4 status)`.
+pub(super) fn positions(gates: &Map<String, Value>) -> Option<String> {
     let accepted = gates.get("accepted")?;
     let by_gate = gates.get("refused").and_then(Value::as_object)?;
     let all: u64 = by_gate.values().filter_map(Value::as_u64).sum();
@@ -96,7 +96,7 @@ pub fn to_json(run: &Run) -> Value {
 
 /// The warnings of `run`, the most serious first; its events with their times come last.
 fn warnings(run: &Run) -> Vec<String> {
-    let mut all = doubts(run);
+    let mut all = record_warnings(run);
     let depth_mm = run.depth_over_time();
     all.extend(run.events_from(Severity::Warning).map(|line| {
         let time_s = line.time.as_secs_f64();
@@ -106,8 +106,8 @@ fn warnings(run: &Run) -> Vec<String> {
     all
 }
 
-/// The doubts about `run` other than its events, the most serious first.
-pub(super) fn doubts(run: &Run) -> Vec<String> {
+/// The warnings of `run` other than its events, the most serious first.
+pub(super) fn record_warnings(run: &Run) -> Vec<String> {
     let manifest = &run.folder.manifest;
     let mut all = Vec::new();
     all.extend(run.folder.caution());
@@ -133,7 +133,11 @@ pub(super) fn doubts(run: &Run) -> Vec<String> {
     all.extend(manifest.faults.iter().map(|fault| format!("record: {fault}")));
     for figure in run.limited_figures().iter().filter(|figure| figure.is_outside()) {
         let Figure { label, unit, .. } = figure;
-        all.push(format!("{label}: {} {unit}, to be {}", figure.value_text(), figure.limit_text()));
+        all.push(format!(
+            "{label}: {} {unit}, must be {}",
+            figure.value_text(),
+            figure.limit_text()
+        ));
     }
     for (key, what) in [
         ("syncs_late", "SYNCs sent late"),
