@@ -1,4 +1,4 @@
-//! Many runs: a line for each, their totals, and which runs are left out and why.
+//! A campaign of many runs: a line for each, their totals, and the runs that are left out, with the reasons.
 
 use super::compare::Keys;
 use super::group::{Group, group};
@@ -27,22 +27,22 @@ pub enum Exclusion {
     Edited,
     /// It is an operation of the stage, such as homing.
     Operation,
-    /// It is a copy of a record that counts already.
+    /// It is a copy of another record of the campaign.
     Copy,
-    /// It repeats an emulated run that counts already, bit for bit.
+    /// It repeats another emulated run of the campaign, bit for bit.
     Repeat,
-    /// It is not a run folder, or has another format.
+    /// It is not a run folder, or has the format of another version.
     Unreadable,
 }
 
 /// A folder of the campaign, with its line in the list.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Line {
-    /// The folder's path.
+    /// The path of the folder.
     pub dir: String,
     /// The run; `None` if it cannot be read.
     pub run: Option<Box<Folder>>,
-    /// Why it does not count, with the details.
+    /// Why it does not count, and the details; `None` if it counts.
     pub excluded: Option<(Exclusion, String)>,
 }
 
@@ -73,9 +73,9 @@ impl Campaign {
     /// key `by`.
     ///
     /// # Errors
-    /// In words, if none of the runs that count has the key `by`.
+    /// None of the runs that count has the key `by`.
     pub fn of(mut lines: Vec<Line>, by: Option<&str>) -> Result<Self, String> {
-        lines.sort_by(|a, b| when(a).cmp(&when(b)));
+        lines.sort_by(|a, b| sort_key(a).cmp(&sort_key(b)));
         exclude_copies(&mut lines);
         exclude_repeats(&mut lines, by);
         let mut groups: BTreeMap<(String, bool), Vec<(&Folder, Keys)>> = BTreeMap::new();
@@ -91,17 +91,17 @@ impl Campaign {
                 }
             };
             known.extend(keys.keys().cloned());
-            let is_true = folder.is_emulated();
-            groups.entry((label, is_true)).or_default().push((folder, keys));
+            let has_truth = folder.is_emulated();
+            groups.entry((label, has_truth)).or_default().push((folder, keys));
         }
         if let Some(key) = by.filter(|key| !known.is_empty() && !known.contains(*key)) {
             let hint = nearest_key(key, known.iter().map(String::as_str));
             return Err(format!("--by {key}: no configuration of these runs has that key; {hint}"));
         }
         let kinds = groups.keys().cloned().collect::<BTreeSet<_>>();
-        let groups = groups.into_iter().map(|((label, is_true), runs)| {
-            let is_mixed = kinds.contains(&(label.clone(), !is_true));
-            let kind = match (is_mixed, is_true) {
+        let groups = groups.into_iter().map(|((label, has_truth), runs)| {
+            let is_mixed = kinds.contains(&(label.clone(), !has_truth));
+            let kind = match (is_mixed, has_truth) {
                 (false, _) => "",
                 (true, true) => ", the true tip known",
                 (true, false) => ", the tip as estimated",
@@ -125,7 +125,7 @@ impl Campaign {
         let rows = self.lines.iter().filter_map(|line| Some(row(line.run.as_deref()?)));
         let more = context! {
             rows => rows.collect::<Vec<_>>(),
-            // In JSON infinite medians are null.
+            // Not from the JSON, in which infinite medians are null.
             groups => minijinja::Value::from(Serde(&self.groups)),
             left_out => self.lines.len() - self.counted(),
         };
@@ -152,7 +152,7 @@ impl Campaign {
 }
 
 /// Sorts by the start of the run; folders that cannot be read come last.
-fn when(line: &Line) -> (bool, &str, &str) {
+fn sort_key(line: &Line) -> (bool, &str, &str) {
     let started = line.run.as_ref().map_or("", |run| run.manifest.started_utc.as_str());
     (line.run.is_none(), started, &line.dir)
 }

@@ -10,7 +10,7 @@ use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 use toml::Table;
 
-/// What a manifest says of bench, rig and people, beside the drives.
+/// The keys of a manifest that describe bench, rig and people, except for the drives.
 const SETTING: [&str; 9] = [
     "version",
     "git",
@@ -26,7 +26,7 @@ const SETTING: [&str; 9] = [
 /// The differences between two runs, and their figures.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Comparison {
-    /// The folders, and how their runs ended.
+    /// For each run its folder and how it ended.
     runs: [(String, String); 2],
     /// Configuration keys that differ.
     configuration: Differences,
@@ -34,7 +34,7 @@ pub struct Comparison {
     setting: Differences,
     /// The figures of both runs, in pairs.
     figures: Vec<[Figure; 2]>,
-    /// Reasons to doubt the comparison.
+    /// Reasons for caution with the comparison.
     warnings: Vec<String>,
 }
 
@@ -64,18 +64,18 @@ impl Comparison {
     /// # Errors
     /// A fault in the template `compare.txt`.
     pub fn to_text(&self) -> Result<String, minijinja::Error> {
-        let side = |value: &Option<String>| value.clone().unwrap_or_else(|| "-".to_owned());
+        let or_dash = |value: &Option<String>| value.clone().unwrap_or_else(|| "-".to_owned());
         let row = |(key, Difference { a, b }): (&String, &Difference)| {
-            [format!("  {key}"), escaped(&format!("{} → {}", side(a), side(b))).into_owned()]
+            [format!("  {key}"), escaped(&format!("{} → {}", or_dash(a), or_dash(b))).into_owned()]
         };
         let rows = |all: &Differences| all.iter().map(row).collect::<Vec<_>>();
         let figures = self.figures.iter().map(|[a, b]| {
-            let difference = difference(a, b).map(|by| format!("{by:+.*}", a.decimals));
+            let difference = difference(a, b).map(|value| format!("{value:+.*}", a.decimals));
             let label = match a.label == b.label {
                 true => format!("  {}", a.label),
                 false => format!("  {}; b: {}", a.label, b.label),
             };
-            [label, a.value_text(), b.value_text(), side(&difference), a.unit.to_owned()]
+            [label, a.value_text(), b.value_text(), or_dash(&difference), a.unit.to_owned()]
         });
         let more = context! {
             differences => [("configuration", rows(&self.configuration)), ("setting", rows(&self.setting))],
@@ -102,13 +102,14 @@ impl Comparison {
     }
 }
 
-/// `None` for figures of different kinds, such as a true and an estimated distance.
+/// The value of `b` minus that of `a`; `None` if they cannot be compared, such as a true and an estimated
+/// distance.
 fn difference(a: &Figure, b: &Figure) -> Option<f64> {
     let difference = b.value? - a.value?;
     (a.label == b.label).then_some(difference)
 }
 
-/// The figures of both runs, in the order of the first; unknown figures are left out.
+/// The figures of both runs in pairs, in the order of the first run. A figure that neither run has is left out.
 fn figures(a: &Run, b: &Run) -> Vec<[Figure; 2]> {
     let (a, b) = (a.all_figures(), b.all_figures());
     let unknown = |figure: &Figure| Figure { value: None, ..figure.clone() };
@@ -121,13 +122,13 @@ fn figures(a: &Run, b: &Run) -> Vec<[Figure; 2]> {
     pairs.filter(|pair| pair.iter().any(|figure| figure.value.is_some())).collect()
 }
 
-/// What a manifest says of bench, rig and people, other than the configuration.
+/// The parts of a manifest that describe bench, rig, people and drives.
 fn setting(manifest: &Manifest) -> Keys {
     let all = serde_json::to_value(manifest).unwrap_or_default();
-    let said = SETTING.into_iter().filter_map(|key| Some((key, all[key].as_str()?)));
-    let said = said.map(|(key, value)| (key.to_owned(), value.to_owned()));
+    let given = SETTING.into_iter().filter_map(|key| Some((key, all[key].as_str()?)));
+    let given = given.map(|(key, value)| (key.to_owned(), value.to_owned()));
     let drives = manifest.drives.iter().map(|d| (format!("{} drive", d.axis), drive(d)));
-    said.chain(drives).collect()
+    given.chain(drives).collect()
 }
 
 /// A drive's identity in one line.
@@ -165,6 +166,7 @@ pub fn keys(toml: &str) -> Result<Keys, toml::de::Error> {
     Ok(keys)
 }
 
+/// Adds the keys of the `table` at `path` to `keys`.
 fn flatten(path: &str, table: &Table, keys: &mut Keys) {
     for (name, value) in table {
         let key = if path.is_empty() { name.clone() } else { format!("{path}.{name}") };
@@ -172,10 +174,10 @@ fn flatten(path: &str, table: &Table, keys: &mut Keys) {
             toml::Value::Table(table) => flatten(&key, table, keys),
             toml::Value::Array(values) if values.iter().any(toml::Value::is_table) => {
                 for (n, value) in values.iter().enumerate() {
-                    let at = format!("{key}[{n}]");
+                    let element = format!("{key}[{n}]");
                     match value {
-                        toml::Value::Table(table) => flatten(&at, table, keys),
-                        other => drop(keys.insert(at, other.to_string())),
+                        toml::Value::Table(table) => flatten(&element, table, keys),
+                        other => drop(keys.insert(element, other.to_string())),
                     }
                 }
             }

@@ -1,4 +1,4 @@
-//! The totals of runs of one kind, with confidence intervals of 95 %.
+//! The totals of a group of runs, with confidence intervals of 95 %.
 
 use super::compare::Keys;
 use super::run::Folder;
@@ -8,7 +8,7 @@ use crate::study::{FigureReport, OFF_PLANE_LIMIT_MM, quantile};
 use serde::Serialize;
 use std::collections::BTreeSet;
 
-/// Runs with the same name, or with the same value of a key, and their totals.
+/// The totals of the runs with the same name, or with the same value of a key.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Group {
     /// The name or the value.
@@ -22,13 +22,14 @@ pub struct Group {
     pub completed: Proportion,
     /// The runs without a target that reached it within 1 mm RMS of the plane over the last third.
     pub settled: Proportion,
-    /// Their distance from the plane over the last third, RMS, mm; infinite for a run that was stopped.
+    /// The distance of these runs from the plane over the last third, RMS, mm; infinite for a run that was
+    /// stopped.
     pub off_plane_rms_mm: Option<MedianInterval>,
-    /// Depth after which the tip stays within 1 mm of the plane, mm; infinite where it does not.
+    /// Depth after which the tip stays within 1 mm of the plane, mm; infinite if it does not.
     pub settling_mm: Option<MedianInterval>,
     /// The runs to a target that ended within its tolerance.
     pub reached: Proportion,
-    /// Distance of their tips from the target at the end, mm: the true one if known, else the
+    /// Distance of the tip from the target at the end of these runs, mm: the true one if known, else the
     /// estimated one; infinite for a run that was stopped.
     pub target_error_mm: Option<MedianInterval>,
 }
@@ -43,8 +44,8 @@ pub(super) fn group(label: String, runs: &[(&Folder, Keys)]) -> Group {
         let figures = run.figures().filter(|_| is_completed(run));
         figures.as_ref().and_then(of).unwrap_or(f64::INFINITY)
     };
-    let pick = |of| in_plane.iter().map(|run| figure(run, of)).collect::<Vec<_>>();
-    let off_plane = pick(|figures| figures.off_plane_rms_mm);
+    let in_plane_figures = |of| in_plane.iter().map(|run| figure(run, of)).collect::<Vec<_>>();
+    let off_plane = in_plane_figures(|figures| figures.off_plane_rms_mm);
     let settled = off_plane.iter().filter(|rms_mm| **rms_mm < OFF_PLANE_LIMIT_MM).count();
     let errors = to_target.iter().map(|run| figure(run, FigureReport::target_error));
     let errors: Vec<f64> = errors.collect();
@@ -55,18 +56,18 @@ pub(super) fn group(label: String, runs: &[(&Folder, Keys)]) -> Group {
     Group {
         label,
         configurations: hashes.len(),
-        varied: varied(runs),
+        varied: varied_keys(runs),
         completed: Proportion::new(completed, runs.len()),
         settled: Proportion::new(settled, in_plane.len()),
         off_plane_rms_mm: MedianInterval::of(&off_plane),
-        settling_mm: MedianInterval::of(&pick(|figures| figures.settling_mm)),
+        settling_mm: MedianInterval::of(&in_plane_figures(|figures| figures.settling_mm)),
         reached: Proportion::new(reached, to_target.len()),
         target_error_mm: MedianInterval::of(&errors),
     }
 }
 
-/// The keys that differ between `runs`.
-fn varied(runs: &[(&Folder, Keys)]) -> Vec<String> {
+/// The keys whose values differ between `runs`.
+fn varied_keys(runs: &[(&Folder, Keys)]) -> Vec<String> {
     let all: BTreeSet<&String> = runs.iter().flat_map(|(_, keys)| keys.keys()).collect();
     let differs = |key: &&String| {
         let values: BTreeSet<Option<&String>> =
@@ -78,13 +79,13 @@ fn varied(runs: &[(&Folder, Keys)]) -> Vec<String> {
 
 /// The 0.975 quantile of the normal distribution.
 const Z: f64 = 1.959_963_984_540_054;
-/// The probability that an interval leaves out at each side.
+/// The probability outside an interval, at each side.
 const TAIL: f64 = 0.025;
 
-/// A share of runs, with its interval.
+/// A share of runs, with its confidence interval.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Proportion {
-    /// Number of runs that did.
+    /// Number of runs that have the property.
     pub count: usize,
     /// Number of all runs.
     pub of: usize,
@@ -110,14 +111,14 @@ impl Proportion {
     }
 }
 
-/// A median, with its interval. Infinite values are null in JSON.
+/// A median, with its confidence interval. Infinite values are null in JSON.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct MedianInterval {
-    /// Half of the runs are better; infinite if half of the runs never got there.
+    /// The median; infinite if half of the values are.
     #[serde(rename = "median")]
     pub value: f64,
-    /// An interval of at least 95 % between two of the values, for any distribution; `None` with
-    /// fewer than six runs.
+    /// A distribution-free interval of at least 95 %, between two of the values; `None` with fewer than six
+    /// runs.
     #[serde(rename = "order_statistics_95")]
     pub interval: Option<[f64; 2]>,
 }
@@ -138,9 +139,9 @@ impl MedianInterval {
     }
 }
 
-/// The rank k of the interval's lower end among `n`, from 1.
+/// The rank k, from 1, of the lower end of the median's interval among `n` values.
 fn median_rank(n: usize) -> Option<usize> {
-    // P(B = i) by its logarithm: for some thousand runs 2^-n underflows.
+    // Uses the logarithm of P(B = i), since 2^-n underflows for some thousand runs.
     let mut log_mass = -(n as f64) * std::f64::consts::LN_2;
     let mut below = 0.0;
     for i in 0..n {

@@ -1,7 +1,6 @@
-//! Reviews of recorded runs: one run, two side by side, a campaign.
+//! Reviews of recorded runs, as text, JSON and HTML: one run, two side by side, or a campaign.
 //!
-//! Text, JSON and HTML from the content of run folders. Nothing here reads a file: the caller
-//! passes the content and the condition of each folder.
+//! Nothing here reads a file: the caller passes the content and the condition of each run folder.
 
 mod campaign;
 mod compare;
@@ -15,7 +14,7 @@ mod summary;
 pub use campaign::{Campaign, Line};
 pub use compare::{Comparison, differences, keys};
 pub use figures::figures_of_steps;
-pub use motion::{Motion, stamped};
+pub use motion::{Motion, timed_frame};
 pub use report::{GENERATOR, html};
 pub use run::{Condition, Folder, Run, event};
 pub use summary::{to_json, to_text};

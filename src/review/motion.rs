@@ -1,15 +1,15 @@
-//! How the axes moved, from the frames of a record: an operation takes no steps.
+//! The motion of the axes, from the recorded frames: an operation has no steps.
 
 use super::run::Folder;
 use crate::archive::{CandumpLine, unix_us_of};
 use crate::canopen::{Frame, NodeId, cob};
 use crate::stage::{Axis, PerAxis, StageConfig, Unwrapper};
 
-/// The least time between two points of a curve, s.
+/// Minimum time between two points of a curve, s.
 const POINT_EVERY_S: f64 = 0.02;
 
-/// A frame of `can.log`, and when it came, UTC, µs since 1970.
-pub(super) type Stamped = (i64, Frame);
+/// The time of a frame of `can.log`, UTC, µs since 1970, and the frame.
+pub(super) type TimedFrame = (i64, Frame);
 
 /// Times, s since the start of the run, with positions in mm or degrees.
 type Course = Vec<(f64, f64)>;
@@ -24,14 +24,14 @@ pub struct Motion {
 }
 
 /// The frame in a `line` of `can.log`; `None` for any other text.
-pub fn stamped(line: &str) -> Option<Stamped> {
+pub fn timed_frame(line: &str) -> Option<TimedFrame> {
     CandumpLine::parse(line).map(|line| (line.unix_us, line.frame))
 }
 
 impl Motion {
-    /// The motion in the `frames` of the run in `folder`; none where its configuration or the time of its
-    /// start cannot be read.
-    pub fn new(frames: &[Stamped], folder: &Folder) -> Self {
+    /// The motion in the `frames` of the run in `folder`; empty if its configuration or its start time cannot be
+    /// read.
+    pub fn new(frames: &[TimedFrame], folder: &Folder) -> Self {
         let config = folder.config().ok();
         let stage = config.and_then(|config| config.stage.to_stage(&config.can).ok());
         let started_us = unix_us_of(&folder.manifest.started_utc);
@@ -43,25 +43,25 @@ impl Motion {
     }
 }
 
-/// The targets or positions of `axis` in the PDOs that its node sends or takes under the identifier
-/// `cob_id`: two bytes and then the counts, as the bench maps both.
+/// The positions of `axis` in the PDOs with the identifier `cob_id` of its node. The bench maps the counts
+/// after two bytes in both PDOs.
 fn course(
-    frames: &[Stamped],
+    frames: &[TimedFrame],
     started_us: i64,
     stage: &StageConfig,
     axis: Axis,
     cob_id: fn(NodeId) -> u16,
 ) -> Course {
     let config = stage.axis(axis);
-    let of_axis = Some(cob_id(config.node));
-    let pdos = frames.iter().filter(|(_, frame)| frame.cob_id() == of_axis);
-    let mut counts = None::<Unwrapper>;
+    let pdo_id = Some(cob_id(config.node));
+    let pdos = frames.iter().filter(|(_, frame)| frame.cob_id() == pdo_id);
+    let mut unwrapper = None::<Unwrapper>;
     let mut scale = None;
     let mut course = Course::new();
     for (unix_us, frame) in pdos {
         let &[_, _, c0, c1, c2, c3] = frame.data() else { continue };
         let reading = i32::from_le_bytes([c0, c1, c2, c3]);
-        let position = counts.get_or_insert(Unwrapper::new(reading)).unwrap(reading);
+        let position = unwrapper.get_or_insert(Unwrapper::new(reading)).unwrap(reading);
         let scale = scale.get_or_insert_with(|| config.scale(axis, position));
         let time_s = unix_us.saturating_sub(started_us) as f64 * 1e-6;
         if course.last().is_none_or(|(last_s, _)| time_s - last_s >= POINT_EVERY_S) {
@@ -98,7 +98,7 @@ mod tests {
             // As no bench stamps it: the file was edited.
             "(-9223372036854.000000) vcan0 185#3702C4090000 R".to_owned(),
         ];
-        let frames: Vec<Stamped> = lines.iter().filter_map(|line| stamped(line)).collect();
+        let frames: Vec<TimedFrame> = lines.iter().filter_map(|line| timed_frame(line)).collect();
         assert_eq!(frames.len(), lines.len());
         let motion = Motion::new(&frames, &folder);
         assert_eq!(motion.measured.insertion, [(0.11, 0.0), (0.13, 1.0), (0.16, 2.0)]);

@@ -34,14 +34,14 @@ pub struct Folder {
     pub manifest: Manifest,
     /// Its condition.
     pub condition: Condition,
-    /// The figures from its steps, if its manifest has none: the run was not closed, or closed by a
+    /// The figures computed from its steps, if its manifest has none: the record was not closed, or closed by a
     /// repair.
     pub figures_of_steps: Option<FigureReport>,
     /// Its `config.toml`; `None` if the file is missing.
     pub config_toml: Option<String>,
 }
 
-/// The run entered a state.
+/// A change of the run's state.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(super) struct StateChange {
     /// Time since the start of the run, s.
@@ -61,7 +61,7 @@ pub struct Run {
     pub steps: StepsTable,
     /// The times in `tracker.ndjson`.
     pub samples: Vec<TrackerTimes>,
-    /// How the axes moved, for an operation.
+    /// The motion of the axes, in an operation.
     pub motion: Motion,
     /// `events.log`.
     pub events: Vec<EventLine<'static>>,
@@ -75,25 +75,25 @@ impl Run {
         self.folder.figures().unwrap_or_default()
     }
 
-    /// The depth, mm, at a time in s: linear between two steps; after the last as fast as before it, up to the
-    /// depth to which the needle got; `None` before the first.
+    /// The depth, mm, at a time in s: linear between two steps; after the last step with the speed before it, up
+    /// to the final depth; `None` before the first step.
     pub(super) fn depth_over_time(&self) -> impl Fn(f64) -> Option<f64> {
         let (times, depths) = (self.steps.column("time_s"), self.steps.column("insertion_mm"));
         let steps: Vec<(f64, f64)> =
             times.into_iter().zip(depths).filter_map(|(t, mm)| t.zip(mm)).collect();
-        let reached_mm = self.folder.depth_reached_mm();
+        let reached_mm = self.folder.final_depth_mm();
         move |time_s| {
             let after = steps.partition_point(|(t, _)| *t <= time_s);
             let (t0, mm0) = *steps.get(after.checked_sub(1)?)?;
-            let other = steps.get(after).or_else(|| steps.get(after.checked_sub(2)?));
-            let speed = other.map_or(f64::INFINITY, |(t1, mm1)| (mm1 - mm0) / (t1 - t0));
+            let neighbour = steps.get(after).or_else(|| steps.get(after.checked_sub(2)?));
+            let speed = neighbour.map_or(f64::INFINITY, |(t1, mm1)| (mm1 - mm0) / (t1 - t0));
             let end_mm = match steps.get(after) {
                 Some(_) => f64::INFINITY,
                 None => reached_mm.unwrap_or(mm0).max(mm0),
             };
-            // A single step tells no speed.
-            let way_mm = if speed.is_finite() { speed * (time_s - t0) } else { f64::INFINITY };
-            Some((mm0 + way_mm).min(end_mm))
+            // A single step gives no speed.
+            let travel_mm = if speed.is_finite() { speed * (time_s - t0) } else { f64::INFINITY };
+            Some((mm0 + travel_mm).min(end_mm))
         }
     }
 
@@ -110,15 +110,15 @@ impl Run {
         self.events.iter().filter(is_state).map(change).collect()
     }
 
-    /// When the run was stopped, s; `None` if it was not stopped, or if the record lacks the time.
-    pub(super) fn stopped_at_s(&self) -> Option<f64> {
+    /// When the run was stopped, s; `None` if it was not stopped, or if the time is not recorded.
+    pub(super) fn stop_time_s(&self) -> Option<f64> {
         let is_stopped = self.folder.manifest.outcome == Some(RunOutcome::Stopped);
         let stopping = State::Stopping.as_str();
         let change = self.states().into_iter().find(|change| change.state == stopping);
         change.filter(|_| is_stopped).map(|change| change.time_s)
     }
 
-    /// The events of at least this severity.
+    /// The events of at least the severity `least`.
     pub(super) fn events_from(&self, least: Severity) -> impl Iterator<Item = &EventLine<'static>> {
         self.events.iter().filter(
             move |line| matches!(line.kind, EventKind::Event(severity) if severity >= least),
@@ -126,7 +126,7 @@ impl Run {
     }
 }
 
-/// A line of `events.log`, if it is one.
+/// Parses a line of `events.log`.
 pub fn event(line: &str) -> Option<EventLine<'static>> {
     let line = EventLine::parse(line)?;
     Some(EventLine { text: Cow::Owned(line.text.into_owned()), ..line })
@@ -145,7 +145,7 @@ fn first_line(error: impl Display) -> String {
 }
 
 impl Folder {
-    /// What became of it; `whole` is a record that holds all of its run.
+    /// The condition in a word. `whole` means that nothing of the run is missing.
     pub(super) fn condition_name(&self) -> &'static str {
         match self.condition {
             Condition::Whole if self.is_incomplete() => "incomplete",
@@ -156,12 +156,12 @@ impl Folder {
         }
     }
 
-    /// Whether stage and needle were emulated in memory, so that the truth is in the record.
+    /// True if stage and needle were emulated in memory, so that the truth is recorded.
     pub(super) fn is_emulated(&self) -> bool {
         self.manifest.bus == CanInterface::Memory.to_string()
     }
 
-    /// Whether something of the run is not in the record, by the record's own account.
+    /// True if the manifest says that a part of the run is missing.
     pub(super) fn is_incomplete(&self) -> bool {
         let manifest = &self.manifest;
         let lost = manifest.dropped.unwrap_or_default();
@@ -184,7 +184,7 @@ impl Folder {
         }
     }
 
-    /// How its run ended, with the reason where it was stopped.
+    /// How its run ended, and if it was stopped, why.
     pub(super) fn ending(&self) -> String {
         let Manifest { outcome, stop_reason, .. } = &self.manifest;
         match (outcome, stop_reason) {
@@ -206,7 +206,7 @@ impl Folder {
     /// Its configuration.
     ///
     /// # Errors
-    /// Why it cannot be read, in a line; another version may have written it.
+    /// Why it cannot be read, in one line; for example another version of the bench wrote it.
     pub(super) fn config(&self) -> Result<Config, String> {
         let source = Source { name: "config.toml", text: self.toml()? };
         Config::from_sources(&[source], &[]).map_err(first_line)
@@ -220,7 +220,7 @@ impl Folder {
         keys(self.toml()?).map_err(first_line)
     }
 
-    /// The limits that its run was under.
+    /// The limits of its figures.
     ///
     /// # Errors
     /// Why they are not known, in words.
@@ -228,18 +228,18 @@ impl Folder {
         limits(&self.config()?).map_err(first_line)
     }
 
-    /// `goal.tolerance_mm` of a run to a target; `None` for another run, and without its configuration.
+    /// `goal.tolerance_mm` of a run to a target; `None` for any other run or without a configuration.
     pub(super) fn tolerance_mm(&self) -> Option<f64> {
         self.limits().ok()?.get("target_error_mm").copied()
     }
 
-    /// What became of the plan, where the run had a target and a step.
+    /// Whether the run reached its target; `None` without a target or a step.
     pub(super) fn plan_status(&self) -> Option<PlanStatus> {
         let is_completed = self.manifest.outcome? == RunOutcome::Completed;
         self.figures()?.plan_status(is_completed, self.tolerance_mm()?)
     }
 
-    /// The figures that the manifest keeps, or else those that the steps tell.
+    /// The figures in the manifest, or else those computed from the steps.
     pub(super) fn figures(&self) -> Option<FigureReport> {
         self.figures_of_manifest().or_else(|| self.figures_of_steps.clone())
     }
@@ -249,8 +249,8 @@ impl Folder {
         (!figures.is_empty()).then(|| serde_json::from_value(figures.into()).ok()).flatten()
     }
 
-    /// How deep the needle was at the end, mm, where the bench that closed the record said so.
-    fn depth_reached_mm(&self) -> Option<f64> {
+    /// The depth at the end, mm, if the manifest has it.
+    fn final_depth_mm(&self) -> Option<f64> {
         Some(self.figures_of_manifest()?.insertion_mm)
     }
 }

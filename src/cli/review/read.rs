@@ -3,7 +3,7 @@
 use crate::archive::{StepsTable, TrackerTimes, file};
 use crate::cli::Failure;
 use crate::cli::records::folders_in;
-use crate::review::{Condition, Folder, Line, Motion, Run, event, figures_of_steps, stamped};
+use crate::review::{Condition, Folder, Line, Motion, Run, event, figures_of_steps, timed_frame};
 use crate::telemetry::{RunFolder, TelemetryError, is_being_written};
 use std::io;
 use std::path::Path;
@@ -22,7 +22,7 @@ pub(super) fn run(path: &Path) -> Result<Run, Failure> {
     });
     let samples = lines(&record, file::TRACKER, TrackerTimes::parse, &mut unreadable);
     let motion = match folder.manifest.operation {
-        Some(_) => Motion::new(&lines(&record, file::CAN, stamped, &mut unreadable), &folder),
+        Some(_) => Motion::new(&lines(&record, file::CAN, timed_frame, &mut unreadable), &folder),
         None => Motion::default(),
     };
     let events = lines(&record, file::EVENTS, event, &mut unreadable);

@@ -1,4 +1,4 @@
-//! A chart, laid out in the pixels of the template `chart.svg`.
+//! A chart with its layout, in the pixels of the template `chart.svg`.
 
 use crate::math::log10;
 use derive_more::Display;
@@ -35,7 +35,7 @@ const BAND_MARGIN: f64 = 0.5;
 /// Larger values come from a damaged file and are left out of the charts.
 pub(super) const VALUE_MAX: f64 = 1e12;
 
-/// Points of a curve; an infinite coordinate is at the end of its axis.
+/// Points of a curve. A point with an infinite coordinate is drawn at the end of that axis.
 pub(super) type Points = Vec<(f64, f64)>;
 
 /// How a layer is drawn, in the chart and in its legend.
@@ -44,7 +44,7 @@ pub(super) type Points = Vec<(f64, f64)>;
 pub(super) enum Shape {
     /// Lines through the points of each piece.
     Line,
-    /// The same, but broad enough to be visible under another line.
+    /// Such lines, but broad enough to be visible under another line.
     Broad,
     /// The points alone.
     Points,
@@ -54,7 +54,7 @@ pub(super) enum Shape {
     Area,
 }
 
-/// The shapes of what a run has measured, estimated or commanded.
+/// The shapes of measured, estimated and commanded values.
 const CURVES: [Shape; 3] = [Shape::Line, Shape::Broad, Shape::Points];
 
 /// A layer of a chart, with its name in the legend.
@@ -92,7 +92,7 @@ impl Layer {
         Layer::new(name, NEUTRAL, Shape::Level, vec![across])
     }
 
-    /// Intervals of the x axis.
+    /// Bands over intervals of the x axis.
     pub(super) fn intervals(name: &'static str, intervals: Points) -> Self {
         let (low, high) = (f64::NEG_INFINITY, f64::INFINITY);
         let outline = |(from, to)| vec![(from, low), (from, high), (to, high), (to, low)];
@@ -105,11 +105,11 @@ impl Layer {
 
     /// Its SVG path.
     fn path(&self, x: &Axis, y: &Axis) -> String {
-        let at = |point: &(f64, f64)| format!("{:.1} {:.1}", x.at(point.0), y.at(point.1));
+        let at = |point: &(f64, f64)| format!("{:.1} {:.1}", x.pixel(point.0), y.pixel(point.1));
         let path = |piece: &Points| {
             let points: Vec<String> = piece.iter().map(at).collect();
             match self.shape {
-                // Lines without a length: their round ends are dots.
+                // Lines of zero length, whose round ends are dots.
                 Shape::Points => format!("M{}h0", points.join("h0M")),
                 Shape::Area => format!("M{}Z", points.join("L")),
                 _ => format!("M{}", points.join("L")),
@@ -119,33 +119,33 @@ impl Layer {
     }
 }
 
-/// An axis: its range of values, and where its ends are in the picture.
+/// An axis: its range of values, and the pixels of its ends.
 struct Axis {
     range: (f64, f64),
     ends: (f64, f64),
 }
 
 impl Axis {
-    fn at(&self, value: f64) -> f64 {
+    /// The pixel of `value`.
+    fn pixel(&self, value: f64) -> f64 {
         let (low, high) = self.range;
         let value = if value.is_infinite() { value.clamp(low, high) } else { value };
-        let part = (value - low) / (high - low);
-        self.ends.0 + part * (self.ends.1 - self.ends.0)
+        let fraction = (value - low) / (high - low);
+        self.ends.0 + fraction * (self.ends.1 - self.ends.0)
     }
 
-    /// The labels and where they are: about `count` of them, at multiples of 1, 2 or 5 times a power of
-    /// ten.
+    /// About `count` labels, each with its pixel, at multiples of 1, 2 or 5 times a power of ten.
     fn labels(&self, count: f64) -> Vec<(String, String)> {
         let (low, high) = self.range;
-        let least = (high - low) / count;
-        let power = log10(least).floor() as i32;
+        let step_min = (high - low) / count;
+        let power = log10(step_min).floor() as i32;
         let steps = [1.0, 2.0, 5.0, 10.0].map(|factor| factor * 10f64.powi(power));
-        let step = steps.into_iter().find(|step| *step >= least).unwrap_or(least);
+        let step = steps.into_iter().find(|step| *step >= step_min).unwrap_or(step_min);
         let decimals = usize::try_from(-log10(step * 1.001).floor() as i32).unwrap_or(0);
         let multiples = (low / step).ceil() as i64..=(high / step).floor() as i64;
         let label = |multiple| {
             let value = multiple as f64 * step;
-            (format!("{:.1}", self.at(value)), format!("{value:.decimals$}"))
+            (format!("{:.1}", self.pixel(value)), format!("{value:.decimals$}"))
         };
         multiples.map(label).collect()
     }
@@ -161,7 +161,7 @@ impl Chart {
         Chart { title, x, y, layers, span: None }
     }
 
-    /// Whether there is a curve and not only limits.
+    /// True if there is a curve and not only limits.
     pub(super) fn has_curve(&self) -> bool {
         self.points(&CURVES).next().is_some()
     }
@@ -195,8 +195,7 @@ impl Chart {
         padded(range(self.points(&CURVES).map(|(x, _)| x)), 0.0)
     }
 
-    /// The range of the curves from `x_from` on, with a margin: a y axis that earlier values do not
-    /// stretch.
+    /// A range of the y axis for the part of the curves from `x_from` on, with a margin.
     pub(super) fn span_from(&self, x_from: f64) -> Option<(f64, f64)> {
         let late = self.points(&CURVES).filter(|(x, _)| *x >= x_from);
         range(late.map(|(_, y)| y)).map(|range| padded(Some(range), MARGIN))

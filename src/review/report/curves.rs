@@ -1,4 +1,4 @@
-//! The curves of a run.
+//! The charts of a run.
 
 use super::chart::{
     COMMANDED, COORDINATES, Chart, ESTIMATE, FAULT, Layer, MEASURED, Points, Shape, TRUTH,
@@ -6,7 +6,7 @@ use super::chart::{
 };
 use crate::archive::RunOutcome;
 use crate::math;
-use crate::review::figures::{BLIND_DEPTH, GOAL, Limits, OFF_PLANE, TIP_AGE};
+use crate::review::figures::{BLIND_DEPTH, Limits, OFF_PLANE, TARGET_DEPTH, TIP_AGE};
 use crate::review::run::Run;
 use crate::session::{Lane, State};
 use crate::stage::Axis;
@@ -66,9 +66,8 @@ fn off_plane(run: &Run, limits: &Limits) -> Chart {
     chart
 }
 
-/// The predicted distance from the target at the end of the path, with a band of twice its standard deviation:
-/// that of the position, and that of the heading over the rest of the path. What is corrected on the way is not
-/// in it.
+/// The predicted distance from the target at the end of the path, with a band of ± 2 standard deviations. These
+/// combine that of the position and that of the heading over the rest of the path, and ignore later corrections.
 fn target_error(run: &Run, limits: &Limits) -> Chart {
     let (depth, error) = (depth(run), column(run, "target_error_pred_mm"));
     let largest = |names: &[&str]| {
@@ -77,10 +76,10 @@ fn target_error(run: &Run, limits: &Limits) -> Chart {
     };
     let position = largest(&["x_sd_mm", "y_sd_mm", "z_sd_mm"]).unwrap_or_default();
     let heading = largest(&["yaw_sd_rad", "pitch_sd_rad"]).unwrap_or_default();
-    let left = column(run, "path_left_mm");
-    let sd = position.iter().zip(&heading).zip(&left);
+    let path_left = column(run, "path_left_mm");
+    let sd = position.iter().zip(&heading).zip(&path_left);
     let sd: Column =
-        sd.map(|((mm, rad), left)| Some(math::hypot((*mm)?, (*rad)? * (*left)?))).collect();
+        sd.map(|((mm, rad), left_mm)| Some(math::hypot((*mm)?, (*rad)? * (*left_mm)?))).collect();
     let mut layers = vec![
         area("prediction ± 2 σ", ESTIMATE, band(&depth, &error, &sd, f64::INFINITY)),
         line("prediction", ESTIMATE, points(&depth, &error)),
@@ -89,8 +88,7 @@ fn target_error(run: &Run, limits: &Limits) -> Chart {
     Chart::new("Predicted error at the target", DEPTH, "error (mm)", layers)
 }
 
-/// Errors of the estimate over depth. The errors at the start, which are large, do not stretch the
-/// y axis.
+/// Errors of the estimate over depth. The large errors at the start do not widen the y axis.
 fn errors(run: &Run, title: &'static str, y: &'static str, names: [&'static str; 3]) -> Chart {
     let depth = depth(run);
     let layers = names.into_iter().zip(COORDINATES).map(|(name, colour)| {
@@ -111,8 +109,8 @@ fn errors(run: &Run, title: &'static str, y: &'static str, names: [&'static str;
 /// The residuals after the correction; the innovations are in `run.rrd`.
 fn residuals(run: &Run) -> Chart {
     let layers = ["x", "y", "z"].into_iter().zip(COORDINATES).map(|(name, colour)| {
-        let left = difference(&coordinate(run, name, "meas"), &coordinate(run, name, "est"));
-        dots(name, colour, points(&depth(run), &left))
+        let residual = difference(&coordinate(run, name, "meas"), &coordinate(run, name, "est"));
+        dots(name, colour, points(&depth(run), &residual))
     });
     let (title, y) = ("Measured tip less the estimate", "measured − estimate (mm)");
     Chart::new(title, DEPTH, y, layers.collect())
@@ -141,7 +139,7 @@ fn insertion(run: &Run, limits: &Limits) -> Chart {
     let held = held.map(|(change, end)| (change.time_s, end)).collect();
     let (last, mut course) = (steps.last().copied(), steps);
     // From the last step to the point where the run was stopped.
-    if let (Some(stop_s), Some((last_s, depth_mm))) = (run.stopped_at_s(), last)
+    if let (Some(stop_s), Some((last_s, depth_mm))) = (run.stop_time_s(), last)
         && stop_s > last_s
     {
         course.push((stop_s, run.figures().insertion_mm.max(depth_mm)));
@@ -151,7 +149,7 @@ fn insertion(run: &Run, limits: &Limits) -> Chart {
     if run.folder.manifest.outcome == Some(RunOutcome::Stopped) {
         layers.push(dots("last step", FAULT, last.into_iter().collect()));
     }
-    layers.extend(limits.get(GOAL).map(|mm| Layer::level("depth to reach", *mm)));
+    layers.extend(limits.get(TARGET_DEPTH).map(|mm| Layer::level("depth to reach", *mm)));
     Chart::new("Insertion", TIME, "depth (mm)", layers)
 }
 
@@ -162,37 +160,38 @@ fn motion(run: &Run, axis: Axis, title: &'static str, y: &'static str) -> Chart 
         line("stage, commanded", COMMANDED, commanded.clone()),
         line("stage, measured", MEASURED, measured.clone()),
     ];
-    if let Some(stop_s) = run.stopped_at_s() {
+    if let Some(stop_s) = run.stop_time_s() {
         let stopped = measured.iter().rfind(|(time_s, _)| *time_s <= stop_s).copied();
         layers.push(dots("stopped", FAULT, stopped.into_iter().collect()));
     }
     Chart::new(title, TIME, y, layers)
 }
 
-/// When the next accepted tip position came, or the run was stopped, and when the newest before that was
-/// acquired, s. The hold that ended a run has no next position.
-fn sights(run: &Run) -> Points {
+/// For each accepted tip position, and for the stop of the run: its time, and when the newest position before
+/// it was acquired, s. The stop is included because no position follows the hold that ended a run.
+fn newest_before(run: &Run) -> Points {
     let s = |ns: i64| ns as f64 * 1e-9;
     let accepted = run.samples.iter().filter_map(|sample| {
         Some((s(sample.receive_time_ns), Some(s(sample.acquisition_time_ns?))))
     });
-    let stop = run.stopped_at_s().map(|stop_s| (stop_s, None));
+    let stop = run.stop_time_s().map(|stop_s| (stop_s, None));
     let mut times: Vec<(f64, Option<f64>)> = accepted.chain(stop).collect();
     times.sort_by(|(a, _), (b, _)| a.total_cmp(b));
     let mut newest = None::<f64>;
-    let sights = times.into_iter().filter_map(|(time_s, acquired_s)| {
-        let seen_s = newest;
+    let pairs = times.into_iter().filter_map(|(time_s, acquired_s)| {
+        let before_s = newest;
         newest = newest.into_iter().chain(acquired_s).reduce(f64::max);
-        Some((time_s, seen_s?))
+        Some((time_s, before_s?))
     });
-    sights.collect()
+    pairs.collect()
 }
 
 /// The age of the newest accepted tip position when the next one came; a large age causes a hold.
 fn tip_age(run: &Run, limits: &Limits) -> Chart {
     let refused = run.samples.iter().filter(|sample| sample.refused.is_some());
     let refused = refused.map(|sample| (sample.receive_time_ns as f64 * 1e-9, 0.0)).collect();
-    let ages = sights(run).into_iter().map(|(time_s, seen_s)| (time_s, time_s - seen_s)).collect();
+    let ages = newest_before(run).into_iter();
+    let ages = ages.map(|(time_s, acquired_s)| (time_s, time_s - acquired_s)).collect();
     let mut layers =
         vec![line("age when the next came", MEASURED, ages), dots("refused", FAULT, refused)];
     layers.extend(limits.get(TIP_AGE).map(|age_s| Layer::level("held when older", *age_s)));
@@ -202,10 +201,10 @@ fn tip_age(run: &Run, limits: &Limits) -> Chart {
 /// The depth inserted since the newest accepted tip position, when the next one came.
 fn blind_depth(run: &Run, limits: &Limits) -> Chart {
     let depth_mm = run.depth_over_time();
-    let blind_mm = |time_s, seen_s| Some(depth_mm(time_s)? - depth_mm(seen_s)?);
-    let blind = sights(run)
+    let blind_mm = |time_s, acquired_s| Some(depth_mm(time_s)? - depth_mm(acquired_s)?);
+    let blind = newest_before(run)
         .into_iter()
-        .filter_map(|(time_s, seen_s)| Some((time_s, blind_mm(time_s, seen_s)?)))
+        .filter_map(|(time_s, acquired_s)| Some((time_s, blind_mm(time_s, acquired_s)?)))
         .filter(|(_, mm)| mm.abs() < VALUE_MAX);
     let mut layers = vec![line("inserted when the next came", MEASURED, blind.collect())];
     layers.extend(limits.get(BLIND_DEPTH).map(|mm| Layer::level("held before", *mm)));
@@ -244,7 +243,7 @@ fn depth(run: &Run) -> Column {
     column(run, "insertion_mm")
 }
 
-/// The column of that name, without values that no axis can show.
+/// The column of this name, without values too large for an axis.
 fn column(run: &Run, name: &str) -> Column {
     scaled(run.steps.column(name), |value| value)
 }
@@ -253,7 +252,7 @@ fn is_angle(name: &str) -> bool {
     ["yaw", "pitch", "roll"].contains(&name)
 }
 
-/// A step of a line that is taken as a turn past ± 180 degrees.
+/// The step of a line from which on it counts as a turn past ± 180 degrees.
 fn jump(name: &str) -> f64 {
     if is_angle(name) { 180.0 } else { f64::INFINITY }
 }
@@ -275,12 +274,12 @@ fn difference(a: &Column, b: &Column) -> Column {
     a.iter().zip(b).map(|(a, b)| Some((*a)? - (*b)?)).collect()
 }
 
-/// The points that are known.
+/// The points whose coordinates are both known.
 fn points(xs: &Column, ys: &Column) -> Points {
     xs.iter().zip(ys).filter_map(|(x, y)| x.zip(*y)).collect()
 }
 
-/// The points that are known, in pieces that end where a step exceeds `jump` (an angle passed
+/// The points whose coordinates are both known, in pieces that end where a step exceeds `jump` (an angle passed
 /// ±180°).
 fn pieces(xs: &Column, ys: &Column, jump: f64) -> Vec<Points> {
     let points = points(xs, ys);

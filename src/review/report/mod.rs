@@ -1,4 +1,4 @@
-//! `report.html`: one run on one page that stands alone. It loads no script, font or picture.
+//! `report.html`: one run on one self-contained page. It loads no script, font or picture.
 
 mod chart;
 mod curves;
@@ -7,7 +7,7 @@ use self::chart::Chart;
 use super::compare::drive;
 use super::figures::{Figure, last_third};
 use super::run::{Run, utc};
-use super::summary::{doubts, tracker};
+use super::summary::{positions, record_warnings};
 use crate::archive::{EventKind, RunOutcome};
 use crate::session::Severity;
 use crate::study::TipError;
@@ -21,10 +21,10 @@ const PAGE: &str = include_str!("page.html");
 const CSS: &str = include_str!("page.css");
 const CHART: &str = include_str!("chart.svg");
 
-/// The mark by which a page is recognised as one of this program's.
+/// The mark by which this program recognises its own pages.
 pub const GENERATOR: &str = "<meta name=\"generator\" content=\"needle-bench\">";
 
-/// The page.
+/// The page of `run`.
 ///
 /// # Errors
 /// A fault in the template `page.html`.
@@ -53,17 +53,17 @@ pub fn html(run: &Run) -> Result<String, Error> {
         ending => folder.ending(),
         verdict => manifest.verdict().map(|v| format!("{}: {}", v.verdict, v.reason)),
         manifest => Value::from(Serde(manifest.clone())),
-        warnings => doubts(run),
+        warnings => record_warnings(run),
         figures => known.map(figure).collect::<Vec<_>>(),
         errors => errors.into_iter().filter_map(error_row).collect::<Vec<_>>(),
         charts => curves::curves(run, &limits).iter().map(Chart::drawing).collect::<Vec<_>>(),
         states => Value::from(Serde(run.states())),
-        hazards => hazards(run),
+        hazards => hazard_events(run),
         drives => manifest.drives.iter().map(|d| (d.axis.to_string(), drive(d))).collect::<Vec<_>>(),
-        positions => tracker(&manifest.gates),
+        positions => positions(&manifest.gates),
         config_toml => folder.config_toml.as_deref().unwrap_or_default(),
     })?;
-    // HTML does not allow control characters; the others change how text reads.
+    // HTML does not allow control characters; other unprintable characters can change how text reads.
     let is_bad = |c: char| is_unprintable(c) && c != '\n' && c != '\t';
     Ok(page.replace(is_bad, "\u{FFFD}"))
 }
@@ -84,8 +84,8 @@ fn error_row((label, error): (&str, Option<TipError>)) -> Option<(String, Vec<St
     Some((label.to_owned(), values.collect()))
 }
 
-/// The warnings and faults, with the depth at which they came.
-fn hazards(run: &Run) -> Vec<Value> {
+/// The warnings and faults, each with the depth at which it occurred.
+fn hazard_events(run: &Run) -> Vec<Value> {
     let depth_mm = run.depth_over_time();
     let events = run.events_from(Severity::Warning).map(|line| {
         let time_s = line.time.as_secs_f64();

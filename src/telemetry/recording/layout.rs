@@ -87,7 +87,7 @@ pub(super) fn send(stream: &RecordingStream, scene: &Scene, reach: &Reach) -> Lo
     let (layout, storage) = builder.memory()?;
     let logged = log(&layout, &parts);
     let messages = storage.take();
-    // The stream and its storage refer to each other, so the stream would never end by itself.
+    // The storage keeps the stream alive, so it must be ended here.
     layout.disconnect();
     logged?;
     let Some(first) = messages.first() else { return Ok(()) };
