@@ -4,7 +4,7 @@ use serde_json::{Map, Value as Json, json};
 
 use super::{DefaultHolds, Key, Kind, Range, Rule, Words, expanded, tables};
 
-/// Longest line of a comment.
+/// Longest line of a comment, characters.
 const LINE_MAX: usize = 100;
 
 /// A configuration of all `keys` with their defaults, explained.
@@ -56,10 +56,16 @@ fn write_contents(text: &mut String, key: &Key, start: &str) {
     for (word, meaning) in words(&key.kind) {
         comment(text, start, &format!("\"{word}\": {meaning}"));
     }
-    for inner in tables(&key.kind).into_iter().flat_map(|keys| expanded(keys, key.narrowed)) {
-        let default = inner.default.map(|toml| format!(" Default: {toml}.")).unwrap_or_default();
-        comment(text, start, &format!("{}: {}{default}", inner.name, explanation(&inner)));
-        write_contents(text, &inner, &format!("{start}  "));
+    for (n, keys) in tables(&key.kind).into_iter().enumerate() {
+        if n > 0 {
+            comment(text, start, "or");
+        }
+        for inner in expanded(keys, key.narrowed) {
+            let default = inner.default.map(|toml| format!(" Default: {toml}."));
+            let explanation = explanation(&inner) + &default.unwrap_or_default();
+            comment(text, start, &format!("{}: {explanation}", inner.name));
+            write_contents(text, &inner, &format!("{start}  "));
+        }
     }
 }
 
@@ -102,7 +108,8 @@ fn explanation(key: &Key) -> String {
 fn comment(text: &mut String, start: &str, explanation: &str) {
     let mut line = String::new();
     for word in explanation.split_whitespace() {
-        if !line.is_empty() && start.len() + line.chars().count() + 1 + word.len() > LINE_MAX {
+        let length = start.len() + line.chars().count() + 1 + word.chars().count();
+        if !line.is_empty() && length > LINE_MAX {
             text.push_str(&format!("{start}{line}\n"));
             line.clear();
         }
