@@ -24,7 +24,7 @@ pub struct Motion {
 }
 
 /// The frame in a `line` of `can.log`; `None` for any other text.
-pub fn timed_frame(line: &str) -> Option<TimedFrame> {
+pub fn parse_frame(line: &str) -> Option<TimedFrame> {
     CandumpLine::parse(line).map(|line| (line.unix_us, line.frame))
 }
 
@@ -98,7 +98,7 @@ mod tests {
             // As no bench stamps it: the file was edited.
             "(-9223372036854.000000) vcan0 185#3702C4090000 R".to_owned(),
         ];
-        let frames: Vec<TimedFrame> = lines.iter().filter_map(|line| timed_frame(line)).collect();
+        let frames: Vec<TimedFrame> = lines.iter().filter_map(|line| parse_frame(line)).collect();
         assert_eq!(frames.len(), lines.len());
         let motion = Motion::new(&frames, &folder);
         assert_eq!(motion.measured.insertion, [(0.11, 0.0), (0.13, 1.0), (0.16, 2.0)]);

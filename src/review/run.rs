@@ -127,7 +127,7 @@ impl Run {
 }
 
 /// Parses a line of `events.log`.
-pub fn event(line: &str) -> Option<EventLine<'static>> {
+pub fn parse_event(line: &str) -> Option<EventLine<'static>> {
     let line = EventLine::parse(line)?;
     Some(EventLine { text: Cow::Owned(line.text.into_owned()), ..line })
 }
@@ -310,7 +310,7 @@ pub(super) mod tests {
             steps: StepsTable::parse(&steps_csv()).unwrap(),
             samples: Vec::new(),
             motion: Motion::default(),
-            events: events.iter().filter_map(|line| event(line)).collect(),
+            events: events.iter().filter_map(|line| parse_event(line)).collect(),
             unreadable: Vec::new(),
         }
     }

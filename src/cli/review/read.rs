@@ -3,7 +3,9 @@
 use crate::archive::{StepsTable, TrackerTimes, file};
 use crate::cli::Failure;
 use crate::cli::records::folders_in;
-use crate::review::{Condition, Folder, Line, Motion, Run, event, figures_of_steps, timed_frame};
+use crate::review::{
+    Condition, Folder, Line, Motion, Run, figures_of_steps, parse_event, parse_frame,
+};
 use crate::telemetry::{RunFolder, TelemetryError, is_being_written};
 use std::io;
 use std::path::Path;
@@ -22,10 +24,10 @@ pub(super) fn run(path: &Path) -> Result<Run, Failure> {
     });
     let samples = lines(&record, file::TRACKER, TrackerTimes::parse, &mut unreadable);
     let motion = match folder.manifest.operation {
-        Some(_) => Motion::new(&lines(&record, file::CAN, timed_frame, &mut unreadable), &folder),
+        Some(_) => Motion::new(&lines(&record, file::CAN, parse_frame, &mut unreadable), &folder),
         None => Motion::default(),
     };
-    let events = lines(&record, file::EVENTS, event, &mut unreadable);
+    let events = lines(&record, file::EVENTS, parse_event, &mut unreadable);
     // A record that is not closed has no `run.rrd` yet.
     let is_closed = !matches!(folder.condition, Condition::BeingWritten | Condition::Open);
     if is_closed && !path.join(file::RECORDING).exists() {
