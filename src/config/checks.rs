@@ -335,9 +335,9 @@ fn check_source(config: &Config, reader: &mut Reader) {
 /// Each kind of fault allows only some keys, and needs some of them.
 fn check_faults(config: &Config, reader: &mut Reader) {
     for (i, fault) in config.emulator.fault.iter().enumerate() {
-        let (at, what) =
+        let (table, what) =
             (format!("emulator.fault[{i}]"), format!("a fault of kind \"{}\"", fault.kind));
         let others = &Fault::KEYS[1..];
-        reader.check_own_keys(&at, &what, others, &fault.kind.keys(), fault.check());
+        reader.check_own_keys(&table, &what, others, &fault.kind.keys(), fault.check());
     }
 }

@@ -350,9 +350,9 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
         Ok(Obstacle::Sphere { centre_mm: Vector3::zeros(), radius_mm: 0.0 })
     };
     for (i, obstacle) in goal.obstacle.iter().enumerate() {
-        let (at, what) = (format!("goal.obstacle[{i}]"), format!("a {}", obstacle.shape));
+        let (table, what) = (format!("goal.obstacle[{i}]"), format!("a {}", obstacle.shape));
         let others = &ObstacleConfig::KEYS[1..];
         let made = obstacle.to_obstacle(&any);
-        reader.check_own_keys(&at, &what, others, obstacle.shape.keys(), made);
+        reader.check_own_keys(&table, &what, others, obstacle.shape.keys(), made);
     }
 }

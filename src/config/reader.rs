@@ -78,7 +78,7 @@ impl Reader {
         }
         let mut table = Table::new();
         for key in &keys {
-            let at = join(path, key.name);
+            let key_path = join(path, key.name);
             let alternative = keys
                 .iter()
                 .filter(|other| key.is_alternative_to(other))
@@ -86,56 +86,58 @@ impl Reader {
                 .find(|other| self.is_given(other));
             let has_default = has_defaults || key.default_holds == DefaultHolds::Everywhere;
             match alternative {
-                None if has_default => self.add_default(key, &at),
+                None if has_default => self.add_default(key, &key_path),
                 None => {}
-                Some(other) if self.is_beside(&at, &other) => {
-                    self.refuse_if(&[&other, &at], key.instead_of.is_some(), || {
-                        format!("{at} is given along with {other}: give one of the two")
+                Some(other) if self.is_beside(&key_path, &other) => {
+                    self.refuse_if(&[&other, &key_path], key.instead_of.is_some(), || {
+                        format!("{key_path} is given along with {other}: give one of the two")
                     });
                 }
                 // The source of higher precedence counts.
-                Some(other) if self.layer(&at) < self.layer(&other) => _ = self.tree.remove(&at),
+                Some(other) if self.layer(&key_path) < self.layer(&other) => {
+                    _ = self.tree.remove(&key_path)
+                }
                 Some(_) => {}
             }
-            self.limited.extend(key.at_most.map(|max| (at.clone(), max)));
-            if let Some(value) = self.value(key, &key.kind, &at, has_defaults) {
+            self.limited.extend(key.at_most.map(|max| (key_path.clone(), max)));
+            if let Some(value) = self.value(key, &key.kind, &key_path, has_defaults) {
                 table.insert(key.name.to_owned(), value);
             }
         }
         Value::Table(table)
     }
 
-    /// Adds the default of `key`, which is at `at`, where nothing is given.
-    fn add_default(&mut self, key: &Key, at: &str) {
+    /// Adds the default of `key`, which is at `path`, where nothing is given.
+    fn add_default(&mut self, key: &Key, path: &str) {
         // The defaults fill a given table, unless it is replaced as a whole.
         let is_merged = !tables(&key.kind).is_empty() && !key.is_whole;
-        let is_complete = self.tree.contains_key(at) && !is_merged;
+        let is_complete = self.tree.contains_key(path) && !is_merged;
         let holds = match key.default_holds {
             DefaultHolds::ForEmulatedStage => !self.hardware,
             DefaultHolds::ForEmulatedTracker => self.emulated_tracker,
             DefaultHolds::Undecided | DefaultHolds::ForHardware | DefaultHolds::Everywhere => true,
         };
         let Some(default) = key.default.filter(|_| holds && !is_complete) else { return };
-        for (path, entry) in value::parse_default(at, default) {
-            self.tree.entry(path).or_insert(entry);
+        for (entry_path, entry) in value::parse_default(path, default) {
+            self.tree.entry(entry_path).or_insert(entry);
         }
     }
 
-    /// Reads the value at `at`, which is that of `key` or of an element of it; `None` if it is missing or wrong.
-    fn value(&mut self, key: &Key, kind: &Kind, at: &str, has_defaults: bool) -> Option<Value> {
+    /// Reads the value at `path`, which is that of `key` or of an element of it; `None` if it is missing or wrong.
+    fn value(&mut self, key: &Key, kind: &Kind, path: &str, has_defaults: bool) -> Option<Value> {
         let words = Words::of(kind, &key.rule, key.name);
         let allowed = tables(kind).is_empty().then(|| words.allowed.clone());
-        self.known.insert(at.to_owned(), allowed);
+        self.known.insert(path.to_owned(), allowed);
         if let Kind::Table(_) | Kind::Either(..) = kind {
-            if key.is_optional && !self.is_present(at) {
+            if key.is_optional && !self.is_present(path) {
                 return None;
             }
-            let has_defaults = has_defaults && !(key.is_whole && self.tree.contains_key(at));
-            return Some(self.table(kind, key.narrowed, at, has_defaults));
+            let has_defaults = has_defaults && !(key.is_whole && self.tree.contains_key(path));
+            return Some(self.table(kind, key.narrowed, path, has_defaults));
         }
-        let Some(entry) = self.tree.get(at) else {
+        let Some(entry) = self.tree.get(path) else {
             if !key.is_optional {
-                self.refuse_missing(at, &words.expected);
+                self.refuse_missing(path, &words.expected);
             }
             return None;
         };
@@ -143,24 +145,24 @@ impl Reader {
             (Kind::Array(of, count), Value::Array(given))
                 if count.is_none_or(|count| count == given.len()) =>
             {
-                let places = (0..given.len()).map(|i| element(at, i));
-                let elements = places.filter_map(|at| self.value(key, of, &at, true));
+                let places = (0..given.len()).map(|i| element(path, i));
+                let elements = places.filter_map(|path| self.value(key, of, &path, true));
                 Some(Value::Array(elements.collect()))
             }
             (kind, value) => match scalar(kind, &key.rule, value, &words) {
                 Ok(value) => Some(value),
                 Err(why) => {
-                    let message = format!("{at} is {}, {why}", entry.source_text);
-                    self.fail(at, Some(entry.origin.clone()), message);
+                    let message = format!("{path} is {}, {why}", entry.source_text);
+                    self.fail(path, Some(entry.origin.clone()), message);
                     None
                 }
             },
         }
     }
 
-    /// True if the key `at` or a key inside it is present.
-    fn is_present(&self, at: &str) -> bool {
-        self.tree.contains_key(at) || self.tree.keys().any(|key| is_inside(key, at))
+    /// True if the key `path` or a key inside it is present.
+    fn is_present(&self, path: &str) -> bool {
+        self.tree.contains_key(path) || self.tree.keys().any(|key| is_inside(key, path))
     }
 
     /// Reports `message` if `is_contradiction`, at the one of `keys` from the source of highest precedence.
@@ -200,39 +202,39 @@ impl Reader {
         self.failed.iter().any(is_part) || ancestors(key).any(|outer| self.failed.contains(outer))
     }
 
-    /// Reports that the key `at` is wrong, on the line of `place` or else on its own.
-    pub(super) fn refuse(&mut self, at: &str, place: &str, message: &str) {
-        let origin = self.origin(place).or_else(|| self.origin(at));
-        self.fail(at, origin, format!("{at}: {message}"));
+    /// Reports that the key `path` is wrong, on the line of `place` or else on its own.
+    pub(super) fn refuse(&mut self, path: &str, place: &str, message: &str) {
+        let origin = self.origin(place).or_else(|| self.origin(path));
+        self.fail(path, origin, format!("{path}: {message}"));
     }
 
-    /// Checks a table at `at` that may have only some of the keys in `all`, depending on its kind. `what` is
+    /// Checks a table at `table_path` that may have only some of the keys in `all`, depending on its kind. `what` is
     /// its kind in words, and `known` are its keys. Reports given keys that are not among these; if there are
     /// none, reports the key and the message in `made`, the attempt to use the table.
     pub(super) fn check_own_keys<T>(
         &mut self,
-        at: &str,
+        table_path: &str,
         what: &str,
         all: &[Key],
         known: &[&str],
         made: Result<T, (&'static str, String)>,
     ) {
-        if self.is_wrong(at) {
+        if self.is_wrong(table_path) {
             return;
         }
         // A recorded configuration has all defaults in every table.
         let mut defaults = all.iter().filter(|key| key.default.is_some());
-        let is_recorded = defaults.all(|key| self.is_given(&join(at, key.name)));
+        let is_recorded = defaults.all(|key| self.is_given(&join(table_path, key.name)));
         for key in all.iter().filter(|key| !known.contains(&key.name)) {
-            let path = join(at, key.name);
+            let key_path = join(table_path, key.name);
             let is_allowed = |entry: &Entry| is_recorded && key.default == Some(&entry.source_text);
-            if self.given(&path).is_some_and(|entry| !is_allowed(entry)) {
+            if self.given(&key_path).is_some_and(|entry| !is_allowed(entry)) {
                 let known = known.join(", ");
-                self.refuse(&path, &path, &format!("{what} has no such key, only {known}"));
+                self.refuse(&key_path, &key_path, &format!("{what} has no such key, only {known}"));
             }
         }
-        if let (false, Err((key, message))) = (self.is_wrong(at), made) {
-            self.refuse(at, &join(at, key), &message);
+        if let (false, Err((key, message))) = (self.is_wrong(table_path), made) {
+            self.refuse(table_path, &join(table_path, key), &message);
         }
     }
 

@@ -192,7 +192,7 @@ pub fn figures_of_steps(steps_csv: &str) -> Option<FigureReport> {
             steps.column(&format!("{coordinate}_{provenance}_{unit}"))
         })
     };
-    let at = |columns: &[Vec<Option<f64>>; 6], row: usize| -> Option<[f64; 6]> {
+    let values_at = |columns: &[Vec<Option<f64>>; 6], row: usize| -> Option<[f64; 6]> {
         let mut values = [0.0; 6];
         for (value, column) in values.iter_mut().zip(columns) {
             *value = column.get(row).copied().flatten()?;
@@ -204,7 +204,7 @@ pub fn figures_of_steps(steps_csv: &str) -> Option<FigureReport> {
     let mut figures = RunFigures::default();
     for (row, depth) in depths.into_iter().enumerate() {
         let Some(depth_mm) = depth else { continue };
-        let (est, truth) = (at(&est, row), at(&truth, row));
+        let (est, truth) = (values_at(&est, row), values_at(&truth, row));
         let error = est.zip(truth).map(|(est, truth)| TipError::between(est, truth));
         figures.take_scored(depth_mm, truth.or(est).map(|coordinates| coordinates[0]), error);
     }
