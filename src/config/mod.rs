@@ -83,13 +83,13 @@ const PRESET: usize = 1;
 
 const HEAD: &str = "\
 #:schema schema.json
-# The reference of the configuration: every key with what it means, what it may be, and its default.
+# The reference of the configuration: every key with its meaning, its allowed values and its default.
 # `needle-bench check --reference` prints it. `needle-bench run` with no arguments runs it: a virtual
 # stage on an in-memory bus, an emulated needle and tracker, virtual time.
 #
 # Every key can be given on the command line as --set key=value with a TOML value, for example
 #   needle-bench run --set insertion.depth_mm=200 --set 'observer.kind=\"finite-difference\"'
-# A key left out has the value shown here. Unknown keys are refused.
+# A key that is not given has the value shown here. Unknown keys are refused.
 ";
 
 /// The text of a configuration file.

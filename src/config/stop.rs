@@ -100,8 +100,8 @@ impl StopConfig {
                 tree.extend(value::parse_set(coarse, 1)?);
             }
         }
-        let rest = Config::of(Reader::new(tree).read(Config::KEYS));
-        let mut stage = rest.stage.to_unchecked_stage(&rest.can);
+        let valid = Config::of(Reader::new(tree).read(Config::KEYS));
+        let mut stage = valid.stage.to_unchecked_stage(&valid.can);
         (stage.insertion.node, stage.rotation.node) = (insertion, rotation);
         // The coarser the scale, the longer it takes to see that an axis stands.
         let windows = stage::Axis::BOTH.map(|axis| 2 * stage.standstill_window(axis));

@@ -99,7 +99,7 @@ fn duplicate_key(entries: &Entries, text: &str, line: usize, found: &str) -> Str
             let is_inside = |key: &String| key == table || is_inside(key, table);
             before.filter(|(key, _)| is_inside(key)).min_by_key(|(_, first)| *first)
         }
-        // Between two keys of one table there are no keys of another.
+        // The keys of one table are contiguous.
         None => {
             let is_same = |key: &String| key.rsplit('.').next() == Some(name);
             before.filter(|(key, _)| is_same(key)).max_by_key(|(_, first)| *first)

@@ -177,9 +177,9 @@ fn seal(run: &Folder, name: &str) -> Option<String> {
     Some(seal.sha256.clone())
 }
 
-/// Emulated runs with the same steps, or without a step with the same tip positions, are one insertion,
-/// whatever name and place they have. Counted as independent runs they would narrow the intervals. A
-/// value of the key `by` has it once.
+/// Emulated runs with the same steps, or without steps but with the same tip positions, are the same insertion,
+/// whatever their names and folders. Counted as independent runs they would narrow the intervals. With a key
+/// `by`, such an insertion counts once for each value of the key.
 fn exclude_repeats(lines: &mut [Line], by: Option<&str>) {
     let counted = lines.iter_mut().filter(|line| line.excluded.is_none());
     let insertion = |run: &Folder| {
@@ -194,8 +194,8 @@ fn exclude_repeats(lines: &mut [Line], by: Option<&str>) {
     });
 }
 
-/// Of `lines` with the same `key`, excludes all that would count except the first, for the `reason`
-/// that names the first. Lines excluded for anything but a verdict are left out.
+/// Excludes every line whose `key` equals that of an earlier line, with the `reason` that names the earlier one.
+/// Lines that are excluded already are ignored, except for those with a verdict: these can be the earlier one.
 fn exclude_equal<'a, K: Ord>(
     lines: impl Iterator<Item = &'a mut Line>,
     key: impl Fn(&Folder) -> Option<K>,

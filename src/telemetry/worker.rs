@@ -196,9 +196,9 @@ impl<T: Send + 'static> Worker<T> {
         loop {
             is_close_sent =
                 is_close_sent || self.push(Message::Close(Box::new(manifest.clone()))).is_ok();
-            if let Ok(left) = self.done.recv_timeout(RETRY) {
+            if let Ok(result) = self.done.recv_timeout(RETRY) {
                 let failed = |reason| TelemetryError::writer_failed(writer, reason);
-                return Ok((left, self.vitals.fault().map(failed)));
+                return Ok((result, self.vitals.fault().map(failed)));
             }
             silence.look(self.vitals.beats(), Instant::now());
             let silent = silence.lasted;
