@@ -224,8 +224,11 @@ impl Checks<'_> {
         for (n, index) in self.axis.optional_objects.iter().enumerate() {
             let needed = NEEDED.iter().find(|(indexes, _)| indexes.contains(index));
             let Some((_, why)) = needed else { continue };
+            if *index == SOFTWARE_LIMITS && self.axis.wraps {
+                continue;
+            }
             let key = self.key(&format!("optional_objects[{n}]"));
-            reader.refuse_if(&[&key], *index != SOFTWARE_LIMITS || !self.axis.wraps, || {
+            reader.refuse_if(&[&key], true, || {
                 format!("{key} is 0x{index:04X}, which is not optional; remove it: {why}")
             });
         }

@@ -359,9 +359,10 @@ fn scalar(kind: &Kind, rule: &Rule, value: &Value, words: &Words) -> Result<Valu
             _ => kind.range(rule).is_none_or(|range| range.contains(integer as f64)),
         },
         (Kind::Boolean, Value::Boolean(_)) => true,
-        (Kind::Text, Value::String(text)) => {
-            !matches!(rule, Rule::Text(_, accepts) if !accepts(text))
-        }
+        (Kind::Text, Value::String(text)) => match rule {
+            Rule::Text(_, accepts) => accepts(text),
+            _ => true,
+        },
         (Kind::OneOf(names), Value::String(text)) => names.iter().any(|(name, _)| name == text),
         _ => return Err(format!("expected {}", words.expected)),
     };

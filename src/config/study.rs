@@ -102,20 +102,24 @@ impl Config {
             let Some([low, high]) = self.range(key) else { continue };
             let draw = |number| low + (high - low) * fraction(seed, number);
             let drawn = draw(number);
-            match (key.name, key.name.strip_prefix("torsion_"), emulator.as_table_mut()) {
-                ("curvature_error", _, Some(arc)) => {
+            match key.name {
+                "curvature_error" => {
                     let curvature_per_mm = self.emulator.arc.curvature_per_mm() * (1.0 + drawn);
-                    arc.remove("radius_mm");
-                    arc.insert("curvature_per_mm".to_owned(), curvature_per_mm.into());
+                    if let Some(emulator) = emulator.as_table_mut() {
+                        emulator.remove("radius_mm");
+                        emulator.insert("curvature_per_mm".to_owned(), curvature_per_mm.into());
+                    }
                 }
-                ("creep_error", ..) => {
+                "creep_error" => {
                     let torsion = self.emulator.torsion;
                     emulator["torsion"]["creep_mm"] = (torsion.creep_mm * (1.0 + drawn)).into();
                     let growth = torsion.creep_mm_per_mm * (1.0 + draw(GROWTH_DRAW));
                     emulator["torsion"]["creep_mm_per_mm"] = growth.into();
                 }
-                (_, Some(name), _) => emulator["torsion"][name] = drawn.into(),
-                (name, ..) => emulator["start"][name] = drawn.into(),
+                name => match name.strip_prefix("torsion_") {
+                    Some(name) => emulator["torsion"][name] = drawn.into(),
+                    None => emulator["start"][name] = drawn.into(),
+                },
             }
         }
         emulator["seed"] = i64::try_from(seed).unwrap_or(i64::MAX).into();

@@ -50,7 +50,7 @@ const LOOK_MAX: Duration = Duration::from_millis(50);
 #[derive(Debug)]
 pub(super) struct Silence {
     beats: u64,
-    looked: Instant,
+    last_look: Instant,
     /// The time without a sign of life up to the last look.
     pub(super) lasted: Duration,
 }
@@ -58,16 +58,14 @@ pub(super) struct Silence {
 impl Silence {
     /// Starts at `now` for a thread that has shown `beats` signs of life.
     pub(super) fn new(beats: u64, now: Instant) -> Self {
-        Silence { beats, looked: now, lasted: Duration::ZERO }
+        Silence { beats, last_look: now, lasted: Duration::ZERO }
     }
 
     /// Looks at the thread at `now`, when it has shown `beats` signs of life.
     pub(super) fn look(&mut self, beats: u64, now: Instant) {
-        let since = now.saturating_duration_since(mem::replace(&mut self.looked, now));
-        match mem::replace(&mut self.beats, beats) == beats {
-            true => self.lasted += since.min(LOOK_MAX),
-            false => self.lasted = Duration::ZERO,
-        }
+        let elapsed = now.saturating_duration_since(mem::replace(&mut self.last_look, now));
+        let is_alive = mem::replace(&mut self.beats, beats) != beats;
+        self.lasted = if is_alive { Duration::ZERO } else { self.lasted + elapsed.min(LOOK_MAX) };
     }
 }
 
