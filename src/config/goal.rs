@@ -149,7 +149,10 @@ impl ObstacleConfig {
                 let from_mm = self.from_mm.ok_or_else(|| needs("from_mm"))?;
                 let to_mm = self.to_mm.ok_or_else(|| needs("to_mm"))?;
                 if from_mm == to_mm {
-                    return Err(("to_mm", "to_mm is from_mm: a cylinder has a length".to_owned()));
+                    return Err((
+                        "to_mm",
+                        "to_mm equals from_mm: a cylinder needs a length".to_owned(),
+                    ));
                 }
                 let radius_mm = self.radius_mm.ok_or_else(|| needs("radius_mm"))?;
                 Obstacle::Cylinder { from_mm, to_mm, radius_mm }
@@ -158,7 +161,7 @@ impl ObstacleConfig {
                 let min_mm = self.min_mm.ok_or_else(|| needs("min_mm"))?;
                 let max_mm = self.max_mm.ok_or_else(|| needs("max_mm"))?;
                 if !is_box(&min_mm, &max_mm) {
-                    let message = "each coordinate of max_mm is over that of min_mm";
+                    let message = "each coordinate of max_mm must be over that of min_mm";
                     return Err(("max_mm", message.to_owned()));
                 }
                 Obstacle::Box { min_mm, max_mm }
@@ -318,8 +321,8 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     reader.refuse_if(&[tool, "tracker.tool"], is_tip, || {
         format!("{tool} is tracker.tool, the needle's tip: name the target's own tool")
     });
-    let has_one = config.tip_source() == TrackerSource::Csv;
-    reader.refuse_if(&[tool, "tracker.source"], goal.tool.is_some() && has_one, || {
+    let has_one_tool = config.tip_source() == TrackerSource::Csv;
+    reader.refuse_if(&[tool, "tracker.source"], goal.tool.is_some() && has_one_tool, || {
         format!("{tool} needs a stream of two tools, and tracker.source = \"csv\" has one")
     });
     let (law, chosen) = ("control.kind", config.control.kind);
@@ -328,14 +331,14 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
         format!("{law} is \"{chosen}\", allowed with {kind} = \"target\": \"nested-saturation\"")
     });
     let WorkspaceConfig { min, max } = goal.workspace_mm;
-    let is_workspace = is_box(&min, &max);
-    reader.refuse_if(&[workspace], !is_workspace, || {
-        format!("{workspace}: each coordinate of max is over that of min")
+    let is_box = is_box(&min, &max);
+    reader.refuse_if(&[workspace], !is_box, || {
+        format!("{workspace}: each coordinate of max must be over that of min")
     });
     let has_plane = min.x <= 0.0 && max.x >= 0.0;
     let in_plane = "goal.in_plane";
-    reader.refuse_if(&[workspace, in_plane], is_workspace && goal.in_plane && !has_plane, || {
-        format!("{workspace} does not have the plane x = 0 in it, where {in_plane} keeps the path")
+    reader.refuse_if(&[workspace, in_plane], is_box && goal.in_plane && !has_plane, || {
+        format!("{workspace} does not contain the plane x = 0, to which {in_plane} keeps the path")
     });
     let aside_mm = goal.position_mm.map_or(0.0, |target_mm| target_mm.x);
     let is_aside = is_target && goal.in_plane && aside_mm != 0.0;
@@ -345,14 +348,14 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
              {in_plane} = false"
         )
     });
-    // Files are not read here, so any obstacle stands for a mask.
-    let any = |_: &str, _: Option<u32>, _: &PoseConfig| {
+    // Files are not read here, so a sphere stands for every mask.
+    let placeholder = |_: &str, _: Option<u32>, _: &PoseConfig| {
         Ok(Obstacle::Sphere { centre_mm: Vector3::zeros(), radius_mm: 0.0 })
     };
     for (i, obstacle) in goal.obstacle.iter().enumerate() {
         let (table, what) = (format!("goal.obstacle[{i}]"), format!("a {}", obstacle.shape));
         let others = &ObstacleConfig::KEYS[1..];
-        let made = obstacle.to_obstacle(&any);
+        let made = obstacle.to_obstacle(&placeholder);
         reader.check_own_keys(&table, &what, others, obstacle.shape.keys(), made);
     }
 }
