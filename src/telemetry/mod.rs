@@ -1,10 +1,11 @@
 //! The run folder and the recording of a run.
 //!
-//! A [`Recorder`] takes [`Entry`]s from the session's thread through a bounded queue. One thread appends the text files (`steps.csv`, `can.log`, `tracker.ndjson`,
-//! `inputs.log`, `events.log`). A second thread keeps the folder: it syncs the text files, which can take
-//! longer than the 200 ms that a kill may cost, writes the manifest, and checks that the folder is still
-//! there. Records that a full queue refuses are counted and reported. A thread that fails or stalls is
-//! reported to the runtime ([`Recorder::news`]). The live view is a lossy tap with a queue of its own.
+//! A [`Recorder`] takes [`Entry`]s from the session's thread through a bounded queue. One thread appends to
+//! the text files (`steps.csv`, `can.log`, `tracker.ndjson`, `inputs.log`, `events.log`). A second thread
+//! keeps the folder: it syncs the text files, which can take longer than the 200 ms that a kill may cost,
+//! writes the manifest, and checks that the folder is still there. Entries that do not fit into a full queue
+//! are dropped, counted and reported. A thread that fails or stalls is reported to the runtime
+//! ([`Recorder::news`]). The live view is a lossy tap with a queue of its own.
 //!
 //! `run.rrd` is made from the text files when they are closed ([`Recording`]): it can be made again at
 //! any time.

@@ -193,8 +193,8 @@ impl Recorder {
         };
         manifest.dropped = Some(dropped);
         manifest.faults.clone_from(&self.faults);
-        let manifest_written = self.keeper.close(&manifest, MANIFEST_LIMIT).map(|(_, fault)| fault);
-        match (closed, manifest_written) {
+        let keeper_result = self.keeper.close(&manifest, MANIFEST_LIMIT).map(|(_, fault)| fault);
+        match (closed, keeper_result) {
             (Ok((written, _)), Ok(None)) => {
                 // The keeper has added these to the manifest.
                 while let Ok(problem) = self.problems.pop() {
