@@ -35,8 +35,10 @@ impl Now {
     pub(super) fn enter(&mut self, time: Time, lane: &str, state: &str, meaning: Meaning) {
         let row = self.row(lane);
         (row.state, row.since) = (state.to_owned(), time);
-        let is_over = |said| meaning == Meaning::Good && said < time;
-        row.why.take_if(|(said, _)| is_over(*said) || time.since(*said) > REASON_AGE_MAX);
+        row.why.take_if(|(event_time, _)| {
+            let is_over = meaning == Meaning::Good && *event_time < time;
+            is_over || time.since(*event_time) > REASON_AGE_MAX
+        });
     }
 
     /// Takes an event as the reason of a state: a warning, a fault, or a command of the operator. Returns true
