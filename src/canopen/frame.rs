@@ -23,7 +23,7 @@ impl fmt::Display for CanId {
     }
 }
 
-/// A CANopen node number, 1 to 127 (CiA 301, 7.2.2).
+/// A CANopen node number, 1 to 127.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct NodeId(u8);
 
@@ -100,13 +100,15 @@ impl Frame {
         self.remote
     }
 
-    /// The payload, 0 to 8 bytes.
+    /// The payload, 0 to 8 bytes. A remote frame has no payload: for it, these are as many zeros as the
+    /// bytes that it requests.
     pub fn data(&self) -> &[u8] {
         &self.data[..usize::from(self.len)]
     }
 }
 
-/// candump's notation, `123#DEADBEEF`; remote frames `123#R`.
+/// candump's notation: `123#DEADBEEF`; a remote frame is `123#R`, with its length as in `123#R8` unless
+/// that is 0.
 impl fmt::Display for Frame {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}#", self.id)?;
@@ -125,8 +127,8 @@ impl fmt::Display for Frame {
 #[error("not a CAN frame as candump writes it (123#DEADBEEF)")]
 pub struct NotAFrame;
 
-/// Reads candump's notation: three digits of a base identifier or eight of an extended one, `#`,
-/// and two for each byte, or `R` and the length of a remote frame.
+/// Reads candump's notation: three hexadecimal digits of a base identifier or eight of an extended one, `#`,
+/// then two digits for each byte. In a remote frame, `R` and at most one digit, its length, replace the bytes.
 impl FromStr for Frame {
     type Err = NotAFrame;
 
@@ -143,8 +145,12 @@ fn parse(text: &str) -> Option<Frame> {
         _ => return None,
     };
     if let Some(len) = data.strip_prefix('R') {
-        let len = if len.is_empty() { 0 } else { len.parse().ok()? };
-        return Frame::from_parts(id, true, [0; 8].get(..len)?);
+        let len = match len.as_bytes() {
+            [] => 0,
+            [digit @ b'0'..=b'8'] => usize::from(digit - b'0'),
+            _ => return None,
+        };
+        return Frame::from_parts(id, true, &[0; 8][..len]);
     }
     if !data.is_ascii() || data.len() % 2 != 0 {
         return None;
@@ -187,7 +193,9 @@ mod tests {
         {
             assert_eq!(text.parse::<Frame>(), Err(NotAFrame), "{text}");
         }
-        assert_eq!("181#R9".parse::<Frame>(), Err(NotAFrame));
+        for text in ["181#R9", "181#R+8", "181#R08", "181#R8 "] {
+            assert_eq!(text.parse::<Frame>(), Err(NotAFrame), "{text}");
+        }
     }
 
     #[test]
