@@ -21,18 +21,14 @@ pub enum HeartbeatEvent {
 /// Watches the heartbeat of one node.
 ///
 /// Monitoring starts with the first heartbeat received, as CiA 301 says, so a node that never sends
-/// one would not be reported lost. Setting the [`deadline`](Self::deadline) closes that gap. After a loss or a
+/// one is not reported lost, unless a heartbeat is [expected](Self::expect_by). After a loss or a
 /// boot-up, monitoring starts again with the next heartbeat.
 #[derive(Debug, Clone)]
 pub struct HeartbeatConsumer {
-    /// The node that is watched.
-    pub node: NodeId,
+    node: NodeId,
     timeout: Duration,
-    /// The state last reported; `None` before the first heartbeat and after a loss.
-    pub state: Option<NmtState>,
-    /// When [`handle_timeout`](Self::handle_timeout) is due: a loss is reported unless a heartbeat
-    /// comes before.
-    pub deadline: Time,
+    state: Option<NmtState>,
+    deadline: Time,
 }
 
 impl HeartbeatConsumer {
@@ -41,12 +37,33 @@ impl HeartbeatConsumer {
         HeartbeatConsumer { node, timeout, state: None, deadline: Time::NEVER }
     }
 
+    /// The node that is watched.
+    pub fn node(&self) -> NodeId {
+        self.node
+    }
+
+    /// The state in the last heartbeat; `None` before the first one, and after a loss or a boot-up.
+    pub fn state(&self) -> Option<NmtState> {
+        self.state
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) is due: a loss is reported unless a heartbeat
+    /// comes before.
+    pub fn deadline(&self) -> Time {
+        self.deadline
+    }
+
+    /// Forgets the state. A loss is reported unless a heartbeat comes before `deadline`.
+    pub fn expect_by(&mut self, deadline: Time) {
+        self.state = None;
+        self.deadline = deadline;
+    }
+
     /// Takes any frame; frames of other nodes and of other kinds change nothing.
     pub fn handle_frame(&mut self, now: Time, frame: &Frame) -> Option<HeartbeatEvent> {
         let (_, state) = parse_heartbeat(frame).filter(|(node, _)| *node == self.node)?;
         if state == NmtState::BootUp {
-            self.state = None;
-            self.deadline = Time::NEVER;
+            self.expect_by(Time::NEVER);
             return Some(HeartbeatEvent::BootUp);
         }
         self.deadline = now + self.timeout;
@@ -59,8 +76,7 @@ impl HeartbeatConsumer {
         if now < self.deadline {
             return None;
         }
-        self.state = None;
-        self.deadline = Time::NEVER;
+        self.expect_by(Time::NEVER);
         Some(HeartbeatEvent::Lost)
     }
 }
@@ -70,20 +86,24 @@ impl HeartbeatConsumer {
 pub struct HeartbeatProducer {
     node: NodeId,
     period: Duration,
-    /// When [`handle_timeout`](Self::handle_timeout) is due.
-    pub deadline: Time,
+    deadline: Time,
 }
 
 impl HeartbeatProducer {
-    /// Heartbeats of `node` every `period`, the first at `first`; a period of zero is off.
+    /// Heartbeats of `node` every `period`, the first at `first`; none if `period` is zero.
     pub fn new(node: NodeId, period: Duration, first: Time) -> Self {
         let deadline = if period.is_zero() { Time::NEVER } else { first };
         HeartbeatProducer { node, period, deadline }
     }
 
-    /// The heartbeat to send now, if one is due. Beats missed are not made up for.
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
+    pub fn deadline(&self) -> Time {
+        self.deadline
+    }
+
+    /// The heartbeat to send now, if one is due. Missed heartbeats are skipped.
     pub fn handle_timeout(&mut self, now: Time, state: NmtState) -> Option<Frame> {
-        if self.period.is_zero() || now < self.deadline {
+        if now < self.deadline {
             return None;
         }
         self.deadline = self.deadline + self.period;
@@ -112,7 +132,7 @@ mod tests {
     #[test]
     fn monitoring_starts_with_the_first_heartbeat() {
         let mut consumer = HeartbeatConsumer::new(NODE, TIMEOUT);
-        assert_eq!(consumer.deadline, Time::NEVER);
+        assert_eq!(consumer.deadline(), Time::NEVER);
         assert_eq!(consumer.handle_timeout(at(10_000)), None);
 
         let event = consumer.handle_frame(at(10_000), &beat(NmtState::Operational));
@@ -120,14 +140,14 @@ mod tests {
         assert_eq!(consumer.handle_frame(at(10_050), &beat(NmtState::Operational)), None);
         assert_eq!(consumer.handle_timeout(at(10_149)), None);
         assert_eq!(consumer.handle_timeout(at(10_150)), Some(HeartbeatEvent::Lost));
-        assert_eq!(consumer.state, None);
+        assert_eq!(consumer.state(), None);
         assert_eq!(consumer.handle_timeout(at(20_000)), None, "a loss is reported once");
     }
 
     #[test]
     fn a_node_that_never_speaks_is_missed_when_expected() {
         let mut consumer = HeartbeatConsumer::new(NODE, TIMEOUT);
-        consumer.deadline = at(500);
+        consumer.expect_by(at(500));
         assert_eq!(consumer.handle_timeout(at(499)), None);
         assert_eq!(consumer.handle_timeout(at(500)), Some(HeartbeatEvent::Lost));
     }
@@ -138,7 +158,7 @@ mod tests {
         consumer.handle_frame(at(0), &beat(NmtState::Operational));
         let event = consumer.handle_frame(at(10), &beat(NmtState::BootUp));
         assert_eq!(event, Some(HeartbeatEvent::BootUp));
-        assert_eq!(consumer.deadline, Time::NEVER);
+        assert_eq!(consumer.deadline(), Time::NEVER);
         let event = consumer.handle_frame(at(20), &beat(NmtState::PreOperational));
         assert_eq!(event, Some(HeartbeatEvent::State(NmtState::PreOperational)));
     }
@@ -148,7 +168,7 @@ mod tests {
         let mut consumer = HeartbeatConsumer::new(NODE, TIMEOUT);
         consumer.handle_frame(at(0), &beat(NmtState::Operational));
         consumer.handle_frame(at(90), &Frame::new(0x706, &[5]));
-        assert_eq!(consumer.deadline, at(100));
+        assert_eq!(consumer.deadline(), at(100));
     }
 
     #[test]
@@ -158,10 +178,10 @@ mod tests {
             producer.handle_timeout(at(3), NmtState::Operational),
             Some(beat(NmtState::Operational))
         );
-        assert_eq!(producer.deadline, at(100), "the beat is absolute");
+        assert_eq!(producer.deadline(), at(100), "the beat is absolute");
         assert!(producer.handle_timeout(at(99), NmtState::Operational).is_none());
         assert!(producer.handle_timeout(at(350), NmtState::Operational).is_some());
         assert!(producer.handle_timeout(at(350), NmtState::Operational).is_none());
-        assert_eq!(HeartbeatProducer::new(NODE, Duration::ZERO, at(0)).deadline, Time::NEVER);
+        assert_eq!(HeartbeatProducer::new(NODE, Duration::ZERO, at(0)).deadline(), Time::NEVER);
     }
 }

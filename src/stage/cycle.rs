@@ -60,7 +60,7 @@ impl Stage {
     pub(super) fn window_complete(&mut self, now: Time) {
         if matches!(self.phase, Phase::Enabling { .. })
             && self.drives.all(|drive| drive.is_armed() && drive.is_enabled())
-            && self.monitors.all(|monitor| monitor.state == Some(NmtState::Operational))
+            && self.monitors.all(|monitor| monitor.state() == Some(NmtState::Operational))
         {
             self.phase = Phase::Ready;
             self.tell(StageEvent::Ready);
@@ -175,9 +175,9 @@ impl Stage {
                  check power stage, enable input and brake"
             )
         } else {
-            let operational = self.monitors.insertion.state == Some(NmtState::Operational);
+            let operational = self.monitors.insertion.state() == Some(NmtState::Operational);
             let axis = if operational { Axis::Rotation } else { Axis::Insertion };
-            match self.monitors[axis].state {
+            match self.monitors[axis].state() {
                 None => format!(
                     "{axis}: enabled, but no heartbeat within {timeout_ms} ms, is can.heartbeat_ms longer?"
                 ),

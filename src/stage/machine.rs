@@ -197,7 +197,7 @@ impl Stage {
 
     /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
     pub fn deadline(&self) -> Time {
-        let mut deadline = self.heartbeat.deadline;
+        let mut deadline = self.heartbeat.deadline();
         if let Phase::Listening { until } = self.phase {
             deadline = deadline.min(until);
         }
@@ -205,7 +205,7 @@ impl Stage {
             deadline = deadline.min(self.sync.deadline);
         }
         for axis in Axis::BOTH {
-            deadline = deadline.min(self.monitors[axis].deadline);
+            deadline = deadline.min(self.monitors[axis].deadline());
             if let Some(bring_up) = &self.bring_ups[axis] {
                 deadline = deadline.min(bring_up.conversation.deadline());
             }
@@ -381,8 +381,7 @@ impl Stage {
             self.drives[axis].allow_reset(fault.error_code);
         }
         // Only a heartbeat that comes from here on can say that this stage's start command was obeyed.
-        self.monitors[axis].state = None;
-        self.monitors[axis].deadline = now + self.config.bus.heartbeat_timeout();
+        self.monitors[axis].expect_by(now + self.config.bus.heartbeat_timeout());
         if self.bring_ups.all(Option::is_none) {
             for axis in Axis::BOTH {
                 self.send_nmt(NmtCommand::StartRemoteNode, axis);

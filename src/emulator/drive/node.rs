@@ -156,8 +156,8 @@ impl Drive {
     pub fn deadline(&self) -> Time {
         let operational = self.nmt_state() == NmtState::Operational;
         let pdos = self.tpdos.iter().filter(|_| operational).map(Tpdo::deadline);
-        let consumers = self.supervised.iter().map(|supervised| supervised.consumer.deadline);
-        let own = [self.server.deadline(), self.producer.deadline, self.axis.deadline()];
+        let consumers = self.supervised.iter().map(|supervised| supervised.consumer.deadline());
+        let own = [self.server.deadline(), self.producer.deadline(), self.axis.deadline()];
         pdos.chain(consumers).chain(own).min().unwrap_or(Time::NEVER)
     }
 
@@ -211,7 +211,7 @@ impl Drive {
     fn handle_heartbeat(&mut self, now: Time, frame: &Frame) {
         for n in 0..self.supervised.len() {
             let supervised = &mut self.supervised[n];
-            let was_alive = supervised.consumer.state.is_some();
+            let was_alive = supervised.consumer.state().is_some();
             match supervised.consumer.handle_frame(now, frame) {
                 // A supervised node that restarted counts as lost.
                 Some(HeartbeatEvent::BootUp) if was_alive => self.heartbeat_lost(now, n),
@@ -227,7 +227,7 @@ impl Drive {
     fn heartbeat_lost(&mut self, now: Time, n: usize) {
         let supervised = &mut self.supervised[n];
         supervised.lost = true;
-        let lost = [supervised.consumer.node.get(), 0, 0, 0, 0];
+        let lost = [supervised.consumer.node().get(), 0, 0, 0, 0];
         self.device.raise(EmcyCode::HEARTBEAT, lost);
         self.axis.heartbeat_lost(now, &mut self.device);
         let operational = self.nmt_state() == NmtState::Operational;
