@@ -13,12 +13,12 @@ pub const fn emcy(node: NodeId) -> u16 {
 }
 
 /// Transmit PDO 1 of `node` (the node sends it).
-pub const fn tpdo(node: NodeId) -> u16 {
+pub const fn tpdo1(node: NodeId) -> u16 {
     0x180 + node.get() as u16
 }
 
 /// Receive PDO 1 of `node` (the node acts on it).
-pub const fn rpdo(node: NodeId) -> u16 {
+pub const fn rpdo1(node: NodeId) -> u16 {
     0x200 + node.get() as u16
 }
 
@@ -51,7 +51,7 @@ mod tests {
         let node = NodeId::new(5).unwrap();
         let last = NodeId::new(127).unwrap();
         assert_eq!(emcy(node), 0x085);
-        assert_eq!((tpdo(node), rpdo(node)), (0x185, 0x205));
+        assert_eq!((tpdo1(node), rpdo1(node)), (0x185, 0x205));
         assert_eq!((sdo_tx(last), sdo_rx(last), heartbeat(last)), (0x5ff, 0x67f, 0x77f));
     }
 

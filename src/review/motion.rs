@@ -37,8 +37,10 @@ impl Motion {
         let started_us = unix_us_of(&folder.manifest.started_utc);
         let Some((stage, started_us)) = stage.zip(started_us) else { return Motion::default() };
         Motion {
-            commanded: PerAxis::from_fn(|axis| course(frames, started_us, &stage, axis, cob::rpdo)),
-            measured: PerAxis::from_fn(|axis| course(frames, started_us, &stage, axis, cob::tpdo)),
+            commanded: PerAxis::from_fn(|axis| {
+                course(frames, started_us, &stage, axis, cob::rpdo1)
+            }),
+            measured: PerAxis::from_fn(|axis| course(frames, started_us, &stage, axis, cob::tpdo1)),
         }
     }
 }

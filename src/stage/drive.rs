@@ -136,7 +136,7 @@ impl Drive {
         self.commanded = Commanded { counts: position.into(), step_counts: 0 };
     }
 
-    /// The payload of TPDO1 after a SYNC, as [`plan::TPDO`](super::plan::TPDO) maps it.
+    /// The payload of TPDO1 after a SYNC, as [`plan::TPDO1`](super::plan::TPDO1) maps it.
     pub(super) fn take_tpdo(&mut self, payload: [u8; 6], sync: u64) {
         self.taken = payload;
         let [s0, s1, p0, p1, p2, p3] = payload;
@@ -185,12 +185,12 @@ impl Drive {
         (self.sent_ahead.take() != Some(rpdo)).then_some(rpdo)
     }
 
-    /// RPDO1, as [`plan::RPDO`](super::plan::RPDO) maps it.
+    /// RPDO1, as [`plan::RPDO1`](super::plan::RPDO1) maps it.
     fn rpdo(&self, target_counts: i64) -> Frame {
         let [c0, c1] = self.controlword.0.to_le_bytes();
         // Cut to 32 bits: that is the wrap, where limits let a target come that far.
         let [t0, t1, t2, t3] = (target_counts as i32).to_le_bytes();
-        let cob_id = cob::rpdo(self.config.node);
+        let cob_id = cob::rpdo1(self.config.node);
         Frame::new(cob_id, &[c0, c1, t0, t1, t2, t3])
     }
 

@@ -140,7 +140,7 @@ impl Stage {
         self.watch_for_another_master(now, frame);
         for axis in Axis::BOTH {
             let node = self.config.axis(axis).node;
-            if cob_id == cob::tpdo(node) {
+            if cob_id == cob::tpdo1(node) {
                 return self.handle_tpdo(now, axis, frame);
             } else if cob_id == cob::heartbeat(node) {
                 return self.handle_heartbeat(now, axis, frame);

@@ -15,10 +15,10 @@ use crate::canopen::sdo::{SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::canopen::{ObjectAddress, cob};
 
 /// RPDO1: controlword and target in one frame, so that neither is older than the other.
-pub(super) const RPDO: [MappedObject; 2] =
+pub(super) const RPDO1: [MappedObject; 2] =
     [MappedObject::new(0x6040, 0, 16), MappedObject::new(0x607a, 0, 32)];
 /// TPDO1: statusword and position of one instant.
-pub(super) const TPDO: [MappedObject; 2] =
+pub(super) const TPDO1: [MappedObject; 2] =
     [MappedObject::new(0x6041, 0, 16), MappedObject::new(0x6064, 0, 32)];
 
 /// CiA 402, the low word of 0x1000.
@@ -232,8 +232,8 @@ impl Script {
             }
             let (entries, enabled) = match direction {
                 // Bit 30 has no meaning in an RPDO.
-                PdoDirection::Receive => (RPDO, u32::from(cob::rpdo(node))),
-                PdoDirection::Transmit => (TPDO, PdoCobId::enabled(cob::tpdo(node)).0),
+                PdoDirection::Receive => (RPDO1, u32::from(cob::rpdo1(node))),
+                PdoDirection::Transmit => (TPDO1, PdoCobId::enabled(cob::tpdo1(node)).0),
             };
             self.write(communication(2), EVERY_SYNC).await?;
             self.write(mapping(0), 0_u8).await?;

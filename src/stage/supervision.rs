@@ -31,7 +31,7 @@ impl Stage {
     pub(super) fn is_own(&self, cob_id: u16) -> bool {
         let of_drive = |axis: Axis| {
             let node = self.config.axis(axis).node;
-            [cob::rpdo(node), cob::sdo_rx(node)].contains(&cob_id)
+            [cob::rpdo1(node), cob::sdo_rx(node)].contains(&cob_id)
         };
         [cob::NMT, cob::SYNC, cob::heartbeat(self.config.bus.bench_node)].contains(&cob_id)
             || Axis::BOTH.into_iter().any(of_drive)
@@ -252,7 +252,7 @@ fn command_of_another_master(
     } else if cob_id == cob::heartbeat(bench) {
         // The drives would take it for the bench's, and not miss the bench.
         Some("a heartbeat of the bench's own node number")
-    } else if is_one_of(cob::rpdo) {
+    } else if is_one_of(cob::rpdo1) {
         Some("RPDO1 of a drive")
     } else if is_one_of(cob::sdo_rx) {
         let specifier = frame.data().first().map(|command| command >> 5);

@@ -189,8 +189,8 @@ impl Fault {
     pub(super) fn frame_id(&self, node: NodeId) -> Option<CanId> {
         let cob_id = match (self.frames, self.toward) {
             (FrameClass::Any, _) => return None,
-            (FrameClass::Pdo, Toward::Bench) => cob::tpdo(node),
-            (FrameClass::Pdo, Toward::Drives) => cob::rpdo(node),
+            (FrameClass::Pdo, Toward::Bench) => cob::tpdo1(node),
+            (FrameClass::Pdo, Toward::Drives) => cob::rpdo1(node),
             (FrameClass::Sdo, Toward::Bench) => cob::sdo_tx(node),
             (FrameClass::Sdo, Toward::Drives) => cob::sdo_rx(node),
             (FrameClass::Heartbeat, Toward::Bench) => cob::heartbeat(node),

@@ -96,7 +96,7 @@ impl TestDrive {
             (at(0x1029, 1), 1_u8.into()),
             (at(0x1400, 1), (0x200 + id).into()),
             (at(0x1401, 1), (0x300 + id).into()),
-            (at(0x1800, 1), PdoCobId::enabled(cob::tpdo(node)).0.into()),
+            (at(0x1800, 1), PdoCobId::enabled(cob::tpdo1(node)).0.into()),
             (at(0x1801, 1), (0xc000_0280 + id).into()),
             (at(0x6007, 0), 1_i16.into()),
             (at(0x603f, 0), 0x7320_u16.into()),
@@ -202,7 +202,7 @@ impl TestDrive {
                 self.handle_sdo(now, frame);
             }
         } else if self.nmt == NmtState::Operational {
-            if frame.cob_id() == Some(cob::rpdo(self.node)) {
+            if frame.cob_id() == Some(cob::rpdo1(self.node)) {
                 let [c0, c1, t @ ..] = frame.data() else { panic!("an RPDO of no length") };
                 let target = t.try_into().expect("six bytes");
                 self.rpdo = Some((u16::from_le_bytes([*c0, *c1]), i32::from_le_bytes(target)));
@@ -219,7 +219,7 @@ impl TestDrive {
         } else {
             let [s0, s1] = self.statusword().0.to_le_bytes();
             let [p0, p1, p2, p3] = self.counts.to_le_bytes();
-            let tpdo = Frame::new(cob::tpdo(self.node), &[s0, s1, p0, p1, p2, p3]);
+            let tpdo = Frame::new(cob::tpdo1(self.node), &[s0, s1, p0, p1, p2, p3]);
             self.last_tpdo = Some(tpdo);
             self.out.push(tpdo);
         }

@@ -45,7 +45,7 @@ impl Selection {
 
     /// If `frame` is a TPDO1 that reports a new drive state: the axis and that state.
     pub(super) fn entered(&mut self, frame: &Frame) -> Option<(Axis, DriveState)> {
-        let tpdo1 = |axis: &Axis| frame.cob_id() == Some(cob::tpdo(self.nodes[*axis]));
+        let tpdo1 = |axis: &Axis| frame.cob_id() == Some(cob::tpdo1(self.nodes[*axis]));
         let axis = Axis::BOTH.into_iter().find(tpdo1)?;
         let state = Statusword(u16::from_le_bytes(*frame.data().first_chunk()?)).state()?;
         (self.states[axis].replace(state) != Some(state)).then_some((axis, state))
