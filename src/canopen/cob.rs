@@ -37,7 +37,7 @@ pub const fn heartbeat(node: NodeId) -> u16 {
     0x700 + node.get() as u16
 }
 
-/// The node in `cob_id` when it belongs to the function code starting at `base`.
+/// The node that `cob_id` names, if it is one of the 127 identifiers that follow `base`.
 pub(crate) fn node_of(cob_id: u16, base: u16) -> Option<NodeId> {
     cob_id.checked_sub(base).and_then(|id| u8::try_from(id).ok()).and_then(NodeId::new)
 }

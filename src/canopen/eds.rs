@@ -1,4 +1,4 @@
-//! Electronic data sheets (CiA 306-1): a device and its objects as a file that CANopen tools read.
+//! Electronic data sheets (EDS, CiA 306-1): files that describe a device's objects to CANopen tools.
 
 use std::fmt;
 
@@ -43,8 +43,8 @@ impl Eds {
         }
     }
 
-    /// Adds an unsigned number of 8, 16 or 32 `bits` that can be read and written, unless the sheet has
-    /// this object.
+    /// Adds `object` as a number (UNSIGNED8, 16 or 32, by `bits`) that can be read and written, unless the
+    /// sheet has it.
     pub fn add_number(&mut self, object: ObjectAddress, bits: u8) {
         if self.sections.iter().any(|section| section.object() == Some(object)) {
             return;
@@ -68,13 +68,13 @@ impl Eds {
     /// Removes an optional object: its sections and its line in the list of optional objects.
     pub fn remove_object(&mut self, index: u16) {
         self.sections.retain(|section| section.object().is_none_or(|object| object.index != index));
-        let listed = format!("0x{index:04X}");
+        let removed = format!("0x{index:04X}");
         let lists = self.sections.iter_mut().filter(|section| section.name == "OptionalObjects");
         for keys in lists.map(|section| &mut section.keys) {
-            keys.retain(|(_, value)| *value != listed);
+            keys.retain(|(_, value)| *value != removed);
             let count = keys.len().saturating_sub(1);
             for (n, (key, value)) in keys.iter_mut().enumerate() {
-                // The first key is the number of objects.
+                // The value of the first key is the number of objects.
                 if n == 0 { *value = count.to_string() } else { *key = n.to_string() }
             }
         }
@@ -113,9 +113,9 @@ impl Section {
 
     /// The value that the section describes; `None` for a section that has no value of its own.
     fn entry(&self, node: NodeId) -> Option<Entry> {
-        let integer = |key| integer(self.get(key)?, node);
-        let data_type = DataType::from_index(integer("DataType")?)?;
-        let mappable = integer("PDOMapping") == Some(1);
+        let number = |key| parse_integer(self.get(key)?, node);
+        let data_type = DataType::from_index(number("DataType")?)?;
+        let mappable = number("PDOMapping") == Some(1);
         let (access, direction) = match self.get("AccessType")? {
             "ro" | "const" => (Access::ReadOnly, PdoDirection::Transmit),
             "wo" => (Access::WriteOnly, PdoDirection::Receive),
@@ -124,18 +124,18 @@ impl Section {
         };
         let mut entry = match data_type {
             DataType::Text => Entry::text(self.get("DefaultValue")?),
-            _ => Entry::new(data_type, access, integer("DefaultValue")?),
+            _ => Entry::new(data_type, access, number("DefaultValue")?),
         };
         entry.mappable = mappable.then_some(direction);
-        entry.limits = integer("LowLimit").zip(integer("HighLimit")).map(|(low, high)| low..=high);
+        entry.limits = number("LowLimit").zip(number("HighLimit")).map(|(low, high)| low..=high);
         Some(entry)
     }
 }
 
-/// A decimal or hexadecimal number. `$NODEID+0x80` is a COB-ID that follows the node number.
-fn integer(text: &str, node: NodeId) -> Option<i64> {
+/// A decimal or hexadecimal number. `$NODEID+0x80` is the sum of the node number and 0x80.
+fn parse_integer(text: &str, node: NodeId) -> Option<i64> {
     if let Some(offset) = text.strip_prefix("$NODEID+") {
-        return Some(integer(offset, node)? + i64::from(node.get()));
+        return Some(parse_integer(offset, node)? + i64::from(node.get()));
     }
     match text.strip_prefix("0x") {
         Some(digits) => i64::from_str_radix(digits, 16).ok(),

@@ -25,16 +25,6 @@ impl fmt::Display for ObjectAddress {
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn prints_as_manuals_do() {
-        assert_eq!(ObjectAddress::new(0x60c2, 1).to_string(), "0x60C2:01");
-    }
-}
-
 /// Objects of the communication profile (CiA 301, 7.5.2).
 pub mod communication {
     use super::ObjectAddress;
@@ -43,21 +33,22 @@ pub mod communication {
     pub const DEVICE_TYPE: ObjectAddress = ObjectAddress::new(0x1000, 0);
     /// u8.
     pub const ERROR_REGISTER: ObjectAddress = ObjectAddress::new(0x1001, 0);
-    /// u32: bit 30 makes the node produce SYNC.
+    /// u32: identifier of SYNC; bit 30 makes the node produce it.
     pub const SYNC_COB_ID: ObjectAddress = ObjectAddress::new(0x1005, 0);
-    /// u32: bit 31 switches emergency messages off.
+    /// u32: identifier of emergency messages; bit 31 switches them off.
     pub const EMCY_COB_ID: ObjectAddress = ObjectAddress::new(0x1014, 0);
-    /// u16, ms.
+    /// u16, ms: period of the node's heartbeat; 0 is off.
     pub const PRODUCER_HEARTBEAT: ObjectAddress = ObjectAddress::new(0x1017, 0);
-    /// u8: where the node goes when a supervised one falls silent; 0 is Pre-operational.
+    /// u8: what the node does when it misses a heartbeat that it monitors: 0 enters Pre-operational,
+    /// 1 changes nothing, 2 enters Stopped.
     pub const COMMUNICATION_ERROR_BEHAVIOUR: ObjectAddress = ObjectAddress::new(0x1029, 1);
 
-    /// The number of errors kept (0), and the errors, the newest at 1.
+    /// u32: the errors, the newest at subindex 1; their number at 0.
     pub const fn error_history(subindex: u8) -> ObjectAddress {
         ObjectAddress::new(0x1003, subindex)
     }
 
-    /// u32: a supervised node in bits 16 to 23, and its time in ms in bits 0 to 15.
+    /// u32: a monitored node in bits 16 to 23, its heartbeat timeout in ms in bits 0 to 15.
     pub const fn consumer_heartbeat(subindex: u8) -> ObjectAddress {
         ObjectAddress::new(0x1016, subindex)
     }
@@ -65,5 +56,15 @@ pub mod communication {
     /// u32: vendor (1), product (2), revision (3), serial number (4).
     pub const fn identity(subindex: u8) -> ObjectAddress {
         ObjectAddress::new(0x1018, subindex)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn prints_as_manuals_do() {
+        assert_eq!(ObjectAddress::new(0x60c2, 1).to_string(), "0x60C2:01");
     }
 }

@@ -9,7 +9,7 @@ use super::ObjectAddress;
 use super::pdo::PdoDirection;
 use super::sdo::{AbortCode, SdoValue};
 
-/// A data type (CiA 301, 7.4.7) that drives of the bench need.
+/// The data types (CiA 301, 7.4.7) that the emulated drives need.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum DataType {
     /// An INTEGER of so many bits, up to 32.
@@ -43,11 +43,11 @@ impl DataType {
         }
     }
 
-    /// The number in the lowest bits of `bits`, as many as the type has.
-    const fn integer(self, bits: u64) -> i64 {
+    /// `raw` truncated to the length of the type, as a number.
+    const fn integer(self, raw: u64) -> i64 {
         match self {
-            DataType::Signed(len) => (bits << (64 - len)) as i64 >> (64 - len),
-            DataType::Unsigned(len) => (bits << (64 - len) >> (64 - len)) as i64,
+            DataType::Signed(len) => (raw << (64 - len)) as i64 >> (64 - len),
+            DataType::Unsigned(len) => (raw << (64 - len) >> (64 - len)) as i64,
             DataType::Text => 0,
         }
     }
@@ -73,7 +73,7 @@ pub(super) struct Entry {
     pub(super) mappable: Option<PdoDirection>,
     /// The range of the values that can be written over the bus.
     pub(super) limits: Option<RangeInclusive<i64>>,
-    /// At power-on.
+    /// The value at power-on.
     default: i64,
     value: i64,
     /// The content of a constant string.
@@ -106,12 +106,12 @@ impl Entry {
         match bits.cmp(&self.data_type.bits().map_or(0, usize::from)) {
             Ordering::Greater => Err(AbortCode::LENGTH_TOO_HIGH),
             Ordering::Less => Err(AbortCode::LENGTH_TOO_LOW),
-            Ordering::Equal => self.parse_bits(value.to_u32().into()),
+            Ordering::Equal => self.parse_raw(value.to_u32().into()),
         }
     }
 
-    fn parse_bits(&self, bits: u64) -> Result<i64, AbortCode> {
-        let value = self.data_type.integer(bits);
+    fn parse_raw(&self, raw: u64) -> Result<i64, AbortCode> {
+        let value = self.data_type.integer(raw);
         match &self.limits {
             Some(limits) if value > *limits.end() => Err(AbortCode::VALUE_TOO_HIGH),
             Some(limits) if value < *limits.start() => Err(AbortCode::VALUE_TOO_LOW),
@@ -122,16 +122,17 @@ impl Entry {
 
 /// The objects of a node.
 ///
-/// Access over the bus uses [`read`](Self::read), [`parse`](Self::parse) and
-/// [`parse_bits`](Self::parse_bits), which check rights and limits. The device's own program uses
-/// [`integer`](Self::integer) and [`set`](Self::set), which do not.
+/// An SDO uses [`read`](Self::read) and [`parse`](Self::parse), which check access rights and limits. A PDO
+/// uses [`check_mappable`](Self::check_mappable), which checks access rights when the PDO is mapped, and
+/// [`parse_raw`](Self::parse_raw), which checks limits. The device's own program uses
+/// [`integer`](Self::integer) and [`set`](Self::set), which check nothing.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct ObjectDictionary {
     pub(super) entries: BTreeMap<ObjectAddress, Entry>,
 }
 
 impl ObjectDictionary {
-    /// The number in `object`; 0 when there is none. For the device's own program.
+    /// The number in `object`; 0 when there is no such object. For the device's own program.
     pub fn integer(&self, object: ObjectAddress) -> i64 {
         self.entries.get(&object).map_or(0, |entry| entry.value)
     }
@@ -168,15 +169,16 @@ impl ObjectDictionary {
         entry.parse(value)
     }
 
-    /// The same for a value from a PDO.
+    /// The number in the bits `raw` of a PDO, if they are within the limits of the mapped `object`. It is not
+    /// written yet.
     ///
     /// # Errors
-    /// As [`parse`](Self::parse).
-    pub fn parse_bits(&self, object: ObjectAddress, bits: u64) -> Result<i64, AbortCode> {
-        self.entry(object)?.parse_bits(bits)
+    /// The abort code: no such object or subindex, out of limits.
+    pub fn parse_raw(&self, object: ObjectAddress, raw: u64) -> Result<i64, AbortCode> {
+        self.entry(object)?.parse_raw(raw)
     }
 
-    /// Whether `bits` bits of `object` may be mapped into a PDO of this direction.
+    /// Checks that `object` is `bits` long and may be mapped into a PDO of this direction.
     ///
     /// # Errors
     /// The abort code: no such object or subindex, or not mappable.
@@ -187,7 +189,7 @@ impl ObjectDictionary {
         direction: PdoDirection,
     ) -> Result<(), AbortCode> {
         let entry = self.entry(object)?;
-        // A command that can be read may also be sent in a TPDO.
+        // An object that an RPDO may write can also be sent in a TPDO, if it can be read.
         let readable = direction == PdoDirection::Transmit && entry.access == Access::ReadWrite;
         let mappable = entry.mappable.is_some_and(|allowed| allowed == direction || readable);
         if mappable && entry.data_type.bits() == Some(bits) {
@@ -253,7 +255,7 @@ mod tests {
         assert_eq!(dictionary.read(RO), Ok(vec![0x50, 0x02]));
         assert_eq!(dictionary.read(NAME), Ok(b"drive".to_vec()));
         assert_eq!(dictionary.parse(RW, (-2_i32).into()), Ok(-2));
-        assert_eq!(dictionary.parse_bits(RW, 0xffff_fffe), Ok(-2));
+        assert_eq!(dictionary.parse_raw(RW, 0xffff_fffe), Ok(-2));
     }
 
     #[test]

@@ -5,7 +5,7 @@ use super::ObjectAddress;
 /// Transmission type of a PDO that is sent, or acted upon, at every SYNC (CiA 301, tables 72 and 74).
 pub const EVERY_SYNC: u8 = 1;
 
-/// How many PDOs of each direction a node has. Here a PDO is called by its offset, 0 for PDO 1.
+/// How many PDOs a node has in each direction. In this module `offset` is the PDO's number less 1.
 pub const PDOS: u16 = 4;
 
 /// The direction of a PDO, seen from the node.
@@ -47,12 +47,12 @@ impl MappedObject {
         MappedObject { object: ObjectAddress::new(index, subindex), bits }
     }
 
-    /// As a mapping parameter holds it: index, subindex, bits from the top.
+    /// The entry in the mapping parameters: from the highest bit on, index, subindex and length.
     pub const fn to_u32(self) -> u32 {
         (self.object.index as u32) << 16 | (self.object.subindex as u32) << 8 | self.bits as u32
     }
 
-    /// From a mapping parameter.
+    /// Reads an entry of the mapping parameters.
     pub const fn from_u32(entry: u32) -> Self {
         MappedObject::new((entry >> 16) as u16, (entry >> 8) as u8, entry as u8)
     }
@@ -69,8 +69,8 @@ pub struct PdoMapping {
 }
 
 impl PdoMapping {
-    /// A mapping of these objects; `None` when one has no length or all together exceed the 64 bits
-    /// of a frame.
+    /// A mapping of these objects; `None` when the length of one is 0, or their sum exceeds the 64 bits of a
+    /// frame.
     pub fn new(objects: impl Into<Vec<MappedObject>>) -> Option<Self> {
         let objects = objects.into();
         let bits: u32 = objects.iter().map(|object| u32::from(object.bits)).sum();
@@ -88,8 +88,8 @@ impl PdoMapping {
         self.objects.iter().map(|object| usize::from(object.bits)).sum::<usize>().div_ceil(8)
     }
 
-    /// The payload that carries `values`, in the order of the mapping. Bits beyond an object's
-    /// length are cut off, so a negative `i32` may be given `as u64`; missing values are zero.
+    /// The payload that carries `values`, in the order of the mapping. A value is truncated to its object's
+    /// length, so a negative `i32` may be given `as u64`. Missing values are zero.
     pub fn pack(&self, values: impl IntoIterator<Item = u64>) -> Vec<u8> {
         let mut word = 0;
         let mut shift = 0;
@@ -100,8 +100,8 @@ impl PdoMapping {
         word.to_le_bytes()[..self.len_bytes()].to_vec()
     }
 
-    /// The values in `payload`, in the order of the mapping; bytes beyond it are ignored. `None`
-    /// when the payload is shorter than the mapping: none of it may be used.
+    /// The values in `payload`, in the order of the mapping; bytes beyond the mapping are ignored. `None`
+    /// when the payload is shorter than the mapping: no part of it may be used then.
     pub fn unpack(&self, payload: &[u8]) -> Option<Vec<(ObjectAddress, u64)>> {
         let needed = self.len_bytes();
         let used = payload.get(..needed)?;

@@ -30,14 +30,14 @@ impl SyncProducer {
         SyncProducer { period, deadline: first }
     }
 
-    /// If a SYNC is due, the number of SYNCs that were missed before it. They are skipped: two SYNCs
-    /// in a row would make the drives jump.
+    /// If a SYNC is due, the number of SYNCs that were missed before it. Missed SYNCs are skipped: two in
+    /// quick succession would make the drives jump.
     pub fn handle_timeout(&mut self, now: Time) -> Option<u32> {
         if now < self.deadline {
             return None;
         }
-        let late = now.since(self.deadline).as_nanos() / self.period.as_nanos().max(1);
-        let missed = u32::try_from(late).unwrap_or(u32::MAX);
+        let periods = now.since(self.deadline).as_nanos() / self.period.as_nanos().max(1);
+        let missed = u32::try_from(periods).unwrap_or(u32::MAX);
         self.deadline = self.deadline + self.period.saturating_mul(missed) + self.period;
         Some(missed)
     }

@@ -326,7 +326,7 @@ impl Drive {
     fn write_values(&mut self, now: Time, values: Values) {
         let mut written = Vec::with_capacity(values.len());
         for (object, bits) in values {
-            let Ok(value) = self.device.objects.parse_bits(object, bits) else { continue };
+            let Ok(value) = self.device.objects.parse_raw(object, bits) else { continue };
             if self.axis.check_write(object, value).is_ok() {
                 self.device.objects.set(object, value);
                 written.push(object);
