@@ -64,7 +64,7 @@ impl Statusword {
     /// Bit 13 in homing: homing error.
     pub const HOMING_ERROR: u16 = 1 << 13;
 
-    /// The states, each with the bits that tell it and what they are in it.
+    /// Each state, the mask of the bits that identify it, and their value.
     const STATES: [(DriveState, u16, u16); 8] = [
         (DriveState::NotReadyToSwitchOn, 0x4f, 0x00),
         (DriveState::SwitchOnDisabled, 0x4f, 0x40),
@@ -87,7 +87,7 @@ impl Statusword {
         state.map(|(state, ..)| *state)
     }
 
-    /// Bits 0 to 3, 5 and 6 in `state`.
+    /// The bits that identify `state`, of bits 0 to 3, 5 and 6.
     pub fn state_bits(state: DriveState) -> u16 {
         let bits = Self::STATES.iter().find(|(known, ..)| *known == state);
         bits.map_or(0, |(.., bits)| *bits)
@@ -163,7 +163,7 @@ impl Mode {
     /// Cyclic synchronous position.
     pub const CSP: Self = Mode(8);
 
-    /// True when `supported_modes`, object 0x6502, has this mode's bit.
+    /// True when `supported_modes` (object 0x6502) has this mode's bit set.
     pub const fn is_in(self, supported_modes: u32) -> bool {
         matches!(self.0, 1..=32) && supported_modes >> (self.0 - 1) & 1 != 0
     }
@@ -188,18 +188,18 @@ impl fmt::Display for Mode {
     }
 }
 
-/// Leads a drive from any state to Operation Enabled, one controlword for each statusword. A new one
-/// does not know the controlword that was sent before.
+/// Leads a drive from any state to Operation Enabled, one controlword for each statusword. A new sequence
+/// does not know which controlword the drive was sent last.
 #[derive(Debug, Clone, Default)]
 pub struct EnableSequence {
-    /// Bit 7 of the last controlword was clear, so that the next can set it.
-    armed: bool,
+    /// Bit 7 (fault reset) of the last controlword was clear, so that the next can make its rising edge.
+    reset_bit_was_clear: bool,
 }
 
 impl EnableSequence {
-    /// The controlword to send now: one step nearer to Operation Enabled, or 0x0000 where only
-    /// waiting helps. In Fault it goes 0x0000, 0x0080, 0x0000 and so on, so that a drive that missed
-    /// or refused one rising edge of Fault Reset gets another.
+    /// The controlword to send now: one step nearer to Operation Enabled, or 0x0000 in a state that the
+    /// drive must leave by itself. In Fault, 0x0000 and 0x0080 alternate, so that a drive that missed or
+    /// refused one rising edge of Fault Reset gets another.
     pub fn step(&mut self, statusword: Statusword) -> Controlword {
         let controlword = match statusword.state() {
             Some(DriveState::SwitchOnDisabled) => Controlword::SHUTDOWN,
@@ -207,10 +207,10 @@ impl EnableSequence {
             Some(DriveState::SwitchedOn | DriveState::OperationEnabled) => {
                 Controlword::ENABLE_OPERATION
             }
-            Some(DriveState::Fault) if self.armed => Controlword::FAULT_RESET,
+            Some(DriveState::Fault) if self.reset_bit_was_clear => Controlword::FAULT_RESET,
             _ => Controlword::DISABLE_VOLTAGE,
         };
-        self.armed = controlword != Controlword::FAULT_RESET;
+        self.reset_bit_was_clear = controlword != Controlword::FAULT_RESET;
         controlword
     }
 }

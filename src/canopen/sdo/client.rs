@@ -12,14 +12,14 @@ use crate::canopen::object::communication::{DEVICE_TYPE, ERROR_REGISTER};
 use crate::canopen::{Frame, NodeId, ObjectAddress, cob};
 use crate::units::Time;
 
-/// If an old answer may still come, one of these objects, which every node has, is read before the next
-/// request.
+/// If an old answer may still come, the first of these objects that the next request does not name is read
+/// before that request. Every node has both.
 const FENCES: [ObjectAddress; 2] = [ERROR_REGISTER, DEVICE_TYPE];
 
 #[derive(Debug, Clone, Copy)]
 struct Transfer {
     request: SdoRequest,
-    /// The request is sent once the node has answered for this object.
+    /// The request is sent once the node has answered about this object.
     fence: Option<ObjectAddress>,
     deadline: Time,
 }
@@ -33,15 +33,15 @@ struct Transfer {
 /// A late answer is never taken for the answer to the next request. Answers name their object, so an
 /// answer about another object is ignored. After a transfer that the client itself ended (by a
 /// timeout or an abort) even an answer about the same object may be old. Then the client first reads
-/// the error register (0x1001) and ignores everything before that answer. A node answers in order,
-/// so no old answer comes after it.
+/// another object as a fence, usually the error register (0x1001), and ignores everything before the answer
+/// to that. A node answers in order, so no old answer comes after it.
 #[derive(Debug, Clone)]
 pub struct SdoClient {
     node: NodeId,
     timeout: Duration,
     transfer: Option<Transfer>,
     /// An answer to an earlier request may still come.
-    owed: bool,
+    expects_old_answer: bool,
     outgoing: VecDeque<ClientFrame>,
     result: Option<Result<SdoReply, SdoError>>,
 }
@@ -54,13 +54,13 @@ impl SdoClient {
             node,
             timeout,
             transfer: None,
-            owed: false,
+            expects_old_answer: false,
             outgoing: VecDeque::new(),
             result: None,
         }
     }
 
-    /// The server.
+    /// The node whose objects are read and written.
     pub fn node(&self) -> NodeId {
         self.node
     }
@@ -69,9 +69,8 @@ impl SdoClient {
     /// polled is dropped.
     pub fn start(&mut self, now: Time, request: SdoRequest) {
         self.cancel();
-        let [usual, other] = FENCES;
-        let fence = if request.object() == usual { other } else { usual };
-        let fence = self.owed.then_some(fence);
+        let fence = FENCES.into_iter().find(|fence| *fence != request.object());
+        let fence = fence.filter(|_| self.expects_old_answer);
         let first = fence.map_or(request, SdoRequest::Upload);
         self.outgoing.push_back(ClientFrame::Request(first));
         self.transfer = Some(Transfer { request, fence, deadline: now + self.timeout });
@@ -90,7 +89,7 @@ impl SdoClient {
         let object = transfer.request.object();
         if transfer.fence.is_some() {
             if answer.object() == transfer.fence {
-                self.owed = false;
+                self.expects_old_answer = false;
                 transfer.fence = None;
                 transfer.deadline = now + self.timeout;
                 self.outgoing.push_back(ClientFrame::Request(transfer.request));
@@ -157,7 +156,7 @@ impl SdoClient {
     /// Ends the transfer and tells the node, whose answer may still come.
     fn abort(&mut self, code: AbortCode) {
         if let Some(transfer) = self.transfer.take() {
-            self.owed = true;
+            self.expects_old_answer = true;
             self.outgoing.push_back(ClientFrame::Abort(transfer.request.object(), code));
         }
     }

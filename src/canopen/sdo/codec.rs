@@ -181,15 +181,15 @@ fn decode_value(bytes: &SdoBytes) -> Option<SdoValue> {
     SdoValue::from_bytes(&bytes[4..8 - unused])
 }
 
-/// The next segment of an upload, and the data that remains after it; `rest` is the data not yet sent.
-pub(super) fn encode_segment(rest: &[u8], toggle: bool) -> (SdoBytes, &[u8]) {
-    let (data, rest) = rest.split_at(rest.len().min(7));
+/// The next segment of `unsent`, the rest of an upload, and the data that remains after it.
+pub(super) fn encode_segment(unsent: &[u8], toggle: bool) -> (SdoBytes, &[u8]) {
+    let (data, remaining) = unsent.split_at(unsent.len().min(7));
     let unused = 7 - data.len() as u8;
-    let last = if rest.is_empty() { LAST } else { 0 };
+    let last = if remaining.is_empty() { LAST } else { 0 };
     let mut bytes = [0; 8];
     bytes[0] = toggle_bit(toggle) | unused << 1 | last;
     bytes[1..=data.len()].copy_from_slice(data);
-    (bytes, rest)
+    (bytes, remaining)
 }
 
 #[cfg(test)]

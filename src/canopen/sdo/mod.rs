@@ -54,7 +54,7 @@ pub enum SdoError {
     /// The value is longer than the 4 bytes of one frame.
     #[error("value of more than 4 bytes, is it an object of this drive?")]
     TooLong,
-    /// The response is none of these.
+    /// The response has a command specifier that the request does not lead to.
     #[error("answer with unexpected command 0x{0:02X}")]
     UnexpectedCommand(u8),
 }
@@ -74,8 +74,8 @@ impl SdoValue {
         (!bytes.is_empty()).then_some(value)
     }
 
-    /// `value` in an object of `size` bytes, signed or not; `None` when it does not fit or the
-    /// size is none of 1, 2 and 4.
+    /// `value` in an object of `size` bytes, signed or unsigned; `None` when it does not fit, or the size is
+    /// not 1, 2 or 4.
     pub fn sized(value: i64, size: u8) -> Option<Self> {
         let bits = match size {
             1 | 2 | 4 => u32::from(size) * 8,
@@ -92,8 +92,8 @@ impl SdoValue {
         &self.bytes[..usize::from(self.len)]
     }
 
-    /// The value of an object of at least `len` bytes, as an unsigned number; `None` if it has fewer. An
-    /// expedited answer may leave out how many of its four bytes are the object's (CiA 301, 7.2.4.3.6).
+    /// As an unsigned number, if there are at least `len` bytes. There may be more than the object has: an
+    /// expedited answer need not say how many of its four bytes belong to the object (CiA 301, 7.2.4.3.6).
     pub fn at_least(self, len: u8) -> Option<u32> {
         (self.len >= len).then_some(self.to_u32())
     }
@@ -129,7 +129,7 @@ impl fmt::Display for SdoValue {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct AbortCode(pub u32);
 
-/// Those that the bench or its emulated drives send or act on.
+/// The codes that the bench or its emulated drives send or act on.
 impl AbortCode {
     /// Toggle bit not alternated.
     pub const TOGGLE_NOT_ALTERNATED: Self = AbortCode(0x0503_0000);

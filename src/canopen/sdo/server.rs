@@ -31,8 +31,8 @@ pub trait ObjectAccess {
 struct Upload {
     object: ObjectAddress,
     toggle: bool,
-    /// What is still to be sent.
-    rest: Vec<u8>,
+    /// The data that is still to be sent.
+    unsent: Vec<u8>,
     deadline: Time,
 }
 
@@ -115,10 +115,10 @@ impl SdoServer {
         match objects.read(object).map(|data| (SdoValue::from_bytes(&data), data)) {
             Err(code) => ServerFrame::Abort(object, code),
             Ok((Some(value), _)) => ServerFrame::Reply(object, SdoReply::Uploaded(value)),
-            Ok((None, rest)) => {
-                let size = u32::try_from(rest.len()).unwrap_or(u32::MAX);
+            Ok((None, unsent)) => {
+                let size = u32::try_from(unsent.len()).unwrap_or(u32::MAX);
                 let deadline = now + self.timeout;
-                self.upload = Some(Upload { object, toggle: false, rest, deadline });
+                self.upload = Some(Upload { object, toggle: false, unsent, deadline });
                 ServerFrame::InitiateUpload(object, size)
             }
         }
@@ -128,9 +128,9 @@ impl SdoServer {
         if toggle != upload.toggle {
             return ServerFrame::Abort(upload.object, AbortCode::TOGGLE_NOT_ALTERNATED).encode();
         }
-        let (segment, rest) = encode_segment(&upload.rest, toggle);
-        if !rest.is_empty() {
-            upload.rest = rest.to_vec();
+        let (segment, unsent) = encode_segment(&upload.unsent, toggle);
+        if !unsent.is_empty() {
+            upload.unsent = unsent.to_vec();
             upload.toggle = !toggle;
             upload.deadline = now + self.timeout;
             self.upload = Some(upload);
