@@ -81,11 +81,11 @@ pub(super) struct SoFar {
 }
 
 impl BringUp {
-    /// The bring-up of `axis`, to be moved or to be `homed`.
-    pub(super) fn new(config: &StageConfig, axis: Axis, homed: bool, now: Time) -> Self {
+    /// The bring-up of `axis`, to be homed in `homing_mode` or to be moved in cyclic synchronous position.
+    pub(super) fn new(config: &StageConfig, axis: Axis, homing_mode: bool, now: Time) -> Self {
         let sdo = Sdo::new(config, axis);
         let so_far = Rc::new(Cell::new(SoFar::default()));
-        let script = Script { axis, homed, config: config.clone(), sdo, so_far };
+        let script = Script { axis, homing_mode, config: config.clone(), sdo, so_far };
         BringUp {
             conversation: Conversation::begin(&script.sdo, now, script.clone().run()),
             script,
@@ -100,7 +100,7 @@ impl BringUp {
         if found && self.restarts_left > 0 {
             self.restarts_left -= 1;
             self.script.so_far.take();
-            self.script.tell(Progress::Restarted(self.script.axis));
+            self.script.emit(Progress::Restarted(self.script.axis));
             let script = self.script.clone();
             self.conversation = Conversation::begin(&self.script.sdo, now, script.run());
         } else if found {
@@ -137,8 +137,8 @@ pub(super) fn optional(address: ObjectAddress) -> Object {
 #[derive(Debug, Clone)]
 pub(super) struct Script {
     pub(super) axis: Axis,
-    /// The axis is brought up to be homed.
-    pub(super) homed: bool,
+    /// The axis is brought up in homing mode, to be homed; otherwise in cyclic synchronous position.
+    pub(super) homing_mode: bool,
     pub(super) config: StageConfig,
     pub(super) sdo: Sdo,
     so_far: Rc<Cell<SoFar>>,
@@ -158,11 +158,11 @@ impl Script {
     /// Begins a part of the bring-up.
     pub(super) fn begin(&self, part: &'static str) {
         self.note(|so_far| so_far.part = part);
-        self.tell(Progress::BringUp(self.axis, part));
+        self.emit(Progress::BringUp(self.axis, part));
     }
 
-    fn tell(&self, progress: Progress) {
-        self.sdo.tell(StageEvent::Progress(progress));
+    fn emit(&self, progress: Progress) {
+        self.sdo.emit(StageEvent::Progress(progress));
     }
 
     /// The drive's answer to `request`; `None` if it lacks an object that it may lack.
@@ -183,7 +183,7 @@ impl Script {
             SdoError::Aborted(AbortCode::NO_SUCH_OBJECT | AbortCode::NO_SUCH_SUBINDEX)
         );
         if is_absent && may_lack {
-            self.tell(Progress::Skipped(self.axis, object));
+            self.emit(Progress::Skipped(self.axis, object));
             return Ok(None);
         }
         let hint = if is_absent {

@@ -63,10 +63,10 @@ impl Stage {
             && self.monitors.all(|monitor| monitor.state() == Some(NmtState::Operational))
         {
             self.phase = Phase::Ready;
-            self.tell(StageEvent::Ready);
+            self.emit(StageEvent::Ready);
             for axis in Axis::BOTH {
                 for flag in self.drives[axis].flags_not_shown() {
-                    self.tell(StageEvent::NotShown(axis, flag));
+                    self.emit(StageEvent::NotShown(axis, flag));
                 }
             }
         }
@@ -77,7 +77,7 @@ impl Stage {
             return;
         }
         if self.drives.all(Drive::is_armed) {
-            self.tell(StageEvent::Feedback(Feedback {
+            self.emit(StageEvent::Feedback(Feedback {
                 time: self.sync_time,
                 sync: self.sync_count,
                 measured: self.both(Drive::measured),
@@ -146,11 +146,11 @@ impl Stage {
         }
         if !located {
             self.phase = Phase::Standby { give_up, located: true };
-            self.tell(StageEvent::Located(self.both(Drive::commanded)));
+            self.emit(StageEvent::Located(self.both(Drive::commanded)));
         }
         if self.power_permitted {
             self.phase = Phase::Enabling { give_up: now + self.config.power.enable_timeout };
-            self.tell(StageEvent::Progress(Progress::Enabling));
+            self.emit(StageEvent::Progress(Progress::Enabling));
             // Targets are armed in a later cycle: the owner may refuse to go on from here.
             self.lead_to_enabled();
         }
@@ -243,7 +243,7 @@ impl Stage {
         } else if standing || now >= give_up {
             let give_up = now + self.config.power.stop_timeout;
             self.phase = Phase::Disabling { quick, standing, give_up };
-            self.tell(StageEvent::Progress(Progress::Disabling));
+            self.emit(StageEvent::Progress(Progress::Disabling));
             if quick {
                 // Shutdown is not a way out of Quick Stop Active.
                 self.command_also_by_sdo(now, Controlword::DISABLE_VOLTAGE);
@@ -274,7 +274,7 @@ impl Stage {
 
     pub(super) fn begin_stop(&mut self, now: Time, quick: bool) {
         self.phase = Phase::Stopping { quick, give_up: now + self.config.power.stop_timeout };
-        self.tell(StageEvent::Progress(Progress::Stopping));
+        self.emit(StageEvent::Progress(Progress::Stopping));
         for axis in Axis::BOTH {
             self.drives[axis].next_counts = None;
             self.drives[axis].watch_standstill();

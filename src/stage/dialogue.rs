@@ -77,7 +77,7 @@ impl Sdo {
         self.0.borrow_mut().outputs.push_back(Output::Transmit(frame));
     }
 
-    pub(super) fn tell(&self, event: StageEvent) {
+    pub(super) fn emit(&self, event: StageEvent) {
         self.0.borrow_mut().outputs.push_back(Output::Event(event));
     }
 

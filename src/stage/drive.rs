@@ -48,8 +48,8 @@ pub(super) struct Drive {
     axis: Axis,
     config: AxisConfig,
     sync_period: Duration,
-    /// It is in homing mode: it follows no target, and its position is not known.
-    pub(super) homes: bool,
+    /// The drive is in homing mode: it follows no target, and its position is not known.
+    pub(super) homing_mode: bool,
     /// Scale and limits, known once the axis's zero is.
     armed: Option<LimitCheck>,
     commanded: Commanded,
@@ -94,13 +94,13 @@ pub(super) struct Drive {
 }
 
 impl Drive {
-    /// A drive in cyclic synchronous position, or in the mode in which it `homes`.
-    pub(super) fn new(config: &StageConfig, axis: Axis, homes: bool) -> Self {
+    /// A drive in homing mode or in cyclic synchronous position.
+    pub(super) fn new(config: &StageConfig, axis: Axis, homing_mode: bool) -> Self {
         Drive {
             axis,
             config: config.axis(axis).clone(),
             sync_period: config.bus.sync_period(),
-            homes,
+            homing_mode,
             armed: None,
             commanded: Commanded { counts: 0, step_counts: 0 },
             next_counts: None,
@@ -144,7 +144,7 @@ impl Drive {
         self.take_position(i32::from_le_bytes([p0, p1, p2, p3]), sync);
         self.fresh = true;
         // Until the drive is commanded to follow, the target follows it.
-        if self.armed.is_none() || self.homes {
+        if self.armed.is_none() || self.homing_mode {
             self.commanded = Commanded { counts: self.position.counts(), step_counts: 0 };
         }
     }
@@ -275,14 +275,15 @@ impl Drive {
     pub(super) fn meets_internal_limit(&mut self) -> bool {
         let is_limited = self.statusword.is_some_and(|word| word.has(Statusword::INTERNAL_LIMIT));
         let was_limited = std::mem::replace(&mut self.was_limited, is_limited);
-        is_limited && !was_limited && !self.homes
+        is_limited && !was_limited && !self.homing_mode
     }
 
     /// The bits that an enabled drive is to show.
     fn flags(&self) -> impl Iterator<Item = DriveFlag> + use<> {
-        // In homing mode bit 12 is of the homing.
-        let homes = self.homes;
-        DriveFlag::ALL.into_iter().filter(move |flag| !homes || *flag != DriveFlag::FollowsCommand)
+        // In homing mode bit 12 says that the axis is homed.
+        let homing_mode = self.homing_mode;
+        let means_homed = move |flag: &DriveFlag| homing_mode && *flag == DriveFlag::FollowsCommand;
+        DriveFlag::ALL.into_iter().filter(move |flag| !means_homed(flag))
     }
 
     /// A bit that the drive has set before and has cleared now. While an internal limit is active a drive
@@ -327,7 +328,7 @@ impl Drive {
     /// The limit outside which the axis stands.
     pub(super) fn arm(&mut self) -> Result<(), String> {
         let armed = self.armed_here();
-        if !self.homes {
+        if !self.homing_mode {
             armed.check_position(armed.scale.value(self.commanded.counts))?;
         }
         self.armed = Some(armed);

@@ -83,7 +83,8 @@ impl Stage {
     /// When the stage is not ready, or `axis` not in homing mode.
     pub fn home(&mut self, now: Time, axis: Axis) -> Result<(), String> {
         let config = self.config.axis(axis).homing;
-        let (Phase::Ready, Some(config), true) = (self.phase, config, self.drives[axis].homes)
+        let (Phase::Ready, Some(config), true) =
+            (self.phase, config, self.drives[axis].homing_mode)
         else {
             return Err("the stage is not ready to home".to_owned());
         };
@@ -131,7 +132,7 @@ impl Stage {
             self.drives[axis].controlword = Controlword::ENABLE_OPERATION;
             let position = self.drives[axis].take_home();
             self.phase = Phase::Ready;
-            self.tell(StageEvent::Homed { axis, position });
+            self.emit(StageEvent::Homed { axis, position });
         }
     }
 }

@@ -94,10 +94,10 @@ impl Stage {
     /// When the configuration cannot work, or says nothing of how an axis is homed.
     pub fn for_homing(
         config: StageConfig,
-        homes: PerAxis<bool>,
+        homed_axes: PerAxis<bool>,
         now: Time,
     ) -> Result<Self, String> {
-        let unknown = |axis: &Axis| homes[*axis] && config.axis(*axis).homing.is_none();
+        let unknown = |axis: &Axis| homed_axes[*axis] && config.axis(*axis).homing.is_none();
         if let Some(axis) = Axis::BOTH.into_iter().find(unknown) {
             return Err(no_homing(axis));
         }
@@ -107,7 +107,7 @@ impl Stage {
         let mut stage = Stage {
             phase: Phase::Listening { until },
             bring_ups: PerAxis::default(),
-            drives: PerAxis::from_fn(|axis| Drive::new(&config, axis, homes[axis])),
+            drives: PerAxis::from_fn(|axis| Drive::new(&config, axis, homed_axes[axis])),
             monitors: PerAxis::from_fn(|axis| {
                 HeartbeatConsumer::new(config.axis(axis).node, timeout)
             }),
@@ -128,7 +128,7 @@ impl Stage {
             outputs: VecDeque::new(),
             config,
         };
-        stage.tell(StageEvent::Progress(Progress::Listening));
+        stage.emit(StageEvent::Progress(Progress::Listening));
         stage.handle_timeout(now);
         Ok(stage)
     }
@@ -160,7 +160,7 @@ impl Stage {
             && now >= until
         {
             self.phase = Phase::BringUp;
-            let begin = |axis| BringUp::new(&self.config, axis, self.drives[axis].homes, now);
+            let begin = |axis| BringUp::new(&self.config, axis, self.drives[axis].homing_mode, now);
             self.bring_ups = PerAxis::from_fn(|axis| Some(begin(axis)));
         }
         for axis in Axis::BOTH {
@@ -177,13 +177,13 @@ impl Stage {
         {
             if skipped > 0 {
                 self.counters.syncs_skipped += skipped;
-                self.tell(StageEvent::SyncSkipped(skipped));
+                self.emit(StageEvent::SyncSkipped(skipped));
             }
             self.cycle(now);
         }
         // After the SYNC, which must not wait.
         if let Some(frames) = self.flood.look(now) {
-            self.tell(StageEvent::Flood(frames));
+            self.emit(StageEvent::Flood(frames));
         }
         if let Some(frame) = self.heartbeat.handle_timeout(now, NmtState::Operational) {
             self.send(frame);
@@ -223,7 +223,7 @@ impl Stage {
     /// the last SYNC have not come. The axes then keep the target they had.
     pub fn command(&mut self, set_point: SetPoint) -> Result<(), String> {
         let not_ready = match self.phase {
-            Phase::Ready if self.drives.all(|drive| !drive.homes) => None,
+            Phase::Ready if self.drives.all(|drive| !drive.homing_mode) => None,
             Phase::Ready | Phase::Homing(_) => Some("in homing mode"),
             Phase::Stopping { .. } | Phase::Disabling { .. } => Some("while it stops"),
             Phase::Stopped => Some("after it has stopped"),
@@ -324,7 +324,7 @@ impl Stage {
             return;
         }
         self.faulted = true;
-        self.tell(StageEvent::Fault(fault));
+        self.emit(StageEvent::Fault(fault));
         self.quick_stop(now);
     }
 
@@ -332,7 +332,7 @@ impl Stage {
         self.outputs.push_back(Output::Transmit(frame));
     }
 
-    pub(super) fn tell(&mut self, event: StageEvent) {
+    pub(super) fn emit(&mut self, event: StageEvent) {
         self.outputs.push_back(Output::Event(event));
     }
 
@@ -355,7 +355,7 @@ impl Stage {
         *counter += 1;
         let count = *counter;
         if count.is_power_of_two() {
-            self.tell(StageEvent::Ignored { why, count, frame: *frame });
+            self.emit(StageEvent::Ignored { why, count, frame: *frame });
         }
     }
 
@@ -389,7 +389,7 @@ impl Stage {
             let give_up = now + self.config.power.enable_timeout;
             self.phase = Phase::Standby { give_up, located: false };
             self.sync.deadline = now + self.config.bus.sync_period();
-            self.tell(StageEvent::Progress(Progress::Standby));
+            self.emit(StageEvent::Progress(Progress::Standby));
         }
     }
 
@@ -433,6 +433,6 @@ impl Stage {
 
     fn end(&mut self, standing: bool, off: bool) {
         self.phase = Phase::Stopped;
-        self.tell(StageEvent::Stopped { standing, off });
+        self.emit(StageEvent::Stopped { standing, off });
     }
 }

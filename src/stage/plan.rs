@@ -92,8 +92,8 @@ impl Script {
         let serial = self.read(optional(identity(4))).await?.map(SdoValue::to_u32);
         let supported = self.read(drive::SUPPORTED_MODES).await?;
         let identity = Identity { vendor, product, revision, serial };
-        self.sdo.tell(StageEvent::Identity(self.axis, identity));
-        let mode = if self.homed { Mode::HOMING } else { Mode::CSP };
+        self.sdo.emit(StageEvent::Identity(self.axis, identity));
+        let mode = if self.homing_mode { Mode::HOMING } else { Mode::CSP };
         match supported.map(SdoValue::to_u32) {
             Some(supported) if !mode.is_in(supported) => Err(format!(
                 "{}: supported modes {supported:#010X} lack {mode} (bit {})",
@@ -258,7 +258,8 @@ impl Script {
 
     async fn check_homed(&self) -> Result<(), String> {
         let AxisConfig { homing, reference, .. } = self.drive();
-        let Some(homing) = homing.filter(|_| *reference == Reference::Homing && !self.homed) else {
+        let Some(homing) = homing.filter(|_| *reference == Reference::Homing && !self.homing_mode)
+        else {
             return Ok(());
         };
         self.begin("checking that it is homed");
@@ -283,7 +284,7 @@ impl Script {
         self.write(drive::INTERPOLATION_PERIOD_EXPONENT, -3_i8).await?;
         self.write(drive::INTERPOLATION_PERIOD_VALUE, self.config.bus.sync_ms as u8).await?;
         match self.drive().homing {
-            Some(homing) if self.homed => {
+            Some(homing) if self.homing_mode => {
                 self.configure_homing(homing).await?;
                 self.set_mode(Mode::HOMING).await
             }
@@ -319,7 +320,7 @@ impl Script {
             // An axis that goes round has no limits. Limits left from another use of the drive would stop it.
             self.write(optional(min), i32::MIN).await?;
             self.write(optional(max), i32::MAX).await?;
-        } else if !self.homed {
+        } else if !self.homing_mode {
             let [lower, upper] = self.limit_counts(position);
             // In this order the upper limit is never under the lower one, whatever the drive had before.
             self.write(min, i32::MIN).await?;

@@ -104,7 +104,7 @@ impl Stage {
             return self.ignore(Ignored::WrongLength, frame);
         };
         if self.drives[axis].is_news(emcy) {
-            self.tell(StageEvent::Emergency(axis, emcy));
+            self.emit(StageEvent::Emergency(axis, emcy));
         }
         // What was wrong with a drive before bring-up took its power off shows in its statusword.
         let is_watched = self.bring_ups[axis].as_ref().is_none_or(|drive| drive.so_far().disarmed)
@@ -161,10 +161,10 @@ impl Stage {
         let has_power =
             matches!(state, Some(S::SwitchedOn | S::OperationEnabled | S::QuickStopActive));
         if must_follow && self.drives[axis].meets_internal_limit() {
-            self.tell(StageEvent::InternalLimit(axis));
+            self.emit(StageEvent::InternalLimit(axis));
         }
         if must_follow && let Some(count) = self.drives[axis].begins_to_warn() {
-            self.tell(StageEvent::Warns { axis, statusword, count });
+            self.emit(StageEvent::Warns { axis, statusword, count });
         }
         let drive = &self.drives[axis];
         let fault = if standby && has_power {
@@ -185,7 +185,7 @@ impl Stage {
             && let Some(flag) = drive.lost_flag()
         {
             lost_flag(flag, statusword)
-        } else if drive.homes {
+        } else if drive.homing_mode {
             // It follows no target, and its bit 13 is of its homing.
             return;
         } else if state == Some(S::OperationEnabled) && statusword.has(Statusword::FOLLOWING_ERROR)
