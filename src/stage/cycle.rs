@@ -16,7 +16,7 @@ use std::time::Duration;
 /// Interval at which a drive that does not obey is commanded again by SDO.
 const REPEAT_PERIOD: Duration = Duration::from_millis(100);
 /// SYNCs between two looks by SDO at an object of a drive that sends no TPDO.
-const LOOK_SYNCS: u64 = 10;
+const READ_SYNCS: u64 = 10;
 
 impl Stage {
     /// Judges the last SYNC, then sends the RPDOs that were not sent ahead, and the next SYNC.
@@ -44,7 +44,7 @@ impl Stage {
             Phase::Listening { .. } | Phase::BringUp | Phase::Stopped => return,
         }
         for axis in Axis::BOTH {
-            self.look_by_sdo(axis);
+            self.read_by_sdo(axis);
             if let Some(rpdo) = self.drives[axis].rpdo_due() {
                 self.send(rpdo);
             }
@@ -57,7 +57,7 @@ impl Stage {
 
     /// Both positions of this SYNC are in. Nothing moves before both drives' heartbeats
     /// were heard, and say that PDOs are taken.
-    pub(super) fn window_complete(&mut self, now: Time) {
+    pub(super) fn handle_feedback(&mut self, now: Time) {
         if matches!(self.phase, Phase::Enabling { .. })
             && self.drives.all(|drive| drive.is_armed() && drive.is_enabled())
             && self.monitors.all(|monitor| monitor.state() == Some(NmtState::Operational))
@@ -80,13 +80,13 @@ impl Stage {
             self.emit(StageEvent::Feedback(Feedback {
                 time: self.sync_time,
                 sync: self.sync_count,
-                measured: self.both(Drive::measured),
-                commanded: self.both(Drive::commanded),
+                measured: self.positions(Drive::measured),
+                commanded: self.positions(Drive::commanded),
             }));
         }
     }
 
-    pub(super) fn both(&self, position: impl Fn(&Drive) -> f64) -> SetPoint {
+    pub(super) fn positions(&self, position: impl Fn(&Drive) -> f64) -> SetPoint {
         let PerAxis { insertion, rotation } = &self.drives;
         SetPoint { insertion_mm: position(insertion), rotation_rad: position(rotation) }
     }
@@ -101,7 +101,7 @@ impl Stage {
             let drive = &mut self.drives[axis];
             let missed = drive.missed_in_a_row.saturating_add(1);
             drive.missed_in_a_row = if drive.fresh { 0 } else { missed };
-            if let Some((syncs, frame)) = drive.conflicts_in_a_row()
+            if let Some((syncs, frame)) = drive.count_conflict()
                 && syncs > missed_max
             {
                 let fault = format!(
@@ -146,7 +146,7 @@ impl Stage {
         }
         if !located {
             self.phase = Phase::Standby { give_up, located: true };
-            self.emit(StageEvent::Located(self.both(Drive::commanded)));
+            self.emit(StageEvent::Located(self.positions(Drive::commanded)));
         }
         if self.power_permitted {
             self.phase = Phase::Enabling { give_up: now + self.config.power.enable_timeout };
@@ -201,7 +201,7 @@ impl Stage {
         }
         for axis in Axis::BOTH {
             if let Some(statusword) =
-                self.drives[axis].refuses_to_switch_on(self.config.power.state_transition_timeout)
+                self.drives[axis].overdue_transition(self.config.power.state_transition_timeout)
             {
                 let fault = refused_to_switch_on(statusword);
                 return self.fail(now, format!("{axis}: {fault}"));
@@ -305,29 +305,29 @@ impl Stage {
 
     /// A drive that left Operational sends no TPDO. While it stops it is asked by SDO, a few times a
     /// second, one object at a time, what it does and where it is.
-    fn look_by_sdo(&mut self, axis: Axis) {
+    fn read_by_sdo(&mut self, axis: Axis) {
         let stops = matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. });
         if !stops || self.drives[axis].fresh {
             return;
         }
-        let object = match self.sync_count % LOOK_SYNCS {
+        let object = match self.sync_count % READ_SYNCS {
             3 => object::STATUSWORD,
             7 => object::POSITION_ACTUAL,
             _ => return,
         };
-        self.drives[axis].asked = Some(object);
+        self.drives[axis].requested = Some(object);
         self.send_sdo(axis, SdoRequest::Upload(object));
     }
 
-    /// Takes a drive's answer to [`Stage::look_by_sdo`].
-    pub(super) fn take_look(&mut self, axis: Axis, frame: &Frame) {
+    /// Takes a drive's answer to [`Stage::read_by_sdo`].
+    pub(super) fn take_reading(&mut self, axis: Axis, frame: &Frame) {
         let Some(ServerFrame::Reply(object, SdoReply::Uploaded(value))) =
             ServerFrame::decode(frame.data())
         else {
             return;
         };
         // An answer without a request may be another node's.
-        if self.drives[axis].asked.take_if(|asked| *asked == object).is_none() {
+        if self.drives[axis].requested.take_if(|requested| *requested == object).is_none() {
             return;
         }
         let drive = &mut self.drives[axis];

@@ -10,8 +10,8 @@ use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword
 use crate::canopen::emcy::{Emcy, EmcyCode};
 use crate::canopen::{Frame, ObjectAddress, cob};
 
-/// From Fault Reset to the end of the fault.
-const RESET_WITHIN: Duration = Duration::from_millis(500);
+/// Longest time from Fault Reset to the end of the fault.
+const RESET_TIMEOUT: Duration = Duration::from_millis(500);
 /// The bits that a drive on its way to Operation Enabled keeps once it has shown them.
 const BEFORE_POWER: u16 = Statusword::REMOTE | Statusword::VOLTAGE_ENABLED;
 
@@ -33,12 +33,12 @@ impl DriveReport {
 
 /// The one reset of a drive that was found in Fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Reset {
+enum FaultReset {
     /// The drive was not found in Fault, or that fault is over.
     None,
-    /// To be sent for the fault with this code (0x603F), if the drive has that object.
+    /// To be sent. The code of the fault (0x603F) is `None` if the drive lacks that object.
     Due(Option<EmcyCode>),
-    /// Sent so many SYNCs ago.
+    /// Sent this many SYNCs ago.
     Sent(u32),
 }
 
@@ -50,7 +50,7 @@ pub(super) struct Drive {
     sync_period: Duration,
     /// The drive is in homing mode: it follows no target, and its position is not known.
     pub(super) homing_mode: bool,
-    /// Scale and limits, known once the axis's zero is.
+    /// Scale and limits, once the drive is [armed](Self::arm).
     armed: Option<LimitCheck>,
     commanded: Commanded,
     /// The target for the next SYNC; without one the axis is held.
@@ -61,32 +61,35 @@ pub(super) struct Drive {
     /// The SYNC after which the newest position came.
     position_sync: u64,
     pub(super) statusword: Option<Statusword>,
-    /// Its TPDO1 of the last SYNC has come.
+    /// The drive's TPDO1 for the last SYNC has come.
     pub(super) fresh: bool,
-    /// SYNCs in a row without its TPDO1.
+    /// SYNCs in a row without the drive's TPDO1.
     pub(super) missed_in_a_row: u32,
     sequence: EnableSequence,
-    reset: Reset,
-    /// SYNCs in a state that it is commanded to leave.
-    held_back: u32,
-    /// The payload of the TPDO1 taken for this SYNC, and a second one that differs.
-    taken: [u8; 6],
-    second: Option<Frame>,
+    reset: FaultReset,
+    /// SYNCs that the drive has stayed in a state that it is commanded to leave.
+    transition_syncs: u32,
+    /// The payload of the TPDO1 taken for the last SYNC.
+    tpdo: [u8; 6],
+    /// A second TPDO1 after the last SYNC, with another payload.
+    second_tpdo: Option<Frame>,
+    /// SYNCs in a row with such a second TPDO1.
     conflicts: u32,
     was_limited: bool,
-    /// The bits of the statusword that it has shown since it was enabled; those of `BEFORE_POWER` count from
-    /// its first statusword.
+    /// The bits that the statusword has shown since the drive was enabled; those of `BEFORE_POWER` count from
+    /// the first statusword.
     shown: u16,
-    /// Bit 7 was set in the last statusword, and how often it was set anew.
-    was_warned: bool,
+    /// Bit 7 (warning) was set in the last statusword.
+    was_warning: bool,
+    /// How often bit 7 was set anew.
     warnings: u64,
     /// SYNCs in a row without a new target, and how many of them may be due to lost answers.
-    held: u32,
-    held_max: u32,
-    /// The object that it was asked for by SDO while it stops.
-    pub(super) asked: Option<ObjectAddress>,
-    /// The fault that it was found in, if its bring-up was ended.
-    pub(super) found: Option<FoundFault>,
+    held_syncs: u32,
+    held_syncs_max: u32,
+    /// The object that was requested by SDO while the drive stops.
+    pub(super) requested: Option<ObjectAddress>,
+    /// The fault that the drive was found in, if its bring-up was abandoned.
+    pub(super) found_fault: Option<FoundFault>,
     /// The last emergency message, and how many times in a row it came.
     emcy: (Option<Emcy>, u64),
     pub(super) controlword: Controlword,
@@ -111,45 +114,45 @@ impl Drive {
             fresh: false,
             missed_in_a_row: 0,
             sequence: EnableSequence::default(),
-            reset: Reset::None,
-            held_back: 0,
-            taken: [0; 6],
-            second: None,
+            reset: FaultReset::None,
+            transition_syncs: 0,
+            tpdo: [0; 6],
+            second_tpdo: None,
             conflicts: 0,
             was_limited: false,
             shown: 0,
-            was_warned: false,
+            was_warning: false,
             warnings: 0,
-            held: 0,
-            held_max: config.bus.missed_feedback_max.max(1).into(),
-            asked: None,
-            found: None,
+            held_syncs: 0,
+            held_syncs_max: config.bus.missed_feedback_max.max(1).into(),
+            requested: None,
+            found_fault: None,
             emcy: (None, 0),
             controlword: Controlword::DISABLE_VOLTAGE,
             standstill: config.standstill(axis),
         }
     }
 
-    /// The axis stands at `position`, and that is its target.
+    /// Makes `position`, where the axis stands, its target.
     pub(super) fn seed(&mut self, position: i32) {
         self.position = Unwrapper::new(position);
         self.commanded = Commanded { counts: position.into(), step_counts: 0 };
     }
 
-    /// The payload of TPDO1 after a SYNC, as [`plan::TPDO1`](super::plan::TPDO1) maps it.
+    /// Takes the payload of TPDO1 after a SYNC, as [`plan::TPDO1`](super::plan::TPDO1) maps it.
     pub(super) fn take_tpdo(&mut self, payload: [u8; 6], sync: u64) {
-        self.taken = payload;
+        self.tpdo = payload;
         let [s0, s1, p0, p1, p2, p3] = payload;
         self.take_statusword(Statusword(u16::from_le_bytes([s0, s1])));
         self.take_position(i32::from_le_bytes([p0, p1, p2, p3]), sync);
         self.fresh = true;
-        // Until the drive is commanded to follow, the target follows it.
+        // Until the drive follows its target, the target follows the drive.
         if self.armed.is_none() || self.homing_mode {
             self.commanded = Commanded { counts: self.position.counts(), step_counts: 0 };
         }
     }
 
-    /// A statusword, by whatever way it came.
+    /// Takes a statusword, received by PDO or SDO.
     pub(super) fn take_statusword(&mut self, statusword: Statusword) {
         self.statusword = Some(statusword);
         self.end_reset(statusword.state());
@@ -163,12 +166,12 @@ impl Drive {
         };
     }
 
-    /// A position, by PDO or SDO, after the SYNC of this number.
+    /// Takes a position, received by PDO or SDO after the SYNC of this number.
     pub(super) fn take_position(&mut self, position: i32, sync: u64) {
         let counts = self.position.unwrap(position);
         let syncs = u32::try_from(sync - self.position_sync).unwrap_or(u32::MAX);
         self.position_sync = sync;
-        self.standstill.look(counts, self.sync_period.saturating_mul(syncs));
+        self.standstill.take(counts, self.sync_period.saturating_mul(syncs));
     }
 
     /// RPDO1 with the target for the next SYNC, to be sent before that is due.
@@ -179,7 +182,7 @@ impl Drive {
         rpdo
     }
 
-    /// RPDO1 with the present target, unless this very frame was sent ahead of the SYNC.
+    /// RPDO1 with the present target; `None` if this very frame was sent ahead of the SYNC.
     pub(super) fn rpdo_due(&mut self) -> Option<Frame> {
         let rpdo = self.rpdo(self.commanded.counts);
         (self.sent_ahead.take() != Some(rpdo)).then_some(rpdo)
@@ -188,97 +191,100 @@ impl Drive {
     /// RPDO1, as [`plan::RPDO1`](super::plan::RPDO1) maps it.
     fn rpdo(&self, target_counts: i64) -> Frame {
         let [c0, c1] = self.controlword.0.to_le_bytes();
-        // Cut to 32 bits: that is the wrap, where limits let a target come that far.
+        // Truncated to 32 bits: a target that the limits allow beyond them wraps.
         let [t0, t1, t2, t3] = (target_counts as i32).to_le_bytes();
         let cob_id = cob::rpdo1(self.config.node);
         Frame::new(cob_id, &[c0, c1, t0, t1, t2, t3])
     }
 
-    /// The controlword one step nearer to Operation Enabled, to be sent only if the other drive
-    /// is as far. Out of a Fault it was found in it is led by one rising edge of Fault Reset.
+    /// The controlword one step nearer to Operation Enabled; the last step is to be sent only together with
+    /// the other drive's. One rising edge of Fault Reset leads a drive out of the Fault that it was found in.
     pub(super) fn next_controlword(&mut self) -> Controlword {
         let Some(statusword) = self.statusword.filter(|_| self.fresh) else {
             return self.controlword;
         };
-        if let Reset::Sent(syncs) = &mut self.reset {
+        if let FaultReset::Sent(syncs) = &mut self.reset {
             *syncs = syncs.saturating_add(1);
             return Controlword::DISABLE_VOLTAGE;
         }
         let controlword = self.sequence.step(statusword);
         if controlword.has(Controlword::FAULT_RESET_BIT) {
-            self.reset = Reset::Sent(0);
+            self.reset = FaultReset::Sent(0);
         }
         controlword
     }
 
-    /// The drive was found in Fault, with this code: it is to be reset once.
+    /// Allows one reset, of the fault with this code that the drive was found in.
     pub(super) fn allow_reset(&mut self, error_code: Option<EmcyCode>) {
-        self.reset = Reset::Due(error_code);
+        self.reset = FaultReset::Due(error_code);
     }
 
-    /// The reset is for the fault that the drive was found in. Once that fault is over, by the reset or by
-    /// itself, another fault is a new one, which is not reset.
+    /// Withdraws the reset once the fault that the drive was found in is over, by the reset or by itself.
+    /// Another fault is a new one, which is not reset.
     fn end_reset(&mut self, state: Option<DriveState>) {
         let same_fault = match self.reset {
-            Reset::None => false,
-            Reset::Due(_) => state.is_some_and(DriveState::is_fault),
-            Reset::Sent(_) => state == Some(DriveState::Fault),
+            FaultReset::None => false,
+            FaultReset::Due(_) => state.is_some_and(DriveState::is_fault),
+            FaultReset::Sent(_) => state == Some(DriveState::Fault),
         };
         if !same_fault {
-            self.reset = Reset::None;
+            self.reset = FaultReset::None;
         }
     }
 
     /// Whether an emergency message with this code belongs to the fault that the drive was found in, whose
     /// reset was not sent yet.
-    pub(super) fn excuses(&self, code: EmcyCode) -> bool {
-        self.reset == Reset::Due(Some(code))
+    pub(super) fn is_of_found_fault(&self, code: EmcyCode) -> bool {
+        self.reset == FaultReset::Due(Some(code))
     }
 
     /// Whether the fault that the drive was found in may not be over yet.
-    pub(super) fn may_be_in_fault(&self) -> bool {
+    pub(super) fn may_be_in_found_fault(&self) -> bool {
         match self.reset {
-            Reset::None => false,
-            Reset::Due(_) => true,
-            Reset::Sent(syncs) => self.sync_period.saturating_mul(syncs) < RESET_WITHIN,
+            FaultReset::None => false,
+            FaultReset::Due(_) => true,
+            FaultReset::Sent(syncs) => self.sync_period.saturating_mul(syncs) < RESET_TIMEOUT,
         }
     }
 
-    /// Its statusword, once the drive has been told for longer than `within` to leave a state on the
-    /// way to Switched On, and has not.
-    pub(super) fn refuses_to_switch_on(&mut self, within: Duration) -> Option<Statusword> {
-        let held = matches!(
+    /// To be called once a SYNC. Returns the statusword if the drive has stayed for longer than `timeout` in a
+    /// state on the way to Switched On that it is commanded to leave.
+    pub(super) fn overdue_transition(&mut self, timeout: Duration) -> Option<Statusword> {
+        let is_commanded_on = matches!(
             (self.state(), self.controlword),
             (Some(DriveState::SwitchOnDisabled), Controlword::SHUTDOWN)
                 | (Some(DriveState::ReadyToSwitchOn), Controlword::SWITCH_ON)
         );
-        self.held_back = if held { self.held_back.saturating_add(1) } else { 0 };
-        self.statusword.filter(|_| self.sync_period.saturating_mul(self.held_back) > within)
+        self.transition_syncs =
+            if is_commanded_on { self.transition_syncs.saturating_add(1) } else { 0 };
+        let waited = self.sync_period.saturating_mul(self.transition_syncs);
+        self.statusword.filter(|_| waited > timeout)
     }
 
-    /// Takes note of a second TPDO1 after one SYNC.
-    pub(super) fn take_second(&mut self, frame: &Frame, payload: [u8; 6]) {
-        if self.fresh && payload != self.taken {
-            self.second = Some(*frame);
+    /// Notes a second TPDO1 after one SYNC, if it differs from the first.
+    pub(super) fn note_second_tpdo(&mut self, frame: &Frame, payload: [u8; 6]) {
+        if self.fresh && payload != self.tpdo {
+            self.second_tpdo = Some(*frame);
         }
     }
 
-    /// SYNCs in a row, this one the last, after which two positions came that differ, with the
-    /// newest second; to be asked once a SYNC.
-    pub(super) fn conflicts_in_a_row(&mut self) -> Option<(u32, Frame)> {
-        let second = self.second.take();
+    /// To be called once a SYNC. If a second TPDO1 differed from the first after it, returns for how many
+    /// SYNCs in a row that was so, and the newest second TPDO1.
+    pub(super) fn count_conflict(&mut self) -> Option<(u32, Frame)> {
+        let second = self.second_tpdo.take();
         self.conflicts = if second.is_some() { self.conflicts.saturating_add(1) } else { 0 };
         second.map(|frame| (self.conflicts, frame))
     }
 
-    /// A limit inside the drive has begun to hold. A homing rests on a limit switch by itself.
-    pub(super) fn meets_internal_limit(&mut self) -> bool {
+    /// To be called once for each statusword. True if it is the first to show an active limit inside the drive.
+    /// In homing that is normal: the axis may rest on a limit switch.
+    pub(super) fn internal_limit_begins(&mut self) -> bool {
         let is_limited = self.statusword.is_some_and(|word| word.has(Statusword::INTERNAL_LIMIT));
         let was_limited = std::mem::replace(&mut self.was_limited, is_limited);
         is_limited && !was_limited && !self.homing_mode
     }
 
-    /// The bits that an enabled drive is to show.
+    /// The bits that an enabled drive must show.
     fn flags(&self) -> impl Iterator<Item = DriveFlag> + use<> {
         // In homing mode bit 12 says that the axis is homed.
         let homing_mode = self.homing_mode;
@@ -286,13 +292,15 @@ impl Drive {
         DriveFlag::ALL.into_iter().filter(move |flag| !means_homed(flag))
     }
 
-    /// A bit that the drive has set before and has cleared now. While an internal limit is active a drive
-    /// may clear bit 12: the limit of the following error then stops the run.
+    /// A bit that the drive has set before and has cleared now. While an internal limit is active, a drive
+    /// may clear bit 12: if it then stays behind its target, the following error stops the run.
     pub(super) fn lost_flag(&self) -> Option<DriveFlag> {
         let word = self.statusword?;
         self.flags().find(|flag| {
-            let held = *flag == DriveFlag::FollowsCommand && word.has(Statusword::INTERNAL_LIMIT);
-            self.shown & !word.0 & *flag as u16 != 0 && !held
+            let was_lost = self.shown & !word.0 & *flag as u16 != 0;
+            let may_clear =
+                *flag == DriveFlag::FollowsCommand && word.has(Statusword::INTERNAL_LIMIT);
+            was_lost && !may_clear
         })
     }
 
@@ -302,16 +310,20 @@ impl Drive {
         self.flags().filter(move |flag| shown & *flag as u16 == 0)
     }
 
-    /// How often bit 7 (warning) was set, if it has just been set for the 1st, 2nd, 4th, 8th … time.
-    pub(super) fn begins_to_warn(&mut self) -> Option<u64> {
-        let warns = self.statusword.is_some_and(|word| word.has(Statusword::WARNING));
-        let warned = std::mem::replace(&mut self.was_warned, warns);
-        self.warnings += u64::from(warns && !warned);
-        (warns && !warned && self.warnings.is_power_of_two()).then_some(self.warnings)
+    /// To be called once for each statusword. Returns how often bit 7 (warning) was set, if this statusword sets
+    /// it for the 1st, 2nd, 4th, 8th … time.
+    pub(super) fn warning_begins(&mut self) -> Option<u64> {
+        let is_warning = self.statusword.is_some_and(|word| word.has(Statusword::WARNING));
+        let was_warning = std::mem::replace(&mut self.was_warning, is_warning);
+        if !is_warning || was_warning {
+            return None;
+        }
+        self.warnings += 1;
+        self.warnings.is_power_of_two().then_some(self.warnings)
     }
 
-    /// Whether to report `emcy`: a repeated one is reported only the 2nd, 4th, 8th … time.
-    pub(super) fn is_news(&mut self, emcy: Emcy) -> bool {
+    /// Notes `emcy`. Returns whether to report it: a repeated one is reported only the 2nd, 4th, 8th … time.
+    pub(super) fn note_emcy(&mut self, emcy: Emcy) -> bool {
         let count = if self.emcy.0 == Some(emcy) { self.emcy.1 + 1 } else { 1 };
         self.emcy = (Some(emcy), count);
         count.is_power_of_two()
@@ -322,16 +334,16 @@ impl Drive {
         self.emcy.1 = 0;
     }
 
-    /// Fixes zero, scale and target: from here on the drive follows its target.
+    /// Fixes zero, scale and limits: from here on the drive follows its target.
     ///
     /// # Errors
     /// The limit outside which the axis stands.
     pub(super) fn arm(&mut self) -> Result<(), String> {
-        let armed = self.armed_here();
+        let limits = self.limits_from_here();
         if !self.homing_mode {
-            armed.check_position(armed.scale.value(self.commanded.counts))?;
+            limits.check_position(limits.scale.value(self.commanded.counts))?;
         }
-        self.armed = Some(armed);
+        self.armed = Some(limits);
         Ok(())
     }
 
@@ -341,20 +353,22 @@ impl Drive {
 
     /// Scale and limits; before the drive is armed, as they would be if it were armed now.
     pub(super) fn limits(&self) -> LimitCheck {
-        self.armed.unwrap_or_else(|| self.armed_here())
+        self.armed.unwrap_or_else(|| self.limits_from_here())
     }
 
-    fn armed_here(&self) -> LimitCheck {
+    /// Scale and limits. If the axis has no configured zero, its present target is zero.
+    fn limits_from_here(&self) -> LimitCheck {
         let AxisConfig { limits, wraps, .. } = self.config;
         let scale = self.config.scale(self.axis, self.commanded.counts);
         LimitCheck::new(self.axis, scale, limits, self.sync_period, wraps)
     }
 
-    /// The axis is homed: the drive counts from another zero than before. Returns the position, mm or rad.
+    /// Begins anew at the drive's last reading after homing, which has changed the drive's zero. Returns the
+    /// position, mm or rad.
     pub(super) fn take_home(&mut self) -> f64 {
-        // The last reading is the low half of the position that it led to.
+        // The low 32 bits of the unwrapped position are the last reading.
         self.seed(self.position.counts() as i32);
-        self.armed = Some(self.armed_here());
+        self.armed = Some(self.limits_from_here());
         self.measured()
     }
 
@@ -363,17 +377,17 @@ impl Drive {
         self.limits().check(target, self.commanded)
     }
 
-    /// Makes the next target the present one; without a next one the axis is held. If it is held for no more
-    /// SYNCs than answers may be lost, the next step is compared with the step before the hold: such a hold is
-    /// no commanded acceleration.
+    /// Makes the next target the present one; without a next one the axis is held. A hold of no more SYNCs than
+    /// answers may be lost is no commanded acceleration: the step after it is compared with the step before it.
     pub(super) fn advance_target(&mut self) {
         if let Some(counts) = self.next_counts.take() {
             let step_counts = counts - self.commanded.counts;
-            (self.commanded, self.held) = (Commanded { counts, step_counts }, 0);
+            self.commanded = Commanded { counts, step_counts };
+            self.held_syncs = 0;
             return;
         }
-        self.held = self.held.saturating_add(1);
-        if self.held > self.held_max {
+        self.held_syncs = self.held_syncs.saturating_add(1);
+        if self.held_syncs > self.held_syncs_max {
             self.commanded.step_counts = 0;
         }
     }
@@ -383,28 +397,27 @@ impl Drive {
         self.limits().scale.value(self.position.counts())
     }
 
-    /// Target sent last, mm or rad; before the drive is armed, where the axis stands.
+    /// The target that was sent last, mm or rad; before the drive is armed, where the axis stands.
     pub(super) fn commanded(&self) -> f64 {
         self.limits().scale.value(self.commanded.counts)
     }
 
-    /// Target less position, mm or rad.
+    /// Target minus position, mm or rad; 0 before the drive is armed.
     pub(super) fn following_error(&self) -> f64 {
         if self.is_armed() { self.commanded() - self.measured() } else { 0.0 }
     }
 
-    /// Why a measured position is too far from the target, whether or not the drive reports it: the axis is
-    /// blocked, or the position is wrong.
-    pub(super) fn not_following(&self) -> Option<String> {
+    /// The fault of a measured position that is too far from the target, whether or not the drive reports it.
+    pub(super) fn following_error_fault(&self) -> Option<String> {
         let following_error = self.following_error();
         let limit = self.config.following_error_limit(self.sync_period);
-        let follows = following_error.abs() <= limit;
-        (!follows).then(|| {
-            let (off, limit) = (self.axis.shown(following_error), self.axis.in_unit(limit).0);
-            format!(
-                "following error of {off} (limit {limit:.3}); is the axis blocked, or the encoder lost?"
-            )
-        })
+        if following_error.abs() <= limit {
+            return None;
+        }
+        let (error, limit) = (self.axis.shown(following_error), self.axis.in_unit(limit).0);
+        Some(format!(
+            "following error of {error} (limit {limit:.3}); is the axis blocked, or the encoder lost?"
+        ))
     }
 
     pub(super) fn state(&self) -> Option<DriveState> {
@@ -416,10 +429,10 @@ impl Drive {
     }
 
     pub(super) fn report(&self) -> DriveReport {
-        let statusword = self.statusword.or(self.found.map(|fault| fault.statusword));
-        let told =
-            self.emcy.0.map(|emcy| emcy.code).or(self.found.and_then(|fault| fault.error_code));
-        let error = told.filter(|code| *code != EmcyCode::NO_ERROR);
+        let statusword = self.statusword.or(self.found_fault.map(|fault| fault.statusword));
+        let found_code = self.found_fault.and_then(|fault| fault.error_code);
+        let reported_code = self.emcy.0.map(|emcy| emcy.code);
+        let error = reported_code.or(found_code).filter(|code| *code != EmcyCode::NO_ERROR);
         DriveReport { state: statusword.and_then(Statusword::state), error }
     }
 
@@ -428,12 +441,12 @@ impl Drive {
         self.standstill.watch_from(self.position.counts());
     }
 
-    /// The axis has not moved for a while.
+    /// True if the axis was seen to stand, see [`Standstill`].
     pub(super) fn stands(&self) -> bool {
         self.standstill.stands()
     }
 
-    /// The motor has no power, or is losing it.
+    /// True if the motor has no power, or is losing it.
     pub(super) fn is_off(&self) -> bool {
         !may_have_power(self.state())
     }

@@ -26,7 +26,7 @@ impl FloodWatch {
 
     /// At the end of the first window of a flood, the number of frames in it. To be called at least
     /// once a window.
-    pub(super) fn look(&mut self, now: Time) -> Option<u64> {
+    pub(super) fn check(&mut self, now: Time) -> Option<u64> {
         if now < self.window_ends {
             return None;
         }
@@ -47,16 +47,16 @@ mod tests {
     fn a_flood_is_told_once_each_time_it_begins() {
         let at = |ms: i64| Time::from_nanos(ms * 1_000_000);
         let mut watch = FloodWatch::new(at(0));
-        let mut look = |ms, frames| {
+        let mut check = |ms, frames| {
             watch.frames += frames;
-            watch.look(at(ms))
+            watch.check(at(ms))
         };
-        assert_eq!(look(50, 30), None, "the window is not over");
-        assert_eq!(look(100, 19), None);
-        assert_eq!(look(200, 50), Some(50));
-        assert_eq!(look(300, 900), None, "it goes on");
-        assert_eq!(look(400, 1), None, "it is over");
-        assert_eq!(look(500, 200), Some(200));
-        assert_eq!(look(5000, 7800), None, "of an unknown rate");
+        assert_eq!(check(50, 30), None, "the window is not over");
+        assert_eq!(check(100, 19), None);
+        assert_eq!(check(200, 50), Some(50));
+        assert_eq!(check(300, 900), None, "it goes on");
+        assert_eq!(check(400, 1), None, "it is over");
+        assert_eq!(check(500, 200), Some(200));
+        assert_eq!(check(5000, 7800), None, "of an unknown rate");
     }
 }

@@ -110,7 +110,7 @@ impl AxisHalt {
             let counts = position_actual.inspect_err(|_| self.is_unanswered = true)? as i32;
             let (position_counts, now) = (position.unwrap(counts), self.sdo.now());
             match seen.replace(now) {
-                Some(before) => self.standstill.look(position_counts, now.since(before)),
+                Some(before) => self.standstill.take(position_counts, now.since(before)),
                 None => self.standstill.watch_from(position_counts),
             }
             if self.standstill.stands() {

@@ -182,7 +182,7 @@ impl Stage {
             self.cycle(now);
         }
         // After the SYNC, which must not wait.
-        if let Some(frames) = self.flood.look(now) {
+        if let Some(frames) = self.flood.check(now) {
             self.emit(StageEvent::Flood(frames));
         }
         if let Some(frame) = self.heartbeat.handle_timeout(now, NmtState::Operational) {
@@ -273,7 +273,7 @@ impl Stage {
                 self.fall_silent();
                 self.end(false, false);
             }
-            Phase::BringUp => self.abandon(),
+            Phase::BringUp => self.abandon_bring_up(),
             _ => self.begin_quick_stop(now),
         }
     }
@@ -311,7 +311,7 @@ impl Stage {
 
     /// Where the axes were last measured; `None` before both drives have answered a SYNC.
     pub fn position(&self) -> Option<SetPoint> {
-        self.both_heard().then(|| self.both(Drive::measured))
+        self.both_heard().then(|| self.positions(Drive::measured))
     }
 
     pub(super) fn sync_runs(&self) -> bool {
@@ -364,7 +364,7 @@ impl Stage {
             let Some(bring_up) = &mut self.bring_ups[axis] else { continue };
             self.outputs.extend(std::iter::from_fn(|| bring_up.conversation.poll()));
             match bring_up.conversation.outcome().cloned() {
-                Some(Ok(position)) => self.drive_is_up(now, axis, position),
+                Some(Ok(position)) => self.finish_bring_up(now, axis, position),
                 Some(Err(error)) => {
                     let node = self.config.axis(axis).node;
                     self.fail(now, format!("node {node} ({axis}): {error}"));
@@ -374,7 +374,7 @@ impl Stage {
         }
     }
 
-    fn drive_is_up(&mut self, now: Time, axis: Axis, position: i32) {
+    fn finish_bring_up(&mut self, now: Time, axis: Axis, position: i32) {
         let bring_up = self.bring_ups[axis].take();
         self.drives[axis].seed(position);
         if let Some(fault) = bring_up.and_then(|bring_up| bring_up.so_far().found_in_fault) {
@@ -395,14 +395,14 @@ impl Stage {
 
     /// Ends bring-up. An earlier run may have left a drive enabled: its power is taken off, and its
     /// heartbeat consumer stays as that run left it. A node that is not identified is not written to.
-    fn abandon(&mut self) {
+    fn abandon_bring_up(&mut self) {
         for axis in Axis::BOTH {
             let (identified, may_be_supervised) = match self.bring_ups[axis].take() {
                 Some(mut bring_up) => {
                     bring_up.conversation.cancel();
-                    let left = std::iter::from_fn(|| bring_up.conversation.poll());
-                    self.outputs.extend(left);
-                    self.drives[axis].found = bring_up.so_far().found_in_fault;
+                    let unsent = std::iter::from_fn(|| bring_up.conversation.poll());
+                    self.outputs.extend(unsent);
+                    self.drives[axis].found_fault = bring_up.so_far().found_in_fault;
                     (bring_up.so_far().identified, bring_up.so_far().may_be_supervised)
                 }
                 None => (true, true),

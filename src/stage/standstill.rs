@@ -2,56 +2,59 @@
 
 use std::time::Duration;
 
-/// An axis slower than this stands, mm/s or rad/s: what still moves it is a hunting servo or encoder noise.
+/// An axis slower than this stands, mm/s or rad/s: a slower motion is a hunting servo or encoder noise.
 const SPEED_MAX: f64 = 0.04;
-/// It is watched for at least this time, and for at least this number of positions.
+/// The axis is watched for at least this time, and for at least this number of positions.
 const WINDOW_MIN: Duration = Duration::from_millis(50);
-const LOOKS_MIN: u32 = 5;
-/// A coarse axis is watched until it would have moved by so many counts.
+const POSITIONS_MIN: u32 = 5;
+/// The axis is watched at least for the time in which it would move by this many counts at `SPEED_MAX`.
 const COUNTS_MIN: f64 = 2.0;
 
 /// Watches the positions of one axis for standstill.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Standstill {
     window: Duration,
-    /// What an axis at the highest speed that counts as standing moves in that time.
+    /// How far the axis may be from `anchor_counts`: its travel in `window` at `SPEED_MAX`.
     band_counts: f64,
+    /// The position from which on the axis has stood; the number of positions since then, and the time.
     anchor_counts: i64,
-    looks: u32,
+    positions: u32,
     stood: Duration,
 }
 
 impl Standstill {
-    /// Of an axis with so many counts per mm or rad.
+    /// Watches an axis with this many counts per mm or rad.
     pub(super) fn new(counts_per_unit: f64) -> Self {
         let counts_per_s = SPEED_MAX * counts_per_unit;
-        let coarse = Duration::try_from_secs_f64(COUNTS_MIN / counts_per_s);
-        let window = WINDOW_MIN.max(coarse.unwrap_or(Duration::MAX));
+        let resolvable = Duration::try_from_secs_f64(COUNTS_MIN / counts_per_s);
+        let window = WINDOW_MIN.max(resolvable.unwrap_or(Duration::MAX));
         let band_counts = counts_per_s * window.as_secs_f64();
-        Standstill { window, band_counts, anchor_counts: 0, looks: 0, stood: Duration::ZERO }
+        Standstill { window, band_counts, anchor_counts: 0, positions: 0, stood: Duration::ZERO }
     }
 
-    /// How long the axis is watched at least, looked at once a `period`.
+    /// How long the axis must be watched at least, if its position comes once a `period`.
     pub(super) fn window(&self, period: Duration) -> Duration {
-        self.window.max(period.saturating_mul(LOOKS_MIN))
+        self.window.max(period.saturating_mul(POSITIONS_MIN))
     }
 
     /// Begins to watch, from this position on.
     pub(super) fn watch_from(&mut self, counts: i64) {
-        (self.anchor_counts, self.looks, self.stood) = (counts, 0, Duration::ZERO);
+        self.anchor_counts = counts;
+        self.positions = 0;
+        self.stood = Duration::ZERO;
     }
 
-    /// Takes a position, so long after the one before.
-    pub(super) fn look(&mut self, counts: i64, after: Duration) {
+    /// Takes the next position, `elapsed` after the one before.
+    pub(super) fn take(&mut self, counts: i64, elapsed: Duration) {
         if counts.abs_diff(self.anchor_counts) as f64 > self.band_counts {
             return self.watch_from(counts);
         }
-        self.looks = self.looks.saturating_add(1);
-        self.stood = self.stood.saturating_add(after);
+        self.positions = self.positions.saturating_add(1);
+        self.stood = self.stood.saturating_add(elapsed);
     }
 
     pub(super) fn stands(&self) -> bool {
-        self.looks >= LOOKS_MIN && self.stood >= self.window
+        self.positions >= POSITIONS_MIN && self.stood >= self.window
     }
 }
 
@@ -59,14 +62,14 @@ impl Standstill {
 mod tests {
     use super::*;
 
-    /// How long an axis at `mm_per_s` that is looked at every `period_ms` is watched until it
-    /// counts as standing; `None` where it does not within 3 s.
+    /// How long an axis at `mm_per_s`, with a position every `period_ms`, is watched until it counts as
+    /// standing; `None` if it does not within 3 s.
     fn stands_after_ms(counts_per_mm: f64, mm_per_s: f64, period_ms: u64) -> Option<u64> {
         let mut standstill = Standstill::new(counts_per_mm);
         standstill.watch_from(0);
-        (1..=3000 / period_ms).map(|look| look * period_ms).find(|ms| {
+        (1..=3000 / period_ms).map(|n| n * period_ms).find(|ms| {
             let counts = counts_per_mm * mm_per_s * *ms as f64 / 1e3;
-            standstill.look(counts as i64, Duration::from_millis(period_ms));
+            standstill.take(counts as i64, Duration::from_millis(period_ms));
             standstill.stands()
         })
     }

@@ -52,7 +52,7 @@ impl Stage {
                 Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped
             ) =>
             {
-                self.take_look(axis, frame);
+                self.take_reading(axis, frame);
             }
             None => self.ignore(Ignored::Unexpected, frame),
         }
@@ -103,14 +103,14 @@ impl Stage {
         let Some((_, emcy)) = parse_emcy(frame) else {
             return self.ignore(Ignored::WrongLength, frame);
         };
-        if self.drives[axis].is_news(emcy) {
+        if self.drives[axis].note_emcy(emcy) {
             self.emit(StageEvent::Emergency(axis, emcy));
         }
         // What was wrong with a drive before bring-up took its power off shows in its statusword.
         let is_watched = self.bring_ups[axis].as_ref().is_none_or(|drive| drive.so_far().disarmed)
             && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped);
-        let is_of_the_fault_found = self.drives[axis].excuses(emcy.code);
-        if is_watched && !is_of_the_fault_found && emcy.code != EmcyCode::NO_ERROR {
+        let is_of_found_fault = self.drives[axis].is_of_found_fault(emcy.code);
+        if is_watched && !is_of_found_fault && emcy.code != EmcyCode::NO_ERROR {
             let hint = match emcy.code {
                 EmcyCode::HEARTBEAT => {
                     ": the drive missed the bench's heartbeat; is the bench stalled or unplugged?"
@@ -126,7 +126,7 @@ impl Stage {
             return self.ignore(Ignored::WrongLength, frame);
         };
         if !self.sync_runs() || self.sync_count == 0 || self.drives[axis].fresh {
-            self.drives[axis].take_second(frame, payload);
+            self.drives[axis].note_second_tpdo(frame, payload);
             return self.ignore(Ignored::Unexpected, frame);
         }
         self.flood.frames -= 1;
@@ -134,7 +134,7 @@ impl Stage {
         self.drives[axis].take_tpdo(payload, self.sync_count);
         self.check_statusword(now, axis, was);
         if self.drives.all(|drive| drive.fresh) {
-            self.window_complete(now);
+            self.handle_feedback(now);
         }
     }
 
@@ -160,10 +160,10 @@ impl Stage {
             );
         let has_power =
             matches!(state, Some(S::SwitchedOn | S::OperationEnabled | S::QuickStopActive));
-        if must_follow && self.drives[axis].meets_internal_limit() {
+        if must_follow && self.drives[axis].internal_limit_begins() {
             self.emit(StageEvent::InternalLimit(axis));
         }
-        if must_follow && let Some(count) = self.drives[axis].begins_to_warn() {
+        if must_follow && let Some(count) = self.drives[axis].warning_begins() {
             self.emit(StageEvent::Warns { axis, statusword, count });
         }
         let drive = &self.drives[axis];
@@ -172,7 +172,8 @@ impl Stage {
                 "the drive has power before the bench gave it any (statusword {statusword}), does an \
                  input or another tool enable it?"
             )
-        } else if statusword.is_fault() && !((standby || enabling) && drive.may_be_in_fault()) {
+        } else if statusword.is_fault() && !((standby || enabling) && drive.may_be_in_found_fault())
+        {
             format!("drive in fault (statusword {statusword})")
         } else if fell_back {
             refused_to_switch_on(statusword)
@@ -184,7 +185,7 @@ impl Stage {
         } else if (must_follow || enabling)
             && let Some(flag) = drive.lost_flag()
         {
-            lost_flag(flag, statusword)
+            lost_flag_fault(flag, statusword)
         } else if drive.homing_mode {
             // It follows no target, and its bit 13 is of its homing.
             return;
@@ -192,7 +193,7 @@ impl Stage {
         {
             let off = axis.shown(drive.following_error());
             format!("following error reported by the drive; target minus position is {off}")
-        } else if must_follow && let Some(fault) = drive.not_following() {
+        } else if must_follow && let Some(fault) = drive.following_error_fault() {
             fault
         } else {
             return;
@@ -211,7 +212,7 @@ pub(super) fn refused_to_switch_on(statusword: Statusword) -> String {
 }
 
 /// Why a bit of the statusword that the drive cleared while it was enabled stops the run.
-fn lost_flag(flag: DriveFlag, statusword: Statusword) -> String {
+fn lost_flag_fault(flag: DriveFlag, statusword: Statusword) -> String {
     match flag {
         DriveFlag::Remote => format!(
             "the drive no longer obeys the bus (statusword {statusword}, bit 9 clear): it will \
