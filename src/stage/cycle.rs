@@ -1,4 +1,4 @@
-//! The SYNC cycle: set-points out, positions in, and the way to standstill.
+//! The SYNC cycle: sends set-points, takes positions, enables and stops the axes.
 
 use super::drive::Drive;
 use super::machine::Phase;
@@ -15,11 +15,11 @@ use std::time::Duration;
 
 /// Interval at which a drive that does not obey is commanded again by SDO.
 const REPEAT_PERIOD: Duration = Duration::from_millis(100);
-/// SYNCs between two looks by SDO at an object of a drive that sends no TPDO.
+/// An object of a drive that sends no TPDO is read by SDO once in this many SYNCs.
 const READ_SYNCS: u64 = 10;
 
 impl Stage {
-    /// Judges the last SYNC, then sends the RPDOs that were not sent ahead, and the next SYNC.
+    /// Checks the answers to the last SYNC, then sends the RPDOs that were not sent ahead, and the next SYNC.
     pub(super) fn cycle(&mut self, now: Time) {
         self.judge_feedback(now);
         match self.phase {
@@ -36,8 +36,8 @@ impl Stage {
                     return self.finish(standing);
                 }
                 if now >= give_up {
-                    let what = "the drive still has power";
-                    self.fail_orderly_end(now, Drive::is_off, what, "shutdown");
+                    let trouble = "the drive still has power";
+                    self.fail_orderly_end(now, Drive::is_off, trouble, "shutdown");
                 }
                 self.repeat_by_sdo(now, |drive| !drive.is_off());
             }
@@ -55,8 +55,8 @@ impl Stage {
         self.sync_count += 1;
     }
 
-    /// Both positions of this SYNC are in. Nothing moves before both drives' heartbeats
-    /// were heard, and say that PDOs are taken.
+    /// Takes both answers to this SYNC, once both have come. The stage is ready only when the heartbeats of
+    /// both drives say Operational, in which a drive takes PDOs.
     pub(super) fn handle_feedback(&mut self, now: Time) {
         if matches!(self.phase, Phase::Enabling { .. })
             && self.drives.all(|drive| drive.is_armed() && drive.is_enabled())
@@ -91,7 +91,8 @@ impl Stage {
         SetPoint { insertion_mm: position(insertion), rotation_rad: position(rotation) }
     }
 
-    /// Counts SYNCs without both positions, once both drives have been heard.
+    /// Counts SYNCs that were not answered by both drives, once both have answered one. Too many in a row stop
+    /// the stage.
     fn judge_feedback(&mut self, now: Time) {
         if !self.both_heard() {
             return;
@@ -119,12 +120,10 @@ impl Stage {
         self.counters.feedback_missed += 1;
         if self.missed_in_a_row > missed_max {
             let syncs = self.missed_in_a_row;
-            // The other drive may have missed only this SYNC.
+            // Name the drive that has missed more: the other may have missed only this SYNC.
             let PerAxis { insertion, rotation } = &self.drives;
-            let axis = match rotation.missed_in_a_row > insertion.missed_in_a_row {
-                true => Axis::Rotation,
-                false => Axis::Insertion,
-            };
+            let is_rotation = rotation.missed_in_a_row > insertion.missed_in_a_row;
+            let axis = if is_rotation { Axis::Rotation } else { Axis::Insertion };
             let fault = format!(
                 "{axis}: no TPDO1 for {syncs} SYNCs in a row, check bus load, cable and the drive"
             );
@@ -136,7 +135,7 @@ impl Stage {
         self.drives.all(|drive| drive.statusword.is_some())
     }
 
-    /// Tells where the axes stand, and begins to enable them once they may have power.
+    /// Reports where the axes stand, and begins to enable them once they may have power.
     fn stand_by(&mut self, now: Time, give_up: Time, located: bool) {
         if !self.both_heard() {
             if now >= give_up {
@@ -151,7 +150,7 @@ impl Stage {
         if self.power_permitted {
             self.phase = Phase::Enabling { give_up: now + self.config.power.enable_timeout };
             self.emit(StageEvent::Progress(Progress::Enabling));
-            // Targets are armed in a later cycle: the owner may refuse to go on from here.
+            // The drives are armed in a later cycle: until then the caller may refuse to go on from here.
             self.lead_to_enabled();
         }
     }
@@ -160,8 +159,8 @@ impl Stage {
     /// without a heartbeat in Operational.
     fn fail_enabling(&mut self, now: Time) {
         let timeout_ms = self.config.power.enable_timeout.as_millis();
-        let first = |is_late: &dyn Fn(&Drive) -> bool| {
-            Axis::BOTH.into_iter().find(|axis| is_late(&self.drives[*axis]))
+        let first = |fails: &dyn Fn(&Drive) -> bool| {
+            Axis::BOTH.into_iter().find(|axis| fails(&self.drives[*axis]))
         };
         let fault = if let Some(axis) = first(&|drive| drive.statusword.is_none()) {
             format!(
@@ -245,7 +244,7 @@ impl Stage {
             self.phase = Phase::Disabling { quick, standing, give_up };
             self.emit(StageEvent::Progress(Progress::Disabling));
             if quick {
-                // Shutdown is not a way out of Quick Stop Active.
+                // A drive does not leave Quick Stop Active by Shutdown.
                 self.command_also_by_sdo(now, Controlword::DISABLE_VOLTAGE);
             } else {
                 self.set_controlwords(Controlword::SHUTDOWN);
@@ -254,19 +253,20 @@ impl Stage {
         self.repeat_by_sdo(now, Drive::is_enabled);
     }
 
-    /// An orderly end has timed out; the first drive that is not `done` is the reason.
+    /// An orderly end has timed out: the first drive that is not `done` still has this `trouble`, the stop
+    /// timeout after the `last_step` of the end.
     fn fail_orderly_end(
         &mut self,
         now: Time,
         done: impl Fn(&Drive) -> bool,
-        what: &str,
-        since: &str,
+        trouble: &str,
+        last_step: &str,
     ) {
         let axis = if done(&self.drives.insertion) { Axis::Rotation } else { Axis::Insertion };
         let statusword = self.drives[axis].statusword.unwrap_or_default();
         let ms = self.config.power.stop_timeout.as_millis();
         let fault = format!(
-            "{axis}: {what} {ms} ms after {since} (statusword {statusword}); if it does not stop now, \
+            "{axis}: {trouble} {ms} ms after {last_step} (statusword {statusword}); if it does not stop now, \
              press the emergency stop"
         );
         self.fail(now, fault);
@@ -281,7 +281,7 @@ impl Stage {
         }
     }
 
-    /// From any phase in which SYNC runs.
+    /// Begins a quick stop in a phase in which SYNC runs, unless one is under way.
     pub(super) fn begin_quick_stop(&mut self, now: Time) {
         match self.phase {
             Phase::Standby { .. }
@@ -296,15 +296,15 @@ impl Stage {
         self.command_also_by_sdo(now, Controlword::QUICK_STOP);
     }
 
-    /// Sets the controlword of both drives, and sends it by SDO at once: a drive that left Operational takes
-    /// no PDOs.
+    /// Sets the controlword of both drives, and sends it by SDO at once too: a drive that has left Operational
+    /// takes no PDOs.
     fn command_also_by_sdo(&mut self, now: Time, controlword: Controlword) {
         self.set_controlwords(controlword);
         self.send_controlwords(now, |_| true);
     }
 
-    /// A drive that left Operational sends no TPDO. While it stops it is asked by SDO, a few times a
-    /// second, one object at a time, what it does and where it is.
+    /// While the stage stops, reads the statusword and the position of a drive that sends no TPDO, because it
+    /// has left Operational: one object at a time, a few times a second.
     fn read_by_sdo(&mut self, axis: Axis) {
         let stops = matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. });
         if !stops || self.drives[axis].fresh {
@@ -319,14 +319,14 @@ impl Stage {
         self.send_sdo(axis, SdoRequest::Upload(object));
     }
 
-    /// Takes a drive's answer to [`Stage::read_by_sdo`].
+    /// Takes a drive's reply to [`Stage::read_by_sdo`].
     pub(super) fn take_reading(&mut self, axis: Axis, frame: &Frame) {
         let Some(ServerFrame::Reply(object, SdoReply::Uploaded(value))) =
             ServerFrame::decode(frame.data())
         else {
             return;
         };
-        // An answer without a request may be another node's.
+        // A reply without a request may be another node's.
         if self.drives[axis].requested.take_if(|requested| *requested == object).is_none() {
             return;
         }

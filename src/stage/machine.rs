@@ -1,4 +1,4 @@
-//! The stage itself: takes frames and time, keeps supervision, runs bring-up.
+//! The stage's state machine: distributes frames and time, runs the bring-up, begins and ends stops.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -21,20 +21,20 @@ use crate::canopen::sync::SyncProducer;
 use crate::canopen::{Frame, cob};
 use crate::units::Time;
 
-/// What the stage does. It never goes back to an earlier phase, except from `Homing` to `Ready`.
+/// What the stage does now. It never goes back to an earlier phase, except from `Homing` to `Ready`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Phase {
-    /// Nothing is sent, so that another master is heard first.
+    /// The stage sends nothing, and listens for another master.
     Listening {
         until: Time,
     },
     BringUp,
-    /// SYNC runs from here to the end of `Disabling`. The drives are watched, and get no power before
+    /// SYNC runs from here to the end of `Disabling`. The drives are supervised, and get no power before
     /// it is permitted.
     Standby {
         /// When both drives must have answered a SYNC.
         give_up: Time,
-        /// Where the axes stand was reported.
+        /// [`StageEvent::Located`] was emitted.
         located: bool,
     },
     Enabling {
@@ -55,7 +55,7 @@ pub(super) enum Phase {
     Stopped,
 }
 
-/// The master of the two axes; see the [module](super) for how it is driven.
+/// The master of the two axes; the [module](super) states its contract.
 #[derive(Debug)]
 pub struct Stage {
     pub(super) config: StageConfig,
@@ -68,8 +68,9 @@ pub struct Stage {
     pub(super) sync_time: Time,
     pub(super) sync_count: u64,
     pub(super) missed_in_a_row: u32,
-    /// When a drive that does not obey a quick stop is commanded again by SDO.
+    /// When drives that do not obey a quick stop are commanded again by SDO.
     pub(super) repeat_due: Time,
+    /// A fault was reported, or is not to be reported any more: see [`Stage::fall_silent`].
     faulted: bool,
     /// The axes may be given power, see [`Stage::permit_power`].
     pub(super) power_permitted: bool,
@@ -79,7 +80,7 @@ pub struct Stage {
 }
 
 impl Stage {
-    /// A stage that begins to bring up its drives at `now`.
+    /// A stage that begins at `now`: it listens, then brings up its drives.
     ///
     /// # Errors
     /// When the configuration cannot work; nothing has been sent then.
@@ -87,19 +88,20 @@ impl Stage {
         Self::for_homing(config, PerAxis::default(), now)
     }
 
-    /// A stage that homes: these axes are enabled in homing mode, to be homed by [`Stage::home`],
-    /// and it takes no set-points.
+    /// A stage that enables the `homed_axes` in homing mode, to be homed by [`Stage::home`]. It takes no
+    /// set-points.
     ///
     /// # Errors
-    /// When the configuration cannot work, or says nothing of how an axis is homed.
+    /// When the configuration cannot work, or has no homing for one of these axes.
     pub fn for_homing(
         config: StageConfig,
         homed_axes: PerAxis<bool>,
         now: Time,
     ) -> Result<Self, String> {
-        let unknown = |axis: &Axis| homed_axes[*axis] && config.axis(*axis).homing.is_none();
-        if let Some(axis) = Axis::BOTH.into_iter().find(unknown) {
-            return Err(no_homing(axis));
+        for axis in Axis::BOTH {
+            if homed_axes[axis] && config.axis(axis).homing.is_none() {
+                return Err(no_homing(axis));
+            }
         }
         config.validate()?;
         let timeout = config.bus.heartbeat_timeout();
@@ -154,14 +156,15 @@ impl Stage {
         self.ignore(why, frame);
     }
 
-    /// Does what is due at `now`: to be called at [`deadline`](Self::deadline), or later.
+    /// Does what is due at `now`. Call it at [`deadline`](Self::deadline) or later.
     pub fn handle_timeout(&mut self, now: Time) {
         if let Phase::Listening { until } = self.phase
             && now >= until
         {
             self.phase = Phase::BringUp;
-            let begin = |axis| BringUp::new(&self.config, axis, self.drives[axis].homing_mode, now);
-            self.bring_ups = PerAxis::from_fn(|axis| Some(begin(axis)));
+            self.bring_ups = PerAxis::from_fn(|axis| {
+                Some(BringUp::new(&self.config, axis, self.drives[axis].homing_mode, now))
+            });
         }
         for axis in Axis::BOTH {
             if let Some(bring_up) = &mut self.bring_ups[axis] {
@@ -181,7 +184,7 @@ impl Stage {
             }
             self.cycle(now);
         }
-        // After the SYNC, which must not wait.
+        // Only after the SYNC, which must not wait.
         if let Some(frames) = self.flood.check(now) {
             self.emit(StageEvent::Flood(frames));
         }
@@ -190,12 +193,12 @@ impl Stage {
         }
     }
 
-    /// The next thing to do or to know; drain to `None` after every call that hands something in.
+    /// The next frame to send or event to handle. Drain to `None` after every call that may make one.
     pub fn poll(&mut self) -> Option<Output> {
         self.outputs.pop_front()
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
     pub fn deadline(&self) -> Time {
         let mut deadline = self.heartbeat.deadline();
         if let Phase::Listening { until } = self.phase {
@@ -214,13 +217,13 @@ impl Stage {
     }
 
     /// Makes `set_point` the target of both axes at the next SYNC; a later call before that SYNC
-    /// replaces it. Without a new one the axes are held. The drives are sent it at once and take it up
-    /// with the SYNC (transmission type 1), which then has nothing to wait for; a hold or a stop in
-    /// between is sent before that SYNC.
+    /// replaces it. Without a new set-point the axes are held. RPDO1 takes it to the drives at once, and they
+    /// act on it at the SYNC (transmission type 1), so that the SYNC need not wait for it. A stop in between is
+    /// sent before that SYNC.
     ///
     /// # Errors
-    /// Why neither axis is sent anything: a limit is broken, the stage is not ready, or the positions at
-    /// the last SYNC have not come. The axes then keep the target they had.
+    /// A limit is exceeded, the stage is not ready, or the positions at the last SYNC have not come. Nothing is
+    /// sent then, and both axes keep their targets.
     pub fn command(&mut self, set_point: SetPoint) -> Result<(), String> {
         let not_ready = match self.phase {
             Phase::Ready if self.drives.all(|drive| !drive.homing_mode) => None,
@@ -249,24 +252,24 @@ impl Stage {
         Ok(())
     }
 
-    /// Whether both axes may be sent to `goal` in time; nothing is sent. To be asked once it is
-    /// known where they stand ([`StageEvent::Located`]).
+    /// Checks `goal` against the position limits of both axes; sends nothing. Call it only after
+    /// [`StageEvent::Located`], since the limits of an axis may count from where it stands.
     ///
     /// # Errors
-    /// The position limit that `goal` breaks.
+    /// The position limit that `goal` exceeds.
     pub fn check_goal(&self, goal: SetPoint) -> Result<(), String> {
         let check = |axis| self.drives[axis].limits().check_position(goal.along(axis));
         Axis::BOTH.into_iter().try_for_each(|axis| check(axis).map(drop))
     }
 
-    /// Whether the axes may be given power; until this is called they may. While they may not, the
-    /// drives are brought up, SYNC runs and everything is watched, and the axes stay without power.
-    /// Once enabling has begun this changes nothing: only a stop takes power off.
+    /// Permits or forbids to give the axes power; at first it is permitted. While it is forbidden, the drives
+    /// are brought up, SYNC runs and everything is supervised, and the axes stay without power. Once enabling
+    /// has begun this changes nothing: only a stop takes power off.
     pub fn permit_power(&mut self, permitted: bool) {
         self.power_permitted = permitted;
     }
 
-    /// Stops both axes as fast as their drives may, then takes power off.
+    /// Stops both axes by the drives' quick stop, then takes power off.
     pub fn quick_stop(&mut self, now: Time) {
         match self.phase {
             Phase::Listening { .. } => {
@@ -287,9 +290,9 @@ impl Stage {
         }
     }
 
-    /// Sends no heartbeat any more, as a bench that has died: drives that watch it stop by
-    /// themselves, and say so in emergency messages. From here on the stage reports no fault: only
-    /// [`quick_stop`](Self::quick_stop) stops the axes.
+    /// Sends no more heartbeats, like a bench that has died: drives that monitor them stop by themselves and
+    /// send emergency messages. From here on the stage reports no fault and stops the axes only by
+    /// [`quick_stop`](Self::quick_stop).
     pub fn fall_silent(&mut self) {
         self.faulted = true;
         for axis in Axis::BOTH {
@@ -304,7 +307,7 @@ impl Stage {
         self.counters
     }
 
-    /// What each drive has last said of itself.
+    /// The last state and error of each drive.
     pub fn drive_reports(&self) -> PerAxis<DriveReport> {
         PerAxis::from_fn(|axis| self.drives[axis].report())
     }
@@ -340,12 +343,12 @@ impl Stage {
         self.send(nmt_frame(command, Some(self.config.axis(axis).node)));
     }
 
-    /// Reads or writes an object without waiting for the answer.
+    /// Requests to read or write an object, without waiting for the reply.
     pub(super) fn send_sdo(&mut self, axis: Axis, request: SdoRequest) {
         self.send(ClientFrame::Request(request).to_frame(self.config.axis(axis).node));
     }
 
-    /// Writes a controlword without waiting for the answer.
+    /// Writes a controlword, without waiting for the reply.
     pub(super) fn send_controlword(&mut self, axis: Axis, word: Controlword) {
         self.send_sdo(axis, SdoRequest::Download(object::CONTROLWORD, word.0.into()));
     }
@@ -393,8 +396,9 @@ impl Stage {
         }
     }
 
-    /// Ends bring-up. An earlier run may have left a drive enabled: its power is taken off, and its
-    /// heartbeat consumer stays as that run left it. A node that is not identified is not written to.
+    /// Ends bring-up without success. An earlier run may have left a drive enabled, so power is taken off. A
+    /// heartbeat consumer that this bring-up has not written stays as that run left it. A node that is not
+    /// identified is not written to.
     fn abandon_bring_up(&mut self) {
         for axis in Axis::BOTH {
             let (identified, may_be_supervised) = match self.bring_ups[axis].take() {
@@ -415,8 +419,8 @@ impl Stage {
         self.end(false, false);
     }
 
-    /// Leaves the drives without power and without PDOs. Drives known to be without power need no
-    /// bench any more: they would go to Fault when its heartbeat ends.
+    /// Ends SYNC, with both nodes in Pre-operational. A drive that is known to be without power stops monitoring
+    /// the bench: it would go to Fault when the bench's heartbeat ends.
     pub(super) fn finish(&mut self, standing: bool) {
         for axis in Axis::BOTH {
             self.release(axis, self.drives[axis].is_off());
@@ -424,9 +428,9 @@ impl Stage {
         self.end(standing, self.drives.all(Drive::is_off));
     }
 
-    fn release(&mut self, axis: Axis, needs_no_bench: bool) {
+    fn release(&mut self, axis: Axis, end_monitoring: bool) {
         self.send_nmt(NmtCommand::EnterPreOperational, axis);
-        if needs_no_bench {
+        if end_monitoring {
             self.send_sdo(axis, SdoRequest::Download(consumer_heartbeat(1), 0_u32.into()));
         }
     }
