@@ -6,7 +6,7 @@ use std::fmt;
 use std::rc::Rc;
 use std::time::Duration;
 
-use super::dialogue::{Conversation, Sdo};
+use super::dialogue::{ScriptRunner, Sdo};
 use super::{Axis, AxisConfig, Progress, StageConfig, StageEvent};
 use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::Statusword;
@@ -14,7 +14,7 @@ use crate::canopen::emcy::EmcyCode;
 use crate::canopen::sdo::{AbortCode, SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::units::Time;
 
-/// Who a drive says it is (object 0x1018).
+/// A drive's identity object (0x1018).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Identity {
     /// 0x1018:01.
@@ -49,34 +49,34 @@ pub struct FoundFault {
     pub error_code: Option<EmcyCode>,
 }
 
-/// Bytes of an expedited answer that does not give its size.
+/// Length of an expedited answer that does not say its size.
 const UNSIZED: usize = 4;
-/// Interval between two readings of an object that the drive changes by itself.
+/// Interval between two reads of an object that the drive changes by itself.
 pub(super) const POLL_PERIOD: Duration = Duration::from_millis(10);
 
-/// Brings up one drive.
+/// The bring-up of one drive.
 #[derive(Debug)]
 pub(super) struct BringUp {
     script: Script,
-    /// Gives where the axis stood (0x6064), or why the drive could not be brought up.
-    pub(super) conversation: Conversation<Result<i32, String>>,
+    /// Returns where the axis stood (0x6064), or why the drive could not be brought up.
+    pub(super) runner: ScriptRunner<Result<i32, String>>,
     restarts_left: u8,
 }
 
 /// How far a bring-up has come.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct SoFar {
-    /// The part of the bring-up that goes on.
+pub(super) struct BringUpState {
+    /// The part of the bring-up that is under way, as an operator reads it.
     part: &'static str,
     /// The drive has answered.
     pub(super) found: bool,
-    /// The drive is known to be the one of the configuration.
+    /// Its identity is that of the configuration.
     pub(super) identified: bool,
-    /// Its power is off, and its statusword was read: any fault from here on is a new one.
+    /// Power is off, and the statusword was read: any fault from here on is a new one.
     pub(super) disarmed: bool,
-    /// The drive may have been told to watch the bench; its power was taken off before.
+    /// The drive may have been configured to monitor the bench's heartbeat; its power was taken off before.
     pub(super) may_be_supervised: bool,
-    /// The fault that it was in when its statusword was read.
+    /// The fault that the drive was in when its statusword was read.
     pub(super) found_in_fault: Option<FoundFault>,
 }
 
@@ -84,33 +84,33 @@ impl BringUp {
     /// The bring-up of `axis`, to be homed in `homing_mode` or to be moved in cyclic synchronous position.
     pub(super) fn new(config: &StageConfig, axis: Axis, homing_mode: bool, now: Time) -> Self {
         let sdo = Sdo::new(config, axis);
-        let so_far = Rc::new(Cell::new(SoFar::default()));
-        let script = Script { axis, homing_mode, config: config.clone(), sdo, so_far };
+        let state = Rc::new(Cell::new(BringUpState::default()));
+        let script = Script { axis, homing_mode, config: config.clone(), sdo, state };
         BringUp {
-            conversation: Conversation::begin(&script.sdo, now, script.clone().run()),
+            runner: ScriptRunner::begin(&script.sdo, now, script.clone().run()),
             script,
             restarts_left: config.bus.boot_attempts.saturating_sub(1),
         }
     }
 
-    /// Takes a boot-up message. A drive that has not answered yet is expected to send one. Later it means
-    /// that the drive has lost what was written: its bring-up starts again, a limited number of times.
+    /// Takes a boot-up message. A drive that has not answered yet is expected to send one. Later, it means
+    /// that the drive has lost what was written: its bring-up begins again, a limited number of times.
     pub(super) fn handle_boot_up(&mut self, now: Time) {
-        let SoFar { part, found, .. } = self.so_far();
+        let BringUpState { part, found, .. } = self.state();
         if found && self.restarts_left > 0 {
             self.restarts_left -= 1;
-            self.script.so_far.take();
+            self.script.state.take();
             self.script.emit(Progress::Restarted(self.script.axis));
             let script = self.script.clone();
-            self.conversation = Conversation::begin(&self.script.sdo, now, script.run());
+            self.runner = ScriptRunner::begin(&self.script.sdo, now, script.run());
         } else if found {
             let error = format!("boot-up message while {part}, is its supply stable?");
-            self.conversation.end(Err(error));
+            self.runner.end(Err(error));
         }
     }
 
-    pub(super) fn so_far(&self) -> SoFar {
-        self.script.so_far.get()
+    pub(super) fn state(&self) -> BringUpState {
+        self.script.state.get()
     }
 }
 
@@ -127,13 +127,13 @@ impl From<ObjectAddress> for Object {
     }
 }
 
-/// For objects that CiA leaves to the manufacturer.
+/// `address`, which the drive may lack, since CiA leaves it to the manufacturer.
 pub(super) fn optional(address: ObjectAddress) -> Object {
     Object { address, is_optional: true }
 }
 
-/// What the steps of a bring-up use. An object that the configuration lists as optional is skipped if the
-/// drive lacks it, as an [`optional`] one is.
+/// The script of a bring-up, and the reads and writes that its steps use. They skip an object that the drive
+/// lacks if it is [`optional`], or if the configuration lists it as optional.
 #[derive(Debug, Clone)]
 pub(super) struct Script {
     pub(super) axis: Axis,
@@ -141,7 +141,7 @@ pub(super) struct Script {
     pub(super) homing_mode: bool,
     pub(super) config: StageConfig,
     pub(super) sdo: Sdo,
-    so_far: Rc<Cell<SoFar>>,
+    state: Rc<Cell<BringUpState>>,
 }
 
 impl Script {
@@ -149,15 +149,15 @@ impl Script {
         self.config.axis(self.axis)
     }
 
-    pub(super) fn note(&self, change: impl FnOnce(&mut SoFar)) {
-        let mut so_far = self.so_far.get();
-        change(&mut so_far);
-        self.so_far.set(so_far);
+    pub(super) fn note(&self, change: impl FnOnce(&mut BringUpState)) {
+        let mut state = self.state.get();
+        change(&mut state);
+        self.state.set(state);
     }
 
     /// Begins a part of the bring-up.
     pub(super) fn begin(&self, part: &'static str) {
-        self.note(|so_far| so_far.part = part);
+        self.note(|state| state.part = part);
         self.emit(Progress::BringUp(self.axis, part));
     }
 
@@ -165,8 +165,11 @@ impl Script {
         self.sdo.emit(StageEvent::Progress(progress));
     }
 
-    /// The drive's answer to `request`; `None` if it lacks an object that it may lack.
-    pub(super) fn judge(
+    /// The reply in the drive's `answer` to `request`; `None` if the drive lacks an object that it may lack.
+    ///
+    /// # Errors
+    /// Any other failure, with the object and, where there is one, the next step.
+    pub(super) fn accept(
         &self,
         request: SdoRequest,
         is_optional: bool,
@@ -212,7 +215,7 @@ impl Script {
         request: SdoRequest,
         is_optional: bool,
     ) -> Result<Option<SdoReply>, String> {
-        self.judge(request, is_optional, self.sdo.ask(request).await)
+        self.accept(request, is_optional, self.sdo.ask(request).await)
     }
 
     /// Reads `object`; `None` if the drive lacks an object that it may lack.
@@ -224,8 +227,8 @@ impl Script {
         }
     }
 
-    /// Writes `value` to `object`, which does not read as written.
-    pub(super) async fn command(
+    /// Writes `value` to `object` without reading it back: it would not read as written.
+    pub(super) async fn write_unchecked(
         &self,
         object: ObjectAddress,
         value: SdoValue,
@@ -233,7 +236,7 @@ impl Script {
         self.ask(SdoRequest::Download(object, value), false).await.map(drop)
     }
 
-    /// Writes `value` to `object`, and reads it back.
+    /// Writes `value` to `object`, reads it back and compares.
     pub(super) async fn write(
         &self,
         object: impl Into<Object>,
@@ -245,7 +248,7 @@ impl Script {
             return Ok(());
         }
         match self.read(object).await? {
-            Some(received) => check(object.address, value, received),
+            Some(received) => check_read_back(object.address, value, received),
             None => Ok(()),
         }
     }
@@ -256,11 +259,11 @@ impl Script {
         object: ObjectAddress,
         value: SdoValue,
     ) -> Result<(), String> {
-        let patience =
+        let timeout =
             self.config.bus.sdo_timeout().saturating_mul(self.config.bus.sdo_attempts.into());
-        let give_up = self.sdo.now() + patience;
+        let give_up = self.sdo.now() + timeout;
         while let Some(received) = self.read(object).await? {
-            let checked = check(object, value, received);
+            let checked = check_read_back(object, value, received);
             if checked.is_ok() || self.sdo.now() >= give_up {
                 return checked;
             }
@@ -270,17 +273,23 @@ impl Script {
     }
 }
 
-/// Checks that `received` is what `expected` reads as. An expedited answer may leave out how many of its
-/// four bytes are the object's (CiA 301, 7.2.4.3.6); the others are then zero. Bit 30 of a PDO's COB-ID
-/// (remote requests) is fixed in many drives and of no consequence here.
-fn check(object: ObjectAddress, expected: SdoValue, received: SdoValue) -> Result<(), String> {
+/// Checks that the value read back, `received`, is the `expected` one. An expedited answer need not say how
+/// many of its four bytes belong to the object (CiA 301, 7.2.4.3.6); the others are then zero. Bit 30 of a
+/// PDO's COB-ID (remote requests) is ignored: it is fixed in many drives, and the bench uses no remote requests.
+fn check_read_back(
+    object: ObjectAddress,
+    expected: SdoValue,
+    received: SdoValue,
+) -> Result<(), String> {
     let is_pdo_cob_id =
         matches!(object.index, 0x1400..=0x15ff | 0x1800..=0x19ff) && object.subindex == 1;
     let ignored = if is_pdo_cob_id { 1 << 30 } else { 0 };
     let length = received.as_bytes().len();
-    let fits = length == expected.as_bytes().len() || length == UNSIZED;
-    match fits && (expected.to_u32() ^ received.to_u32()) & !ignored == 0 {
-        true => Ok(()),
-        false => Err(format!("{object}: expected {expected}, received {received}")),
+    let same_length = length == expected.as_bytes().len() || length == UNSIZED;
+    let same_bits = (expected.to_u32() ^ received.to_u32()) & !ignored == 0;
+    if same_length && same_bits {
+        Ok(())
+    } else {
+        Err(format!("{object}: expected {expected}, received {received}"))
     }
 }

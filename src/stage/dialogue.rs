@@ -1,8 +1,8 @@
 //! Dialogues with drives over SDO alone.
 //!
-//! Each is a script: an async function that asks a drive for one object after the other and waits for
-//! each answer. No runtime runs it. A [`Conversation`] lets it go on whenever a frame or the time is
-//! handed in, so it is sans-IO like everything here.
+//! Each is a script: an async function that reads and writes one object after the other and awaits each
+//! reply. No async runtime runs it. A [`ScriptRunner`] resumes it whenever it is given a frame or the time, so
+//! a script is sans-IO like everything here.
 
 use std::cell::RefCell;
 use std::collections::VecDeque;
@@ -20,8 +20,8 @@ use crate::canopen::sdo::{SdoClient, SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::canopen::{Frame, NodeId, ObjectAddress};
 use crate::units::Time;
 
-/// A machine that talks with the drives and comes to an end, sans-IO: hand in frames and the time,
-/// drain [`poll_transmit`](Self::poll_transmit) after each, until [`is_over`](Self::is_over).
+/// A sans-IO machine that talks with the drives until it [is over](Self::is_over). Hand in frames and the
+/// time, and drain [`poll_transmit`](Self::poll_transmit) after each.
 pub trait Dialogue {
     /// Takes any frame of the bus.
     fn handle_frame(&mut self, now: Time, frame: &Frame);
@@ -32,10 +32,10 @@ pub trait Dialogue {
     /// The next frame to send.
     fn poll_transmit(&mut self) -> Option<Frame>;
 
-    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
     fn deadline(&self) -> Time;
 
-    /// True when it has come to its end.
+    /// True once the dialogue has ended.
     fn is_over(&self) -> bool;
 }
 
@@ -81,7 +81,7 @@ impl Sdo {
         self.0.borrow_mut().outputs.push_back(Output::Event(event));
     }
 
-    /// A node out of Operational takes no PDOs.
+    /// Sends the node to Pre-operational, where it takes no PDOs.
     pub(super) fn leave_operational(&self) {
         self.send(nmt_frame(NmtCommand::EnterPreOperational, Some(self.node())));
     }
@@ -104,7 +104,7 @@ impl Sdo {
         .await
     }
 
-    /// As [`Sdo::ask_once`], but a request that the drive neither answers nor refuses is repeated, up to the
+    /// As [`Sdo::ask_once`], but repeats a request that the drive neither answers nor refuses, up to the
     /// configured number of attempts.
     pub(super) async fn ask(&self, request: SdoRequest) -> Result<SdoReply, SdoError> {
         let attempts_max = self.0.borrow().attempts_max;
@@ -120,7 +120,7 @@ impl Sdo {
     /// Reads `object`.
     ///
     /// # Errors
-    /// Why the drive's answer cannot be used, with the node and the object.
+    /// There is no usable answer: the reason, with the node and the object.
     pub(super) async fn read(&self, object: ObjectAddress) -> Result<SdoValue, String> {
         match self.ask(SdoRequest::Upload(object)).await {
             Ok(SdoReply::Uploaded(value)) => Ok(value),
@@ -188,22 +188,22 @@ impl Sdo {
     }
 }
 
-/// A script that talks with a drive, and its outcome.
-pub(super) struct Conversation<T> {
+/// Runs a script that talks with a drive, and keeps its outcome.
+pub(super) struct ScriptRunner<T> {
     sdo: Sdo,
     script: Pin<Box<dyn Future<Output = T>>>,
     outcome: Option<T>,
     nmt_state: Option<NmtState>,
 }
 
-impl<T> Conversation<T> {
-    /// Begins `script` at `now`. What another script had under way over `sdo` is cancelled.
+impl<T> ScriptRunner<T> {
+    /// Begins `script` at `now`. A transfer of another script over `sdo` is cancelled.
     pub(super) fn begin(sdo: &Sdo, now: Time, script: impl Future<Output = T> + 'static) -> Self {
         let (sdo, script) = (sdo.clone(), Box::pin(script));
-        let mut conversation = Conversation { sdo, script, outcome: None, nmt_state: None };
-        conversation.cancel();
-        conversation.go_on(now);
-        conversation
+        let mut runner = ScriptRunner { sdo, script, outcome: None, nmt_state: None };
+        runner.cancel();
+        runner.resume(now);
+        runner
     }
 
     pub(super) fn handle_frame(&mut self, now: Time, frame: &Frame) {
@@ -213,15 +213,15 @@ impl<T> Conversation<T> {
             self.nmt_state = Some(state);
         }
         self.sdo.0.borrow_mut().client.handle_frame(now, frame);
-        self.go_on(now);
+        self.resume(now);
     }
 
     pub(super) fn handle_timeout(&mut self, now: Time) {
         self.sdo.0.borrow_mut().client.handle_timeout(now);
-        self.go_on(now);
+        self.resume(now);
     }
 
-    fn go_on(&mut self, now: Time) {
+    fn resume(&mut self, now: Time) {
         self.sdo.0.borrow_mut().now = now;
         let mut context = Context::from_waker(Waker::noop());
         if self.outcome.is_none()
@@ -261,35 +261,35 @@ impl<T> Conversation<T> {
         self.outcome.as_ref()
     }
 
-    /// The drive's NMT state, if a heartbeat was received meanwhile.
+    /// The drive's NMT state, if a heartbeat was received while the script ran.
     pub(super) fn nmt_state(&self) -> Option<NmtState> {
         self.nmt_state
     }
 }
 
-impl<T> fmt::Debug for Conversation<T> {
+impl<T> fmt::Debug for ScriptRunner<T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Conversation").field("sdo", &self.sdo).finish_non_exhaustive()
+        f.debug_struct("ScriptRunner").field("sdo", &self.sdo).finish_non_exhaustive()
     }
 }
 
-/// The same script with both drives, side by side.
+/// Runs the same script with both drives at the same time.
 #[derive(Debug)]
 pub struct WithBothDrives<T> {
-    /// Sent before anything else.
+    /// Frames to send before those of the scripts.
     first: VecDeque<Frame>,
-    axes: PerAxis<Conversation<Result<T, String>>>,
+    axes: PerAxis<ScriptRunner<Result<T, String>>>,
 }
 
 impl<T> WithBothDrives<T> {
     pub(super) fn begin(
         first: impl Into<VecDeque<Frame>>,
-        axis: impl FnMut(Axis) -> Conversation<Result<T, String>>,
+        axis: impl FnMut(Axis) -> ScriptRunner<Result<T, String>>,
     ) -> Self {
         WithBothDrives { first: first.into(), axes: PerAxis::from_fn(axis) }
     }
 
-    pub(super) fn axis(&self, axis: Axis) -> &Conversation<Result<T, String>> {
+    pub(super) fn axis(&self, axis: Axis) -> &ScriptRunner<Result<T, String>> {
         &self.axes[axis]
     }
 }

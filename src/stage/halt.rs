@@ -9,7 +9,7 @@
 
 use std::time::Duration;
 
-use super::dialogue::{Conversation, Sdo, WithBothDrives};
+use super::dialogue::{ScriptRunner, Sdo, WithBothDrives};
 use super::drive::may_have_power;
 use super::standstill::Standstill;
 use super::{Axis, StageConfig, Unwrapper};
@@ -34,7 +34,7 @@ impl Halt {
             .map(|node| nmt_frame(NmtCommand::EnterPreOperational, Some(node)));
         WithBothDrives::begin(leave, |axis| {
             let drive = AxisHalt::new(config, axis, now, give_up);
-            Conversation::begin(&drive.sdo.clone(), now, drive.stop())
+            ScriptRunner::begin(&drive.sdo.clone(), now, drive.stop())
         })
     }
 
@@ -44,7 +44,7 @@ impl Halt {
         WithBothDrives::begin([], |axis| {
             let mut drive = AxisHalt::new(config, axis, now, give_up);
             let sdo = drive.sdo.clone();
-            Conversation::begin(&sdo, now, async move { drive.come_to_stand(None).await })
+            ScriptRunner::begin(&sdo, now, async move { drive.come_to_stand(None).await })
         })
     }
 

@@ -168,7 +168,7 @@ impl Stage {
         }
         for axis in Axis::BOTH {
             if let Some(bring_up) = &mut self.bring_ups[axis] {
-                bring_up.conversation.handle_timeout(now);
+                bring_up.runner.handle_timeout(now);
             }
             if let Some(event) = self.monitors[axis].handle_timeout(now) {
                 self.handle_heartbeat_event(now, axis, event);
@@ -210,7 +210,7 @@ impl Stage {
         for axis in Axis::BOTH {
             deadline = deadline.min(self.monitors[axis].deadline());
             if let Some(bring_up) = &self.bring_ups[axis] {
-                deadline = deadline.min(bring_up.conversation.deadline());
+                deadline = deadline.min(bring_up.runner.deadline());
             }
         }
         deadline
@@ -365,8 +365,8 @@ impl Stage {
     pub(super) fn drain_bring_ups(&mut self, now: Time) {
         for axis in Axis::BOTH {
             let Some(bring_up) = &mut self.bring_ups[axis] else { continue };
-            self.outputs.extend(std::iter::from_fn(|| bring_up.conversation.poll()));
-            match bring_up.conversation.outcome().cloned() {
+            self.outputs.extend(std::iter::from_fn(|| bring_up.runner.poll()));
+            match bring_up.runner.outcome().cloned() {
                 Some(Ok(position)) => self.finish_bring_up(now, axis, position),
                 Some(Err(error)) => {
                     let node = self.config.axis(axis).node;
@@ -380,7 +380,7 @@ impl Stage {
     fn finish_bring_up(&mut self, now: Time, axis: Axis, position: i32) {
         let bring_up = self.bring_ups[axis].take();
         self.drives[axis].seed(position);
-        if let Some(fault) = bring_up.and_then(|bring_up| bring_up.so_far().found_in_fault) {
+        if let Some(fault) = bring_up.and_then(|bring_up| bring_up.state().found_in_fault) {
             self.drives[axis].allow_reset(fault.error_code);
         }
         // Only a heartbeat that comes from here on can say that this stage's start command was obeyed.
@@ -403,11 +403,11 @@ impl Stage {
         for axis in Axis::BOTH {
             let (identified, may_be_supervised) = match self.bring_ups[axis].take() {
                 Some(mut bring_up) => {
-                    bring_up.conversation.cancel();
-                    let unsent = std::iter::from_fn(|| bring_up.conversation.poll());
+                    bring_up.runner.cancel();
+                    let unsent = std::iter::from_fn(|| bring_up.runner.poll());
                     self.outputs.extend(unsent);
-                    self.drives[axis].found_fault = bring_up.so_far().found_in_fault;
-                    (bring_up.so_far().identified, bring_up.so_far().may_be_supervised)
+                    self.drives[axis].found_fault = bring_up.state().found_in_fault;
+                    (bring_up.state().identified, bring_up.state().may_be_supervised)
                 }
                 None => (true, true),
             };

@@ -46,9 +46,9 @@ impl Script {
         self.begin("looking for the drive");
         let boot_timeout = self.config.bus.boot_timeout;
         let give_up = self.sdo.now() + boot_timeout;
-        let look = SdoRequest::Upload(DEVICE_TYPE);
+        let request = SdoRequest::Upload(DEVICE_TYPE);
         let answer = loop {
-            match self.sdo.ask_once(look).await {
+            match self.sdo.ask_once(request).await {
                 Err(SdoError::Timeout(_)) if self.sdo.now() >= give_up => {
                     let cob_id = cob::sdo_rx(self.sdo.node());
                     let timeout_s = boot_timeout.as_secs_f64();
@@ -69,7 +69,7 @@ impl Script {
             }
         };
         self.note(|so_far| so_far.found = true);
-        match self.judge(look, false, answer)? {
+        match self.accept(request, false, answer)? {
             Some(SdoReply::Uploaded(value)) if value.to_u32() as u16 != DRIVE_PROFILE => {
                 let profile = value.to_u32() as u16;
                 Err(format!(
@@ -120,7 +120,7 @@ impl Script {
     /// the drive is in Fault, the cause is read; unless it may be reset, bring-up ends there.
     async fn disarm(&self) -> Result<(), String> {
         self.begin("taking power off, looking for faults");
-        self.command(drive::CONTROLWORD, Controlword::DISABLE_VOLTAGE.0.into()).await?;
+        self.write_unchecked(drive::CONTROLWORD, Controlword::DISABLE_VOLTAGE.0.into()).await?;
         let statusword = self.wait_for_power_off().await?;
         self.note(|so_far| so_far.disarmed = true);
         if !statusword.is_fault() {
@@ -174,7 +174,7 @@ impl Script {
             let (object, value) = raw.to_write()?;
             match raw.read_back {
                 true => self.write(object, value).await?,
-                false => self.command(object, value).await?,
+                false => self.write_unchecked(object, value).await?,
             }
         }
         if let Some(timeout_ms) = config.following_error_timeout_ms {

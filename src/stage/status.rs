@@ -1,7 +1,7 @@
 //! Reads the status of both drives by SDO, writing nothing; and resets their faults on purpose. Nothing gets
 //! power by either.
 
-use super::dialogue::{Conversation, Sdo, WithBothDrives};
+use super::dialogue::{ScriptRunner, Sdo, WithBothDrives};
 use super::drive::may_have_power;
 use super::{Axis, AxisConfig, HomingConfig, Identity, StageConfig};
 use crate::canopen::NodeId;
@@ -54,7 +54,7 @@ impl StatusReader {
         WithBothDrives::begin([], |axis| {
             let sdo = Sdo::new(config, axis);
             let script = read_status(sdo.clone(), axis, config.axis(axis).clone());
-            Conversation::begin(&sdo, now, script)
+            ScriptRunner::begin(&sdo, now, script)
         })
     }
 
@@ -127,7 +127,7 @@ impl Reset {
     pub fn new(config: &StageConfig, now: Time) -> Self {
         WithBothDrives::begin([], |axis| {
             let sdo = Sdo::new(config, axis);
-            Conversation::begin(&sdo.clone(), now, reset(sdo))
+            ScriptRunner::begin(&sdo.clone(), now, reset(sdo))
         })
     }
 

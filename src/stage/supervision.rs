@@ -44,7 +44,7 @@ impl Stage {
         match &mut self.bring_ups[axis] {
             Some(bring_up) => {
                 self.flood.frames -= 1;
-                bring_up.conversation.handle_frame(now, frame);
+                bring_up.runner.handle_frame(now, frame);
                 self.drain_bring_ups(now);
             }
             None if matches!(
@@ -107,7 +107,7 @@ impl Stage {
             self.emit(StageEvent::Emergency(axis, emcy));
         }
         // What was wrong with a drive before bring-up took its power off shows in its statusword.
-        let is_watched = self.bring_ups[axis].as_ref().is_none_or(|drive| drive.so_far().disarmed)
+        let is_watched = self.bring_ups[axis].as_ref().is_none_or(|drive| drive.state().disarmed)
             && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped);
         let is_of_found_fault = self.drives[axis].is_of_found_fault(emcy.code);
         if is_watched && !is_of_found_fault && emcy.code != EmcyCode::NO_ERROR {
