@@ -1,20 +1,20 @@
-//! Notices a bus that carries much more than belongs there.
+//! Notices a flood on the bus: many more frames than the stage expects.
 
 use std::time::Duration;
 
 use crate::units::Time;
 
-/// Over how long frames are counted.
+/// How long frames are counted before the count is checked.
 const WINDOW: Duration = Duration::from_millis(100);
 
 /// This many frames in a window are a flood: some 5% of a bus at 1 Mbit/s.
 const FRAMES_MIN: u64 = 50;
 
-/// Watches how many frames come that are no part of the cycle or of the bring-up.
+/// Counts the frames that are no part of the SYNC cycle or of the bring-up.
 #[derive(Debug, Clone)]
 pub(super) struct FloodWatch {
     window_ends: Time,
-    /// Those that have come in this window.
+    /// Such frames in this window. The stage counts every frame, and takes an expected one off again.
     pub(super) frames: u64,
     flooded: bool,
 }
@@ -30,7 +30,7 @@ impl FloodWatch {
         if now < self.window_ends {
             return None;
         }
-        // The frames before a late look came in more time than a window.
+        // If the check is late, the frames came in more time than a window.
         let on_time = now < self.window_ends + WINDOW;
         let FloodWatch { frames, flooded: was_flooded, .. } = *self;
         let flooded = frames >= FRAMES_MIN && on_time;

@@ -1,7 +1,7 @@
-//! Soft limits that refuse: a target is sent as asked, or not at all.
+//! Soft limits: a target within them is sent unchanged, any other is refused.
 //!
-//! They are checked on the whole counts that would go to the drive, so a sum such as
-//! 0.1 + 0.2 is not refused for its last bit, and what is sent is what was checked.
+//! They are checked in the whole counts that would go to the drive. So a sum such as 0.1 + 0.2 is not
+//! refused for its last bit, and the checked value is the one that is sent.
 
 use std::time::Duration;
 
@@ -33,15 +33,15 @@ section! {
 }
 
 impl AxisLimits {
-    /// Refuses a finite `target` (mm or rad) outside the positions of `axis`. NaN breaks no limit.
+    /// Checks `target` (mm or rad) against the position limits of `axis`. NaN passes.
     ///
     /// # Errors
-    /// The position limit that `target` breaks.
+    /// The position limit that `target` exceeds.
     pub fn check_range(&self, axis: Axis, target: f64) -> Result<(), String> {
         self.check_rounded(axis, target, |value| value)
     }
 
-    /// The same, with `round` applied to the target and to the limits.
+    /// As [`check_range`](Self::check_range), with `round` applied to the target and to the limits.
     fn check_rounded(
         &self,
         axis: Axis,
@@ -66,7 +66,7 @@ impl AxisLimits {
 pub struct Commanded {
     /// The last target, counts.
     pub counts: i64,
-    /// From the target before to the last one, counts.
+    /// The last target minus the one before, counts.
     pub step_counts: i64,
 }
 
@@ -81,8 +81,8 @@ pub struct LimitCheck {
 }
 
 impl LimitCheck {
-    /// Checks the targets of `axis`, one for each `sync_period`. `wraps` says that the drive goes
-    /// on past the end of its 32-bit position the short way round.
+    /// Checks the targets of `axis`, one for each `sync_period`. `wraps`: the axis keeps moving while the
+    /// drive's 32-bit position wraps around, so targets may exceed 32 bits.
     pub fn new(
         axis: Axis,
         scale: Scale,
@@ -122,9 +122,9 @@ impl LimitCheck {
             )
         };
         let counts = self.scale.counts(target).ok_or_else(does_not_fit)?;
-        // Compared on the grid of counts, along the axis.
-        let on_grid = |value| self.scale.counts(value).map_or(value, |c| self.scale.value(c));
-        self.limits.check_rounded(axis, target, on_grid)?;
+        let to_whole_counts =
+            |value| self.scale.counts(value).map_or(value, |counts| self.scale.value(counts));
+        self.limits.check_rounded(axis, target, to_whole_counts)?;
         if !self.wraps && i32::try_from(counts).is_err() {
             return Err(does_not_fit());
         }

@@ -1,4 +1,4 @@
-//! Between mm or rad and the counts of a drive, without accumulated rounding.
+//! Converts mm or rad to the counts of a drive and back, without accumulating rounding errors.
 //!
 //! Targets are absolute: every conversion starts from the target itself, never from the counts
 //! sent before, so a million increments round no worse than one.
@@ -12,8 +12,8 @@ use toml::Value;
 
 /// Counts per mm (insertion) or per turn (rotation), as a ratio of integers.
 ///
-/// 2000 quanta a turn through a 5.9:1 gear on a 2.54 mm lead screw is 4645.669… counts per mm:
-/// no decimal, but exactly 11800/2.54 = 590000/127.
+/// Example: 2000 encoder counts a turn through a 5.9:1 gear on a 2.54 mm lead screw make 4645.669… counts per
+/// mm. No decimal fraction is exact, but 11800/2.54 = 590000/127 is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CountsRatio {
     counts: NonZeroU32,
@@ -145,8 +145,7 @@ impl Scale {
         self.zero_counts.checked_add(relative)
     }
 
-    /// A distance in counts, with the sign that they have; `None` when it is not finite or does not
-    /// fit 32 bits.
+    /// `distance`, in mm or rad, in counts of the drive; `None` when it is not finite or does not fit 32 bits.
     pub fn relative_counts(&self, distance: f64) -> Option<i32> {
         let from_zero = self.counts(distance)?.checked_sub(self.zero_counts)?;
         i32::try_from(from_zero).ok()
@@ -171,7 +170,7 @@ impl Scale {
     }
 }
 
-/// Carries the 32-bit position of a drive (6064h) on past its wrap.
+/// Extends the 32-bit position of a drive (0x6064) to 64 bits, past its wrap-around.
 ///
 /// Assumes that the axis moves less than half the range, 2³¹ counts, between two readings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -180,12 +179,12 @@ pub struct Unwrapper {
 }
 
 impl Unwrapper {
-    /// Starts at the first reading, taken as it is.
+    /// Starts at the first reading.
     pub const fn new(first: i32) -> Self {
         Unwrapper { counts: first as i64 }
     }
 
-    /// Takes the next reading and gives the position it stands for.
+    /// Takes the next reading and returns the extended position.
     pub const fn unwrap(&mut self, reading: i32) -> i64 {
         // The low 32 bits of the position are the last reading.
         let moved = reading.wrapping_sub(self.counts as i32);

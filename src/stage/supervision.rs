@@ -1,4 +1,4 @@
-//! What the drives and others say, and what of it ends a run.
+//! Takes frames from the drives and from other nodes, and decides which of them stop the run.
 
 use super::machine::Phase;
 use super::{Axis, DriveFlag, Ignored, Stage, StageEvent};
@@ -10,17 +10,17 @@ use crate::canopen::{Frame, NodeId, cob};
 use crate::units::Time;
 
 impl Stage {
-    /// Stops if another master commands the drives. While this stage stops them, `needle-bench stop` may do so
-    /// as well.
+    /// Stops if another master commands the drives. While this stage stops them, that is no fault:
+    /// `needle-bench stop` may stop them as well.
     pub(super) fn watch_for_another_master(&mut self, now: Time, frame: &Frame) {
         if matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped) {
             return;
         }
         let nodes = self.config.nodes();
         let drives = [nodes.insertion, nodes.rotation];
-        if let Some(word) = command_of_another_master(frame, self.config.bus.bench_node, drives) {
+        if let Some(what) = command_of_another_master(frame, self.config.bus.bench_node, drives) {
             let fault = format!(
-                "another master on the bus: {word} ({frame}); stop it, or give it other nodes: two \
+                "another master on the bus: {what} ({frame}); stop it, or give it other nodes: two \
                  masters cannot share an axis"
             );
             self.fail(now, fault);
@@ -69,18 +69,18 @@ impl Stage {
 
     pub(super) fn handle_heartbeat_event(&mut self, now: Time, axis: Axis, event: HeartbeatEvent) {
         if let Some(bring_up) = &mut self.bring_ups[axis] {
-            // A loss means nothing yet: the drive may still have another heartbeat period.
+            // A loss is no fault yet: the drive's heartbeat may still have another period.
             if event == HeartbeatEvent::BootUp {
                 bring_up.handle_boot_up(now);
                 self.drain_bring_ups(now);
             }
             return;
         }
-        // Supervision begins with bring-up.
+        // Heartbeats are supervised only from bring-up on.
         if matches!(self.phase, Phase::Listening { .. }) {
             return;
         }
-        // A heartbeat may still be from before the start command.
+        // The heartbeat may have been sent before the drive took the start command.
         let may_be_old =
             matches!(self.phase, Phase::BringUp | Phase::Standby { .. } | Phase::Enabling { .. });
         let fault = match event {
@@ -106,7 +106,7 @@ impl Stage {
         if self.drives[axis].note_emcy(emcy) {
             self.emit(StageEvent::Emergency(axis, emcy));
         }
-        // What was wrong with a drive before bring-up took its power off shows in its statusword.
+        // Errors from before bring-up took power off are ignored here: bring-up reads the statusword instead.
         let is_watched = self.bring_ups[axis].as_ref().is_none_or(|drive| drive.state().disarmed)
             && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped);
         let is_of_found_fault = self.drives[axis].is_of_found_fault(emcy.code);
@@ -130,15 +130,15 @@ impl Stage {
             return self.ignore(Ignored::Unexpected, frame);
         }
         self.flood.frames -= 1;
-        let was = self.drives[axis].state();
+        let previous = self.drives[axis].state();
         self.drives[axis].take_tpdo(payload, self.sync_count);
-        self.check_statusword(now, axis, was);
+        self.check_statusword(now, axis, previous);
         if self.drives.all(|drive| drive.fresh) {
             self.handle_feedback(now);
         }
     }
 
-    fn check_statusword(&mut self, now: Time, axis: Axis, was: Option<DriveState>) {
+    fn check_statusword(&mut self, now: Time, axis: Axis, previous: Option<DriveState>) {
         let Some(statusword) = self.drives[axis].statusword else { return };
         use DriveState as S;
         let state = statusword.state();
@@ -146,13 +146,13 @@ impl Stage {
         let enabling = matches!(self.phase, Phase::Enabling { .. });
         let must_follow = match self.phase {
             Phase::Ready | Phase::Homing(_) | Phase::Stopping { quick: false, .. } => true,
-            // From the first time that it says so, while it waits for the other, too.
-            Phase::Enabling { .. } => [was, state].contains(&Some(S::OperationEnabled)),
+            // As soon as the drive is in Operation Enabled, even if it still waits for the other drive.
+            Phase::Enabling { .. } => [previous, state].contains(&Some(S::OperationEnabled)),
             _ => false,
         };
         let fell_back = enabling
             && matches!(
-                (was, state),
+                (previous, state),
                 (
                     Some(S::ReadyToSwitchOn | S::SwitchedOn),
                     Some(S::SwitchOnDisabled | S::NotReadyToSwitchOn)
@@ -187,7 +187,7 @@ impl Stage {
         {
             lost_flag_fault(flag, statusword)
         } else if drive.homing_mode {
-            // It follows no target, and its bit 13 is of its homing.
+            // The drive follows no target, and bit 13 means a homing error.
             return;
         } else if state == Some(S::OperationEnabled) && statusword.has(Statusword::FOLLOWING_ERROR)
         {
@@ -202,8 +202,7 @@ impl Stage {
     }
 }
 
-/// Why a drive that went back on its way to Operation Enabled, or did not leave a state in time, stops the
-/// run.
+/// The fault of a drive that, on its way to Operation Enabled, went back or did not leave a state in time.
 pub(super) fn refused_to_switch_on(statusword: Statusword) -> String {
     format!(
         "the drive refused to switch on (statusword {statusword}); check safety input, emergency stop and \
@@ -211,7 +210,7 @@ pub(super) fn refused_to_switch_on(statusword: Statusword) -> String {
     )
 }
 
-/// Why a bit of the statusword that the drive cleared while it was enabled stops the run.
+/// The fault of an enabled drive that has cleared a bit of its statusword.
 fn lost_flag_fault(flag: DriveFlag, statusword: Statusword) -> String {
     match flag {
         DriveFlag::Remote => format!(
@@ -233,9 +232,9 @@ fn lost_flag_fault(flag: DriveFlag, statusword: Statusword) -> String {
 const INITIATE_DOWNLOAD: u8 = 1;
 const BLOCK_DOWNLOAD: u8 = 6;
 
-/// What another master says in a received `frame`: a command to one of `drives`, or a heartbeat under the
-/// node number of `bench`. `None` for any other frame, and for two that change nothing: a request to read
-/// an object, and Start Remote Node.
+/// Names what a received `frame` is if only another master can have sent it: a command to one of `drives`, or
+/// a heartbeat with the node number of `bench`. `None` for any other frame, and for two harmless commands: a
+/// request to read an object, and Start Remote Node.
 fn command_of_another_master(
     frame: &Frame,
     bench: NodeId,
@@ -251,7 +250,7 @@ fn command_of_another_master(
         let is_harmless = command == NmtCommand::StartRemoteNode as u8;
         (is_ours && !is_harmless).then_some("an NMT command")
     } else if cob_id == cob::heartbeat(bench) {
-        // The drives would take it for the bench's, and not miss the bench.
+        // The drives would take it for the bench's heartbeat, and not notice if the bench dies.
         Some("a heartbeat of the bench's own node number")
     } else if is_one_of(cob::rpdo1) {
         Some("RPDO1 of a drive")
@@ -269,9 +268,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_moves_or_rewires_a_drive_is_a_masters_word() {
+    fn what_moves_or_configures_a_drive_is_a_masters_command() {
         let node = |n| NodeId::new(n).unwrap();
-        let word = |id, data: &[u8]| {
+        let command = |id, data: &[u8]| {
             command_of_another_master(&Frame::new(id, data), node(127), [node(1), node(2)])
         };
         let of_a_master: [(u16, &[u8]); 9] = [
@@ -286,9 +285,9 @@ mod tests {
             (0x602, &[0xC2, 0x10, 0x10, 1, 0, 0, 0, 0]),
         ];
         for (id, data) in of_a_master {
-            assert!(word(id, data).is_some(), "{id:03X} {data:?}");
+            assert!(command(id, data).is_some(), "{id:03X} {data:?}");
         }
-        let of_nobody: [(u16, &[u8]); 9] = [
+        let harmless: [(u16, &[u8]); 9] = [
             (0x000, &[0x01, 0]),
             (0x000, &[0x80, 3]),
             (0x000, &[]),
@@ -299,8 +298,8 @@ mod tests {
             (0x77E, &[5]),
             (0x601, &[]),
         ];
-        for (id, data) in of_nobody {
-            assert_eq!(word(id, data), None, "{id:03X} {data:?}");
+        for (id, data) in harmless {
+            assert_eq!(command(id, data), None, "{id:03X} {data:?}");
         }
     }
 }
