@@ -28,7 +28,7 @@ impl Stage {
             Phase::Ready | Phase::Homing(_) => {
                 self.drives.insertion.advance_target();
                 self.drives.rotation.advance_target();
-                self.check_home_in_time(now);
+                self.check_homing_timeout(now);
             }
             Phase::Stopping { quick, give_up } => self.stop(now, quick, give_up),
             Phase::Disabling { quick, standing, give_up } => {

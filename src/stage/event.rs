@@ -1,4 +1,4 @@
-//! What the stage reports to its owner.
+//! What the stage gives to its caller: frames to send, and events.
 
 use super::{Axis, Identity};
 use crate::canopen::cia402::Statusword;
@@ -30,18 +30,18 @@ impl SetPoint {
 pub struct Feedback {
     /// When the SYNC went out.
     pub time: Time,
-    /// Which SYNC, counted from 1.
+    /// The number of the SYNC, counted from 1.
     pub sync: u64,
     /// Where both axes were, the angle counted on over full turns.
     pub measured: SetPoint,
-    /// What this SYNC made their targets.
+    /// The targets that took effect at this SYNC.
     pub commanded: SetPoint,
 }
 
 /// How far the stage has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, derive_more::Display)]
 pub enum Progress {
-    /// Nothing is sent yet; another master would be heard.
+    /// The stage sends nothing yet, and listens for another master.
     #[display("listening for another master")]
     Listening,
     /// A part of a drive's bring-up begins.
@@ -50,7 +50,7 @@ pub enum Progress {
     /// A drive lacks an optional object.
     #[display("{_0}: drive has no {_1}, skipped")]
     Skipped(Axis, ObjectAddress),
-    /// A drive restarted in the middle of its bring-up, which begins anew.
+    /// A drive restarted in the middle of its bring-up, which begins again.
     #[display("{_0}: the drive restarted, its bring-up begins anew")]
     Restarted(Axis),
     /// Both drives are configured; SYNC runs, and they have no power.
@@ -67,17 +67,17 @@ pub enum Progress {
     Disabling,
 }
 
-/// A bit of the statusword that an enabled drive is to show, and whose loss stops the run.
+/// A bit of the statusword that an enabled drive must show, and whose loss stops the run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, derive_more::Display)]
 #[repr(u16)]
 pub enum DriveFlag {
-    /// It obeys the controlword.
+    /// The drive obeys the controlword.
     #[display("bit 9 (remote)")]
     Remote = Statusword::REMOTE,
-    /// Its power stage has its supply.
+    /// The power stage has its supply.
     #[display("bit 4 (voltage enabled)")]
     Voltage = Statusword::VOLTAGE_ENABLED,
-    /// In cyclic synchronous position: it follows its targets.
+    /// In cyclic synchronous position: the drive follows its targets.
     #[display("bit 12 (drive follows command)")]
     FollowsCommand = Statusword::FOLLOWS_COMMAND,
 }
@@ -90,22 +90,23 @@ impl DriveFlag {
 /// Why a frame had no effect.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, derive_more::Display)]
 pub enum Ignored {
-    /// Not from a drive of this stage.
+    /// It is not from a drive of this stage.
     #[display("frame from elsewhere")]
     Foreign,
-    /// With an identifier under which the bench alone sends: SYNC, NMT, its heartbeat, RPDO1 and
-    /// SDO requests of its drives.
+    /// It has an identifier that only the bench sends: SYNC, NMT, the bench's heartbeat, RPDO1 and SDO requests
+    /// of its drives.
     #[display("frame under an identifier of the bench's own, is there another master?")]
     OwnIdentifier,
-    /// From a drive, but of the wrong length.
+    /// It is from a drive, but has the wrong length.
     #[display("frame of the wrong length")]
     WrongLength,
-    /// A TPDO1 before the first SYNC, or a second one after the same SYNC; an SDO answer without a request.
+    /// It is a TPDO1 before the first SYNC, or a second one after the same SYNC, or an SDO answer without a
+    /// request.
     #[display("position without a SYNC, or answer without a question")]
     Unexpected,
 }
 
-/// How often something went wrong that stops nothing by itself.
+/// Counts of irregularities that do not stop the stage by themselves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counters {
     /// Frames without effect, for each [`Ignored`] in the order of its variants.
@@ -116,48 +117,48 @@ pub struct Counters {
     pub syncs_skipped: u64,
 }
 
-/// What happened.
+/// An event of the stage.
 #[derive(Debug, Clone, PartialEq)]
 pub enum StageEvent {
-    /// Something for the operator to follow.
+    /// The stage has come this far.
     Progress(Progress),
-    /// Who a drive is.
+    /// A drive's identity was read.
     Identity(Axis, Identity),
     /// Where both axes stand, before they have power: the moment to refuse a goal
     /// ([`Stage::check_goal`](super::Stage::check_goal)).
     Located(SetPoint),
-    /// Both drives follow their targets: set-points are taken.
+    /// Both drives follow their targets: from now on the stage takes set-points.
     Ready,
     /// Both axes at a SYNC.
     Feedback(Feedback),
     /// An axis has found its home.
     Homed {
-        /// Which.
+        /// The axis.
         axis: Axis,
         /// Where it stands now, mm or rad.
         position: f64,
     },
-    /// A drive's emergency message, error or reset. The same one again and again is told at the
-    /// 1st, 2nd, 4th, 8th … time.
+    /// A drive's emergency message: an error, or its end. A repeated message is reported the 1st, 2nd, 4th,
+    /// 8th … time.
     Emergency(Axis, Emcy),
-    /// A limit inside the drive has begun to hold (statusword bit 11): it goes no further, whatever
-    /// its target.
+    /// A limit inside the drive has become active (statusword bit 11): the axis goes no further, whatever its
+    /// target.
     InternalLimit(Axis),
-    /// A drive that is enabled and ready has not set this bit of its statusword: its loss could not
-    /// be noticed. Told once a bit.
+    /// A drive has not set this bit of its statusword when the stage became ready, so its loss cannot be
+    /// noticed. Reported once for each bit.
     NotShown(Axis, DriveFlag),
-    /// An enabled drive warns (statusword bit 7), and goes on. Told at the 1st, 2nd, 4th, 8th … time.
+    /// An enabled drive has set its warning bit (statusword bit 7). Reported the 1st, 2nd, 4th, 8th … time.
     Warns {
-        /// Whose drive.
+        /// The drive's axis.
         axis: Axis,
-        /// As heard.
+        /// The statusword with this bit.
         statusword: Statusword,
-        /// How often it has begun to.
+        /// How often the drive has set it.
         count: u64,
     },
-    /// A flood begins: so many frames that are no part of the cycle or of the bring-up came within 100 ms.
+    /// A flood begins: this many frames that are no part of the SYNC cycle or of the bring-up came within 100 ms.
     Flood(u64),
-    /// A frame had no effect. Told at the 1st, 2nd, 4th, 8th … of a kind.
+    /// A frame had no effect. Reported for the 1st, 2nd, 4th, 8th … of a kind.
     Ignored {
         /// Why.
         why: Ignored,
@@ -170,22 +171,22 @@ pub enum StageEvent {
     SyncSkipped(u64),
     /// The stage stops for this reason. It never moves again: a new run needs a new stage.
     Fault(String),
-    /// The nodes were told to take power off and to go to Pre-operational, SYNC has ended. The last
-    /// event but for emergency messages.
+    /// The drives were commanded to take power off and to enter Pre-operational, and SYNC has ended. No event
+    /// follows except emergency messages.
     Stopped {
-        /// Both axes were seen to stand before. False after a time-out, and when bring-up ended
-        /// early.
+        /// Both axes were seen to stand before power was taken off. False after a timeout, and when bring-up
+        /// ended early.
         standing: bool,
-        /// Both drives have said that they are without power.
+        /// Both drives have reported a state without power.
         off: bool,
     },
 }
 
-/// What the stage wants done.
+/// An output of the stage.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Output {
-    /// Send this frame now.
+    /// A frame to send now.
     Transmit(Frame),
-    /// Know this.
+    /// Something that has happened.
     Event(StageEvent),
 }

@@ -53,53 +53,56 @@ impl HomingConfig {
     /// Bit 12 in homing mode: homing attained.
     pub const ATTAINED_BIT: u8 = 12;
 
-    /// True if the bit that says so is set in `statusword`.
-    pub(super) fn is_set(&self, statusword: Statusword) -> bool {
+    /// True if `statusword` has the [homed bit](Self::homed_bit) set.
+    pub(super) fn says_homed(&self, statusword: Statusword) -> bool {
         u32::from(statusword.0) >> self.homed_bit.min(31) & 1 != 0
     }
 }
 
-/// After this time the bits of the statusword belong to this homing, if the axis stands, even if they were
-/// never seen to clear: some methods take no time at all, and no drive takes this long to begin.
+/// After this time, if the axis stands, the bits of the statusword are taken for this homing's even if they
+/// were never seen to clear: some methods take no time at all, and no drive takes this long to begin.
 const BEGUN_AFTER: Duration = Duration::from_secs(1);
 
 /// A homing under way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Homing {
     axis: Axis,
-    /// The SYNC that began it, counted from 1.
-    began: u64,
-    since: Time,
-    /// Its bits were seen clear, so that from now on they belong to this homing.
-    cleared: bool,
+    /// The number of the SYNC that starts the homing, counted from 1.
+    first_sync: u64,
+    started: Time,
+    /// The homing bits of the statusword belong to this homing, not to an earlier one.
+    bits_are_valid: bool,
     give_up: Time,
 }
 
 impl Stage {
-    /// Lets `axis` find its home; [`StageEvent::Homed`] says when it has. To be called when the
-    /// stage is [`StageEvent::Ready`], for one axis after the other.
+    /// Starts the homing of `axis`; [`StageEvent::Homed`] reports its end. Call it when the stage is
+    /// [`StageEvent::Ready`], for one axis at a time.
     ///
     /// # Errors
-    /// When the stage is not ready, or `axis` not in homing mode.
+    /// When the stage is not ready, or `axis` is not in homing mode.
     pub fn home(&mut self, now: Time, axis: Axis) -> Result<(), String> {
-        let config = self.config.axis(axis).homing;
-        let (Phase::Ready, Some(config), true) =
-            (self.phase, config, self.drives[axis].homing_mode)
-        else {
+        let homing = self.config.axis(axis).homing.filter(|_| self.drives[axis].homing_mode);
+        let (Phase::Ready, Some(config)) = (self.phase, homing) else {
             return Err("the stage is not ready to home".to_owned());
         };
         self.drives[axis].controlword = Controlword::START_HOMING;
-        let began = self.sync_count + 1;
         self.drives[axis].watch_standstill();
-        let (since, give_up) = (now, now + config.timeout);
-        self.phase = Phase::Homing(Homing { axis, began, since, cleared: false, give_up });
+        self.phase = Phase::Homing(Homing {
+            axis,
+            first_sync: self.sync_count + 1,
+            started: now,
+            bits_are_valid: false,
+            give_up: now + config.timeout,
+        });
         Ok(())
     }
 
-    pub(super) fn check_home_in_time(&mut self, now: Time) {
-        let Phase::Homing(Homing { axis, since, give_up, .. }) = self.phase else { return };
+    /// Stops with a fault if the homing under way has timed out.
+    pub(super) fn check_homing_timeout(&mut self, now: Time) {
+        let Phase::Homing(Homing { axis, started, give_up, .. }) = self.phase else { return };
         if now >= give_up {
-            let timeout_s = give_up.since(since).as_secs_f64();
+            let timeout_s = give_up.since(started).as_secs_f64();
             let statusword = self.drives[axis].statusword.unwrap_or_default();
             let fault = format!(
                 "{axis}: not home within {timeout_s:.1} s (statusword {statusword}); is the switch too \
@@ -109,26 +112,26 @@ impl Stage {
         }
     }
 
-    /// Judges the statusword of this SYNC. Until its bits were seen to clear, they may belong to an earlier
-    /// homing; so may the statusword of the SYNC that began this one.
+    /// Takes the statusword of this SYNC. Until its homing bits were seen clear, they may belong to an earlier
+    /// homing. The statusword of the SYNC that starts this homing is ignored for the same reason.
     pub(super) fn watch_homing(&mut self, now: Time, mut homing: Homing) {
-        let Homing { axis, began, since, .. } = homing;
-        if self.sync_count <= began {
+        let Homing { axis, first_sync, started, .. } = homing;
+        if self.sync_count <= first_sync {
             return;
         }
         let Some(statusword) = self.drives[axis].statusword else { return };
-        let over =
-            statusword.has(Statusword::HOMING_ATTAINED) || statusword.has(Statusword::HOMING_ERROR);
-        let has_begun = now.since(since) >= BEGUN_AFTER && self.drives[axis].stands();
-        homing.cleared |= !over || has_begun;
+        let has_failed = statusword.has(Statusword::HOMING_ERROR);
+        let has_ended = has_failed || statusword.has(Statusword::HOMING_ATTAINED);
+        let must_have_begun = now.since(started) >= BEGUN_AFTER && self.drives[axis].stands();
+        homing.bits_are_valid |= !has_ended || must_have_begun;
         self.phase = Phase::Homing(homing);
-        if homing.cleared && statusword.has(Statusword::HOMING_ERROR) {
+        if homing.bits_are_valid && has_failed {
             let fault = format!(
                 "{axis}: homing failed (statusword {statusword}); check switches, method (0x6098) and \
                  speeds"
             );
             self.fail(now, fault);
-        } else if homing.cleared && is_home(statusword) {
+        } else if homing.bits_are_valid && is_home(statusword) {
             self.drives[axis].controlword = Controlword::ENABLE_OPERATION;
             let position = self.drives[axis].take_home();
             self.phase = Phase::Ready;
@@ -137,7 +140,7 @@ impl Stage {
     }
 }
 
-/// Attained, and standing.
+/// True if the homing has succeeded and the axis stands (CiA 402-2, bits 12 and 10 in homing mode).
 fn is_home(statusword: Statusword) -> bool {
     statusword.has(Statusword::HOMING_ATTAINED) && statusword.has(Statusword::TARGET_REACHED)
 }

@@ -268,7 +268,7 @@ impl Script {
             self.set_mode(Mode::HOMING).await?;
         }
         let statusword = self.read_statusword().await?;
-        match homing.is_set(statusword) {
+        match homing.says_homed(statusword) {
             false => Err(format!(
                 "not homed (statusword {statusword}, bit {} clear), home it first: needle-bench stage \
                  home",

@@ -113,7 +113,7 @@ async fn read_status(sdo: Sdo, axis: Axis, config: AxisConfig) -> Result<AxisSta
 /// other mode.
 fn is_homed(homing: HomingConfig, statusword: Statusword, mode: Option<Mode>) -> Option<bool> {
     let is_valid = homing.homed_bit != HomingConfig::ATTAINED_BIT || mode == Some(Mode::HOMING);
-    is_valid.then_some(homing.is_set(statusword))
+    is_valid.then_some(homing.says_homed(statusword))
 }
 
 /// A drive leaves Fault within this time, or stays there.
