@@ -89,8 +89,8 @@ impl<T> IndexMut<Axis> for PerAxis<T> {
     }
 }
 
-/// What an axis does in 30 ms at its highest speed: a servo's lag, where no following-error window
-/// is configured.
+/// Lag of a servo: without a configured following-error window, the window is the travel in this time at the
+/// highest speed.
 const FOLLOWING_LAG: Duration = Duration::from_millis(30);
 
 const IDENTITY: Rule = Rule::Or("any", "a 32-bit whole number");
@@ -194,7 +194,7 @@ section! {
 }
 
 impl RawSdo {
-    /// The object, and what to write to it.
+    /// The object, and the value to write to it.
     ///
     /// # Errors
     /// The value does not fit the bits.
@@ -208,7 +208,7 @@ impl RawSdo {
 }
 
 impl AxisConfig {
-    /// How far the drive may be from where it is to be, mm or rad.
+    /// The drive's following-error window: how far its position may be from its demand, mm or rad.
     pub fn following_error_window(&self) -> f64 {
         let lag = self.limits.speed_max * FOLLOWING_LAG.as_secs_f64();
         self.following_error_max.unwrap_or(lag)
@@ -217,14 +217,14 @@ impl AxisConfig {
     /// How far the measured position may be from the target at a SYNC, mm or rad: more stops the
     /// run.
     ///
-    /// To the drive's own window comes what the target does in two SYNC periods: the axis is at the
-    /// target of one SYNC no sooner than at the next, and drives that interpolate take one more.
+    /// This is the drive's own window and the travel of the target in two SYNC periods: the axis reaches the
+    /// target of one SYNC at the next at the earliest, and a drive that interpolates takes one more.
     pub fn following_error_limit(&self, sync_period: Duration) -> f64 {
-        let way = self.limits.speed_max * 2.0 * sync_period.as_secs_f64();
-        self.following_error_window() + way
+        let travel = self.limits.speed_max * 2.0 * sync_period.as_secs_f64();
+        self.following_error_window() + travel
     }
 
-    /// The scale of `axis` whose zero is as configured, or at `here_counts`.
+    /// The scale of `axis`. Its zero is the configured one, or `here_counts` if none is configured.
     pub fn scale(&self, axis: Axis, here_counts: i64) -> Scale {
         let zero_counts = self.zero.map_or(here_counts, i64::from);
         Scale::new(axis, self.ratio, self.sign, zero_counts)
@@ -296,8 +296,8 @@ pub struct StageConfig {
     pub bus: BusConfig,
     /// How power is switched on and off.
     pub power: PowerConfig,
-    /// How long another master is listened for before the first frame is sent: as long as the
-    /// heartbeat of a living one may be late.
+    /// How long the stage listens for another master before it sends its first frame: the longest interval
+    /// between two heartbeats of a master that is alive.
     pub listen_first: Duration,
     /// The insertion axis.
     pub insertion: AxisConfig,
@@ -314,7 +314,7 @@ impl StageConfig {
         }
     }
 
-    /// How long the counts of `axis` are watched to see that it stands.
+    /// How long the position of `axis` must be watched to see that it stands.
     pub fn standstill_window(&self, axis: Axis) -> Duration {
         self.standstill(axis).window(self.bus.sync_period())
     }
@@ -328,10 +328,10 @@ impl StageConfig {
         PerAxis { insertion: self.insertion.node, rotation: self.rotation.node }
     }
 
-    /// Checks what the types do not.
+    /// Checks what the ranges of the keys cannot express.
     ///
     /// # Errors
-    /// The first thing that the stage cannot work with.
+    /// The first setting that the stage cannot work with.
     pub fn validate(&self) -> Result<(), String> {
         let PerAxis { insertion, rotation } = self.nodes();
         let nodes = [insertion, rotation, self.bus.bench_node];
@@ -341,18 +341,16 @@ impl StageConfig {
                 "node {node} is used twice among the bench, insertion and rotation"
             ));
         }
-        let BusConfig {
-            sync_ms, heartbeat_ms: period_ms, heartbeat_timeout_ms: timeout_ms, ..
-        } = self.bus;
+        let BusConfig { sync_ms, heartbeat_ms, heartbeat_timeout_ms, .. } = self.bus;
         if !(1..=255).contains(&sync_ms) {
             return Err(format!(
                 "a SYNC period of {sync_ms} ms does not fit object 0x60C2: 1 to 255 ms"
             ));
         }
-        if period_ms == 0 || timeout_ms <= period_ms {
+        if heartbeat_ms == 0 || heartbeat_timeout_ms <= heartbeat_ms {
             return Err(format!(
-                "heartbeat every {period_ms} ms, lost after {timeout_ms} ms: 1 to 65535 ms, and the \
-                 second must be the longer"
+                "heartbeat every {heartbeat_ms} ms (can.heartbeat_ms) and timeout {heartbeat_timeout_ms} ms \
+                 (can.heartbeat_timeout_ms): the timeout must be longer than the period, and both over 0"
             ));
         }
         Axis::BOTH.into_iter().try_for_each(|axis| self.validate_axis(axis))
@@ -363,8 +361,8 @@ impl StageConfig {
         let config = self.axis(axis);
         let AxisLimits { min, max, speed_max, acceleration_max } = config.limits;
         let rates = [speed_max, acceleration_max.unwrap_or(1.0)];
-        let range_ok = min.is_finite() && max.is_finite() && min < max;
-        if !range_ok || rates.iter().any(|rate| !rate.is_finite() || *rate <= 0.0) {
+        let is_range = min.is_finite() && max.is_finite() && min < max;
+        if !is_range || !rates.iter().all(|rate| rate.is_finite() && *rate > 0.0) {
             let [min, max, speed] = [min, max, speed_max].map(|value| axis.shown(value));
             return Err(format!(
                 "{axis}: limits {min} to {max}, {speed}/s: range, speed and acceleration_max must be \
@@ -375,25 +373,25 @@ impl StageConfig {
         if config.reference == Reference::Homing && homing.is_none() {
             return Err(no_homing(axis));
         }
+        let default_window = match config.following_error_max {
+            Some(_) => String::new(),
+            None => format!(
+                "; it is that of 30 ms at the highest speed: set following_error_{}",
+                axis.unit()
+            ),
+        };
+        let window = Some(config.following_error_window());
         let values = [
-            (Some(config.following_error_window()), FOLLOWING_ERROR, ""),
-            (config.quick_stop_deceleration, "a quick-stop deceleration", "/s²"),
-            (homing.and_then(|homing| homing.speed_switch), "a homing speed", "/s"),
-            (homing.and_then(|homing| homing.speed_zero), "a homing speed", "/s"),
-            (homing.and_then(|homing| homing.acceleration), "a homing acceleration", "/s²"),
+            (window, "a following error", "", default_window.as_str()),
+            (config.quick_stop_deceleration, "a quick-stop deceleration", "/s²", ""),
+            (homing.and_then(|homing| homing.speed_switch), "a homing speed", "/s", ""),
+            (homing.and_then(|homing| homing.speed_zero), "a homing speed", "/s", ""),
+            (homing.and_then(|homing| homing.acceleration), "a homing acceleration", "/s²", ""),
         ];
         let scale = config.scale(axis, 0);
-        for (value, what, per) in values {
+        for (value, what, per, hint) in values {
             if let Some(value) = value.filter(|value| unsigned_counts(scale, *value).is_none()) {
                 let (value, unit) = axis.in_unit(value);
-                let hint = match config.following_error_max {
-                    None if what == FOLLOWING_ERROR => {
-                        format!(
-                            "; it is that of 30 ms at the highest speed: set following_error_{unit}"
-                        )
-                    }
-                    _ => String::new(),
-                };
                 return Err(format!(
                     "{axis}: {what} of {value} {unit}{per}: less than half a count, or more than 32 bits \
                      hold{hint}"
@@ -407,7 +405,7 @@ impl StageConfig {
                 "{axis}: a home offset of {offset}: more than 32 bits hold in counts"
             ));
         }
-        // It brakes first, and the last SYNC counts when the next is due.
+        // The axis brakes first, and the answer to a SYNC counts only when the next is due.
         let needed = self.standstill_window(axis) + 2 * self.bus.sync_period();
         if needed >= self.power.stop_timeout {
             return Err(format!(
@@ -421,16 +419,13 @@ impl StageConfig {
     }
 }
 
-/// What a following-error window is called in an error.
-const FOLLOWING_ERROR: &str = "a following error";
-
-/// An axis is to be homed, and no homing is configured.
+/// The error of an axis that needs homing, for which none is configured.
 pub(super) fn no_homing(axis: Axis) -> String {
     format!("{axis}: its position is to come from homing, and no homing is configured")
 }
 
-/// `value`, in mm or rad (a second, a second squared), in the counts of an unsigned object; `None`
-/// when that would be 0, or not fit.
+/// `value`, in mm or rad (per second, per second squared), in counts for an unsigned 32-bit object; `None` if
+/// they round to 0 or do not fit.
 pub(super) fn unsigned_counts(scale: Scale, value: f64) -> Option<u32> {
     let counts = (value * scale.counts_per_unit()).round();
     (1.0..=f64::from(u32::MAX)).contains(&counts).then_some(counts as u32)

@@ -23,11 +23,11 @@ pub(super) const TPDO1: [MappedObject; 2] =
 
 /// CiA 402, the low word of 0x1000.
 const DRIVE_PROFILE: u16 = 402;
-/// SYNC is on the usual identifier, and made by the bench alone (bit 30: the node makes it).
+/// The bits of 0x1005 that are checked: the identifier, and bit 30, which makes the node produce SYNC.
 const SYNC_BITS: u32 = 0x4000_07ff;
 
 impl Script {
-    /// Brings the drive up, to be moved in cyclic synchronous position or to be homed. Gives where the
+    /// Brings the drive up, to be moved in cyclic synchronous position or to be homed. Returns where the
     /// axis stands (0x6064).
     pub(super) async fn run(self) -> Result<i32, String> {
         self.find().await?;
@@ -41,7 +41,7 @@ impl Script {
         self.seed_target().await
     }
 
-    /// Reads until the drive answers: is it a CiA 402 drive?
+    /// Reads the device type until the drive answers, and checks that it is a CiA 402 drive.
     async fn find(&self) -> Result<(), String> {
         self.begin("looking for the drive");
         let boot_timeout = self.config.bus.boot_timeout;
@@ -86,7 +86,7 @@ impl Script {
         let vendor = self.read_identity(1, self.drive().vendor_id).await?;
         let product = self.read_identity(2, self.drive().product_code).await?;
         self.note(|so_far| so_far.identified = true);
-        // Not a reset: the drive may hold a load.
+        // The node is not reset: the drive may hold a load.
         self.sdo.leave_operational();
         let revision = self.read(optional(identity(3))).await?.map(SdoValue::to_u32);
         let serial = self.read(optional(identity(4))).await?.map(SdoValue::to_u32);
@@ -143,7 +143,7 @@ impl Script {
         ))
     }
 
-    /// Reads the statusword until the motor has no power: a brake may take its time.
+    /// Reads the statusword until the motor has no power, which takes some time with a brake.
     async fn wait_for_power_off(&self) -> Result<Statusword, String> {
         let give_up = self.sdo.now() + self.config.power.enable_timeout;
         loop {
@@ -166,19 +166,20 @@ impl Script {
         Ok(Statusword(value.map_or(0, SdoValue::to_u32) as u16))
     }
 
-    /// Writes the raw objects of the configuration, then what it gives in mm or rad.
+    /// Writes the raw objects of the configuration, then its settings that have objects of their own.
     async fn configure(&self) -> Result<(), String> {
         self.begin("writing the configured objects");
         let config = self.drive();
         for raw in &config.sdo {
             let (object, value) = raw.to_write()?;
-            match raw.read_back {
-                true => self.write(object, value).await?,
-                false => self.write_unchecked(object, value).await?,
+            if raw.read_back {
+                self.write(object, value).await?;
+            } else {
+                self.write_unchecked(object, value).await?;
             }
         }
         if let Some(timeout_ms) = config.following_error_timeout_ms {
-            // A drive without it does not wait.
+            // A drive without this object faults at once.
             self.write(optional(drive::FOLLOWING_ERROR_TIMEOUT), timeout_ms).await?;
         }
         let window = Some(config.following_error_window());
@@ -202,7 +203,7 @@ impl Script {
         self.write(PRODUCER_HEARTBEAT, self.config.bus.heartbeat_ms).await?;
         self.write(consumer_heartbeat(1), watched).await?;
         match config.communication_error_behaviour {
-            // A node without it behaves as by 0.
+            // A node without this object behaves as if it were 0.
             0 => self.write(optional(COMMUNICATION_ERROR_BEHAVIOUR), 0_u8).await?,
             behaviour => self.write(COMMUNICATION_ERROR_BEHAVIOUR, behaviour).await?,
         }
@@ -246,7 +247,7 @@ impl Script {
         Ok(())
     }
 
-    /// Sets bit 31 of a COB-ID and leaves the others, which may not change while it is clear.
+    /// Sets bit 31 of a COB-ID. The other bits stay as they are: they must not change while bit 31 is clear.
     async fn disable_pdo(&self, object: Object) -> Result<(), String> {
         match self.read(object).await?.map(SdoValue::to_u32) {
             Some(cob_id) if PdoCobId(cob_id).is_valid() => {
@@ -263,19 +264,18 @@ impl Script {
             return Ok(());
         };
         self.begin("checking that it is homed");
-        // Bit 12 says it in homing mode alone, and so the drive is asked in that mode, without power.
+        // Bit 12 means "homed" only in homing mode, so the statusword is read in that mode, without power.
         if homing.homed_bit == HomingConfig::ATTAINED_BIT {
             self.set_mode(Mode::HOMING).await?;
         }
         let statusword = self.read_statusword().await?;
-        match homing.says_homed(statusword) {
-            false => Err(format!(
-                "not homed (statusword {statusword}, bit {} clear), home it first: needle-bench stage \
-                 home",
-                homing.homed_bit
-            )),
-            true => Ok(()),
+        if homing.says_homed(statusword) {
+            return Ok(());
         }
+        Err(format!(
+            "not homed (statusword {statusword}, bit {} clear), home it first: needle-bench stage home",
+            homing.homed_bit
+        ))
     }
 
     async fn set_modes(&self) -> Result<(), String> {
@@ -317,7 +317,7 @@ impl Script {
         })?;
         let (min, max) = (drive::SOFTWARE_LIMIT_MIN, drive::SOFTWARE_LIMIT_MAX);
         if self.drive().wraps {
-            // An axis that goes round has no limits. Limits left from another use of the drive would stop it.
+            // A wrapping axis needs no limits in the drive. Limits from an earlier use of the drive would stop it.
             self.write(optional(min), i32::MIN).await?;
             self.write(optional(max), i32::MAX).await?;
         } else if !self.homing_mode {
@@ -331,8 +331,8 @@ impl Script {
         Ok(position)
     }
 
-    /// The drive's own limits, counts: the soft limits, and beyond them what the axis may be from its
-    /// target. The bench's limits refuse; these hold when the bench does not.
+    /// The drive's own limits, counts: the soft limits, widened by the following-error window. They stop the
+    /// axis if the bench fails to refuse a target.
     fn limit_counts(&self, position: i32) -> [i32; 2] {
         let config = self.drive();
         let AxisConfig { limits, sign, .. } = config;
@@ -343,12 +343,13 @@ impl Script {
             Sign::Positive => ends,
             Sign::Negative => [ends[1], ends[0]],
         };
-        let fitting = |counts: Option<i64>| counts.and_then(|counts| i32::try_from(counts).ok());
-        [fitting(lower).unwrap_or(i32::MIN), fitting(upper).unwrap_or(i32::MAX)]
+        let to_i32 = |counts: Option<i64>| counts.and_then(|counts| i32::try_from(counts).ok());
+        [to_i32(lower).unwrap_or(i32::MIN), to_i32(upper).unwrap_or(i32::MAX)]
     }
 }
 
-/// A value, in mm or rad, that `object` cannot hold in counts; the configuration is checked for such.
+/// The error of a `value`, in mm or rad, that `object` cannot hold in counts. [`StageConfig::validate`](super::StageConfig::validate) refuses
+/// such a configuration.
 fn unfit(object: ObjectAddress, value: f64) -> String {
     format!("{object} cannot hold {value} in counts")
 }
