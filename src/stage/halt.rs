@@ -1,9 +1,9 @@
 //! Stopping both axes from outside a run: quick stop, standstill, power off.
 //!
-//! Both nodes leave Operational first, so that no master's PDO can cancel the stop. Then both drives get
-//! quick stop by SDO. Their identities are not checked: whatever has these node numbers must stop. Power
-//! is taken off in the end, whatever a drive reports and also if it reports nothing. A command that is
-//! not obeyed is repeated.
+//! Both nodes leave Operational first, so that no master's PDO can cancel the stop. Then both drives are
+//! commanded to quick stop by SDO. Their identities are not checked: any node with these numbers must stop. At
+//! the end power is taken off, whatever a drive reports, and even if it reports nothing. A command that is not
+//! obeyed is repeated.
 //!
 //! [`Halt::watch`] reads the same objects and writes nothing: it shows whether drives stop by themselves.
 
@@ -19,10 +19,10 @@ use crate::canopen::sdo::codec::ClientFrame;
 use crate::canopen::sdo::{SdoRequest, SdoValue};
 use crate::units::Time;
 
-/// Interval between two readings of a drive.
-const LOOK_PERIOD: Duration = Duration::from_millis(20);
+/// Interval between two reads of a drive.
+const READ_PERIOD: Duration = Duration::from_millis(20);
 
-/// Stops both axes, or watches them stop; gives where each stands, counts.
+/// Stops both axes, or watches them stop; returns where each stands, counts.
 pub type Halt = WithBothDrives<i32>;
 
 impl Halt {
@@ -30,9 +30,9 @@ impl Halt {
     pub fn new(config: &StageConfig, now: Time) -> Self {
         let give_up = now + config.power.stop_timeout;
         let nodes = config.nodes();
-        let leave = [nodes.insertion, nodes.rotation]
+        let leave_operational = [nodes.insertion, nodes.rotation]
             .map(|node| nmt_frame(NmtCommand::EnterPreOperational, Some(node)));
-        WithBothDrives::begin(leave, |axis| {
+        WithBothDrives::begin(leave_operational, |axis| {
             let drive = AxisHalt::new(config, axis, now, give_up);
             ScriptRunner::begin(&drive.sdo.clone(), now, drive.stop())
         })
@@ -48,11 +48,11 @@ impl Halt {
         })
     }
 
-    /// Where `axis` stands, counts, out of Operation Enabled: without power unless it was only
-    /// watched. `None` while that is not known yet.
+    /// Where `axis` stands, counts. The drive has left Operation Enabled, and has no power unless it was only
+    /// watched. `None` until the end.
     ///
     /// # Errors
-    /// What was not confirmed.
+    /// The axis was not seen to stand, or its power not to be off.
     pub fn result(&self, axis: Axis) -> Option<Result<i32, String>> {
         self.outcome(axis)
     }
@@ -61,11 +61,12 @@ impl Halt {
 #[derive(Debug)]
 struct AxisHalt {
     sdo: Sdo,
-    /// A request failed: from now on each command is also sent at once, see [`AxisHalt::command`].
-    is_unanswered: bool,
+    /// A request has failed: from now on each command is also sent at once, see [`AxisHalt::command`].
+    request_failed: bool,
+    /// When to give up waiting for the axis to stand.
     give_up: Time,
-    /// Until then a drive that keeps its power is commanded again to take it off.
-    off_by: Time,
+    /// When to give up waiting for power to be off.
+    give_up_power_off: Time,
     standstill: Standstill,
 }
 
@@ -73,9 +74,9 @@ impl AxisHalt {
     fn new(config: &StageConfig, axis: Axis, now: Time, give_up: Time) -> Self {
         AxisHalt {
             sdo: Sdo::new(config, axis),
-            is_unanswered: false,
+            request_failed: false,
             give_up,
-            off_by: now + config.power.stop_timeout * 2,
+            give_up_power_off: now + config.power.stop_timeout * 2,
             standstill: config.standstill(axis),
         }
     }
@@ -89,7 +90,7 @@ impl AxisHalt {
         result
     }
 
-    /// Waits until the axis has left Operation Enabled and stands; gives its position, counts. `command` is
+    /// Waits until the axis has left Operation Enabled and stands; returns its position, counts. `command` is
     /// repeated until the axis has left Operation Enabled.
     async fn come_to_stand(&mut self, command: Option<Controlword>) -> Result<i32, String> {
         let node = self.sdo.node();
@@ -102,14 +103,14 @@ impl AxisHalt {
                 break;
             }
             let trouble = format!("node {node} stays in operation enabled ({word})");
-            self.wait_to_look_again(trouble).await?;
+            self.wait_to_read_again(trouble).await?;
         }
-        let (mut position, mut seen) = (Unwrapper::new(0), None);
+        let (mut position, mut last_read) = (Unwrapper::new(0), None);
         loop {
             let position_actual = self.sdo.read_at_least(object::POSITION_ACTUAL, 4).await;
-            let counts = position_actual.inspect_err(|_| self.is_unanswered = true)? as i32;
+            let counts = position_actual.inspect_err(|_| self.request_failed = true)? as i32;
             let (position_counts, now) = (position.unwrap(counts), self.sdo.now());
-            match seen.replace(now) {
+            match last_read.replace(now) {
                 Some(before) => self.standstill.take(position_counts, now.since(before)),
                 None => self.standstill.watch_from(position_counts),
             }
@@ -117,7 +118,7 @@ impl AxisHalt {
                 return Ok(counts);
             }
             let trouble = format!("node {node} was not seen to stand, at {counts} counts");
-            self.wait_to_look_again(trouble).await?;
+            self.wait_to_read_again(trouble).await?;
         }
     }
 
@@ -137,10 +138,10 @@ impl AxisHalt {
                 }
                 Err(error) => error,
             };
-            if self.sdo.now() >= self.off_by {
+            if self.sdo.now() >= self.give_up_power_off {
                 return Err(format!("{trouble}: power off was not seen, press the emergency stop"));
             }
-            self.sdo.pause(LOOK_PERIOD).await;
+            self.sdo.pause(READ_PERIOD).await;
         }
     }
 
@@ -148,31 +149,31 @@ impl AxisHalt {
     async fn command(&mut self, word: Controlword) -> Result<(), String> {
         let (object, value) = (object::CONTROLWORD, SdoValue::from(word.0));
         loop {
-            // After a request without an answer the client first reads another object, and sends the
-            // command only when that is answered. So it is sent here at once, too.
-            if self.is_unanswered {
+            // After an unanswered request the SDO client first reads another object, and sends the command only
+            // when that is answered. So the command is also sent here, at once.
+            if self.request_failed {
                 let request = SdoRequest::Download(object, value);
                 self.sdo.send(ClientFrame::Request(request).to_frame(self.sdo.node()));
             }
             let Err(error) = self.sdo.write(object, value).await else { return Ok(()) };
-            self.is_unanswered = true;
+            self.request_failed = true;
             if self.sdo.now() >= self.give_up {
                 return Err(error);
             }
-            self.sdo.pause(LOOK_PERIOD).await;
+            self.sdo.pause(READ_PERIOD).await;
         }
     }
 
     async fn statusword(&mut self) -> Result<Statusword, String> {
-        self.sdo.statusword().await.inspect_err(|_| self.is_unanswered = true)
+        self.sdo.statusword().await.inspect_err(|_| self.request_failed = true)
     }
 
-    /// Waits before the next look. Once there is no more time to look, `trouble` is the error.
-    async fn wait_to_look_again(&self, trouble: String) -> Result<(), String> {
+    /// Waits before the next read. Once the time is over, `trouble` is the error.
+    async fn wait_to_read_again(&self, trouble: String) -> Result<(), String> {
         if self.sdo.now() >= self.give_up {
             return Err(trouble);
         }
-        self.sdo.pause(LOOK_PERIOD).await;
+        self.sdo.pause(READ_PERIOD).await;
         Ok(())
     }
 }

@@ -4,36 +4,36 @@
 //! Hand a [`Stage`] every frame received ([`Stage::handle_frame`]) and the time at its
 //! [`Stage::deadline`] ([`Stage::handle_timeout`]). After each, drain [`Stage::poll`] to `None`, and send
 //! the frames in order and at once. Before you hand in the time, hand in every frame that was received
-//! before it: a bench that was held up would otherwise take unread frames for missing ones. The stage
+//! before it: a late bench would otherwise take frames that it has not read for missing ones. The stage
 //! touches no clock and no socket.
 //!
 //! The stage listens first, for as long as a heartbeat may be late. If another master commands these
-//! drives, the stage ends without sending anything; if one begins to do so later, it stops with a fault.
+//! drives, the stage ends without sending anything. If one begins to do so later, that is a fault.
 //!
-//! It brings both drives up over SDO and reads every object back. Then it starts SYNC, enables both drives
-//! together, their targets where they stand, and reports [`StageEvent::Ready`]. From then on it sends
-//! RPDO1 to both axes (controlword and target) and SYNC, at absolute deadlines. If it is late by whole
+//! The stage brings both drives up over SDO and reads every object back. Then it starts SYNC, enables both
+//! drives together, each with its position as its target, and reports [`StageEvent::Ready`]. From then on it
+//! sends RPDO1 to both axes (controlword and target) and SYNC, at absolute deadlines. If it is late by whole
 //! periods it skips and counts them; it never sends a burst. It awaits both TPDO1 (statusword and position,
-//! latched at that SYNC) until the next deadline. When both are in, it reports one [`Feedback`] at once.
+//! sampled at that SYNC) until the next deadline. When both have come, it reports one [`Feedback`] at once.
 //!
-//! [`Stage::command`] takes the targets for the next SYNC, for both axes or neither: only while the stage is
-//! ready, only while the positions at the last SYNC are known, only within the soft limits. Without a
+//! [`Stage::command`] sets the targets of both axes for the next SYNC. It refuses them unless the stage is
+//! ready, both positions at the last SYNC are known, and both targets are within the soft limits. Without a
 //! command the axes are held.
 //!
-//! A [`StageEvent::Fault`] is reported once and quick-stops both axes. SYNC goes on until they are seen to
-//! stand, or until a timeout; then power is taken off, the nodes are sent to Pre-operational and
+//! A [`StageEvent::Fault`] is reported once and quick-stops both axes. SYNC continues until both are seen to
+//! stand, or until a timeout. Then power is taken off, the nodes are sent to Pre-operational and
 //! [`StageEvent::Stopped`] is reported. A drive that does not obey is commanded again by SDO every 100 ms.
-//! An orderly end ([`Stage::disable`]) that times out is such a fault, too. The stage never moves again: a
+//! If an orderly end ([`Stage::disable`]) times out, that is such a fault, too. The stage never moves again: a
 //! new run needs a new stage.
 //!
-//! The bench's heartbeat, which the drives watch, begins when the listening ends and lasts as long as the
-//! stage. In the end, drives known to be without power are configured to watch it no more.
+//! The bench's heartbeat, which the drives monitor, begins when the listening ends and lasts as long as the
+//! stage. When the stage ends, drives known to be without power are configured to monitor it no longer.
 //!
-//! Frames of the wrong length, from elsewhere, or without a SYNC are counted and have no other effect. A
-//! TPDO carries no stamp, so one that comes after the next SYNC is taken for that SYNC's answer. The answer
-//! that follows is then the one that is counted; if it differs, SYNC after SYNC, there is a second sender,
-//! which is a fault. A drive whose every answer is late by a whole period cannot be told from one that is
-//! on time.
+//! Frames of the wrong length, from other nodes, or without a SYNC are counted and have no other effect. A
+//! TPDO carries no timestamp, so one that comes after the next SYNC is taken for the answer to that SYNC. The
+//! real answer, which follows, is then ignored and counted. If the two differ after several SYNCs in a row,
+//! there is a second sender, which is a fault. A drive whose every answer is late by a whole period cannot be
+//! distinguished from one that is on time.
 
 mod bring_up;
 mod config;

@@ -1,5 +1,5 @@
-//! Reads the status of both drives by SDO, writing nothing; and resets their faults on purpose. Nothing gets
-//! power by either.
+//! Reads the status of both drives by SDO, which writes nothing, and resets their faults on request. Neither
+//! gives a drive power.
 
 use super::dialogue::{ScriptRunner, Sdo, WithBothDrives};
 use super::drive::may_have_power;
@@ -13,7 +13,7 @@ use crate::canopen::sdo::SdoValue;
 use crate::units::Time;
 use std::time::Duration;
 
-/// The most entries read of an error history.
+/// At most this many entries of an error history are read.
 const HISTORY_MAX: u32 = 8;
 
 /// The status of one drive; `None` for an object that the drive lacks.
@@ -45,7 +45,7 @@ pub struct AxisStatus {
     pub nmt_state: Option<NmtState>,
 }
 
-/// Reads the status of both drives, side by side.
+/// Reads the status of both drives at the same time.
 pub type StatusReader = WithBothDrives<AxisStatus>;
 
 impl StatusReader {
@@ -109,21 +109,21 @@ async fn read_status(sdo: Sdo, axis: Axis, config: AxisConfig) -> Result<AxisSta
     })
 }
 
-/// Whether the axis is homed. Bit 12 (homing attained) means that only in homing mode: `None` in any
-/// other mode.
+/// Whether the axis is homed; `None` if the present mode does not show it: bit 12 (homing attained) means that
+/// in homing mode only.
 fn is_homed(homing: HomingConfig, statusword: Statusword, mode: Option<Mode>) -> Option<bool> {
     let is_valid = homing.homed_bit != HomingConfig::ATTAINED_BIT || mode == Some(Mode::HOMING);
     is_valid.then_some(homing.says_homed(statusword))
 }
 
-/// A drive leaves Fault within this time, or stays there.
-const SETTLE: Duration = Duration::from_millis(200);
+/// A drive that a reset leads out of Fault leaves it within this time.
+const RESET_TIME: Duration = Duration::from_millis(200);
 
-/// Resets both drives, side by side; gives their statuswords after it.
+/// Resets the faults of both drives at the same time; returns their statuswords after it.
 pub type Reset = WithBothDrives<Statusword>;
 
 impl Reset {
-    /// Begins to reset at `now`.
+    /// Begins the reset at `now`.
     pub fn new(config: &StageConfig, now: Time) -> Self {
         WithBothDrives::begin([], |axis| {
             let sdo = Sdo::new(config, axis);
@@ -131,10 +131,10 @@ impl Reset {
         })
     }
 
-    /// The state of the drive of `axis` after the reset.
+    /// The statusword of the drive of `axis` after the reset.
     ///
     /// # Errors
-    /// Why it was not reset: it does not answer, has power, or its cause is still there.
+    /// The drive does not answer, has power, or stays in Fault because the cause is still there.
     pub fn result(&self, axis: Axis) -> Result<Statusword, String> {
         let interrupted = || Err(format!("{axis}: the reset did not come to its end"));
         self.outcome(axis).unwrap_or_else(interrupted)
@@ -146,13 +146,13 @@ async fn reset(sdo: Sdo) -> Result<Statusword, String> {
     if may_have_power(word.state()) {
         return Err(format!("node {node} has power ({word}): stop it first, needle-bench stop"));
     }
-    // The drive takes the rising edge of the reset bit.
+    // A rising edge of bit 7 resets the fault.
     for word in
         [Controlword::DISABLE_VOLTAGE, Controlword::FAULT_RESET, Controlword::DISABLE_VOLTAGE]
     {
         sdo.write(object::CONTROLWORD, SdoValue::from(word.0)).await?;
     }
-    sdo.pause(SETTLE).await;
+    sdo.pause(RESET_TIME).await;
     let word = sdo.statusword().await?;
     if word.is_fault() {
         let code = sdo.read(object::ERROR_CODE).await.map(|code| EmcyCode(code.to_u32() as u16));
