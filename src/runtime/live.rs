@@ -148,7 +148,7 @@ impl<'a, W: Witness> Live<'a, W> {
                 self.give(Input::Tracker(event));
             }
         }
-        for _ in 0..Link::PORTION {
+        for _ in 0..Link::BATCH_MAX {
             if self.clock.now() >= self.session.deadline() {
                 break;
             }

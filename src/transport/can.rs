@@ -21,9 +21,8 @@ pub enum BusEvent {
     Error(BusError),
 }
 
-/// A report of a CAN controller about itself and the wires, as the kernel gives it to programs: an error
-/// frame with the layout of `linux/can/error.h`, which was never on the bus. It may report several
-/// things at once.
+/// A report of a CAN controller about itself and the wires: an error frame as the kernel gives it to programs,
+/// with the layout of `linux/can/error.h`. It was never on the bus. One frame may report several errors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BusError(pub CanErrorFrame);
 
@@ -49,7 +48,7 @@ impl BusError {
     }
 }
 
-/// Names all that is reported: `bus off; error counters: tx=248, rx=0`.
+/// Names every error that is reported: `bus off; error counters: tx=248, rx=0`.
 impl fmt::Display for BusError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         errors::CanError::from(self.0).fmt(f)
@@ -60,17 +59,17 @@ impl fmt::Display for BusError {
 ///
 /// A bus carries each frame to every endpoint but its sender, in the same order for all.
 pub trait CanBus: Send {
-    /// Queues `frame` for sending. It never blocks and never retries, because a delayed set-point is
+    /// Queues `frame` for sending. This never blocks and never retries, because a delayed set-point is
     /// stale.
     ///
     /// # Errors
     /// [`CanError::TransmitQueueFull`] when the interface takes no more frames;
-    /// [`CanError::NotConfirmed`] when earlier frames were not sent; [`CanError::Down`] or
-    /// [`CanError::Gone`] when the interface is; [`CanError::Io`] otherwise.
+    /// [`CanError::NotConfirmed`] when earlier frames were not confirmed; [`CanError::Down`] or
+    /// [`CanError::Gone`] when the interface is down or gone; [`CanError::Io`] otherwise.
     fn send(&mut self, frame: &Frame) -> Result<(), CanError>;
 
-    /// Waits up to `timeout` for the next event; `None` when none came in that time. With a zero
-    /// `timeout` it returns at once.
+    /// Waits up to `timeout` for the next event; `None` if none came in that time. With a zero
+    /// `timeout` this returns at once.
     ///
     /// # Errors
     /// [`CanError::Down`], [`CanError::Gone`] or [`CanError::Io`].
@@ -113,13 +112,13 @@ pub enum CanError {
     )]
     NoCan(String),
     /// There is no interface of this name.
-    #[error("no interface {0}: {next}", next = bring_up(.0))]
+    #[error("no interface {0}: {next}", next = bring_up_hint(.0))]
     NoInterface(String),
     /// The interface is another kind, such as a network card.
     #[error("interface {0} is not a CAN interface; ip -brief link show type can lists them")]
     NotCan(String),
     /// The interface is down, or went down while in use.
-    #[error("interface {0} is down: {next}", next = bring_up(.0))]
+    #[error("interface {0} is down: {next}", next = bring_up_hint(.0))]
     Down(String),
     /// The interface vanished while in use.
     #[error("interface {0} is gone, was the adapter unplugged?")]
@@ -163,8 +162,8 @@ pub enum CanError {
 /// The emulated bus, which no command can bring up.
 const MEMORY: &str = "memory";
 
-/// The command that brings `interface` up.
-fn bring_up(interface: &str) -> String {
+/// What brings `interface` up: a command, for most interfaces.
+fn bring_up_hint(interface: &str) -> String {
     if interface == MEMORY {
         "it is emulated, an [[emulator.fault]] took it down".to_owned()
     } else if interface.starts_with("vcan") {
@@ -184,9 +183,9 @@ fn bring_up(interface: &str) -> String {
     }
 }
 
-/// Waits up to `timeout` until `socket` has data or an error, by ppoll(2): poll(2) counts whole
-/// milliseconds. A signal ends the wait early; the caller waits again for the rest.
-pub(super) fn readable(socket: BorrowedFd<'_>, timeout: Duration) -> io::Result<()> {
+/// Waits up to `timeout` until `socket` has data or an error. It uses ppoll(2), since poll(2) counts whole
+/// milliseconds. A signal ends the wait early; the caller then waits again for the remaining time.
+pub(super) fn wait_readable(socket: BorrowedFd<'_>, timeout: Duration) -> io::Result<()> {
     let mut sockets = [PollFd::new(socket, PollFlags::POLLIN)];
     match ppoll(&mut sockets, Some(TimeSpec::from_duration(timeout)), None) {
         Ok(_) | Err(Errno::EINTR) => Ok(()),

@@ -18,16 +18,16 @@ use tokio::time::sleep;
 pub struct LinkSettings {
     /// The protocol of the stream.
     pub protocol: Protocol,
-    /// The tools whose samples are handed on; none for every tool.
+    /// The tools whose samples are delivered; if empty, those of every tool.
     pub tools: Vec<String>,
     /// The stream to request from an OpenIGTLink peer when it is connected.
     pub request: Option<ToolStream>,
-    /// Wait before the first new attempt to connect; it doubles with each attempt.
+    /// Wait before the first attempt to reconnect; it doubles with each attempt.
     pub retry_first: Duration,
-    /// A peer that is silent for this long may be gone. The bench reconnects to a server; a client is
+    /// A peer that is silent for this long may be gone. Then the bench reconnects to a server; a client is
     /// replaced by the next one that connects.
     pub silence_limit: Duration,
-    /// Events that may wait in the queue before samples are dropped.
+    /// Length of the queue: when this many events wait, samples are dropped.
     pub queue: usize,
 }
 
@@ -60,22 +60,22 @@ pub struct Link {
 struct Shared {
     /// Samples, statuses and refused messages received.
     messages: AtomicU64,
-    /// How many of them the sieve kept back.
+    /// How many of them the sieve passed over, because they are of no use to the bench.
     passed_over: AtomicU64,
     /// Samples dropped because the queue was full or because newer ones were waiting.
     dropped: AtomicU64,
-    /// No more events come.
+    /// No more events will come.
     has_ended: AtomicBool,
     /// Notified when an event was queued or the stream has ended.
     filled: Notify,
 }
 
 impl Link {
-    /// Maximum number of events that the control thread takes at a time. When more are waiting, it
-    /// gets the newest samples, and the others are dropped.
-    pub const PORTION: usize = 64;
+    /// Maximum number of events that the control thread takes at a time. When more are waiting, the older
+    /// samples are dropped.
+    pub const BATCH_MAX: usize = 64;
 
-    /// A link, and where its events go.
+    /// A link, and the end of its queue that a reader fills.
     pub(super) fn new(settings: &LinkSettings) -> (Self, Outlet) {
         let (producer, events) = RingBuffer::new(settings.queue.max(1) + Outlet::RESERVE);
         let shared = Arc::new(Shared::default());
@@ -99,7 +99,7 @@ impl Link {
     pub fn try_next(&mut self) -> Option<Event> {
         let mut event = self.events.pop().ok()?;
         for _ in 0..self.events.buffer().capacity() {
-            let is_behind = self.events.slots() >= Self::PORTION;
+            let is_behind = self.events.slots() >= Self::BATCH_MAX;
             if !is_behind || !matches!(event, Event::Sample(_)) {
                 break;
             }
@@ -121,7 +121,7 @@ impl Link {
         }
     }
 
-    /// The messages passed over and the samples dropped since the last call; `None` if there are none.
+    /// The numbers of messages passed over and of samples dropped since the last call; `None` if both are 0.
     pub fn passed_over(&mut self) -> Option<Event> {
         let Shared { passed_over, dropped, .. } = &*self.shared;
         let now = (passed_over.load(Ordering::Relaxed), dropped.load(Ordering::Relaxed));
@@ -149,8 +149,8 @@ impl Drop for Link {
     }
 }
 
-/// The reader's end of the queue. A slow control thread never blocks the reader: data left in the
-/// socket would get too late a receive time.
+/// The reader's end of the queue. A slow control thread never blocks the reader: data that waits in the
+/// socket would get a receive time that is too late.
 #[derive(Debug)]
 pub(super) struct Outlet {
     events: Producer<Event>,
@@ -160,7 +160,7 @@ pub(super) struct Outlet {
 
 impl Outlet {
     /// Places in the queue that samples leave free for changes of the connection: its beginning, its
-    /// end, a failed attempt, and the names on it.
+    /// end, a failed attempt to connect, and the tools that it names.
     const RESERVE: usize = Reader::NAMES_MAX + 4;
     /// Interval between two checks for room.
     const ROOM_POLL: Duration = Duration::from_millis(10);
@@ -173,9 +173,9 @@ impl Outlet {
         }
     }
 
-    /// Hands on an event received at `now`, if it passes the sieve. A sample, status or refused message
+    /// Delivers an event received at `now`, if it passes the sieve. A sample, status or refused message
     /// is dropped and counted when there is no room.
-    pub(super) fn hand_on(&mut self, now: Time, event: Event) {
+    pub(super) fn deliver(&mut self, now: Time, event: Event) {
         self.shared.messages.fetch_add(u64::from(event.is_message()), Ordering::Relaxed);
         let passed = self.sieve.pass(now, event);
         self.shared.passed_over.store(self.sieve.passed_over(), Ordering::Relaxed);
@@ -187,12 +187,12 @@ impl Outlet {
         self.shared.filled.notify_one();
     }
 
-    /// Hands on the events in the bytes that `reader` got at `now`. An error ends the connection.
-    pub(super) fn hand_on_all(&mut self, now: Time, reader: &mut Reader) -> Result<(), String> {
+    /// Delivers the events in the bytes that `reader` got at `now`. An error ends the connection.
+    pub(super) fn deliver_all(&mut self, now: Time, reader: &mut Reader) -> Result<(), String> {
         loop {
             match reader.poll() {
                 Ok(None) => return Ok(()),
-                Ok(Some(event)) => self.hand_on(now, event),
+                Ok(Some(event)) => self.deliver(now, event),
                 Err(error) => return Err(format!("dropped: {error}")),
             }
         }
@@ -208,8 +208,8 @@ impl Drop for Outlet {
 
 /// Streams that are not over TCP: from standard input or another reader, and from a recording.
 impl Link {
-    /// Reads `input`, called `name` in messages, to its end. A thread of its own does so, because
-    /// reading a pipe may block for ever. `clock` gives the receive times.
+    /// Reads `input`, called `name` in messages, to its end, on a thread of its own, because reading a pipe may
+    /// block for ever. `clock` gives the receive times.
     pub fn read<R, C>(mut input: R, name: &str, settings: LinkSettings, clock: C) -> Self
     where
         R: Read + Send + 'static,
@@ -219,16 +219,16 @@ impl Link {
         let mut reader = Reader::new(settings.protocol);
         let name = name.to_owned();
         thread::spawn(move || {
-            outlet.hand_on(clock(), Event::Connected { peer: name.clone() });
+            outlet.deliver(clock(), Event::Connected { peer: name.clone() });
             let why = read_to_end(&mut input, &mut reader, &mut outlet, &clock);
             let reason = format!("tracker: {name} {why}");
-            outlet.hand_on(clock(), Event::Disconnected { reason });
+            outlet.deliver(clock(), Event::Disconnected { reason });
         });
         link
     }
 
-    /// Gives the events of `replay` when they are due by `clock`. Only the tool and the queue length of
-    /// `settings` matter.
+    /// Delivers the events of `replay` when they are due by `clock`. Of `settings`, only the tools and the
+    /// queue length matter.
     ///
     /// # Panics
     /// Outside a tokio runtime.
@@ -240,7 +240,7 @@ impl Link {
             while replay.deadline() < Time::NEVER {
                 sleep(replay.deadline().since(clock())).await;
                 while let Some(event) = replay.poll(clock()) {
-                    outlet.hand_on(clock(), event);
+                    outlet.deliver(clock(), event);
                 }
             }
         })
@@ -255,12 +255,14 @@ fn read_to_end(
     clock: impl Fn() -> Time,
 ) -> String {
     let mut buffer = [0; 4096];
-    // Until the link is dropped.
+    // The queue is abandoned when the link is dropped.
     while !outlet.events.is_abandoned() {
         let len = match input.read(&mut buffer) {
             Ok(0) => {
-                let cut = reader.finish().err().map(|error| format!(": {error}"));
-                return format!("has ended{}", cut.unwrap_or_default());
+                return match reader.finish() {
+                    Ok(()) => "has ended".to_owned(),
+                    Err(error) => format!("has ended: {error}"),
+                };
             }
             Ok(len) => len,
             Err(error) if error.kind() == ErrorKind::Interrupted => continue,
@@ -268,7 +270,7 @@ fn read_to_end(
         };
         let now = clock();
         reader.push(now, buffer.get(..len).unwrap_or_default());
-        if let Err(reason) = outlet.hand_on_all(now, reader) {
+        if let Err(reason) = outlet.deliver_all(now, reader) {
             return reason;
         }
     }
@@ -304,13 +306,13 @@ mod tests {
     #[test]
     fn a_control_thread_that_was_late_is_given_the_newest_samples() {
         let (mut link, mut outlet) = Link::new(&LinkSettings::default());
-        (0..50).for_each(|n| outlet.hand_on(Time::ZERO, sample(n)));
+        (0..50).for_each(|n| outlet.deliver(Time::ZERO, sample(n)));
         assert_eq!(positions(&mut link), (0..50).collect::<Vec<_>>());
-        outlet.hand_on(Time::ZERO, Event::Connected { peer: "lab".to_owned() });
-        (50..500).for_each(|n| outlet.hand_on(Time::ZERO, sample(n)));
+        outlet.deliver(Time::ZERO, Event::Connected { peer: "lab".to_owned() });
+        (50..500).for_each(|n| outlet.deliver(Time::ZERO, sample(n)));
         assert!(matches!(link.try_next(), Some(Event::Connected { .. })), "no sample, not dropped");
-        assert_eq!(positions(&mut link), (500 - Link::PORTION..500).collect::<Vec<_>>());
-        let dropped = (450 - Link::PORTION) as u64;
+        assert_eq!(positions(&mut link), (500 - Link::BATCH_MAX..500).collect::<Vec<_>>());
+        let dropped = (450 - Link::BATCH_MAX) as u64;
         assert_eq!(link.passed_over(), Some(Event::PassedOver { messages: 0, dropped }));
         assert_eq!((link.passed_over(), link.messages()), (None, 500));
     }
@@ -322,14 +324,14 @@ mod tests {
         let (mut link, mut outlet) = Link::new(&settings);
         let state = |outlet: &mut Outlet, n: usize| {
             let (tool, message_type) = (format!("tool {n}"), "IMAGE".to_owned());
-            outlet.hand_on(Time::ZERO, Event::SawTool { tool, message_type });
+            outlet.deliver(Time::ZERO, Event::SawTool { tool, message_type });
         };
-        outlet.hand_on(Time::ZERO, Event::Connected { peer: "lab".to_owned() });
+        outlet.deliver(Time::ZERO, Event::Connected { peer: "lab".to_owned() });
         for n in 0..Reader::NAMES_MAX {
-            (0..100).for_each(|n| outlet.hand_on(Time::ZERO, sample(n)));
+            (0..100).for_each(|n| outlet.deliver(Time::ZERO, sample(n)));
             state(&mut outlet, n);
         }
-        outlet.hand_on(Time::ZERO, Event::Disconnected { reason: "gone".to_owned() });
+        outlet.deliver(Time::ZERO, Event::Disconnected { reason: "gone".to_owned() });
         drop(outlet);
         let taken: Vec<Event> = std::iter::from_fn(|| link.try_next()).collect();
         let states = taken.iter().filter(|event| !event.is_message()).count();

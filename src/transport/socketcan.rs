@@ -14,7 +14,7 @@ use socketcan::{
     Socket, SocketOptions, StandardId,
 };
 
-use super::can::{BusError, BusEvent, CanBus, CanError, readable};
+use super::can::{BusError, BusEvent, CanBus, CanError, wait_readable};
 use super::unconfirmed::Unconfirmed;
 use crate::canopen::{CanId, Frame, NodeId};
 
@@ -31,7 +31,7 @@ const NODE_BITS: u32 = 0x7F;
 /// Size of the receive buffer; the kernel gives at most twice `net.core.rmem_max`. A frame takes some
 /// 0.8 KiB, so the default of 208 KiB is full after 25 ms at 10,000 frames a second.
 const RECEIVE_BUFFER_BYTES: usize = 4 << 20;
-/// More frames than the receive buffer holds.
+/// To drain the receive buffer, at most this many frames are read: more than the buffer holds.
 const DRAIN_MAX: usize = 16_384;
 
 /// Timestamps that the kernel takes when the driver hands a frame over.
@@ -76,19 +76,20 @@ impl SocketCan {
     }
 
     /// Requires every frame to be confirmed: the kernel echoes a frame when the controller has sent it and
-    /// another node has acknowledged it. While the frames of `syncs_max` SYNCs wait for that, no more
-    /// are taken. Call this before the first frame. A sender must also receive.
+    /// another node has acknowledged it. While the frames of `syncs_max` SYNCs wait for that, no more frames
+    /// are accepted. Call this before the first frame. Echoes are taken only in [`receive`](CanBus::receive).
     ///
     /// # Errors
     /// [`CanError::Io`] if the kernel gives no echoes.
     pub fn confirm_sending(&mut self, syncs_max: usize) -> Result<(), CanError> {
-        let asked = self.socket.set_recv_own_msgs(true);
-        asked.map_err(|error| failed(&self.interface, "ask for echoes", error))?;
+        self.socket
+            .set_recv_own_msgs(true)
+            .map_err(|error| failed(&self.interface, "ask for echoes", error))?;
         self.unconfirmed = Some(Unconfirmed::new(syncs_max));
         Ok(())
     }
 
-    /// Stops waiting for echoes: an interface or controller that went off has dropped the frames.
+    /// Stops waiting for echoes: an interface or controller that has failed has dropped the frames.
     fn give_up_unconfirmed(&mut self) {
         self.unconfirmed.iter_mut().for_each(Unconfirmed::give_up);
     }
@@ -108,7 +109,7 @@ impl SocketCan {
         self.socket
             .set_filters(&filters)
             .map_err(|error| failed(&self.interface, "set filters", error))?;
-        // A flood that passes the filters would never let this end.
+        // Bounded, since a flood that passes the filters would never let this end.
         for _ in 0..DRAIN_MAX {
             if self.receive(Duration::ZERO)?.is_none() {
                 break;
@@ -118,8 +119,9 @@ impl SocketCan {
         Ok(())
     }
 
-    /// True for the echo of an own frame.
-    fn is_echo(&mut self, event: &BusEvent) -> bool {
+    /// Confirms the own frame of which `event` is the echo; false if it is none. An error that says that the
+    /// controller dropped its frames ends the wait for their echoes.
+    fn take_echo(&mut self, event: &BusEvent) -> bool {
         match event {
             BusEvent::Frame(frame) => {
                 self.unconfirmed.as_mut().is_some_and(|waiting| waiting.take_echo(frame))
@@ -174,23 +176,23 @@ impl CanBus for SocketCan {
     fn receive(&mut self, timeout: Duration) -> Result<Option<BusEvent>, CanError> {
         let start = Instant::now();
         loop {
-            let left = timeout.saturating_sub(start.elapsed());
+            let remaining = timeout.saturating_sub(start.elapsed());
             match self.socket.read_frame_with_timestamps() {
                 Ok((frame, stamps)) => {
-                    let event =
-                        event(&frame).map_err(|error| failed(&self.interface, "receive", error))?;
-                    if self.is_echo(&event) {
+                    let event = to_event(&frame)
+                        .map_err(|error| failed(&self.interface, "receive", error))?;
+                    if self.take_echo(&event) {
                         continue;
                     }
                     self.received_at = stamps.sw;
                     return Ok(Some(event));
                 }
-                Err(error) if !nothing_there(&error) => {
+                Err(error) if !is_nothing_yet(&error) => {
                     self.give_up_unconfirmed();
                     return Err(failed(&self.interface, "receive", error));
                 }
-                Err(_) if left.is_zero() => return Ok(None),
-                Err(_) => readable(self.socket.as_fd(), left)
+                Err(_) if remaining.is_zero() => return Ok(None),
+                Err(_) => wait_readable(self.socket.as_fd(), remaining)
                     .map_err(|error| failed(&self.interface, "receive", error))?,
             }
         }
@@ -211,20 +213,21 @@ impl CanBus for SocketCan {
 
     fn dropped(&self) -> Result<u64, CanError> {
         let mut info = [0; MEMINFO_BYTES];
-        let failed = |error| failed(&self.interface, "count drops", error);
-        match self.socket.get_socket_option_bytes(SOL_SOCKET, SO_MEMINFO, &mut info) {
+        let read = self.socket.get_socket_option_bytes(SOL_SOCKET, SO_MEMINFO, &mut info);
+        let error = match read {
             Ok(MEMINFO_BYTES) => {
                 let [.., a, b, c, d] = info;
-                Ok(u32::from_ne_bytes([a, b, c, d]).into())
+                return Ok(u32::from_ne_bytes([a, b, c, d]).into());
             }
-            Ok(_) => Err(failed(ErrorKind::Unsupported.into())),
-            Err(error) => Err(failed(error)),
-        }
+            Ok(_) => ErrorKind::Unsupported.into(),
+            Err(error) => error,
+        };
+        Err(failed(&self.interface, "count drops", error))
     }
 }
 
-/// An error of the operating system as a [`CanError`]. An interface that vanished is ENODEV once, and ENXIO at
-/// each later frame.
+/// An error of the operating system as a [`CanError`]. For an interface that vanished, the first error is
+/// ENODEV, and ENXIO at each later frame.
 fn failed(interface: &str, action: &'static str, reason: io::Error) -> CanError {
     let interface = interface.to_owned();
     match errno(&reason) {
@@ -239,22 +242,23 @@ fn errno(error: &io::Error) -> Option<Errno> {
     error.raw_os_error().map(Errno::from_raw)
 }
 
-/// True if `interface` has a device behind it, whatever it is named. vcan and vxcan have none.
+/// True if `interface` has a device behind it, whatever its name. vcan and vxcan have none.
 pub fn has_device(interface: &str) -> bool {
     Path::new("/sys/class/net").join(interface).join("device").exists()
 }
 
 /// True when there is no frame yet, or a signal interrupted the call.
-fn nothing_there(error: &io::Error) -> bool {
+fn is_nothing_yet(error: &io::Error) -> bool {
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted)
 }
 
 /// Why `interface` did not open. The kernel looks up the name before it checks for CAN, so ENODEV has
-/// three causes.
+/// three causes: no CAN in the kernel, an interface that is not CAN, and no such interface.
 fn cannot_open(interface: &str, error: io::Error) -> CanError {
-    let any = CanSocket::open_iface(0).err().and_then(|error| errno(&error));
+    // Interface 0 stands for all CAN interfaces: this fails only if the kernel has no CAN.
+    let without_interface = CanSocket::open_iface(0).err().and_then(|error| errno(&error));
     let interface = interface.to_owned();
-    match (any, errno(&error)) {
+    match (without_interface, errno(&error)) {
         (Some(Errno::EAFNOSUPPORT | Errno::EPROTONOSUPPORT), _) => CanError::NoCan(interface),
         (_, Some(Errno::ENODEV)) if Path::new("/sys/class/net").join(&interface).exists() => {
             CanError::NotCan(interface)
@@ -277,7 +281,7 @@ fn to_socketcan(frame: &Frame) -> Option<CanFrame> {
     }
 }
 
-fn event(frame: &CanFrame) -> io::Result<BusEvent> {
+fn to_event(frame: &CanFrame) -> io::Result<BusEvent> {
     if let CanFrame::Error(error) = frame {
         return Ok(BusEvent::Error(BusError(*error)));
     }
@@ -303,7 +307,7 @@ mod tests {
         #[test]
         fn frames_convert_both_ways(frame in frames()) {
             let there = to_socketcan(&frame).unwrap();
-            prop_assert_eq!(event(&there).unwrap(), BusEvent::Frame(frame));
+            prop_assert_eq!(to_event(&there).unwrap(), BusEvent::Frame(frame));
         }
     }
 
@@ -312,7 +316,7 @@ mod tests {
         let data = [0, 0x20, 0, 0, 0, 0, 128, 3];
         let frame = CanErrorFrame::new_error(0x244, &data).unwrap();
         let expected = BusEvent::Error(BusError::new(0x244, data));
-        assert_eq!(event(&CanFrame::Error(frame)).unwrap(), expected);
+        assert_eq!(to_event(&CanFrame::Error(frame)).unwrap(), expected);
     }
 
     #[test]

@@ -1,11 +1,11 @@
 //! CAN over UDP multicast, compatible with python-can's `udp_multicast`: one frame per datagram.
 //!
-//! It is for tests, and for machines and containers without CAN. There is no arbitration, datagrams may
+//! This bus is for tests, and for machines and containers without CAN. There is no arbitration, datagrams may
 //! be lost or reordered, and anyone may send, so it must never drive a real stage.
 
 mod message;
 
-use super::can::{BusError, BusEvent, CanBus, CanError, readable};
+use super::can::{BusError, BusEvent, CanBus, CanError, wait_readable};
 use crate::canopen::Frame;
 use nix::cmsg_space;
 use nix::sys::socket::{
@@ -17,11 +17,11 @@ use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
 use std::os::fd::{AsFd, AsRawFd};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-/// More than the length of any message, which is some 190 bytes.
+/// Size of the receive buffer: more than the length of any message, which is some 190 bytes.
 const DATAGRAM_MAX: usize = 2048;
-/// A call whose time is over returns after this many ignored datagrams, so that a flood of them does not block
-/// the caller.
-const PASSED_OVER_MAX: usize = 1024;
+/// A call whose timeout is over returns after this many ignored datagrams, so that a flood of them does not
+/// block the caller.
+const IGNORED_MAX: usize = 1024;
 
 /// An endpoint of the bus. The bus is a multicast group.
 ///
@@ -130,18 +130,19 @@ impl CanBus for UdpBus {
 
     fn receive(&mut self, timeout: Duration) -> Result<Option<BusEvent>, CanError> {
         let start = Instant::now();
-        let mut passed_over = 0;
+        let mut ignored = 0;
         loop {
-            let left = timeout.saturating_sub(start.elapsed());
+            let remaining = timeout.saturating_sub(start.elapsed());
             match self.take() {
                 Ok(Some(event)) => return Ok(Some(event)),
-                Ok(None) if left.is_zero() && passed_over >= PASSED_OVER_MAX => return Ok(None),
-                Ok(None) => passed_over += 1,
+                Ok(None) if remaining.is_zero() && ignored >= IGNORED_MAX => return Ok(None),
+                Ok(None) => ignored += 1,
                 Err(error) if error.kind() == ErrorKind::WouldBlock => {
-                    if left.is_zero() {
+                    if remaining.is_zero() {
                         return Ok(None);
                     }
-                    readable(self.receiver.as_fd(), left).map_err(failed(&self.name, "receive"))?;
+                    wait_readable(self.receiver.as_fd(), remaining)
+                        .map_err(failed(&self.name, "receive"))?;
                 }
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
                 Err(error) => return Err(failed(&self.name, "receive")(error)),

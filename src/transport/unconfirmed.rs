@@ -1,92 +1,98 @@
-//! Frames that the kernel took and that are not confirmed on the bus yet.
+//! Frames that the kernel accepted and that are not confirmed on the bus yet.
 //!
-//! An interface takes frames even when its cable is out. They wait in its queue (10 by default) and in
-//! the controller, and leave in a burst when another node acknowledges again. By then the set-points
+//! An interface accepts frames even when its cable is out. They wait in its queue (10 frames by default) and
+//! in the controller, and leave in a burst when another node acknowledges again. By then the set-points
 //! among them are stale. So the number of SYNCs whose frames may wait is limited.
 
 use crate::canopen::{Frame, cob};
 use std::collections::VecDeque;
 
-/// Maximum number of frames that were given up and whose echo is still recognized: some twenty cycles.
+/// The echoes of at most this many given-up frames are still recognized: those of some twenty cycles.
 const GIVEN_UP_MAX: usize = 64;
 
-/// Own frames that wait for their echo, which the kernel gives when they were sent.
+/// Own frames that wait for their echo, which the kernel delivers once the frame was sent.
 #[derive(Debug, Clone)]
 pub struct Unconfirmed {
-    /// Maximum number of SYNCs that wait.
+    /// Maximum number of waiting SYNCs.
     syncs_max: usize,
     frames: VecDeque<Frame>,
-    /// The socket's count of dropped frames when the oldest SYNC that waits was sent.
+    /// The socket's count of dropped frames when the oldest waiting SYNC was sent.
     dropped_before: u64,
     /// Frames that were given up; their echoes may still come.
     given_up: VecDeque<Frame>,
-    /// Frames whose echo is missing although a later frame's has come: since the last SYNC was sent, and
-    /// since the one before. Their echoes come within two cycles, or were lost. Later, an identical frame
-    /// is another node's.
-    passed: [Vec<Frame>; 2],
+    /// Frames whose echo is missing although the echo of a later frame has come: those since the last SYNC was
+    /// sent, and those since the SYNC before. A missing echo comes within two cycles, or was lost. After that,
+    /// an identical frame is another node's.
+    overtaken: [Vec<Frame>; 2],
 }
 
 impl Unconfirmed {
-    /// No frames yet. The frames of `syncs_max` SYNCs may wait, at least of one.
+    /// No frames yet. The frames of up to `syncs_max` SYNCs, at least one, may wait.
     pub fn new(syncs_max: usize) -> Self {
         Unconfirmed {
             syncs_max: syncs_max.max(1),
             frames: VecDeque::new(),
             dropped_before: 0,
             given_up: VecDeque::new(),
-            passed: Default::default(),
+            overtaken: Default::default(),
         }
     }
 
-    /// How many frames wait, and of how many SYNCs, if no more may be sent.
+    /// If so many SYNCs wait that no more frames may be sent: the numbers of waiting frames and SYNCs.
     pub fn too_many(&self) -> Option<(usize, usize)> {
         let syncs = self.syncs();
         (syncs >= self.syncs_max).then_some((self.frames.len(), syncs))
     }
 
-    /// True if the socket, which has `dropped` so many frames, may have dropped the echoes that are missing:
-    /// a full one drops echoes as it drops other frames.
+    /// True if the missing echoes may have been dropped, since the socket has now `dropped` more frames than when
+    /// the oldest waiting SYNC was sent: a full socket drops echoes as it drops other frames.
     pub fn may_be_dropped(&self, dropped: u64) -> bool {
         dropped != self.dropped_before
     }
 
-    /// Adds a frame that the kernel took, when the socket had `dropped` so many.
+    /// Adds a frame that the kernel accepted; `dropped` is the socket's count of dropped frames at that time.
     pub fn sent(&mut self, frame: Frame, dropped: u64) {
         if is_sync(&frame) {
-            // Frames dropped long before explain no echo that is missing now.
+            // Frames that were dropped before do not explain an echo that is missing now.
             if self.syncs() == 0 {
                 self.dropped_before = dropped;
             }
-            let [newest, before] = &mut self.passed;
+            let [newest, before] = &mut self.overtaken;
             *before = std::mem::take(newest);
         }
         self.frames.push_back(frame);
     }
 
+    /// The number of waiting SYNCs.
     fn syncs(&self) -> usize {
         self.frames.iter().filter(|frame| is_sync(frame)).count()
     }
 
-    /// True if a received frame is the echo of one of these. The bus has carried every frame before it, too.
-    /// Their echoes were lost, or come a little later, because another processor delivers them. If another
-    /// node sends an identical frame, the first one received counts as the echo.
+    /// Takes a received frame; true if it is the echo of an own frame, which is then confirmed. The frames sent
+    /// before that one were on the bus, too: their echoes were lost, or come a little later, because another
+    /// processor delivers them. If another node sends an identical frame, the first one received counts as the
+    /// echo.
     pub fn take_echo(&mut self, frame: &Frame) -> bool {
-        let place = |frames: &VecDeque<Frame>| frames.iter().position(|sent| sent == frame);
-        if let Some(at) = place(&self.frames) {
-            self.passed[0].extend(self.frames.drain(..=at).take(at));
+        let find = |frames: &VecDeque<Frame>| frames.iter().position(|sent| sent == frame);
+        if let Some(index) = find(&self.frames) {
+            self.overtaken[0].extend(self.frames.drain(..index));
+            self.frames.pop_front();
             return true;
         }
-        if let Some(at) = place(&self.given_up) {
-            self.given_up.drain(..=at);
+        if let Some(index) = find(&self.given_up) {
+            self.given_up.drain(..=index);
             return true;
         }
-        self.passed.iter_mut().any(|passed| {
-            let at = passed.iter().position(|sent| sent == frame);
-            at.map(|at| passed.remove(at)).is_some()
-        })
+        for overtaken in &mut self.overtaken {
+            if let Some(index) = overtaken.iter().position(|sent| sent == frame) {
+                overtaken.remove(index);
+                return true;
+            }
+        }
+        false
     }
 
-    /// Stops waiting for them: the interface has dropped them, or their echoes were lost.
+    /// Stops waiting for all frames: the interface has dropped them, or their echoes were lost.
     pub fn give_up(&mut self) {
         self.given_up.append(&mut self.frames);
         let old = self.given_up.len().saturating_sub(GIVEN_UP_MAX);

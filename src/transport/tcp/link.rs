@@ -14,7 +14,7 @@ use tokio::time::{Instant, sleep, timeout};
 
 /// Longest wait for a connection.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
-/// Longest wait between two attempts.
+/// Longest wait between two attempts to connect.
 const RETRY_MAX: Duration = Duration::from_secs(5);
 
 impl Link {
@@ -29,7 +29,7 @@ impl Link {
     {
         let address = address.to_owned();
         Link::filled_by(&settings.clone(), |outlet| {
-            End { settings, clock, outlet }.keep_connected(address)
+            LinkTask { settings, clock, outlet }.keep_connected(address)
         })
     }
 
@@ -43,24 +43,24 @@ impl Link {
         C: Fn() -> Time + Send + Sync + 'static,
     {
         Link::filled_by(&settings.clone(), |outlet| {
-            End { settings, clock, outlet }.keep_listening(listener)
+            LinkTask { settings, clock, outlet }.keep_listening(listener)
         })
     }
 }
 
-/// The task's side of a link.
-struct End<C> {
+/// The task that fills a link.
+struct LinkTask<C> {
     settings: LinkSettings,
     clock: C,
     outlet: Outlet,
 }
 
-impl<C: Fn() -> Time> End<C> {
+impl<C: Fn() -> Time> LinkTask<C> {
     async fn keep_connected(mut self, address: String) {
         let mut retry = self.settings.retry_first;
         loop {
             self.outlet.wait_for_room().await;
-            let reason = match timeout(CONNECT_TIMEOUT, TcpStream::connect(&address)).await {
+            let failure = match timeout(CONNECT_TIMEOUT, TcpStream::connect(&address)).await {
                 Ok(Ok(stream)) => {
                     let mut peer = Peer::new(stream, address.clone(), &self.settings);
                     self.report(Event::Connected { peer: address.clone() });
@@ -74,7 +74,7 @@ impl<C: Fn() -> Time> End<C> {
                 Ok(Err(error)) => Some(error.to_string()),
                 Err(_) => Some(format!("no answer within {CONNECT_TIMEOUT:?}")),
             };
-            if let Some(error) = reason {
+            if let Some(error) = failure {
                 let reason = format!(
                     "tracker: cannot connect to {address}: {error}; is the server running, and \
                      are host and port right? next attempt in {:.1} s",
@@ -89,7 +89,7 @@ impl<C: Fn() -> Time> End<C> {
 
     /// Reads a server until the connection ends, and returns the reason.
     async fn read_to_end(&mut self, peer: &mut Peer) -> String {
-        if let Err(reason) = peer.ask().await {
+        if let Err(reason) = peer.request_stream().await {
             return reason;
         }
         loop {
@@ -136,7 +136,7 @@ impl<C: Fn() -> Time> End<C> {
         listener: &TcpListener,
         next: &mut Option<(TcpStream, SocketAddr)>,
     ) -> String {
-        if let Err(reason) = peer.ask().await {
+        if let Err(reason) = peer.request_stream().await {
             return reason;
         }
         let retry = self.settings.retry_first;
@@ -168,10 +168,10 @@ impl<C: Fn() -> Time> End<C> {
 
     /// Reports a change of the connection.
     fn report(&mut self, event: Event) {
-        self.outlet.hand_on((self.clock)(), event);
+        self.outlet.deliver((self.clock)(), event);
     }
 
-    /// Hands on what was read. An error ends the connection.
+    /// Delivers what was read. An error ends the connection.
     fn take(&mut self, peer: &mut Peer, read: io::Result<usize>) -> Result<(), String> {
         let now = (self.clock)();
         match read {
@@ -188,13 +188,13 @@ impl<C: Fn() -> Time> End<C> {
             }
         }
         peer.last_heard = Instant::now();
-        let handed_on = self.outlet.hand_on_all(now, &mut peer.reader);
-        handed_on.map_err(|reason| format!("tracker: {} {reason}", peer.name))
+        let delivered = self.outlet.deliver_all(now, &mut peer.reader);
+        delivered.map_err(|reason| format!("tracker: {} {reason}", peer.name))
     }
 }
 
-/// The next client. After an error, such as no file descriptors left, it tries again, for the first time
-/// after `retry`.
+/// The next client. After an error, such as no file descriptors left, this tries again after `retry`, which
+/// doubles with each attempt.
 async fn accept(listener: &TcpListener, mut retry: Duration) -> (TcpStream, SocketAddr) {
     loop {
         match listener.accept().await {
@@ -206,7 +206,7 @@ async fn accept(listener: &TcpListener, mut retry: Duration) -> (TcpStream, Sock
     }
 }
 
-/// A connected peer. If it was asked for a stream, it is asked to end it when this is dropped.
+/// A connected peer. If a stream was requested from it, dropping this asks it to end the stream.
 struct Peer {
     stream: TcpStream,
     name: String,
@@ -232,7 +232,7 @@ impl Peer {
     }
 
     /// Requests the stream, if one is to be requested.
-    async fn ask(&mut self) -> Result<(), String> {
+    async fn request_stream(&mut self) -> Result<(), String> {
         let Some(request) = self.request else { return Ok(()) };
         (self.stream.write_all(&request.start()).await)
             .map_err(|error| format!("tracker: connection to {} lost: {error}", self.name))

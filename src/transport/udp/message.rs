@@ -61,36 +61,41 @@ pub(super) fn encode(
     rmp_serde::to_vec_named(&fields)
 }
 
-/// The event in a datagram, whose keys may come in any order; the receiver does not use the
-/// timestamp. `None` when it is no such map, or holds no classic frame.
+/// The event in a datagram, whose keys may come in any order; the timestamp is ignored. `None` if the
+/// datagram is no such map, or holds no classic frame.
 pub(super) fn decode(datagram: &[u8]) -> Option<BusEvent> {
     let mut deserializer = rmp_serde::Deserializer::from_read_ref(datagram);
     deserializer.set_max_depth(DEPTH_MAX);
     let fields = Fields::deserialize(&mut deserializer).ok()?;
-    match (fields.is_fd, fields.is_error_frame) {
-        (true, _) => None,
-        (false, true) => report(&fields),
-        (false, false) => frame(&fields),
+    if fields.is_fd {
+        None
+    } else if fields.is_error_frame {
+        error_event(&fields)
+    } else {
+        frame_event(&fields)
     }
 }
 
-fn report(fields: &Fields<'_>) -> Option<BusEvent> {
+fn error_event(fields: &Fields<'_>) -> Option<BusEvent> {
     let mut bytes = [0; 8];
     bytes.get_mut(..fields.data.len())?.copy_from_slice(fields.data);
     Some(BusEvent::Error(BusError::new(fields.arbitration_id, bytes)))
 }
 
-/// A remote frame has a length and no data.
-fn frame(fields: &Fields<'_>) -> Option<BusEvent> {
-    let id = match fields.is_extended_id {
-        true => CanId::Extended(fields.arbitration_id),
-        false => CanId::Base(u16::try_from(fields.arbitration_id).ok()?),
+fn frame_event(fields: &Fields<'_>) -> Option<BusEvent> {
+    let id = if fields.is_extended_id {
+        CanId::Extended(fields.arbitration_id)
+    } else {
+        CanId::Base(u16::try_from(fields.arbitration_id).ok()?)
     };
     let (len, zeros) = (usize::from(fields.dlc), [0; 8]);
-    let payload = match fields.is_remote_frame {
-        true => zeros.get(..len)?,
-        false if fields.data.len() == len => fields.data,
-        false => return None,
+    let payload = if fields.is_remote_frame {
+        // A remote frame has a length and no data.
+        zeros.get(..len)?
+    } else if fields.data.len() == len {
+        fields.data
+    } else {
+        return None;
     };
     Frame::from_parts(id, fields.is_remote_frame, payload).map(BusEvent::Frame)
 }
