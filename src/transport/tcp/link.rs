@@ -95,7 +95,7 @@ impl<C: Fn() -> Time> LinkTask<C> {
         loop {
             let Ok(read) = timeout(self.settings.silence_limit, peer.read()).await else {
                 return format!(
-                    "tracker: nothing from {} for {:?}; connecting anew",
+                    "tracker: nothing from {} for {:?}; reconnecting",
                     peer.name, self.settings.silence_limit
                 );
             };

@@ -227,7 +227,7 @@ async fn a_silent_server_is_connected_to_anew() {
     let (mut link, _silent, address) = bare_peer(settings).await;
     assert_eq!(
         until(&mut link, disconnected).await,
-        format!("tracker: nothing from {address} for 20ms; connecting anew")
+        format!("tracker: nothing from {address} for 20ms; reconnecting")
     );
 }
 
