@@ -1,4 +1,4 @@
-//! The drives find their home, one axis after the other.
+//! Homes the chosen axes, one after the other.
 
 use crate::session::{AxisMove, Record, Shell, State, Task};
 use crate::stage::{Axis, AxisLimits, PerAxis, StageConfig, StageEvent};
@@ -8,8 +8,8 @@ use std::collections::VecDeque;
 #[derive(Debug)]
 pub(super) struct Homing {
     limits: PerAxis<AxisLimits>,
-    /// The axes still to be homed, the one that is being homed first.
-    left: VecDeque<Axis>,
+    /// The axes that are not homed yet, beginning with the one that is being homed.
+    remaining: VecDeque<Axis>,
     moves: Vec<AxisMove>,
 }
 
@@ -17,13 +17,13 @@ impl Homing {
     pub(super) fn new(config: &StageConfig, axes: PerAxis<bool>) -> Self {
         Homing {
             limits: PerAxis::from_fn(|axis| config.axis(axis).limits),
-            left: Axis::BOTH.into_iter().filter(|axis| axes[*axis]).collect(),
+            remaining: Axis::BOTH.into_iter().filter(|axis| axes[*axis]).collect(),
             moves: Vec::new(),
         }
     }
 
     fn home_next(&self, shell: &mut Shell) -> Result<(), String> {
-        match self.left.front() {
+        match self.remaining.front() {
             Some(axis) => shell.home(*axis),
             None => {
                 shell.complete();
@@ -32,7 +32,7 @@ impl Homing {
         }
     }
 
-    /// Refuses a home from which the axis could not be moved.
+    /// Refuses a home outside the limits, from which the axis could not be moved.
     fn check_home(&self, axis: Axis, position: f64) -> Result<(), String> {
         let AxisLimits { min, max, .. } = self.limits[axis];
         if (min..=max).contains(&position) {
@@ -56,7 +56,7 @@ impl Task for Homing {
             StageEvent::Homed { axis, position } => {
                 self.moves.push(AxisMove { axis, from: None, to: position });
                 self.check_home(axis, position)?;
-                self.left.pop_front();
+                self.remaining.pop_front();
                 self.home_next(shell)
             }
             StageEvent::Feedback(feedback) => {

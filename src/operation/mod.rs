@@ -1,8 +1,8 @@
-//! Operations: what the stage does without a needle to steer. Home, jog, withdraw, prove.
+//! Operations move the stage without steering a needle: home, jog, withdraw, prove, check of handedness.
 //! Only the check of handedness needs a tracker; the others record what a tracker sends.
 //!
-//! An operation is a task of a [`Session`], as an insertion is: the same bring-up, supervision,
-//! limits, stops and teardown, and the same record. What would stop a run stops an operation.
+//! An operation is a task of a [`Session`], as an insertion is: it has the same bring-up, supervision,
+//! limits, stops and teardown, and the same record. What stops an insertion stops an operation.
 
 mod answer;
 mod home;
@@ -23,41 +23,43 @@ use crate::tracker::Gate;
 use crate::units::Time;
 use nalgebra::Vector3;
 
-/// What is to be done.
+/// An operation of the stage.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Operation {
-    /// Let the drives of these axes find their home, one after the other.
+    /// Home these axes, one after the other.
     Home(PerAxis<bool>),
-    /// Move one axis, the other held.
+    /// Move one axis; the other is held.
     Move(Move),
     /// Hold both axes and stop the bench's heartbeat, as if the bench had died: both drives must notice.
     Prove,
-    /// Turn the base in air and see that a sensor off its axis turns the same way.
+    /// The check of handedness: turn the base in air, and check that a sensor off its axis turns in the same
+    /// direction.
     Answer(Box<AnswerSettings>),
 }
 
-/// What the check of a sensor's answer needs to know.
+/// The settings of the check of handedness.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AnswerSettings {
-    /// What a sample must pass; the position is the sensor's, without its offset to the tip.
+    /// The gate that samples must pass. Its position is that of the sensor, without the offset to the tip.
     pub gate: Gate,
     /// Direction of insertion in the bench frame W, of length 1.
     pub axis: Vector3<f64>,
-    /// The turn, made twice and then back: well over 15 degrees, by which it may be off, and up to 90.
+    /// The turn of the base, which is made twice and then back: at most 90 degrees, and well over the tolerance
+    /// of 15 degrees.
     pub turn: Move,
 }
 
-/// Everything an operation needs to know.
+/// Everything that an operation needs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OperationConfig {
     /// The two drives.
     pub stage: StageConfig,
-    /// What is to be done.
+    /// The operation.
     pub operation: Operation,
 }
 
 impl Operation {
-    /// Homes `only` this axis, or every axis of `config` that can be homed.
+    /// Homes the axis `only`, or, for `None`, every axis of `config` that can be homed.
     pub fn home(config: &StageConfig, only: Option<Axis>) -> Self {
         Operation::Home(PerAxis::from_fn(|axis| match only {
             Some(only) => axis == only,
@@ -65,7 +67,7 @@ impl Operation {
         }))
     }
 
-    /// Whether it needs a tracker.
+    /// Whether the operation needs a tracker.
     pub fn needs_tracker(&self) -> bool {
         matches!(self, Operation::Answer(_))
     }
@@ -75,7 +77,7 @@ impl OperationConfig {
     /// The operation as a session that begins at `now`.
     ///
     /// # Errors
-    /// Where the stage refuses its configuration, or an axis is to be homed without being told how.
+    /// The stage refuses its configuration, or has no homing for an axis that is to be homed.
     pub fn begin(self, now: Time) -> Result<Session, String> {
         let OperationConfig { stage: config, operation } = self;
         let stage = match operation {
@@ -85,7 +87,7 @@ impl OperationConfig {
         let stage = stage.map_err(|error| format!("stage: {error}"))?;
         let task: Box<dyn Task> = match operation {
             Operation::Home(axes) => Box::new(Homing::new(&config, axes)),
-            Operation::Move(way) => Box::new(MoveOneAxis::new(&config, way)),
+            Operation::Move(request) => Box::new(MoveOneAxis::new(&config, request)),
             Operation::Prove => Box::new(Prove::new(&config)),
             Operation::Answer(settings) => Box::new(Answering::new(&config, *settings)),
         };
@@ -93,12 +95,12 @@ impl OperationConfig {
     }
 }
 
-/// What a run is: an insertion, or an operation of the stage alone.
+/// The configuration of a run: an insertion, or an operation of the stage alone.
 #[derive(Debug, Clone)]
 pub enum Plan {
-    /// A needle is steered.
+    /// Steers a needle.
     Insertion(Box<SessionConfig>),
-    /// The stage is moved without one.
+    /// Moves the stage without steering a needle.
     Operation(Box<OperationConfig>),
 }
 
@@ -106,7 +108,7 @@ impl Plan {
     /// The run as a session that begins at `now`.
     ///
     /// # Errors
-    /// Where an observer or the stage refuses its configuration.
+    /// An observer or the stage refuses its configuration.
     pub fn begin(self, now: Time) -> Result<Session, String> {
         match self {
             Plan::Insertion(config) => Session::new(*config, now),

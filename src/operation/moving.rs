@@ -1,4 +1,4 @@
-//! One axis on its way, the other held.
+//! Moves one axis to a goal; the other is held.
 
 use crate::session::{AxisMove, Profile, Record, Shell, State, Task};
 use crate::stage::{Axis, Feedback, SetPoint, StageConfig, StageEvent};
@@ -8,78 +8,82 @@ use std::time::Duration;
 /// Time after the last set-point by which the axis must be within its arrival tolerance.
 const ARRIVAL_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// A way to go, in mm or rad.
+/// A move of one axis, in mm or rad.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Move {
-    /// Which axis.
+    /// The axis that moves.
     pub axis: Axis,
-    /// Where to.
+    /// Where it moves to.
     pub goal: Goal,
     /// Highest speed, per second.
     pub speed: f64,
     /// Acceleration and braking, per second squared.
     pub acceleration: f64,
-    /// Standing this near to the goal counts as there.
+    /// Position tolerance at the goal.
     pub arrival: f64,
 }
 
-/// Where to, in mm or rad.
+/// The goal of a move, in mm or rad.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Goal {
-    /// So far from where the axis stands, either way.
+    /// This far from where the axis stands, in either direction.
     By(f64),
-    /// To this position, either way.
+    /// To this position, in either direction.
     To(f64),
-    /// Back to this position, from beyond it only: a needle is never pushed by it.
+    /// Back to this position, from beyond it only: this never pushes the needle.
     BackTo(f64),
 }
 
 /// A move under way.
 #[derive(Debug, Clone)]
 pub(super) struct Moving {
-    way: Move,
+    request: Move,
     from: SetPoint,
-    /// Distance from there, with its sign.
+    /// Distance of the goal from `from`, with its sign.
     distance: f64,
     profile: Profile,
-    /// What the drive stood off its target when the move began, and may stand off it at the end.
+    /// How far the axis stood from its target when the move began. It may stand as far from it at the end.
     offset: Option<f64>,
-    /// Since when the set-points have ended.
+    /// When the last set-point took effect.
     ended: Option<Time>,
 }
 
 impl Moving {
-    /// Begins where both axes are held. An error is the reason not to.
-    pub(super) fn new(way: Move, from: SetPoint) -> Result<Self, String> {
-        let here = from.along(way.axis);
-        let distance = match way.goal {
+    /// Begins at the target `from` at which both axes are held.
+    ///
+    /// # Errors
+    /// The axis would have to be pushed to its goal, which [`Goal::BackTo`] excludes.
+    pub(super) fn new(request: Move, from: SetPoint) -> Result<Self, String> {
+        let here = from.along(request.axis);
+        let distance = match request.goal {
             Goal::By(distance) => distance,
             Goal::To(goal) => goal - here,
-            Goal::BackTo(goal) if here >= goal - way.arrival => (goal - here).min(0.0),
+            Goal::BackTo(goal) if here >= goal - request.arrival => (goal - here).min(0.0),
             Goal::BackTo(goal) => {
-                let (axis, [here, goal]) = (way.axis, [here, goal].map(|at| way.axis.shown(at)));
+                let (axis, [here, goal]) =
+                    (request.axis, [here, goal].map(|at| request.axis.shown(at)));
                 return Err(format!(
-                    "{axis}: stands at {here}, not beyond the {goal} to go back to"
+                    "{axis}: stands at {here}, not beyond {goal}: a withdrawal never pushes the needle"
                 ));
             }
         };
-        let mut profile = Profile::new(way.speed, way.acceleration);
+        let mut profile = Profile::new(request.speed, request.acceleration);
         profile.go_to(distance.abs());
-        Ok(Moving { way, from, distance, profile, offset: None, ended: None })
+        Ok(Moving { request, from, distance, profile, offset: None, ended: None })
     }
 
-    fn at(&self, distance: f64) -> SetPoint {
-        let mut at = self.from;
-        match self.way.axis {
-            Axis::Insertion => at.insertion_mm += distance,
-            Axis::Rotation => at.rotation_rad += distance,
+    fn set_point_at(&self, distance: f64) -> SetPoint {
+        let mut set_point = self.from;
+        match self.request.axis {
+            Axis::Insertion => set_point.insertion_mm += distance,
+            Axis::Rotation => set_point.rotation_rad += distance,
         }
-        at
+        set_point
     }
 
-    /// Where it ends.
+    /// The last set-point.
     pub(super) fn goal(&self) -> SetPoint {
-        self.at(self.distance)
+        self.set_point_at(self.distance)
     }
 
     /// The set-point for the next SYNC.
@@ -88,14 +92,16 @@ impl Moving {
         if gone >= self.distance.abs() {
             self.goal()
         } else {
-            self.at(gone * self.distance.signum())
+            self.set_point_at(gone * self.distance.signum())
         }
     }
 
-    /// True once the last set-point was sent and the axis stands near enough to their end. An error
-    /// is the reason to stop for: it does not come there.
+    /// True once the last set-point has taken effect and the axis is within the tolerance of its goal.
+    ///
+    /// # Errors
+    /// The axis has not come there in time.
     pub(super) fn has_arrived(&mut self, feedback: &Feedback) -> Result<bool, String> {
-        let Move { axis, arrival, .. } = self.way;
+        let Move { axis, arrival, .. } = self.request;
         let here = feedback.measured.along(axis);
         let standing = here - feedback.commanded.along(axis);
         let offset = *self.offset.get_or_insert(standing);
@@ -125,31 +131,36 @@ impl Moving {
 /// The task of moving one axis, from the targets that both are held at.
 #[derive(Debug)]
 pub(super) struct MoveOneAxis {
-    way: Move,
+    request: Move,
     sync_period: Duration,
     moving: Option<Moving>,
     moves: Vec<AxisMove>,
 }
 
 impl MoveOneAxis {
-    pub(super) fn new(config: &StageConfig, way: Move) -> Self {
-        MoveOneAxis { way, sync_period: config.bus.sync_period(), moving: None, moves: Vec::new() }
+    pub(super) fn new(config: &StageConfig, request: Move) -> Self {
+        MoveOneAxis {
+            request,
+            sync_period: config.bus.sync_period(),
+            moving: None,
+            moves: Vec::new(),
+        }
     }
 
-    /// The move from `at`; a goal out of the limits is refused.
-    fn from(&self, shell: &Shell, at: SetPoint) -> Result<Moving, String> {
-        let moving = Moving::new(self.way, at)?;
+    /// The move from `at`, if its goal is within the limits.
+    fn plan_from(&self, shell: &Shell, at: SetPoint) -> Result<Moving, String> {
+        let moving = Moving::new(self.request, at)?;
         shell.check_goal(moving.goal())?;
         Ok(moving)
     }
 
-    /// One SYNC.
-    fn go_on(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
+    /// Computes the set-point for the next SYNC.
+    fn advance(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
         let mut moving = match self.moving.take() {
             Some(moving) => moving,
             None => {
-                let moving = self.from(shell, feedback.commanded)?;
-                let (axis, from) = (self.way.axis, feedback.commanded.along(self.way.axis));
+                let moving = self.plan_from(shell, feedback.commanded)?;
+                let (axis, from) = (self.request.axis, feedback.commanded.along(self.request.axis));
                 self.moves.push(AxisMove { axis, from: Some(from), to: from });
                 shell.enter(State::Moving);
                 moving
@@ -168,17 +179,14 @@ impl MoveOneAxis {
 impl Task for MoveOneAxis {
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
         match event {
-            // Before the axes have power.
-            StageEvent::Located(at) => self.from(shell, *at).map(drop),
+            // Refuses the goal before the axes have power.
+            StageEvent::Located(at) => self.plan_from(shell, *at).map(drop),
             StageEvent::Feedback(feedback) => {
                 shell.record(Record::Stage(*feedback));
                 if let Some(moved) = self.moves.last_mut() {
                     moved.to = feedback.measured.along(moved.axis);
                 }
-                match shell.is_running() {
-                    true => self.go_on(shell, feedback),
-                    false => Ok(()),
-                }
+                if shell.is_running() { self.advance(shell, feedback) } else { Ok(()) }
             }
             _ => Ok(()),
         }

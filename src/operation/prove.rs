@@ -1,5 +1,4 @@
-//! The bench stops its heartbeat on purpose: whether each drive notices, after how long, and whether it
-//! stops.
+//! Stops the bench's heartbeat on purpose, to prove that each drive notices in time and stops.
 
 use crate::canopen::Frame;
 use crate::canopen::emcy::EmcyCode;
@@ -8,7 +7,7 @@ use crate::stage::{Axis, Dialogue, Halt, PerAxis, StageConfig, StageEvent};
 use crate::units::Time;
 use std::time::Duration;
 
-/// A drive may notice a timeout this much later than its configured time.
+/// A drive may notice a missing heartbeat this much later than its configured timeout.
 const MARGIN: Duration = Duration::from_millis(200);
 
 /// A silence under way. The drives are read by SDO: a drive that notices the silence usually leaves
@@ -16,28 +15,28 @@ const MARGIN: Duration = Duration::from_millis(200);
 #[derive(Debug)]
 struct Silence {
     since: Time,
-    /// The longest that a drive may take to notice.
+    /// Within this time a drive must notice.
     within: Duration,
     noticed_after: PerAxis<Option<Duration>>,
-    looks: Halt,
+    watch: Halt,
 }
 
 impl Silence {
-    /// A silence from `since` on. The last heartbeat may have gone out just then.
+    /// A silence from `since` on. The last heartbeat may have been sent at that moment.
     fn new(config: &StageConfig, since: Time) -> Self {
         let within = config.bus.heartbeat_timeout() + MARGIN;
-        let looks = Halt::watch(config, since, since + within + config.power.stop_timeout);
-        Silence { since, within, noticed_after: PerAxis::default(), looks }
+        let watch = Halt::watch(config, since, since + within + config.power.stop_timeout);
+        Silence { since, within, noticed_after: PerAxis::default(), watch }
     }
 
-    /// When something is due.
+    /// When the verdict or the watch is due.
     fn deadline(&self) -> Time {
         let noticed = self.noticed_after.all(|after| after.is_some());
         let notice = if noticed { Time::NEVER } else { self.since + self.within };
-        self.looks.deadline().min(notice)
+        self.watch.deadline().min(notice)
     }
 
-    /// What is proved, per drive.
+    /// The text of the proof.
     fn proof(&self) -> String {
         let noticed = Axis::BOTH.map(|axis| {
             let after_ms = self.noticed_after[axis].unwrap_or_default().as_millis();
@@ -50,7 +49,8 @@ impl Silence {
         )
     }
 
-    /// Once it is known: both drives have noticed and stand. An error names those that did not.
+    /// The proof, once both drives have noticed and stand; `None` until then. An error names the drives that
+    /// have not noticed in time, or were not seen to stop.
     fn verdict(&self, now: Time) -> Option<Result<String, String>> {
         let in_time =
             |axis: &Axis| self.noticed_after[*axis].is_some_and(|after| after <= self.within);
@@ -68,7 +68,7 @@ impl Silence {
                 ))
             });
         }
-        let [insertion, rotation] = Axis::BOTH.map(|axis| self.looks.result(axis));
+        let [insertion, rotation] = Axis::BOTH.map(|axis| self.watch.result(axis));
         let moving: Vec<String> =
             [insertion?, rotation?].into_iter().filter_map(Result::err).collect();
         Some(match moving.is_empty() {
@@ -82,7 +82,7 @@ impl Silence {
     }
 }
 
-/// The task of falling silent while both axes are held, as a bench that has died.
+/// The task that stops the bench's heartbeat while both axes are held, as if the bench had died.
 #[derive(Debug)]
 pub(super) struct Prove {
     config: StageConfig,
@@ -119,7 +119,7 @@ impl Task for Prove {
 
     fn take_frame(&mut self, shell: &Shell, frame: &Frame) {
         if let Some(silence) = &mut self.silence {
-            silence.looks.handle_frame(shell.now, frame);
+            silence.watch.handle_frame(shell.now, frame);
         }
     }
 
@@ -127,11 +127,11 @@ impl Task for Prove {
         let Some(silence) = self.silence.as_mut().filter(|_| shell.is_running()) else {
             return Ok(());
         };
-        if shell.now >= silence.looks.deadline() {
-            silence.looks.handle_timeout(shell.now);
+        if shell.now >= silence.watch.deadline() {
+            silence.watch.handle_timeout(shell.now);
         }
         let verdict = silence.verdict(shell.now);
-        while let Some(frame) = silence.looks.poll_transmit() {
+        while let Some(frame) = silence.watch.poll_transmit() {
             shell.send(frame);
         }
         match verdict {

@@ -220,10 +220,7 @@ fn withdrawing_never_pushes() {
     let back = Move { goal: Goal::BackTo(0.0), ..by(Axis::Insertion, 0.0) };
     let mut bench = Bench::new(&config, Operation::Move(back));
     let reason = bench.reason();
-    assert!(
-        reason.starts_with("insertion: stands at -0.500 mm, not beyond the 0.000 mm"),
-        "{reason}"
-    );
+    assert!(reason.starts_with("insertion: stands at -0.500 mm, not beyond 0.000 mm"), "{reason}");
     assert_eq!(bench.travel(), (0.0, 0.0));
 }
 

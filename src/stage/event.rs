@@ -51,7 +51,7 @@ pub enum Progress {
     #[display("{_0}: drive has no {_1}, skipped")]
     Skipped(Axis, ObjectAddress),
     /// A drive restarted in the middle of its bring-up, which begins again.
-    #[display("{_0}: the drive restarted, its bring-up begins anew")]
+    #[display("{_0}: the drive restarted, its bring-up begins again")]
     Restarted(Axis),
     /// Both drives are configured; SYNC runs, and they have no power.
     #[display("both drives are configured, without power")]
