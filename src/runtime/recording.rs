@@ -1,5 +1,5 @@
-//! `run.rrd`, made from a closed record: its inputs are given to the same session again, and what
-//! leaves the session is logged, with the frames and events of the text files.
+//! Makes `run.rrd` from a closed record: replays the recorded inputs, and logs what the session records then,
+//! with the frames and events of the text files.
 
 use super::sink::{Operator, RunReport};
 use crate::archive::{CandumpLine, EventKind, EventLine, Lines, Manifest, file, unix_us_of};
@@ -11,7 +11,6 @@ use crate::units::Time;
 use std::error::Error;
 use std::fmt::Display;
 use std::io::{self, ErrorKind};
-use std::iter::Peekable;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
@@ -19,22 +18,22 @@ use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::thread;
 use std::time::Duration;
 
-/// Time between two progress messages to the operator.
-const TOLD_EVERY: Duration = Duration::from_secs(2);
-/// The recording is given up after this many intervals without progress: the disk is stalled.
-const GIVEN_UP_AFTER: u32 = 8;
+/// Interval between two progress messages to the operator.
+const PROGRESS_PERIOD: Duration = Duration::from_secs(2);
+/// After this many intervals without progress the disk is taken for stalled, and the recording is given up.
+const STALLED_PERIODS_MAX: u32 = 8;
 
 /// What the recording of a run needs beside the record.
 pub struct RecordedRun {
-    /// What the run was to do.
+    /// The configuration of the run.
     pub plan: Plan,
-    /// What stands still.
+    /// The static parts of the scene.
     pub scene: Scene,
     /// The configuration as used.
     pub config_toml: String,
 }
 
-/// Says what the run of a manifest was.
+/// Makes the [`RecordedRun`] of a manifest.
 pub type Describe = Box<dyn FnOnce(&Manifest) -> Result<RecordedRun, Box<dyn Error>> + Send>;
 
 /// The fault of a `run.rrd` that was not made.
@@ -55,50 +54,49 @@ pub fn complete_record(report: &mut RunReport, describe: Describe, operator: &mu
 }
 
 /// Makes `run.rrd` from the closed record in `dir`, and notes it in the manifest. Returns the fault if
-/// it is not made or ends before the run. `tell` is called every two seconds with the run's time that
-/// is reached.
+/// the recording is not made or not complete. `report_progress` is called every two seconds with the time of
+/// the run that the recording has reached.
 pub fn make_recording(
     dir: &Path,
     describe: Describe,
-    tell: &mut dyn FnMut(Time),
+    report_progress: &mut dyn FnMut(Time),
 ) -> Option<String> {
-    let made = Arc::new(AtomicI64::new(0));
+    let reached_ns = Arc::new(AtomicI64::new(0));
     let (done_tx, done) = channel();
-    let (of_thread, path) = (Arc::clone(&made), dir.to_path_buf());
-    // The thread is left behind when a stalled disk holds it for ever.
+    let (reached_by_thread, path) = (Arc::clone(&reached_ns), dir.to_path_buf());
+    // If a stalled disk blocks the thread for ever, it is abandoned.
     let spawned = thread::Builder::new()
         .name("run-rrd".to_owned())
-        .spawn(move || done_tx.send(make_and_note(&path, describe, &of_thread)));
+        .spawn(move || done_tx.send(make_and_note(&path, describe, &reached_by_thread)));
     if let Err(error) = spawned {
         return not_made(&error);
     }
-    let (mut before, mut without_progress) = (0, 0);
+    let (mut before_ns, mut stalled_periods) = (0, 0);
     loop {
-        match done.recv_timeout(TOLD_EVERY) {
+        match done.recv_timeout(PROGRESS_PERIOD) {
             Ok(fault) => return fault,
             Err(RecvTimeoutError::Disconnected) => return not_made(&"its thread panicked"),
             Err(RecvTimeoutError::Timeout) => {}
         }
-        let now = made.load(Ordering::Relaxed);
-        without_progress = if now == before { without_progress + 1 } else { 0 };
-        before = now;
-        if without_progress == GIVEN_UP_AFTER {
-            let limit_s = (TOLD_EVERY * GIVEN_UP_AFTER).as_secs();
+        let now_ns = reached_ns.load(Ordering::Relaxed);
+        stalled_periods = if now_ns == before_ns { stalled_periods + 1 } else { 0 };
+        before_ns = now_ns;
+        if stalled_periods == STALLED_PERIODS_MAX {
+            let limit_s = (PROGRESS_PERIOD * STALLED_PERIODS_MAX).as_secs();
             return not_made(&format!("no progress for {limit_s} s; is the disk stalled?"));
         }
-        tell(Time::from_nanos(now));
+        report_progress(Time::from_nanos(now_ns));
     }
 }
 
-fn make_and_note(dir: &Path, describe: Describe, made: &AtomicI64) -> Option<String> {
+fn make_and_note(dir: &Path, describe: Describe, reached_ns: &AtomicI64) -> Option<String> {
     let _lock = match lock(dir) {
         Ok(Some(lock)) => lock,
         Ok(None) => return not_made(&"another program has this record in hand"),
         Err(error) => return not_made(&error),
     };
-    let fault = match make_from_text_files(dir, describe, made) {
-        Ok(None) => None,
-        Ok(Some(why)) => Some(format!("{} ends before the run: {why}", file::RECORDING)),
+    let fault = match make_from_text_files(dir, describe, reached_ns) {
+        Ok(fault) => fault,
         Err(error) => not_made(&error),
     };
     match note_recording(dir, fault.clone()) {
@@ -107,11 +105,11 @@ fn make_and_note(dir: &Path, describe: Describe, made: &AtomicI64) -> Option<Str
     }
 }
 
-/// Why the recording ends before the run, where it does.
+/// Makes the recording. Returns its fault if it is not complete.
 fn make_from_text_files(
     dir: &Path,
     describe: Describe,
-    made: &AtomicI64,
+    reached_ns: &AtomicI64,
 ) -> Result<Option<String>, Box<dyn Error>> {
     let folder = RunFolder::open(dir)?;
     let manifest = folder.manifest();
@@ -121,14 +119,14 @@ fn make_from_text_files(
     };
     let RecordedRun { plan, scene, config_toml } = describe(manifest)?;
     let mut log = Log {
-        made,
+        reached_ns,
         recording: Recording::create(dir, manifest, &config_toml, &scene)?,
         failed: None,
-        frames: frames(open(file::CAN)?, manifest).peekable(),
-        events: events(open(file::EVENTS)?).peekable(),
+        frames: frames(open(file::CAN)?, manifest),
+        events: events(open(file::EVENTS)?),
     };
-    let mut why = None;
-    // Killed at once, a bench has given its session nothing.
+    let mut difference = None;
+    // A bench that was killed at once has recorded no inputs.
     if open(file::INPUTS)?.next().is_some() {
         let recorded = Recorded { manifest, plan, open: &open };
         let replayed = replay_to(&recorded, None, &mut |record, truth| {
@@ -137,35 +135,34 @@ fn make_from_text_files(
                 log.take(time, Entry { record, truth });
             }
         });
-        why = match replayed {
+        difference = match replayed {
             Ok(replayed) => replayed.difference,
             Err(error) => Some(error.to_string()),
         };
     }
     log.text_until(Time::NEVER);
+    let unread = log.frames.fault().or_else(|| log.events.fault());
     match log.failed {
         Some(error) => return Err(error.into()),
         None => log.recording.finish()?,
     }
-    Ok(why)
+    let short = difference.map(|why| format!("{} ends before the run: {why}", file::RECORDING));
+    Ok(short.or(unread))
 }
 
-/// The recording, and what the text files hold for it: frames and events in their order.
+/// The recording, and the frames and events of the text files that are to be logged to it.
 struct Log<'a> {
     recording: Recording,
-    /// The run's time that is reached, ns.
-    made: &'a AtomicI64,
+    /// The time of the run that the recording has reached, ns.
+    reached_ns: &'a AtomicI64,
     failed: Option<TelemetryError>,
-    frames: Peekable<TimedRecords>,
-    events: Peekable<TimedRecords>,
+    frames: TimedRecords,
+    events: TimedRecords,
 }
-
-/// The records of a text file, with their times.
-type TimedRecords = Box<dyn Iterator<Item = (Time, Record)>>;
 
 impl Log<'_> {
     fn take(&mut self, time: Time, entry: Entry) {
-        self.made.fetch_max(time.as_nanos(), Ordering::Relaxed);
+        self.reached_ns.fetch_max(time.as_nanos(), Ordering::Relaxed);
         if self.failed.is_none() {
             self.failed = self.recording.take(entry).err();
         }
@@ -174,17 +171,70 @@ impl Log<'_> {
     /// Logs the frames and events up to `time`.
     fn text_until(&mut self, time: Time) {
         loop {
-            let times = [&mut self.frames, &mut self.events]
-                .map(|lines| lines.peek().map_or(Time::NEVER, |(time, _)| *time));
-            let lines = if times[1] <= times[0] { &mut self.events } else { &mut self.frames };
-            let next = lines.next_if(|(line_time, _)| *line_time <= time);
-            let Some((time, record)) = next else { return };
+            let events_first = self.events.next_time() <= self.frames.next_time();
+            let earlier = if events_first { &mut self.events } else { &mut self.frames };
+            if earlier.next_time() > time {
+                return;
+            }
+            let Some((time, record)) = earlier.take_next() else { return };
             self.take(time, Entry::from(record));
         }
     }
 }
 
-/// When `record` was; `None` for the records that the text files hold whole.
+type TimedRecord = (Time, Record);
+
+/// Reads the record in a line; `None` if there is none.
+type ParseLine = Box<dyn Fn(&str) -> Option<TimedRecord>>;
+
+/// The records of a text file, in the order of the file.
+struct TimedRecords {
+    file: &'static str,
+    lines: Lines,
+    parse: ParseLine,
+    next: Option<TimedRecord>,
+    /// An error of reading, which ends the records.
+    error: Option<io::Error>,
+}
+
+impl TimedRecords {
+    fn new(
+        file: &'static str,
+        lines: Lines,
+        parse: impl Fn(&str) -> Option<TimedRecord> + 'static,
+    ) -> Self {
+        let parse = Box::new(parse);
+        let mut records = TimedRecords { file, lines, parse, next: None, error: None };
+        records.take_next();
+        records
+    }
+
+    /// The time of the next record; [`Time::NEVER`] at the end.
+    fn next_time(&self) -> Time {
+        self.next.as_ref().map_or(Time::NEVER, |(time, _)| *time)
+    }
+
+    /// Takes the next record, and reads the one after it.
+    fn take_next(&mut self) -> Option<TimedRecord> {
+        let taken = self.next.take();
+        while self.next.is_none() && self.error.is_none() {
+            match self.lines.next() {
+                Some(Ok(line)) => self.next = (self.parse)(&line),
+                Some(Err(error)) => self.error = Some(error),
+                None => break,
+            }
+        }
+        taken
+    }
+
+    /// The fault of a recording without the lines that could not be read.
+    fn fault(&self) -> Option<String> {
+        let error = self.error.as_ref()?;
+        Some(format!("{} lacks the rest of {}: {error}", file::RECORDING, self.file))
+    }
+}
+
+/// The time of `record`; `None` for a record that the text files hold completely.
 fn time_of(record: &Record) -> Option<Time> {
     match record {
         Record::Sample(sample) | Record::Target(sample) => Some(sample.received.receive_time),
@@ -195,20 +245,20 @@ fn time_of(record: &Record) -> Option<Time> {
     }
 }
 
-/// The records of the lines of `can.log`.
+/// The records in `can.log`.
 fn frames(lines: Lines, manifest: &Manifest) -> TimedRecords {
     let started_unix_us = unix_us_of(&manifest.started_utc).unwrap_or_default();
-    Box::new(lines.map_while(Result::ok).filter_map(move |line| {
-        let line = CandumpLine::parse(&line)?;
+    TimedRecords::new(file::CAN, lines, move |line| {
+        let line = CandumpLine::parse(line)?;
         let (time, direction, frame) = (line.time(started_unix_us), line.direction, line.frame);
         Some((time, Record::Can { time, direction, frame }))
-    }))
+    })
 }
 
-/// The records of the lines of `events.log`.
+/// The records in `events.log`.
 fn events(lines: Lines) -> TimedRecords {
-    Box::new(lines.map_while(Result::ok).filter_map(|line| {
-        let EventLine { time, lane, kind, text } = EventLine::parse(&line)?;
+    TimedRecords::new(file::EVENTS, lines, |line| {
+        let EventLine { time, lane, kind, text } = EventLine::parse(line)?;
         let record = match kind {
             EventKind::State => Record::State { time, state: State::named(lane, &text)? },
             EventKind::Event(severity) => {
@@ -216,7 +266,7 @@ fn events(lines: Lines) -> TimedRecords {
             }
         };
         Some((time, record))
-    }))
+    })
 }
 
 #[cfg(test)]
@@ -226,12 +276,13 @@ mod tests {
     use crate::session::Outcome;
     use crate::telemetry::tests::{CONFIG_TOML, manifest, scene};
     use crate::telemetry::{Backpressure, Recorder};
+    use std::path::PathBuf;
 
-    /// A run that was killed at once, or that does not replay: its frames and events take long as well, and
-    /// must not be taken for a stalled disk.
-    #[test]
-    fn what_the_text_files_alone_hold_is_progress() {
-        let parent = std::env::temp_dir().join(format!("needle-bench-made-{}", std::process::id()));
+    /// A closed record with one event and no inputs, as of a run that was killed at once. Returns the parent of
+    /// its folder, the folder, and the time of the event.
+    fn record_of_one_event(name: &str) -> (PathBuf, PathBuf, Time) {
+        let parent =
+            std::env::temp_dir().join(format!("needle-bench-{name}-{}", std::process::id()));
         let mut recorder =
             Recorder::create(&parent, manifest(), CONFIG_TOML.to_owned(), Backpressure::Block)
                 .unwrap();
@@ -239,13 +290,37 @@ mod tests {
         let (lane, severity) = (Lane::Session, Severity::Warning);
         recorder.record(Entry::from(Record::Event { time, lane, severity, text }));
         let finished = recorder.finish(|manifest| manifest.set_outcome(&Outcome::Completed));
-        let made = AtomicI64::new(0);
-        let describe: Describe = Box::new(|_| {
+        (parent, finished.unwrap().run_dir, time)
+    }
+
+    fn describe() -> Describe {
+        Box::new(|_| {
             let plan = Plan::from(Config::from_sources(&[], &[])?.session()?);
             Ok(RecordedRun { plan, scene: scene(), config_toml: CONFIG_TOML.to_owned() })
-        });
-        let why = make_from_text_files(&finished.unwrap().run_dir, describe, &made).unwrap();
-        assert_eq!((why, made.load(Ordering::Relaxed)), (None, time.as_nanos()));
+        })
+    }
+
+    /// A run that was killed at once, or that does not replay: its frames and events take long as well, and
+    /// must not be taken for a stalled disk.
+    #[test]
+    fn what_the_text_files_alone_hold_is_progress() {
+        let (parent, run_dir, time) = record_of_one_event("made");
+        let reached_ns = AtomicI64::new(0);
+        let fault = make_from_text_files(&run_dir, describe(), &reached_ns).unwrap();
+        assert_eq!((fault, reached_ns.load(Ordering::Relaxed)), (None, time.as_nanos()));
+        std::fs::remove_dir_all(parent).unwrap();
+    }
+
+    #[test]
+    fn lines_that_cannot_be_read_are_a_fault_of_the_recording() {
+        let (parent, run_dir, _) = record_of_one_event("unread");
+        let events = run_dir.join(file::EVENTS);
+        std::fs::remove_file(&events).unwrap();
+        // Opens like a file, and every read at its beginning fails, as at a bad sector.
+        std::os::unix::fs::symlink("/proc/self/mem", &events).unwrap();
+        let fault = make_from_text_files(&run_dir, describe(), &AtomicI64::new(0)).unwrap();
+        let expected = "run.rrd lacks the rest of events.log: Input/output error (os error 5)";
+        assert_eq!(fault.as_deref(), Some(expected));
         std::fs::remove_dir_all(parent).unwrap();
     }
 }
