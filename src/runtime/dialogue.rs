@@ -16,7 +16,7 @@ const RETRY_PERIOD: Duration = Duration::from_millis(100);
 /// Runs `dialogue` on `bus` to its end.
 ///
 /// # Errors
-/// The bus is off or down, or refuses a frame.
+/// The interface is down or gone, or refuses a frame.
 pub fn talk_live(
     dialogue: &mut dyn Dialogue,
     bus: &mut dyn CanBus,
@@ -42,19 +42,19 @@ pub fn talk_live(
     }
 }
 
-/// The bus errors of a dialogue that went on in spite of them.
+/// The bus errors of a dialogue that continued in spite of them.
 #[derive(Debug, Default)]
 pub struct BusTrouble {
     /// Attempts to send that the bus refused.
     pub refused: u32,
-    /// Frames that the bus refused to the end.
+    /// Frames that the bus refused until the end.
     pub unsent: Vec<Frame>,
     /// The first error.
     pub first: Option<CanError>,
 }
 
 impl BusTrouble {
-    /// Sends what is unsent, each frame whether or not the bus takes those before it.
+    /// Tries to send each unsent frame, even if the bus refuses those before it.
     fn send(&mut self, bus: &mut dyn CanBus) {
         for frame in std::mem::take(&mut self.unsent) {
             if let Err(error) = bus.send(&frame) {
@@ -80,7 +80,7 @@ pub fn talk_despite_errors(
         let now = clock.now();
         let waiting = trouble.unsent.len();
         while let Some(frame) = dialogue.poll_transmit() {
-            // The dialogue repeats a request that is not answered, also one that was never sent.
+            // The dialogue repeats an unanswered request, even if it was never sent.
             if !trouble.unsent.contains(&frame) {
                 trouble.unsent.push(frame);
             }

@@ -1,4 +1,4 @@
-//! The one loop of every run, in real time and in virtual time.
+//! The loop of every run, in real time and in virtual time.
 
 use crate::canopen::Frame;
 use crate::emulator::Truth;
@@ -8,21 +8,22 @@ use crate::session::{
 use crate::transport::can::CanError;
 use crate::units::Time;
 
-/// Takes the records of a run.
+/// Takes the records of a run, and passes on what the operator wants.
 pub(super) trait Witness {
-    /// Takes one record, with the truth of its moment where the run is emulated.
+    /// Takes one record; in an emulated run with the true pose at that time.
     fn take(&mut self, record: Record, truth: Option<Truth>);
 
-    /// The run has come this far.
+    /// Takes the progress of the run.
     fn progress(&mut self, _progress: Progress) {}
 
-    /// What the operator asks for next, if anything.
+    /// The operator's next command, if there is one.
     fn command(&mut self) -> Option<OperatorCommand> {
         None
     }
 
-    /// Why the operator or the record ends the run; `None` once the run `is_asked` to end.
-    fn stop_reason(&mut self, _now: Time, _is_asked: bool) -> Option<String> {
+    /// Why the operator or the record stops the run, if one of them does; `None` if the run `is_stopping`
+    /// already.
+    fn stop_reason(&mut self, _now: Time, _is_stopping: bool) -> Option<String> {
         None
     }
 }
@@ -34,7 +35,7 @@ impl<F: FnMut(Record, Option<Truth>)> Witness for F {
     }
 }
 
-/// The bus, the tracker and the clock of a run.
+/// The machine of a run with its bus, tracker and clock.
 pub(super) trait World {
     fn machine(&mut self) -> &mut dyn Machine;
 
@@ -42,19 +43,19 @@ pub(super) trait World {
 
     fn now(&self) -> Time;
 
-    /// Gives `input` to the machine, now.
+    /// Gives `input` to the machine at the present time.
     fn give(&mut self, input: Input);
 
-    /// Sends a frame that was made at `made`; false if it is too old to be sent.
+    /// Sends a frame that was made at `made`; false if it is stale and was not sent.
     ///
     /// # Errors
-    /// Why the bus refuses it.
+    /// The bus refuses the frame.
     fn send(&mut self, made: Time, frame: &Frame) -> Result<bool, CanError>;
 
     fn record(&mut self, record: Record);
 
-    /// Gives the machine the inputs that have arrived; true if their answers must leave before anything else
-    /// is done.
+    /// Gives the machine the inputs that have arrived; true if its outputs must be sent before anything else is
+    /// done.
     fn take_arrived(&mut self) -> bool;
 
     /// Waits for the next deadline or input, and gives it to the machine.
@@ -63,7 +64,7 @@ pub(super) trait World {
 
 /// Runs the machine to its end.
 pub(super) fn drive(world: &mut impl World) -> Outcome {
-    let mut stop_asked = false;
+    let mut is_stopping = false;
     loop {
         carry_out(world);
         if let Some(outcome) = world.machine().outcome() {
@@ -72,12 +73,12 @@ pub(super) fn drive(world: &mut impl World) -> Outcome {
         if world.take_arrived() {
             continue;
         }
-        // The answers leave before anything that is due is done.
+        // Outputs are sent before the machine does what is due.
         carry_out(world);
         let now = world.now();
-        match world.witness().stop_reason(now, stop_asked) {
+        match world.witness().stop_reason(now, is_stopping) {
             Some(reason) => {
-                stop_asked = true;
+                is_stopping = true;
                 world.give(Input::Stop(reason));
             }
             None => {
@@ -92,9 +93,9 @@ pub(super) fn drive(world: &mut impl World) -> Outcome {
     }
 }
 
-/// Sends the machine's frames, and then takes its records: a SYNC waits for no record. A frame is recorded as
-/// sent if it was. If the bus refuses a frame, the machine is told of the fault once. The frames queued behind
-/// the refused one are stale and never sent, so the frames that stop the axes are the next to be tried.
+/// Sends the machine's frames, and only then records its records: a SYNC waits for no record. A frame is
+/// recorded only if it was sent. If the bus refuses a frame, the machine is given the fault, once. The frames
+/// queued behind the refused one are stale and never sent, so the frames that stop the axes are tried next.
 pub(super) fn carry_out(world: &mut impl World) {
     let (mut records, mut has_failed) = (Vec::new(), false);
     while let Some(output) = world.machine().poll() {

@@ -1,8 +1,8 @@
-//! Clocks, threads and sockets: where a session meets the world.
+//! Runs a session: connects it to clocks, threads and sockets.
 //!
-//! [`run_virtual`] joins it to the emulated stage in virtual time, at a [`Pace`] if asked, [`run_live`] to a
-//! CAN bus and a tracker in real time. Both are one loop, which only moves inputs and outputs: every decision
-//! is the session's.
+//! [`run_virtual`] connects it to the emulated stage in virtual time, on request at a [`Pace`]; [`run_live`]
+//! connects it to a CAN bus and a tracker in real time. Both use one loop, which only moves inputs and outputs:
+//! every decision is the session's.
 
 mod dialogue;
 mod drive;

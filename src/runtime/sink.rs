@@ -1,4 +1,4 @@
-//! What the runtime does with a session's records: telemetry, figures, news for the operator.
+//! Passes a session's records on to the recorder, to the figures and to the operator's screen.
 
 use super::drive::Witness;
 use super::interrupt::Interrupt;
@@ -21,25 +21,25 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// The operator's screen and keys: shows progress and events as they happen, gives commands.
-/// Nothing here may wait: the control thread calls it.
+/// No method may block: the control thread calls them.
 pub trait Operator {
-    /// The run has come this far.
+    /// Shows the progress of the run.
     fn progress(&mut self, progress: Progress);
-    /// Something happened.
+    /// Shows an event.
     fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: &str);
-    /// A record, as it is made.
+    /// Takes each record as it is made.
     fn record(&mut self, _record: &Record) {}
-    /// Something is wrong with the record; an event says it too.
+    /// Shows a trouble with the record; an event reports it too.
     fn record_trouble(&mut self, _text: &str) {}
-    /// The run is recorded in this folder.
+    /// Takes the folder in which the run is recorded.
     fn recorded_to(&mut self, _folder: &Path) {}
-    /// What the operator asks for next, if anything.
+    /// The operator's next command, if there is one.
     fn command(&mut self) -> Option<OperatorCommand> {
         None
     }
 }
 
-/// How often an insertion was held, by what held it.
+/// How often an insertion was held, by cause.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
 pub struct Holds {
     /// By the tracker: the tip was not seen, or the stream contradicted the model.
@@ -58,7 +58,7 @@ pub struct Sink<'a> {
     drives: Vec<DriveIdentity>,
     stops_on_failure: bool,
     /// How long it took to hand each record to the recorder, ns.
-    handed_over: DurationHistogram,
+    record_times: DurationHistogram,
     operator: &'a mut dyn Operator,
     interrupt: Interrupt,
 }
@@ -78,19 +78,19 @@ pub struct RunReport {
     pub gates: GateCounts,
     /// The session's time at the end.
     pub end: Time,
-    /// How well time was kept; none in virtual time.
+    /// How punctual the run was; `None` in virtual time.
     pub timing: Option<TimingReport>,
     /// The run folder.
     pub run_dir: PathBuf,
     /// What the closed record holds, or why it could not be closed.
     pub record: Result<Finished, TelemetryError>,
-    /// What can be known only of an emulated run.
+    /// What is known only in an emulated run; `None` in any other.
     pub emulated: Option<EmulationReport>,
 }
 
 impl<'a> Sink<'a> {
-    /// Records go to `recorder`, news to `operator`, who may raise `interrupt`. When recording
-    /// fails the run is stopped if `stops_on_failure`; otherwise it goes on, and what is lost is
+    /// Passes records to `recorder` and news to `operator`; stops the run once `interrupt` is raised. If
+    /// recording fails, the run is stopped if `stops_on_failure`; otherwise it continues, and lost records are
     /// reported and counted.
     pub fn new(
         recorder: Recorder,
@@ -105,7 +105,7 @@ impl<'a> Sink<'a> {
             holds: Holds::default(),
             drives: Vec::new(),
             stops_on_failure,
-            handed_over: DurationHistogram::default(),
+            record_times: DurationHistogram::default(),
             operator,
             interrupt: interrupt.clone(),
         }
@@ -123,8 +123,8 @@ impl<'a> Sink<'a> {
         self.recorder.identify_drives(self.drives.clone());
     }
 
-    /// Reports what has changed about the record, and records it as far as possible. Returns the reason to
-    /// end the run if recording failed, unless the run goes on without a record or `is_ending` anyway.
+    /// Reports the recorder's news, and records them as far as possible. Returns the reason to stop the run if
+    /// recording has failed, unless the run continues without a record or `is_ending` anyway.
     fn look_after_record(&mut self, now: Time, is_ending: bool) -> Option<String> {
         let mut reason = None;
         while let Some(news) = self.recorder.news() {
@@ -156,14 +156,14 @@ impl<'a> Sink<'a> {
         gates: GateCounts,
         timing: Option<TimingReport>,
     ) -> RunReport {
-        let timing = timing.map(|timing| timing.with_record_times(&self.handed_over));
+        let timing = timing.map(|timing| timing.with_record_times(&self.record_times));
         let run_dir = self.recorder.run_dir().to_path_buf();
         let record = self.recorder.finish(|manifest| {
             manifest.set_outcome(&outcome);
             manifest.duration_s = Some(end.as_nanos() as f64 / 1e9);
             manifest.gates = gates_to_json(&gates);
-            manifest.figures = object(&self.figures.report());
-            manifest.timing = object(&timing);
+            manifest.figures = json_keys(&self.figures.report());
+            manifest.timing = json_keys(&timing);
         });
         let (figures, holds) = (self.figures, self.holds);
         let (stage_at_end, emulated) = (StageAtEnd::default(), None);
@@ -201,7 +201,7 @@ impl Witness for Sink<'_> {
         let truth = truth.filter(|_| matches!(record, Record::Step(_)));
         let begun = Instant::now();
         self.recorder.record(Entry { record, truth });
-        self.handed_over.add_ns(begun.elapsed());
+        self.record_times.add_ns(begun.elapsed());
     }
 
     fn progress(&mut self, progress: Progress) {
@@ -212,23 +212,28 @@ impl Witness for Sink<'_> {
         self.operator.command()
     }
 
-    fn stop_reason(&mut self, now: Time, is_asked: bool) -> Option<String> {
-        let is_raised = self.interrupt.is_raised();
-        let record = self.look_after_record(now, is_asked || is_raised);
-        let operator = is_raised.then(|| "operator: interrupted".to_owned());
-        operator.or(record).filter(|_| !is_asked)
+    fn stop_reason(&mut self, now: Time, is_stopping: bool) -> Option<String> {
+        let is_interrupted = self.interrupt.is_raised();
+        let record_reason = self.look_after_record(now, is_stopping || is_interrupted);
+        if is_stopping {
+            None
+        } else if is_interrupted {
+            Some("operator: interrupted".to_owned())
+        } else {
+            record_reason
+        }
     }
 }
 
-/// The keys of what serialises as an object; none of anything else.
-fn object(figures: &impl Serialize) -> Map<String, Value> {
-    match serde_json::to_value(figures) {
+/// The keys of `value` if it serialises as a JSON object; none otherwise.
+fn json_keys(value: &impl Serialize) -> Map<String, Value> {
+    match serde_json::to_value(value) {
         Ok(Value::Object(keys)) => keys,
         _ => Map::new(),
     }
 }
 
-/// Samples of the tool accepted, and refused by each gate that refused any.
+/// The number of accepted samples of the tool, and the number refused by each gate that refused any.
 pub fn gates_to_json(gates: &GateCounts) -> Map<String, Value> {
     let refused: Map<String, Value> =
         gates.by_gate().map(|(gate, count)| (gate.to_string(), json!(count))).collect();

@@ -1,5 +1,5 @@
-//! A session and the virtual stage in one thread, in virtual time: no sockets, and no sleeps unless an
-//! operator practises at the pace of real time.
+//! Runs a session against the virtual stage in one thread, in virtual time: without sockets, and without sleeps
+//! unless an operator practises at the pace of real time.
 
 use super::drive::{Witness, World, drive};
 use super::sink::{RunReport, Sink};
@@ -23,7 +23,7 @@ pub enum TipSource {
     Emulated {
         /// The name of the tool in its samples.
         tool: String,
-        /// The tool that is the target, where that is one.
+        /// The name of the tool that marks the target, if the target is tracked.
         target: Option<String>,
     },
     /// A recording, which replaces that tracker.
@@ -32,7 +32,7 @@ pub enum TipSource {
 
 /// Runs `session`, an insertion or an operation, against `stage` until it ends. Frames and samples
 /// arrive at the moment when they are sent. Time jumps to the earliest deadline of session, stage and
-/// tip source, or with `pace` waits for it. Without `tips` the session has no tracker.
+/// tip source; with `pace`, the thread waits for it. Without `tips` the session has no tracker.
 pub fn run_virtual(
     session: &mut dyn Machine,
     stage: VirtualStage,
@@ -63,12 +63,12 @@ pub(super) fn run_unwatched(
 /// The default transmit queue of a CAN interface (`txqueuelen`), frames.
 const QUEUE_MAX: usize = 10;
 
-/// How many SYNCs may stay unconfirmed by a stuck interface; one more is an error.
+/// How many SYNCs may stay unconfirmed on a stuck interface; after these, sending is an error.
 const UNCONFIRMED_SYNCS_MAX: usize = 2;
 /// The interface's name in messages.
 const INTERFACE: &str = "memory";
 
-/// A run in virtual time: the session, the virtual stage, and what records them.
+/// A run in virtual time: the session, the virtual stage, and the witness that takes their records.
 struct VirtualRun<'a, W> {
     now: Time,
     session: &'a mut dyn Machine,
@@ -93,8 +93,8 @@ impl<'a, W: Witness> VirtualRun<'a, W> {
         VirtualRun { now, session, stage, tips, pace: None, emulated, unconfirmed, witness }
     }
 
-    /// The error of an interface that does not accept `frame`. In bus-off the interface accepts the
-    /// frame and loses it. If no node acknowledges, it accepts frames until its queue is full.
+    /// The error of an interface that does not accept `frame`; `None` if it does. In bus-off the interface
+    /// accepts the frame and loses it. If no node acknowledges, it accepts frames until its queue is full.
     fn refusal(&self, frame: &Frame) -> Option<CanError> {
         let interface = INTERFACE.to_owned();
         let full = |interface| CanError::TransmitQueueFull { interface, frame: *frame };
@@ -117,9 +117,9 @@ impl<'a, W: Witness> VirtualRun<'a, W> {
         }
     }
 
-    /// Gives the session what the emulated tracker sees of the tip or the target, in full precision: no
+    /// Gives the session a sample of the tip or the target from the emulated tracker, in full precision: no
     /// tracker protocol rounds it.
-    fn see(&mut self, seen: &TrackedTip, is_target: bool) {
+    fn give_sample(&mut self, seen: &TrackedTip, is_target: bool) {
         let Some(TipSource::Emulated { tool, target }) = &self.tips else { return };
         let tool = if is_target { target.as_ref() } else { Some(tool) };
         let Some(tool) = tool.cloned() else { return };
@@ -183,18 +183,18 @@ impl<W: Witness> World for VirtualRun<'_, W> {
     }
 
     fn take_arrived(&mut self) -> bool {
-        let mut any = false;
+        let mut has_arrived = false;
         while let Some(output) = self.stage.poll() {
-            any = true;
+            has_arrived = true;
             self.emulated.update(&self.stage, self.now);
             match output {
                 StageOutput::Frame(frame) => self.give(Input::Frame(frame)),
                 StageOutput::FaultBegan(fault) => self.begin_fault(fault),
-                StageOutput::Tip { tip, .. } => self.see(&tip, false),
-                StageOutput::Target(target) => self.see(&target, true),
+                StageOutput::Tip { tip, .. } => self.give_sample(&tip, false),
+                StageOutput::Target(target) => self.give_sample(&target, true),
             }
         }
-        any
+        has_arrived
     }
 
     /// Goes to the earliest deadline of session, stage and tip source.
@@ -221,7 +221,7 @@ impl<W: Witness> World for VirtualRun<'_, W> {
 /// The true positions of both axes at one time of an emulated run.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Moment {
-    /// When.
+    /// The time.
     pub time: Time,
     /// True depth, mm, from where the stage was switched on.
     pub insertion_true_mm: f64,
@@ -245,12 +245,12 @@ pub struct DriveOutcome {
     pub left_operation_enabled: Option<Moment>,
 }
 
-/// What can be known only of an emulated run.
+/// What is known only in an emulated run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EmulationReport {
     /// The scripted faults that began, in order.
     pub faults: Vec<(Fault, Moment)>,
-    /// When the run began to stop.
+    /// The moment at which the run began to stop.
     pub stopping: Option<Moment>,
     /// The insertion drive and the rotation drive.
     pub drives: [DriveOutcome; 2],
@@ -279,10 +279,10 @@ impl EmulationReport {
     }
 }
 
-/// Longest wait: a key is served at least this often.
+/// Longest single wait, so that the operator's keys are handled at least this often.
 const STRIDE: Duration = Duration::from_millis(20);
-/// A delay up to this long is caught up on; after a longer one, such as a suspended program, virtual time
-/// goes on from where it was.
+/// Virtual time catches up on a delay up to this long. After a longer one, such as a suspended program, it
+/// continues from where it was.
 const CATCH_UP_MAX: Duration = Duration::from_millis(100);
 
 /// Keeps virtual time from running ahead of the clock.
@@ -298,15 +298,15 @@ impl Pace {
         Pace { origin: Instant::now() }
     }
 
-    /// Waits at `now` for `due`, at most a stride. Returns the time that is reached.
+    /// Waits at `now` for `due`, at most a [`STRIDE`]. Returns the virtual time that is reached.
     fn wait(&mut self, now: Time, due: Time) -> Time {
         let reached = due.min(now + STRIDE);
-        let at = self.origin + reached.since(Time::ZERO);
-        let late = at.elapsed();
+        let wake_at = self.origin + reached.since(Time::ZERO);
+        let late = wake_at.elapsed();
         if late > CATCH_UP_MAX {
             self.origin += late;
         }
-        thread::sleep(at.saturating_duration_since(Instant::now()));
+        thread::sleep(wake_at.saturating_duration_since(Instant::now()));
         reached
     }
 }
