@@ -7,22 +7,23 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use tokio::signal::unix::{SignalKind, signal};
 
-/// A signal has come. It holds for as long as the process lives: what a command would do next, such as the
-/// run after its preflight, is not begun.
+/// A signal has come. This is never cleared, so that a command begins nothing more: no run after its preflight,
+/// for example.
 static SIGNALLED: AtomicBool = AtomicBool::new(false);
 
-/// Raised once the operator or the system has asked the program to end.
+/// A flag that is raised once the operator or the system has asked the program to end.
 #[derive(Debug, Clone, Default)]
 pub struct Interrupt {
     raised: Arc<AtomicBool>,
-    hears_signals: bool,
+    /// Signals raise the flag, too.
+    listens: bool,
 }
 
 impl Interrupt {
-    /// Listens for SIGINT, SIGTERM, SIGHUP (a terminal that was closed) and SIGQUIT from now on, and knows
-    /// of those that came since the first one listened. They no longer kill the process: the flag is all
-    /// they do, however often they come, so that the stage is stopped in order. Nor does SIGXFSZ: a file
-    /// that may not grow (`ulimit -f`) is an error of writing it.
+    /// A flag that SIGINT, SIGTERM, SIGHUP (a terminal that was closed) and SIGQUIT raise. It is raised already
+    /// if one of them has come since the first call. They no longer kill the process, however often they come,
+    /// so that the stage is stopped in order. Nor does SIGXFSZ: writing a file that may not grow (`ulimit -f`)
+    /// gives an error instead.
     ///
     /// # Errors
     /// When the handlers cannot be installed.
@@ -30,10 +31,10 @@ impl Interrupt {
         static IS_LISTENING: Mutex<bool> = Mutex::new(false);
         let mut is_listening = IS_LISTENING.lock().unwrap_or_else(PoisonError::into_inner);
         if !*is_listening {
-            hear_signals()?;
+            install_handlers()?;
             *is_listening = true;
         }
-        Ok(Interrupt { hears_signals: true, ..Interrupt::default() })
+        Ok(Interrupt { listens: true, ..Interrupt::default() })
     }
 
     /// Raises the flag.
@@ -41,19 +42,19 @@ impl Interrupt {
         self.raised.store(true, Ordering::Relaxed);
     }
 
-    /// True once it was raised.
+    /// True once the flag was raised.
     pub fn is_raised(&self) -> bool {
         self.raised.load(Ordering::Relaxed) || self.is_signalled()
     }
 
-    /// True once a signal has raised it: the program is to end, not only what it does.
+    /// True once a signal has raised the flag: the program must end, not only its present task.
     pub fn is_signalled(&self) -> bool {
-        self.hears_signals && SIGNALLED.load(Ordering::Relaxed)
+        self.listens && SIGNALLED.load(Ordering::Relaxed)
     }
 }
 
-/// A thread that notes signals until the process ends.
-fn hear_signals() -> io::Result<()> {
+/// Installs the signal handlers, and starts a thread that notes signals until the process ends.
+fn install_handlers() -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let in_runtime = runtime.enter();
     for kind in
@@ -66,11 +67,11 @@ fn hear_signals() -> io::Result<()> {
             }
         });
     }
-    // With a handler installed the signal no longer kills; nothing has to read it.
+    // With a handler installed, this signal no longer kills; nothing needs to read it.
     let _ = signal(SignalKind::from_raw(Signal::SIGXFSZ as i32))?;
     drop(in_runtime);
-    let hear = move || runtime.block_on(std::future::pending::<()>());
-    thread::Builder::new().name("signals".to_owned()).spawn(hear)?;
+    let run = move || runtime.block_on(std::future::pending::<()>());
+    thread::Builder::new().name("signals".to_owned()).spawn(run)?;
     Ok(())
 }
 

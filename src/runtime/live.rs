@@ -18,6 +18,10 @@ const WAIT_MAX: Duration = Duration::from_millis(5);
 /// tens of microseconds.
 const SPIN: Duration = Duration::from_micros(150);
 
+/// At most this many waiting frames are taken at once: as many as a bus at full load brings in some 30 ms, so
+/// that an endless flood delays no deadline.
+const ARRIVED_MAX: usize = 256;
+
 /// Interval between two readings of the counts of the tracker's link.
 const LOOK_PERIOD: Duration = Duration::from_millis(100);
 /// More messages a second than this from the tracker are a flood.
@@ -210,12 +214,14 @@ impl<W: Witness> World for Live<'_, W> {
         self.witness.take(record, None);
     }
 
-    /// Takes the frames that wait on the bus: they came before what is due and before the tracker's events. At
-    /// most as many as a bus at full load brings in some 30 ms, so that an endless flood delays no deadline.
+    /// Takes the frames that wait on the bus: they came before what is due and before the tracker's events.
     fn take_arrived(&mut self) -> bool {
         self.met = None;
-        let any = (0..256).take_while(|_| self.take_frame(Duration::ZERO)).count() > 0;
-        any && self.clock.now() < self.session.deadline()
+        let mut taken = 0;
+        while taken < ARRIVED_MAX && self.take_frame(Duration::ZERO) {
+            taken += 1;
+        }
+        taken > 0 && self.clock.now() < self.session.deadline()
     }
 
     fn go_on(&mut self) {

@@ -1,5 +1,5 @@
-//! The SYNC thread in real time: a fixed priority over everything ordinary, memory that is never
-//! paged out, a processor of its own.
+//! `--realtime`: gives the SYNC thread a fixed priority above all ordinary threads, memory that is never paged
+//! out, and a processor of its own.
 
 use nix::errno::Errno;
 use nix::sched::{CpuSet, sched_getaffinity, sched_setaffinity};
@@ -14,9 +14,9 @@ use thread_priority::{
     set_thread_priority_and_policy, thread_native_id,
 };
 
-/// Over the interrupt threads of a PREEMPT_RT kernel (50), under its own housekeeping (99).
+/// Above the interrupt threads of a PREEMPT_RT kernel (50), below the kernel's own housekeeping (99).
 const PRIORITY: u8 = 80;
-/// capabilities(7): whoever has it may lock any amount of memory.
+/// A process with this capability may lock any amount of memory (capabilities(7)).
 const CAP_IPC_LOCK: u64 = 1 << 14;
 
 /// How the SYNC thread runs.
@@ -28,16 +28,17 @@ pub struct RealTime {
     pub cpu: usize,
 }
 
-/// What gives the program the rights that real time needs.
+/// How to give the program the rights that `--realtime` needs.
 const RIGHTS: &str = "run as root, or give the program the right: sudo setcap \
     cap_sys_nice,cap_ipc_lock+ep $(which needle-bench), or give the user";
 
-/// Puts the calling thread in real time, on processor `cpu`, or without one on the last that this
-/// process may use: the first serve most interrupts. Threads made later by this thread inherit
-/// all of it, so it is called when every other thread is there.
+/// Binds the calling thread to processor `cpu`, locks the memory of the process, and gives the thread a
+/// real-time priority. Without `cpu` it takes the last processor that this process may use, since the first
+/// ones serve most interrupts. Threads that this thread starts later inherit processor and priority, so start
+/// all other threads before.
 ///
 /// # Errors
-/// The right that this process does not have, with what gives it. What was given before the refusal stays.
+/// This process lacks a right; the message says how to give it. Earlier steps are not undone.
 pub fn enter_real_time(cpu: Option<usize>) -> Result<RealTime, String> {
     let cpu = bind(cpu)?;
     lock_memory()?;
@@ -72,8 +73,8 @@ fn bind(cpu: Option<usize>) -> Result<usize, String> {
     let numbers: Vec<usize> =
         (0..CpuSet::count()).filter(|&cpu| allowed.is_set(cpu) == Ok(true)).collect();
     let cpu = cpu.or(numbers.last().copied()).unwrap_or(0);
-    let mut one = CpuSet::new();
-    let bound = one.set(cpu).and_then(|()| sched_setaffinity(this_thread, &one));
+    let mut only_cpu = CpuSet::new();
+    let bound = only_cpu.set(cpu).and_then(|()| sched_setaffinity(this_thread, &only_cpu));
     bound.map(|()| cpu).map_err(|reason| {
         format!(
             "--realtime: cannot bind the SYNC thread to processor {cpu}: {reason}; this process may use \
@@ -105,7 +106,7 @@ fn soft_limit(resource: Resource) -> u64 {
     getrlimit(resource).map_or(0, |(soft, _)| soft)
 }
 
-/// True with CAP_IPC_LOCK in effect (proc(5)).
+/// True if this process has CAP_IPC_LOCK (proc(5)).
 fn may_lock_any_amount() -> bool {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     let effective = status.lines().find_map(|line| line.strip_prefix("CapEff:"));

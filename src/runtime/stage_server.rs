@@ -1,4 +1,4 @@
-//! The virtual stage in real time: frames on a CAN bus, tip positions over TCP.
+//! Serves the virtual stage in real time: frames on a CAN bus, tip positions over TCP.
 
 use super::interrupt::Interrupt;
 use super::timing::Clock;
@@ -18,10 +18,10 @@ use std::path::Path;
 use std::time::{Duration, UNIX_EPOCH};
 use tokio::runtime::Runtime;
 
-/// The longest the stage waits on the bus in one go, so that an interrupt is seen.
+/// Longest single wait on the bus, so that an interrupt is noticed.
 const WAIT_MAX: Duration = Duration::from_millis(50);
 
-/// Sends tracked tips to every client as TRANSFORM messages, as a tracker server does.
+/// A tracker server: sends tracked tips to every client as OpenIGTLink TRANSFORM messages.
 #[derive(Debug)]
 pub struct TipServer {
     server: TransformServer,
@@ -55,7 +55,7 @@ impl TipServer {
         Ok(TipServer { server, tool: tool.to_owned(), target, clock, truth })
     }
 
-    /// Where it listens.
+    /// The address that it listens on.
     pub fn local_addr(&self) -> SocketAddr {
         self.server.local_addr()
     }
@@ -95,8 +95,8 @@ fn truth_file(path: &Path) -> io::Result<BufWriter<File>> {
     Ok(file)
 }
 
-/// Logs a scripted fault that begins. Bus off is an error frame, which every program on the bus receives. An
-/// interface is taken down by hand, `ip link set … down`.
+/// Logs a scripted fault that begins. Bus off is put on the bus as an error frame, which every program on it
+/// receives. Other bus faults need no action here: an interface is taken down by hand, `ip link set … down`.
 fn begin_fault(fault: &Fault, bus: &mut dyn CanBus) {
     tracing::warn!("emulated fault: {fault}");
     if fault.kind == FaultKind::BusOff
@@ -106,12 +106,12 @@ fn begin_fault(fault: &Fault, bus: &mut dyn CanBus) {
     }
 }
 
-/// Serves the stage on `bus` until `until`, or until it is interrupted. A frame that the bus does
-/// not take is lost, as a drive's would be, and an interface that goes down is a cable pulled: the
-/// drives go on by themselves. `log` is given every frame that was sent or received.
+/// Serves the stage on `bus` until `until`, or until `interrupt` is raised. A frame that the bus refuses is
+/// lost, as a real drive's would be. An interface that goes down is like a pulled cable: the drives continue by
+/// themselves. `log` is called with every frame that was sent or received.
 ///
 /// # Errors
-/// A bus that is gone, or a truth file that cannot be written.
+/// The bus is gone, or the truth file cannot be written.
 pub fn serve_stage(
     mut stage: VirtualStage,
     bus: &mut dyn CanBus,

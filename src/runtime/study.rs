@@ -1,4 +1,4 @@
-//! A study's trials, on all threads.
+//! Runs the trials of a study, on all processors.
 
 use super::virtual_time::{TipSource, run_unwatched};
 use crate::emulator::{TrackerModel, Truth, VirtualStage, VirtualStageConfig, WhiteNoise};
@@ -21,22 +21,22 @@ pub struct Study<'a> {
     pub tool: &'a str,
     /// The random draws.
     pub prior: Prior,
-    /// The emulated stage, needle and tracker of the trial with the seed given, or why there can be
-    /// none.
+    /// Draws the emulated stage, needle and tracker of the trial with the given seed.
     pub stage: &'a (dyn Fn(u64) -> Result<VirtualStageConfig, String> + Sync),
-    /// The target of the trial with the seed given; `None` in the plane.
+    /// Draws the target of the trial with the given seed.
     pub goal: &'a (dyn Fn(u64) -> Result<DrawnGoal, String> + Sync),
 }
 
-/// A target with the path to it, or why there is none.
+/// A target with the path to it, `None` for an insertion in the plane, or the reason why the target cannot be
+/// reached.
 pub(super) type DrawnGoal = Result<Option<Goal>, String>;
 
 impl Study<'_> {
-    /// Makes the trials with these seeds, in parallel; `done` is called after each. The results are
-    /// in the order of the seeds, whatever thread made them.
+    /// Runs the trials with these seeds, in parallel; calls `done` after each. The results are in the order of
+    /// the seeds.
     ///
     /// # Errors
-    /// Where the session or the emulator refuses its configuration.
+    /// The session or the emulator refuses its configuration.
     pub fn run(&self, seeds: &[u64], done: &(dyn Fn() + Sync)) -> Result<Vec<TrialResult>, String> {
         let Some(&first) = seeds.first() else { return Ok(Vec::new()) };
         self.trials(seeds, &self.timetable(first)?, done)
@@ -52,13 +52,13 @@ impl Study<'_> {
         timetable: &Timetable,
         done: &(dyn Fn() + Sync),
     ) -> Result<Vec<TrialResult>, String> {
-        self.each(seeds, done, |session, stage, score| {
+        self.run_trials(seeds, done, |session, stage, score| {
             let take = |step: &_, truth: &_| score.take(step, truth);
             insert(&session, &stage, timetable, take).map_err(|error| error.to_string())
         })
     }
 
-    /// As [`Study::run`], through whole sessions, drives and CAN frames included: three times slower where every
+    /// As [`Study::run`], but through whole sessions, with drives and CAN frames: three times slower if every
     /// position counts.
     ///
     /// # Errors
@@ -68,7 +68,7 @@ impl Study<'_> {
         seeds: &[u64],
         done: &(dyn Fn() + Sync),
     ) -> Result<Vec<TrialResult>, String> {
-        self.each(seeds, done, |session, stage, score| {
+        self.run_trials(seeds, done, |session, stage, score| {
             self.whole_session(session, stage, |record, truth| {
                 if let (Record::Step(step), Some(truth)) = (record, truth) {
                     score.take(&step, &truth);
@@ -77,8 +77,8 @@ impl Study<'_> {
         })
     }
 
-    /// The trials with these seeds, each made by `insert` unless it has a target that is out of reach.
-    fn each(
+    /// Runs the trials with these seeds, each by `insert` unless its target is out of reach.
+    fn run_trials(
         &self,
         seeds: &[u64],
         done: &(dyn Fn() + Sync),
@@ -86,7 +86,7 @@ impl Study<'_> {
         + Sync,
     ) -> Result<Vec<TrialResult>, String> {
         let trial = |&seed: &u64| {
-            let stage = self.drawn(seed)?;
+            let stage = self.draw_stage(seed)?;
             let goal = (self.goal)(seed).map_err(|reason| refused_trial(seed, &reason))?;
             let result = match goal {
                 Err(why) => TrialResult::refused(seed, stage, &self.prior, &why),
@@ -104,17 +104,17 @@ impl Study<'_> {
         seeds.par_iter().map(trial).collect()
     }
 
-    fn drawn(&self, seed: u64) -> Result<VirtualStageConfig, String> {
+    fn draw_stage(&self, seed: u64) -> Result<VirtualStageConfig, String> {
         (self.stage)(seed).map_err(|reason| refused_trial(seed, &reason))
     }
 
-    /// The times of all trials, from a whole session with a needle that needs no steering, at the
-    /// stage of the trial with this seed.
+    /// The times of the steps of all trials. They are those of a whole session with a needle that needs no
+    /// steering, on the stage of the trial with this seed.
     ///
     /// # Errors
-    /// As [`Study::run`], and where that session is stopped.
+    /// As [`Study::run`], or that session was stopped.
     pub fn timetable(&self, seed: u64) -> Result<Timetable, String> {
-        let stage = self.drawn(seed)?;
+        let stage = self.draw_stage(seed)?;
         let tracker = TrackerModel { noise: TIMETABLE_NOISE, correlated: None, ..stage.tracker };
         // The needle of the bench's own model, so that no gate refuses a position.
         let stage = VirtualStageConfig {

@@ -1,4 +1,4 @@
-//! The clock of a live run, and statistics of how punctual the run was.
+//! The clock of a live run, and statistics of its punctuality.
 
 use super::realtime::RealTime;
 use crate::stage::Counters;
@@ -26,7 +26,7 @@ impl Clock {
         Time::ZERO + self.origin.elapsed()
     }
 
-    /// The origin in UTC.
+    /// The origin, UTC.
     pub fn origin_utc(&self) -> SystemTime {
         self.origin_utc
     }
@@ -98,7 +98,7 @@ impl DurationHistogram {
     }
 }
 
-/// How well time was kept in a run: part of its manifest, times in µs.
+/// How punctual a run was: part of its manifest, times in µs.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct TimingReport {
     /// Deadlines that the thread handled, including those of the SYNCs.
