@@ -52,10 +52,10 @@ pub enum SdoError {
     #[error("refused with SDO abort {0}")]
     Aborted(AbortCode),
     /// The value is longer than the 4 bytes of one frame.
-    #[error("value of more than 4 bytes, is it an object of this drive?")]
+    #[error("value longer than 4 bytes, is this the right object of this drive?")]
     TooLong,
     /// The response has a command specifier that the request does not lead to.
-    #[error("answer with unexpected command 0x{0:02X}")]
+    #[error("SDO reply with unexpected command byte 0x{0:02X}")]
     UnexpectedCommand(u8),
 }
 
