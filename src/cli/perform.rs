@@ -16,7 +16,7 @@ use crate::config::{
 };
 use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
-use crate::operation::Plan;
+use crate::operation::RunConfig;
 use crate::runtime::{
     Clock, DriveOutcome, EmulationReport, Interrupt, Moment, Operator, Pace, RealTime, RunReport,
     Sink, TipSource, complete_record, run_live, run_virtual,
@@ -40,7 +40,7 @@ pub(super) const LIVE_ADDRESS: &str = "127.0.0.1:9876";
 /// A session to run, and what its record says about it.
 pub(super) struct Job<'a> {
     pub(super) config: &'a Config,
-    pub(super) plan: Plan,
+    pub(super) run_config: RunConfig,
     /// The motion of the stage that is recorded; `None` for an insertion.
     pub(super) motion: Option<&'a Motion>,
     pub(super) options: Options,
@@ -125,7 +125,7 @@ impl Job<'_> {
     ) -> Result<(RunReport, Vec<AxisMove>), Failure> {
         let config = self.config;
         let stops_on_record_failure = config.record.on_failure == OnFailure::Stop;
-        let begin = |now| self.plan.clone().begin(now).map_err(Failure::configuration);
+        let begin = |now| self.run_config.clone().begin(now).map_err(Failure::configuration);
         let Options { realtime, live, paced, .. } = self.options;
         live.map_or(Ok(()), check_live_address)?;
         if config.is_emulated() {
@@ -162,9 +162,9 @@ impl Job<'_> {
     }
 
     fn needs_tracker(&self) -> bool {
-        match &self.plan {
-            Plan::Insertion(_) => true,
-            Plan::Operation(plan) => plan.operation.needs_tracker(),
+        match &self.run_config {
+            RunConfig::Insertion(_) => true,
+            RunConfig::Operation(config) => config.operation.needs_tracker(),
         }
     }
 

@@ -8,7 +8,7 @@ use super::perform::scene;
 use super::stage;
 use crate::archive::{Manifest, file, proof};
 use crate::config::{CanInterface, Config, Source};
-use crate::operation::Plan;
+use crate::operation::RunConfig;
 use crate::preflight::Earlier;
 use crate::replay::{Recorded, replay_to};
 use crate::review::{differences, keys};
@@ -95,16 +95,17 @@ pub(super) fn open(path: &Path) -> Result<(RunFolder, Config), Failure> {
 /// The plan, scene and configuration of a run of `config`, which `make_recording` needs beside the record.
 pub(super) fn describe(config: Config) -> Describe {
     Box::new(move |manifest| {
-        let plan = recorded_plan(manifest, &config).map_err(|failure| failure.to_string())?;
-        Ok(RecordedRun { plan, scene: scene(&config)?, config_toml: config.to_toml()? })
+        let run_config =
+            recorded_run_config(manifest, &config).map_err(|failure| failure.to_string())?;
+        Ok(RecordedRun { run_config, scene: scene(&config)?, config_toml: config.to_toml()? })
     })
 }
 
-/// The plan of the run of `manifest`, from its configuration and arguments.
-pub(super) fn recorded_plan(manifest: &Manifest, config: &Config) -> Result<Plan, Failure> {
+/// What the run of `manifest` was to do, from its configuration and arguments.
+pub(super) fn recorded_run_config(manifest: &Manifest, config: &Config) -> Result<RunConfig, Failure> {
     Ok(match stage::recorded_operation(manifest, config)? {
-        Some(operation) => Plan::from(operation),
-        None => Plan::from(config.session_reading(&mask_reader(None))?),
+        Some(operation) => RunConfig::from(operation),
+        None => RunConfig::from(config.session_reading(&mask_reader(None))?),
     })
 }
 
@@ -121,8 +122,9 @@ pub(super) struct ReplayedRun {
 /// Replays the run in the folder `path`.
 pub(super) fn replay_run(path: &Path) -> Result<ReplayedRun, Failure> {
     let (folder, config) = open(path)?;
-    let plan = recorded_plan(folder.manifest(), &config)?;
-    let recorded = Recorded { manifest: folder.manifest(), plan, open: &|name| folder.lines(name) };
+    let run_config = recorded_run_config(folder.manifest(), &config)?;
+    let recorded =
+        Recorded { manifest: folder.manifest(), run_config, open: &|name| folder.lines(name) };
     let (mut stage, mut samples) = (Vec::new(), Vec::new());
     let replayed = replay_to(&recorded, None, &mut |record, _| match record {
         Record::Stage(feedback) => stage.push((feedback.time, feedback.measured)),

@@ -1,11 +1,11 @@
 //! `needle-bench replay`: runs a recorded session again and compares the results.
 
 use super::output::{print_result, refuse_existing, write_new};
-use super::records::{open, recorded_plan};
+use super::records::{open, recorded_run_config};
 use super::{Failure, STOPPED, finish_with};
 use crate::archive::file;
 use crate::config::{Config, Source};
-use crate::operation::Plan;
+use crate::operation::RunConfig;
 use crate::replay::{Recorded, replay as run_again};
 use crate::session::ObserverConfig;
 use crate::study::FigureReport;
@@ -36,12 +36,13 @@ pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
     refuse_existing(arguments.out.as_deref())?;
     let (folder, config) = open(&arguments.run)?;
     let what_if = what_if(&folder.text(file::CONFIG)?, &arguments.set)?;
-    let plan = recorded_plan(folder.manifest(), &config)?;
-    let observer = match &plan {
-        Plan::Insertion(session) => Some(session.observer.name()),
-        Plan::Operation(_) => None,
+    let run_config = recorded_run_config(folder.manifest(), &config)?;
+    let observer = match &run_config {
+        RunConfig::Insertion(session) => Some(session.observer.name()),
+        RunConfig::Operation(_) => None,
     };
-    let recorded = Recorded { manifest: folder.manifest(), plan, open: &|name| folder.lines(name) };
+    let recorded =
+        Recorded { manifest: folder.manifest(), run_config, open: &|name| folder.lines(name) };
     let begun = Instant::now();
     let replayed =
         run_again(&recorded, what_if).map_err(|error| Failure::bad_input(&arguments.run, error))?;

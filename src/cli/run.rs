@@ -98,7 +98,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), Failure> {
         paced: arguments.console,
     };
     let withdrawal_options = options.of_withdrawal();
-    let job = Job { config: &config, plan: session.into(), motion: None, options };
+    let job = Job { config: &config, run_config: session.into(), motion: None, options };
     let Performed { report, wants_withdrawal, .. } = job.perform()?;
     let object = to_json(&config, &report, &preflight);
     let more = screen_values(&config, configured.whole_path(), &report);

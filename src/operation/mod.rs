@@ -97,34 +97,34 @@ impl OperationConfig {
 
 /// The configuration of a run: an insertion, or an operation of the stage alone.
 #[derive(Debug, Clone)]
-pub enum Plan {
+pub enum RunConfig {
     /// Steers a needle.
     Insertion(Box<SessionConfig>),
     /// Moves the stage without steering a needle.
     Operation(Box<OperationConfig>),
 }
 
-impl Plan {
+impl RunConfig {
     /// The run as a session that begins at `now`.
     ///
     /// # Errors
     /// An observer or the stage refuses its configuration.
     pub fn begin(self, now: Time) -> Result<Session, String> {
         match self {
-            Plan::Insertion(config) => Session::new(*config, now),
-            Plan::Operation(config) => config.begin(now),
+            RunConfig::Insertion(config) => Session::new(*config, now),
+            RunConfig::Operation(config) => config.begin(now),
         }
     }
 }
 
-impl From<SessionConfig> for Plan {
+impl From<SessionConfig> for RunConfig {
     fn from(config: SessionConfig) -> Self {
-        Plan::Insertion(Box::new(config))
+        RunConfig::Insertion(Box::new(config))
     }
 }
 
-impl From<OperationConfig> for Plan {
+impl From<OperationConfig> for RunConfig {
     fn from(config: OperationConfig) -> Self {
-        Plan::Operation(Box::new(config))
+        RunConfig::Operation(Box::new(config))
     }
 }

@@ -5,7 +5,7 @@ use super::inputs::{Next, RecordedInputs};
 use super::recorded::Recorded;
 use crate::archive::{STEP_COLUMNS, StepRow, file, is_truth_column, steps_csv_header};
 use crate::emulator::Truth;
-use crate::operation::Plan;
+use crate::operation::RunConfig;
 use crate::session::{
     Input, Machine, ObserverConfig, Outcome, Output, Record, Session, StepRecord,
 };
@@ -117,18 +117,18 @@ pub fn replay_to(
     what_if: Option<ObserverConfig>,
     take: TakeRecord<'_>,
 ) -> Result<Replayed, String> {
-    let mut plan = recorded.plan.clone();
-    match (&mut plan, what_if) {
-        (Plan::Insertion(config), what_if) => config.shadows.extend(what_if),
-        (Plan::Operation(_), Some(_)) => {
+    let mut run_config = recorded.run_config.clone();
+    match (&mut run_config, what_if) {
+        (RunConfig::Insertion(config), what_if) => config.shadows.extend(what_if),
+        (RunConfig::Operation(_), Some(_)) => {
             return Err("an operation of the stage has no observer to ask about".to_owned());
         }
-        (Plan::Operation(_), None) => {}
+        (RunConfig::Operation(_), None) => {}
     }
     let mut inputs = RecordedInputs::open(recorded)?;
     let mut end = inputs.begun();
     let mut replay = Replay {
-        session: plan.begin(end).map_err(|error| format!("{}: {error}", file::CONFIG))?,
+        session: run_config.begin(end).map_err(|error| format!("{}: {error}", file::CONFIG))?,
         comparison: Comparison::open(recorded)?,
         take,
         has_what_if: what_if.is_some(),

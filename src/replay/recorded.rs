@@ -4,7 +4,7 @@ use crate::archive::{
     CandumpLine, Inputs, Lines, Manifest, RecordedColumns, RunOutcome, file, unix_us_of,
 };
 use crate::canopen::Frame;
-use crate::operation::Plan;
+use crate::operation::RunConfig;
 use crate::session::{Direction, Outcome};
 use crate::tracker::ndjson;
 use crate::units::Time;
@@ -16,7 +16,7 @@ pub struct Recorded<'a> {
     /// Its manifest.
     pub manifest: &'a Manifest,
     /// What the run was to do.
-    pub plan: Plan,
+    pub run_config: RunConfig,
     /// Opens the text file of this name.
     pub open: &'a dyn Fn(&str) -> io::Result<Lines>,
 }

@@ -3,7 +3,7 @@
 
 use super::sink::{Operator, RunReport};
 use crate::archive::{CandumpLine, EventKind, EventLine, Lines, Manifest, file, unix_us_of};
-use crate::operation::Plan;
+use crate::operation::RunConfig;
 use crate::replay::{Recorded, replay_to};
 use crate::session::{Lane, Record, Severity, State};
 use crate::telemetry::{Entry, Recording, RunFolder, Scene, TelemetryError, lock, note_recording};
@@ -26,7 +26,7 @@ const STALLED_PERIODS_MAX: u32 = 8;
 /// What the recording of a run needs beside the record.
 pub struct RecordedRun {
     /// The configuration of the run.
-    pub plan: Plan,
+    pub run_config: RunConfig,
     /// The static parts of the scene.
     pub scene: Scene,
     /// The configuration as used.
@@ -117,7 +117,7 @@ fn make_from_text_files(
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(Lines::new(io::empty())),
         opened => opened,
     };
-    let RecordedRun { plan, scene, config_toml } = describe(manifest)?;
+    let RecordedRun { run_config, scene, config_toml } = describe(manifest)?;
     let mut log = Log {
         reached_ns,
         recording: Recording::create(dir, manifest, &config_toml, &scene)?,
@@ -128,7 +128,7 @@ fn make_from_text_files(
     let mut difference = None;
     // A bench that was killed at once has recorded no inputs.
     if open(file::INPUTS)?.next().is_some() {
-        let recorded = Recorded { manifest, plan, open: &open };
+        let recorded = Recorded { manifest, run_config, open: &open };
         let replayed = replay_to(&recorded, None, &mut |record, truth| {
             if let Some(time) = time_of(&record) {
                 log.text_until(time);
@@ -295,8 +295,8 @@ mod tests {
 
     fn describe() -> Describe {
         Box::new(|_| {
-            let plan = Plan::from(Config::from_sources(&[], &[])?.session()?);
-            Ok(RecordedRun { plan, scene: scene(), config_toml: CONFIG_TOML.to_owned() })
+            let run_config = RunConfig::from(Config::from_sources(&[], &[])?.session()?);
+            Ok(RecordedRun { run_config, scene: scene(), config_toml: CONFIG_TOML.to_owned() })
         })
     }
 

@@ -9,7 +9,7 @@ use crate::support::program::{Said, Scratch, needle_bench, repository};
 use crate::support::recorded;
 use needle_bench::archive::{Lines, Manifest, file};
 use needle_bench::config::{Config, Source};
-use needle_bench::operation::Plan;
+use needle_bench::operation::RunConfig;
 use needle_bench::replay::{Recorded, Replayed, replay};
 use needle_bench::session::{ObserverConfig, SessionConfig};
 use needle_bench::telemetry::RunFolder;
@@ -191,8 +191,8 @@ impl Run {
             };
             Ok(Lines::new(Cursor::new(text.clone())))
         };
-        let plan = Plan::from(self.session.clone());
-        replay(&Recorded { manifest: &self.manifest, plan, open: &open }, what_if)
+        let run_config = RunConfig::from(self.session.clone());
+        replay(&Recorded { manifest: &self.manifest, run_config, open: &open }, what_if)
     }
 
     fn replay(&self) -> Result<Replayed, String> {

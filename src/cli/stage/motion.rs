@@ -49,8 +49,8 @@ pub(in crate::cli) fn perform(
 }
 
 fn job<'a>(config: &'a Config, motion: &'a Motion, options: Options) -> Result<Job<'a>, Failure> {
-    let plan = motion.plan(config)?.into();
-    Ok(Job { config, plan, motion: Some(motion), options })
+    let run_config = motion.plan(config)?.into();
+    Ok(Job { config, run_config, motion: Some(motion), options })
 }
 
 fn to_json(name: &str, done: &[AxisMove], report: &RunReport) -> Value {
