@@ -8,7 +8,7 @@ use super::{ENVIRONMENT_FAILED, Failure, finish_with};
 use crate::canopen::Frame;
 use crate::config::{Source, StopConfig};
 use crate::runtime::{BusTrouble, Clock, talk_despite_errors};
-use crate::stage::{Axis, Halt};
+use crate::stage::{Axis, QuickStop};
 use clap::Args;
 use serde_json::json;
 use std::fs;
@@ -38,10 +38,10 @@ pub(super) fn stop(configured: &Configured, as_json: bool) -> Result<(), Failure
     })?;
     let clock = Clock::start();
     let begun = clock.now();
-    let mut halt = Halt::new(&settings.stage, begun);
+    let mut quick_stop = QuickStop::new(&settings.stage, begun);
     let deadline = begun + settings.stage.power.stop_timeout;
-    let trouble = talk_despite_errors(&mut halt, bus.as_mut(), clock, deadline);
-    let status = report(&halt, &trouble, as_json);
+    let trouble = talk_despite_errors(&mut quick_stop, bus.as_mut(), clock, deadline);
+    let status = report(&quick_stop, &trouble, as_json);
     let checked =
         configured.load(None).and_then(|config| Ok(config.stage.to_stage(&config.can)?));
     if let Err(failure) = checked {
@@ -76,11 +76,12 @@ fn settings(configured: &Configured) -> Result<StopConfig, Failure> {
 }
 
 /// Reports which stops were confirmed, which were not, and which frames were not sent.
-fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<(), Failure> {
+fn report(quick_stop: &QuickStop, trouble: &BusTrouble, as_json: bool) -> Result<(), Failure> {
     let mut object = json!({});
     let (mut errors, mut confirmed) = (Vec::new(), Vec::new());
     for axis in Axis::BOTH {
-        let counts = halt.result(axis).and_then(|result| result.map_err(|e| errors.push(e)).ok());
+        let counts =
+            quick_stop.result(axis).and_then(|result| result.map_err(|e| errors.push(e)).ok());
         if let (Some(counts), false) = (counts, as_json) {
             confirmed.push(format!("{axis:<11} stands without power, at {counts} counts"));
         }

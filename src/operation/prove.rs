@@ -3,7 +3,7 @@
 use crate::canopen::Frame;
 use crate::canopen::emcy::EmcyCode;
 use crate::session::{Lane, PROVED, Record, Severity, Shell, State, Task};
-use crate::stage::{Axis, Dialogue, Halt, PerAxis, StageConfig, StageEvent};
+use crate::stage::{Axis, Dialogue, PerAxis, QuickStop, StageConfig, StageEvent};
 use crate::units::Time;
 use std::time::Duration;
 
@@ -18,14 +18,14 @@ struct Silence {
     /// Within this time a drive must notice.
     within: Duration,
     noticed_after: PerAxis<Option<Duration>>,
-    watch: Halt,
+    watch: QuickStop,
 }
 
 impl Silence {
     /// A silence from `since` on. The last heartbeat may have been sent at that moment.
     fn new(config: &StageConfig, since: Time) -> Self {
         let within = config.bus.heartbeat_timeout() + MARGIN;
-        let watch = Halt::watch(config, since, since + within + config.power.stop_timeout);
+        let watch = QuickStop::watch(config, since, since + within + config.power.stop_timeout);
         Silence { since, within, noticed_after: PerAxis::default(), watch }
     }
 

@@ -139,7 +139,7 @@ mod tests {
     use crate::canopen::cia402::DriveState;
     use crate::canopen::nmt::NmtState;
     use crate::config::Config;
-    use crate::stage::{Axis, Halt, StageConfig};
+    use crate::stage::{Axis, QuickStop, StageConfig};
     use std::io;
 
     /// The virtual stage in real time, on a bus that refuses some frames.
@@ -208,15 +208,19 @@ mod tests {
     fn stop<F: FnMut(&Frame) -> bool + Send>(
         refuses: F,
         deaf: u32,
-    ) -> (RefusingBus<F>, Halt, BusTrouble, Duration) {
+    ) -> (RefusingBus<F>, QuickStop, BusTrouble, Duration) {
         let (config, stage) = stage();
         let clock = Clock::start();
         let mut bus = RefusingBus { stage, clock, refuses, sent: Vec::new(), deaf };
         let begun = clock.now();
-        let mut halt = Halt::new(&config, begun);
-        let trouble =
-            talk_despite_errors(&mut halt, &mut bus, clock, begun + config.power.stop_timeout);
-        (bus, halt, trouble, clock.now().since(begun))
+        let mut quick_stop = QuickStop::new(&config, begun);
+        let trouble = talk_despite_errors(
+            &mut quick_stop,
+            &mut bus,
+            clock,
+            begun + config.power.stop_timeout,
+        );
+        (bus, quick_stop, trouble, clock.now().since(begun))
     }
 
     #[test]
@@ -228,9 +232,12 @@ mod tests {
                 left -= u32::from(is_refused);
                 is_refused
             };
-            let (bus, halt, trouble, _) = stop(refuses, 2);
+            let (bus, quick_stop, trouble, _) = stop(refuses, 2);
             for axis in Axis::BOTH {
-                assert!(halt.result(axis).is_some_and(|result| result.is_ok()), "{count}: {axis}");
+                assert!(
+                    quick_stop.result(axis).is_some_and(|result| result.is_ok()),
+                    "{count}: {axis}"
+                );
             }
             assert_eq!((trouble.refused, trouble.unsent.as_slice()), (count, &[][..]));
             let first = trouble.first.expect("an error").to_string();
@@ -250,11 +257,11 @@ mod tests {
         let of_insertion = |frame: &Frame| {
             frame.cob_id() == Some(0x601) || (frame.cob_id(), frame.data()) == (Some(0), &[0x80, 1])
         };
-        let (bus, halt, trouble, took) = stop(of_insertion, 0);
+        let (bus, quick_stop, trouble, took) = stop(of_insertion, 0);
         let sent: Vec<String> = bus.sent.iter().take(2).map(Frame::to_string).collect();
         assert_eq!(sent, ["000#8002", "602#2B40600002000000"]);
-        assert!(halt.result(Axis::Rotation).is_some_and(|result| result.is_ok()));
-        let error = halt.result(Axis::Insertion).expect("over").expect_err("not confirmed");
+        assert!(quick_stop.result(Axis::Rotation).is_some_and(|result| result.is_ok()));
+        let error = quick_stop.result(Axis::Insertion).expect("over").expect_err("not confirmed");
         assert!(error.ends_with("power off was not confirmed"), "{error}");
         let unsent: Vec<String> = trouble.unsent.iter().map(Frame::to_string).collect();
         for frame in ["000#8001", "601#2B40600002000000", "601#2B40600000000000"] {
@@ -268,9 +275,9 @@ mod tests {
     /// The deadline of a bus that is gone altogether.
     #[test]
     fn a_stop_on_a_dead_bus_comes_to_an_end() {
-        let (bus, halt, trouble, took) = stop(|_| true, u32::MAX);
+        let (bus, quick_stop, trouble, took) = stop(|_| true, u32::MAX);
         assert!(bus.sent.is_empty());
-        assert!(Axis::BOTH.iter().all(|axis| halt.result(*axis).is_some_and(|r| r.is_err())));
+        assert!(Axis::BOTH.iter().all(|axis| quick_stop.result(*axis).is_some_and(|r| r.is_err())));
         assert!(trouble.unsent.len() >= 4, "{:?}", trouble.unsent);
         assert!((Duration::from_millis(600)..Duration::from_secs(2)).contains(&took), "{took:?}");
     }

@@ -9,7 +9,8 @@ use needle_bench::emulator::fault::{Fault, FaultKind};
 use needle_bench::emulator::{StageOutput, VirtualStage};
 use needle_bench::runtime::talk_virtual;
 use needle_bench::stage::{
-    Axis, Dialogue, Halt, Output, Reset, SetPoint, Stage, StageConfig, StageEvent, StatusReader,
+    Axis, Dialogue, Output, QuickStop, Reset, SetPoint, Stage, StageConfig, StageEvent,
+    StatusReader,
 };
 use needle_bench::units::Time;
 
@@ -137,12 +138,12 @@ impl Bench {
 fn a_stop_from_outside_ends_a_run_that_is_moving() {
     let mut bench = Bench::moving();
     let at_mm = bench.depth_mm();
-    let mut halt = Halt::new(&bench.config, bench.now);
-    assert_eq!(halt.result(Axis::Insertion), None);
-    bench.talk(&mut halt);
+    let mut quick_stop = QuickStop::new(&bench.config, bench.now);
+    assert_eq!(quick_stop.result(Axis::Insertion), None);
+    bench.talk(&mut quick_stop);
     assert!((bench.depth_mm() - at_mm).abs() < 0.2, "{} mm", bench.depth_mm() - at_mm);
-    assert!(halt.result(Axis::Insertion).unwrap().is_ok());
-    assert!(halt.result(Axis::Rotation).unwrap().is_ok());
+    assert!(quick_stop.result(Axis::Insertion).unwrap().is_ok());
+    assert!(quick_stop.result(Axis::Rotation).unwrap().is_ok());
     let first: Vec<String> = bench.sent.iter().take(4).map(Frame::to_string).collect();
     let quick_stop = ["601#2B40600002000000", "602#2B40600002000000"];
     assert_eq!(first[..2], ["000#8001", "000#8002"]);
@@ -160,11 +161,11 @@ fn a_drive_that_does_not_answer_a_stop_is_named_and_the_other_is_stopped() {
     let mut bench = Bench::moving();
     let mut config = bench.config.clone();
     config.rotation.node = NodeId::new(9).unwrap();
-    let mut halt = Halt::new(&config, bench.now);
-    bench.talk(&mut halt);
-    assert!(halt.result(Axis::Insertion).unwrap().is_ok());
+    let mut quick_stop = QuickStop::new(&config, bench.now);
+    bench.talk(&mut quick_stop);
+    assert!(quick_stop.result(Axis::Insertion).unwrap().is_ok());
     assert_eq!(
-        halt.result(Axis::Rotation).unwrap().unwrap_err(),
+        quick_stop.result(Axis::Rotation).unwrap().unwrap_err(),
         "rotation: node 9 0x6040:00: no SDO reply within 150 ms (attempt 3 of 3), is the drive \
          powered, node-id and bitrate right?; power off was not confirmed"
     );
@@ -172,21 +173,21 @@ fn a_drive_that_does_not_answer_a_stop_is_named_and_the_other_is_stopped() {
 
 /// A stop that hears nothing of the rotation drive, which does not get the first frames either.
 struct Deaf {
-    halt: Halt,
+    quick_stop: QuickStop,
     lost: u32,
 }
 
 impl Dialogue for Deaf {
     fn handle_frame(&mut self, now: Time, frame: &Frame) {
         if frame.cob_id() != Some(0x582) {
-            self.halt.handle_frame(now, frame);
+            self.quick_stop.handle_frame(now, frame);
         }
     }
     fn handle_timeout(&mut self, now: Time) {
-        self.halt.handle_timeout(now);
+        self.quick_stop.handle_timeout(now);
     }
     fn poll_transmit(&mut self) -> Option<Frame> {
-        while let Some(frame) = self.halt.poll_transmit() {
+        while let Some(frame) = self.quick_stop.poll_transmit() {
             match frame.cob_id() {
                 Some(0x602) if self.lost > 0 => self.lost -= 1,
                 _ => return Some(frame),
@@ -195,10 +196,10 @@ impl Dialogue for Deaf {
         None
     }
     fn deadline(&self) -> Time {
-        self.halt.deadline()
+        self.quick_stop.deadline()
     }
     fn is_over(&self) -> bool {
-        self.halt.is_over()
+        self.quick_stop.is_over()
     }
 }
 
@@ -207,10 +208,10 @@ impl Dialogue for Deaf {
 fn a_drive_that_is_not_heard_is_stopped_all_the_same() {
     for lost in [0, 1, 5] {
         let mut bench = Bench::moving();
-        let mut stop = Deaf { halt: Halt::new(&bench.config, bench.now), lost };
+        let mut stop = Deaf { quick_stop: QuickStop::new(&bench.config, bench.now), lost };
         bench.talk(&mut stop);
         assert_eq!(bench.states(), [DriveState::SwitchOnDisabled; 2], "{lost} lost");
-        let said = stop.halt.result(Axis::Rotation).unwrap().unwrap_err();
+        let said = stop.quick_stop.result(Axis::Rotation).unwrap().unwrap_err();
         assert!(said.ends_with("; power off was not confirmed"), "{said}");
         let told = |word: &str| {
             let frame = format!("602#2B406000{word}000000");
@@ -221,7 +222,7 @@ fn a_drive_that_is_not_heard_is_stopped_all_the_same() {
 }
 
 /// A stop whose looks at the rotation drive's statusword are lost.
-struct Blind(Halt);
+struct Blind(QuickStop);
 
 impl Dialogue for Blind {
     fn handle_frame(&mut self, now: Time, frame: &Frame) {
@@ -249,12 +250,12 @@ impl Dialogue for Blind {
 #[test]
 fn a_stop_that_sees_nothing_takes_power_off_and_says_what_it_did_not_see() {
     let mut bench = Bench::moving();
-    let mut halt = Blind(Halt::new(&bench.config, bench.now));
-    bench.talk(&mut halt);
-    let said = halt.0.result(Axis::Rotation).unwrap().unwrap_err();
+    let mut quick_stop = Blind(QuickStop::new(&bench.config, bench.now));
+    bench.talk(&mut quick_stop);
+    let said = quick_stop.0.result(Axis::Rotation).unwrap().unwrap_err();
     assert!(said.starts_with("rotation: node 2 0x6041:00: no SDO reply within 150 ms"), "{said}");
     assert!(said.ends_with(": power off was not seen, press the emergency stop"), "{said}");
-    assert!(halt.0.result(Axis::Insertion).unwrap().is_ok());
+    assert!(quick_stop.0.result(Axis::Insertion).unwrap().is_ok());
     assert_eq!(bench.states(), [DriveState::SwitchOnDisabled; 2]);
     let last: Vec<String> = bench.sent.iter().rev().take(1).map(Frame::to_string).collect();
     assert_eq!(last, ["000#8002"], "the node is told once more to leave Operational");

@@ -5,7 +5,7 @@
 //! the end power is taken off, whatever a drive reports, and even if it reports nothing. A command that is not
 //! obeyed is repeated.
 //!
-//! [`Halt::watch`] reads the same objects and writes nothing: it shows whether drives stop by themselves.
+//! [`QuickStop::watch`] reads the same objects and writes nothing: it shows whether drives stop by themselves.
 
 use std::time::Duration;
 
@@ -23,9 +23,9 @@ use crate::units::Time;
 const READ_PERIOD: Duration = Duration::from_millis(20);
 
 /// Stops both axes, or watches them stop; returns where each stands, counts.
-pub type Halt = WithBothDrives<i32>;
+pub type QuickStop = WithBothDrives<i32>;
 
-impl Halt {
+impl QuickStop {
     /// Begins to stop at `now`.
     pub fn new(config: &StageConfig, now: Time) -> Self {
         let give_up = now + config.power.stop_timeout;
@@ -33,7 +33,7 @@ impl Halt {
         let leave_operational = [nodes.insertion, nodes.rotation]
             .map(|node| nmt_frame(NmtCommand::EnterPreOperational, Some(node)));
         WithBothDrives::begin(leave_operational, |axis| {
-            let drive = AxisHalt::new(config, axis, now, give_up);
+            let drive = AxisStop::new(config, axis, now, give_up);
             ScriptRunner::begin(&drive.sdo.clone(), now, drive.stop())
         })
     }
@@ -42,7 +42,7 @@ impl Halt {
     /// written.
     pub fn watch(config: &StageConfig, now: Time, give_up: Time) -> Self {
         WithBothDrives::begin([], |axis| {
-            let mut drive = AxisHalt::new(config, axis, now, give_up);
+            let mut drive = AxisStop::new(config, axis, now, give_up);
             let sdo = drive.sdo.clone();
             ScriptRunner::begin(&sdo, now, async move { drive.come_to_stand(None).await })
         })
@@ -59,9 +59,9 @@ impl Halt {
 }
 
 #[derive(Debug)]
-struct AxisHalt {
+struct AxisStop {
     sdo: Sdo,
-    /// A request has failed: from now on each command is also sent at once, see [`AxisHalt::command`].
+    /// A request has failed: from now on each command is also sent at once, see [`AxisStop::command`].
     request_failed: bool,
     /// When to give up waiting for the axis to stand.
     give_up: Time,
@@ -70,9 +70,9 @@ struct AxisHalt {
     standstill: Standstill,
 }
 
-impl AxisHalt {
+impl AxisStop {
     fn new(config: &StageConfig, axis: Axis, now: Time, give_up: Time) -> Self {
-        AxisHalt {
+        AxisStop {
             sdo: Sdo::new(config, axis),
             request_failed: false,
             give_up,
@@ -122,7 +122,7 @@ impl AxisHalt {
         }
     }
 
-    /// Takes power off until it is seen to be off. `stood` is the result of [`AxisHalt::come_to_stand`].
+    /// Takes power off until it is seen to be off. `stood` is the result of [`AxisStop::come_to_stand`].
     async fn take_power_off(&mut self, stood: Result<i32, String>) -> Result<i32, String> {
         loop {
             if let Err(error) = self.command(Controlword::DISABLE_VOLTAGE).await {
