@@ -329,8 +329,8 @@ impl Drive {
         count.is_power_of_two()
     }
 
-    /// Makes the next emergency message the first, although it may repeat an earlier one.
-    pub(super) fn expect_news(&mut self) {
+    /// Reports the next emergency message even if it repeats the last one.
+    pub(super) fn restart_emcy_count(&mut self) {
         self.emcy.1 = 0;
     }
 

@@ -296,7 +296,7 @@ impl Stage {
     pub fn fall_silent(&mut self) {
         self.faulted = true;
         for axis in Axis::BOTH {
-            self.drives[axis].expect_news();
+            self.drives[axis].restart_emcy_count();
         }
         self.heartbeat =
             HeartbeatProducer::new(self.config.bus.bench_node, Duration::ZERO, Time::NEVER);

@@ -57,8 +57,8 @@ impl Script {
                          node-id and bitrate right?"
                     ));
                 }
-                // It may have been left in NMT Stopped, where no node answers. The next request must not be
-                // sent before it has left that state.
+                // The drive may have been left in NMT Stopped, where it does not answer. It must have left that
+                // state when the next request comes.
                 Err(SdoError::Timeout(_)) => {
                     self.sdo.leave_operational();
                     self.sdo.pause(POLL_PERIOD).await;

@@ -47,7 +47,7 @@ pub struct SocketCan {
     interface: String,
     socket: CanSocket,
     received_at: Option<SystemTime>,
-    /// Set when sending is confirmed.
+    /// The frames sent and not yet confirmed; `None` if sending need not be confirmed.
     unconfirmed: Option<Unconfirmed>,
 }
 
@@ -138,7 +138,7 @@ impl SocketCan {
 
 impl CanBus for SocketCan {
     fn send(&mut self, frame: &Frame) -> Result<(), CanError> {
-        // Where they cannot be counted, none are known to be dropped.
+        // If the kernel does not count dropped frames, none are known to be dropped.
         let dropped = self.dropped().unwrap_or_default();
         if let Some(waiting) = &mut self.unconfirmed
             && let Some((frames, syncs)) = waiting.too_many()

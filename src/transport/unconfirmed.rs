@@ -44,8 +44,9 @@ impl Unconfirmed {
         (syncs >= self.syncs_max).then_some((self.frames.len(), syncs))
     }
 
-    /// True if the missing echoes may have been dropped, since the socket has now `dropped` more frames than when
-    /// the oldest waiting SYNC was sent: a full socket drops echoes as it drops other frames.
+    /// True if the missing echoes may have been dropped: a full socket drops echoes as it drops other frames.
+    /// `dropped` is the socket's count of dropped frames now, which is then higher than when the oldest waiting
+    /// SYNC was sent.
     pub fn may_be_dropped(&self, dropped: u64) -> bool {
         dropped != self.dropped_before
     }
