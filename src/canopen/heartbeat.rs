@@ -103,7 +103,8 @@ impl HeartbeatProducer {
 
     /// The heartbeat to send now, if one is due. Missed heartbeats are skipped.
     pub fn handle_timeout(&mut self, now: Time, state: NmtState) -> Option<Frame> {
-        if now < self.deadline {
+        // A period of zero is off, even at `Time::NEVER`.
+        if self.period.is_zero() || now < self.deadline {
             return None;
         }
         self.deadline = self.deadline + self.period;

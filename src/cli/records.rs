@@ -102,7 +102,10 @@ pub(super) fn describe(config: Config) -> Describe {
 }
 
 /// What the run of `manifest` was to do, from its configuration and arguments.
-pub(super) fn recorded_run_config(manifest: &Manifest, config: &Config) -> Result<RunConfig, Failure> {
+pub(super) fn recorded_run_config(
+    manifest: &Manifest,
+    config: &Config,
+) -> Result<RunConfig, Failure> {
     Ok(match stage::recorded_operation(manifest, config)? {
         Some(operation) => RunConfig::from(operation),
         None => RunConfig::from(config.session_reading(&mask_reader(None))?),
