@@ -20,18 +20,30 @@ pub struct RoomyPath {
     pub reserve_mm: f64,
 }
 
+/// Why a run has no path to begin with.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NoRoomyPath {
+    /// [`Status::Budget`] if more expansions may find one, else [`Status::None`].
+    pub status: Status,
+    /// The reason in words.
+    pub reason: String,
+}
+
 /// Plans the path with which a run begins, with as much of the reserve as possible, but no less than `least_mm`.
 /// `shortest` is the answer to `problem`. Each try may spend `problem.expansions_max`.
 ///
 /// # Errors
-/// Why there is no such path, in words.
+/// [`NoRoomyPath`].
 pub fn plan_with_reserve(
     world: &World,
     problem: &Problem,
     least_mm: f64,
     shortest: &Answer,
-) -> Result<RoomyPath, String> {
-    let no_path = || shortest.reason.clone().unwrap_or_default();
+) -> Result<RoomyPath, NoRoomyPath> {
+    let no_path = || {
+        let reason = shortest.reason.clone().unwrap_or_default();
+        NoRoomyPath { status: shortest.status, reason }
+    };
     if shortest.status == Status::None {
         return Err(no_path());
     }
@@ -52,15 +64,21 @@ pub fn plan_with_reserve(
     match (least, last) {
         _ if kept_mm >= least_mm => Ok(RoomyPath { path, reserve_mm: least_mm }),
         (None, _) => Ok(RoomyPath { path, reserve_mm: 0.0 }),
-        (Some(_), Status::Budget) => Err(format!(
-            "there is a path, but the budget of expansions was spent before one was found that keeps \
-             goal.reserve_mm, {least_mm}: raise goal.expansions_max, which is {}",
-            problem.expansions_max
-        )),
-        (Some(_), _) => Err(format!(
-            "there is a path, but none was found that keeps goal.reserve_mm, {least_mm}, beside \
-             goal.clearance_mm: the needle may lose it on the way; to try it, set goal.reserve_mm = 0"
-        )),
+        (Some(_), Status::Budget) => {
+            let reason = format!(
+                "there is a path, but the budget of expansions was spent before one was found that keeps \
+                 goal.reserve_mm, {least_mm}: raise goal.expansions_max, which is {}",
+                problem.expansions_max
+            );
+            Err(NoRoomyPath { status: Status::Budget, reason })
+        }
+        (Some(_), _) => {
+            let reason = format!(
+                "there is a path, but none was found that keeps goal.reserve_mm, {least_mm}, beside \
+                 goal.clearance_mm: the needle may lose it on the way; to try it, set goal.reserve_mm = 0"
+            );
+            Err(NoRoomyPath { status: Status::None, reason })
+        }
     }
 }
 
@@ -77,7 +95,7 @@ mod tests {
         gap_mm: f64,
         least_mm: f64,
         expansions_max: u32,
-    ) -> Result<(f64, RoomyPath), String> {
+    ) -> Result<(f64, RoomyPath), NoRoomyPath> {
         let ball = |side: f64| {
             let centre_mm = Vector3::new(0.0, side * (36.0 + gap_mm), 60.0);
             Obstacle::Sphere { centre_mm, radius_mm: 36.0 }
@@ -107,9 +125,12 @@ mod tests {
         let clearance_mm = problem([0.0, 0.0, 120.0], true).clearance_mm;
         let (distance_mm, roomy) = planned(clearance_mm + 0.6, 0.5, MANY).expect("it keeps more");
         assert!(distance_mm >= clearance_mm + 0.5 - 1e-3 && roomy.reserve_mm == 0.5);
-        let reason = planned(clearance_mm + 0.4, 0.5, MANY).expect_err("it keeps less");
+        let NoRoomyPath { status, reason } =
+            planned(clearance_mm + 0.4, 0.5, MANY).expect_err("it keeps less");
+        assert_eq!(status, Status::None);
         assert!(reason.contains("none was found that keeps goal.reserve_mm, 0.5,"), "{reason}");
-        let reason = planned(clearance_mm - 0.5, 0.5, MANY).expect_err("there is no path at all");
+        let NoRoomyPath { reason, .. } =
+            planned(clearance_mm - 0.5, 0.5, MANY).expect_err("there is no path at all");
         assert!(!reason.contains("goal.reserve_mm"), "{reason}");
     }
 
@@ -117,7 +138,9 @@ mod tests {
     #[test]
     fn a_spent_budget_is_not_taken_for_no_path() {
         let clearance_mm = problem([0.0, 0.0, 120.0], true).clearance_mm;
-        let reason = planned(clearance_mm + 0.4, 0.5, 10).expect_err("it keeps less");
+        let NoRoomyPath { status, reason } =
+            planned(clearance_mm + 0.4, 0.5, 10).expect_err("it keeps less");
+        assert_eq!(status, Status::Budget);
         let spent = "the budget of expansions was spent before one was found that keeps";
         assert!(reason.contains(spent) && !reason.contains("none was"), "{reason}");
         assert!(reason.contains("goal.expansions_max, which is 10"), "{reason}");

@@ -42,12 +42,12 @@ pub(super) fn plan(arguments: &Arguments) -> Result<(), Failure> {
     let run_plan = plan_with_reserve(&world, &problem, config.goal.reserve_mm, &answer);
     // A run refuses a path without the reserve, so such a path is no plan.
     if let (Status::Plan, Err(refusal)) = (answer.status, &run_plan) {
-        (answer.status, answer.reason) = (Status::None, Some(refusal.clone()));
+        (answer.status, answer.reason) = (refusal.status, Some(refusal.reason.clone()));
     }
     let mut object = to_json(&world, &problem, &answer, seconds);
     let with_obstacles = run_plan.as_ref().ok().filter(|_| !world.obstacles.is_empty());
     object["run_reserve_mm"] = json!(with_obstacles.map(|run_plan| run_plan.reserve_mm));
-    object["run_refusal"] = json!(run_plan.err());
+    object["run_refusal"] = json!(run_plan.err().map(|refusal| refusal.reason));
     object["curvature_margin"] = json!(config.goal.curvature_margin());
     if let Some(path) = &arguments.out {
         write_new(path, &picture(&world, &problem, &answer)?)?;
