@@ -31,8 +31,8 @@ pub(crate) fn stage_news(event: &StageEvent) -> Option<(Severity, String)> {
         StageEvent::Ignored { why, count, frame } => {
             format!("{why}, {count} so far, the newest {frame}")
         }
-        StageEvent::SyncSkipped(periods) => {
-            format!("the bench was late: {periods} SYNC periods skipped")
+        StageEvent::SyncSkipped { periods, total } => {
+            format!("the bench was late; SYNC periods skipped: {periods}, {total} so far")
         }
         StageEvent::Feedback(_)
         | StageEvent::Located(_)

@@ -167,8 +167,13 @@ pub enum StageEvent {
         /// The newest.
         frame: Frame,
     },
-    /// The bench was late: this many SYNC periods were skipped.
-    SyncSkipped(u64),
+    /// The bench was late. Emitted whenever the total reaches another power of two.
+    SyncSkipped {
+        /// SYNC periods skipped this time.
+        periods: u64,
+        /// SYNC periods skipped so far.
+        total: u64,
+    },
     /// The stage stops for this reason. It never moves again: a new run needs a new stage.
     Fault(String),
     /// The drives were commanded to take power off and to enter Pre-operational, and SYNC has ended. No event

@@ -176,11 +176,13 @@ impl Stage {
         }
         self.drain_bring_ups(now);
         if self.sync_runs()
-            && let Some(skipped) = self.sync.handle_timeout(now).map(u64::from)
+            && let Some(periods) = self.sync.handle_timeout(now).map(u64::from)
         {
-            if skipped > 0 {
-                self.counters.syncs_skipped += skipped;
-                self.emit(StageEvent::SyncSkipped(skipped));
+            let before = self.counters.syncs_skipped;
+            let total = before + periods;
+            self.counters.syncs_skipped = total;
+            if total.checked_ilog2() != before.checked_ilog2() {
+                self.emit(StageEvent::SyncSkipped { periods, total });
             }
             self.cycle(now);
         }

@@ -94,7 +94,7 @@ fn a_late_bench_skips_whole_periods_and_never_bursts() {
         bench.sent.iter().filter(is_sync).map(|(time, _)| *time).collect::<Vec<_>>()
     };
     assert_eq!(syncs(&bench).len(), 1);
-    assert!(bench.events.contains(&StageEvent::SyncSkipped(3)));
+    assert!(bench.events.contains(&StageEvent::SyncSkipped { periods: 3, total: 3 }));
     assert_eq!(bench.stage.counters().syncs_skipped, 3);
     bench.run_for(Duration::from_millis(5));
     assert_eq!(syncs(&bench)[1], due + Duration::from_millis(40), "the beat is absolute");

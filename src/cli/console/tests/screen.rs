@@ -73,7 +73,7 @@ fn figures_are_not_read_from_the_text_of_events() {
     let sync = Frame::new(0x80, &[]);
     screen.take(&Record::Can { time: at(25.0), direction: Direction::Sent, frame: sync });
     for text in [
-        "the bench was late: 12 SYNC periods skipped",
+        "the bench was late; SYNC periods skipped: 12, 12 so far",
         "insertion: emergency 0x3210 overvoltage",
         "record: the disk is full",
     ] {
