@@ -190,7 +190,10 @@ struct Watch {
     last: Option<(Time, Vector3<f64>)>,
     /// How often that position has come in a row.
     repeats: u32,
-    refusal: Option<Refusal>,
+    /// Why the newest sample or message was refused, since the last line.
+    refusal: Option<String>,
+    /// Messages that could not be read.
+    malformed: u64,
     /// Accepted positions since the last line.
     positions: u64,
 }
@@ -209,6 +212,7 @@ impl Watch {
             last: None,
             repeats: 0,
             refusal: None,
+            malformed: 0,
             positions: 0,
         }
     }
@@ -217,6 +221,11 @@ impl Watch {
         let sample = match event {
             Event::Connected { .. } => return self.clock.reconnected(),
             Event::Sample(sample) => sample,
+            Event::Malformed(error) => {
+                self.malformed += 1;
+                self.refusal = Some(format!("a message cannot be read: {error}"));
+                return;
+            }
             _ => return,
         };
         let admitted = self.gate.admit(sample).and_then(|position_mm| {
@@ -235,31 +244,38 @@ impl Watch {
                 self.last = Some(position);
                 self.positions += 1;
             }
-            Err(refusal) => self.refusal = Some(refusal),
+            Err(refusal) => self.refusal = Some(refusal.to_string()),
         }
     }
 
     /// The line at `now` for the last `seconds`.
     fn line(&mut self, now: Time, seconds: f64, listener: &mut Listener) -> String {
-        let at = now.as_secs_f64();
-        let Some((time, p_mm)) = self.last else {
+        self.position_line(now, seconds).unwrap_or_else(|| {
             let refusal = self.refusal.take().map(|refusal| format!("tracker: {refusal}"));
-            return format!(
-                "{at:7.1} s  {}",
-                refusal.unwrap_or_else(|| listener.explain_missing())
-            );
-        };
+            let why = refusal.unwrap_or_else(|| listener.explain_missing());
+            format!("{:7.1} s  {why}", now.as_secs_f64())
+        })
+    }
+
+    /// The same, if there was a position.
+    fn position_line(&mut self, now: Time, seconds: f64) -> Option<String> {
+        let (time, p_mm) = self.last?;
+        let at = now.as_secs_f64();
         let rate_hz = std::mem::take(&mut self.positions) as f64 / seconds;
         let refusal = self.refusal.take().map(|refusal| format!("; {refusal}")).unwrap_or_default();
-        format!(
-            "{at:7.1} s  x {:.2} y {:.2} z {:.2} mm ({})  {rate_hz:.1} Hz  age {:.3} s  {}{refusal}",
+        let malformed = match self.malformed {
+            0 => String::new(),
+            count => format!(", {count} not readable"),
+        };
+        Some(format!(
+            "{at:7.1} s  x {:.2} y {:.2} z {:.2} mm ({})  {rate_hz:.1} Hz  age {:.3} s  {}{malformed}{refusal}",
             p_mm.x,
             p_mm.y,
             p_mm.z,
             self.frame,
             now.seconds_after(time),
             self.counts
-        )
+        ))
     }
 }
 
@@ -457,8 +473,21 @@ mod tests {
             watch.take(&Event::Sample(sample(&tracker.tool)));
         }
         assert_eq!((watch.positions, watch.counts.refused()), (1, 2));
-        let why = watch.refusal.expect("repeats are refused").why;
+        let why = watch.refusal.expect("repeats are refused");
         assert!(why.contains("to the bit, 3 in a row"), "{why}");
+    }
+
+    #[test]
+    fn a_message_that_cannot_be_read_is_shown_beside_a_position() {
+        let tracker = Config::from_sources(&[], &[]).unwrap().tracker;
+        let mut watch = Watch::new(&tracker);
+        watch.gate = tracker.to_unregistered_gate();
+        watch.take(&Event::Sample(sample(&tracker.tool)));
+        watch.take(&Event::Malformed("line 2: garbage".to_owned()));
+        let line = watch.position_line(Time::from_nanos(5), 1.0).expect("a position was seen");
+        let end =
+            "1 accepted, 0 refused, 1 not readable; a message cannot be read: line 2: garbage";
+        assert!(line.ends_with(end), "{line}");
     }
 
     /// A tracker may send an orientation with some positions only.
