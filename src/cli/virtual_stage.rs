@@ -43,6 +43,7 @@ pub(super) struct Arguments {
 }
 
 fn write_data_sheets(stage: &VirtualStageConfig, dir: &Path) -> Result<(), Failure> {
+    std::fs::create_dir_all(dir).map_err(|error| Failure::io(dir, error))?;
     let drives = [("insertion.eds", &stage.insertion.0), ("rotation.eds", &stage.rotation.0)];
     for (name, drive) in drives {
         let path = dir.join(name);
