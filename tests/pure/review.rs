@@ -335,7 +335,7 @@ fn a_record_left_open_is_shown_and_closed() {
     assert_all(&said.stdout, &[": open", "--repair", "off plane (true)", "not closed: "]);
     let said = review(&scratch, &[&dir, "--verdict", "valid", "--reason", "x"]);
     assert_eq!(said.status, 2);
-    assert_all(&said.stderr, &["the record is not closed", "--repair"]);
+    assert_all(&said.stderr, &["a verdict needs a closed record", "--repair"]);
     let said = review(&scratch, &[&dir, "--repair"]);
     assert_eq!(said.status, 0, "{}", said.stderr);
     assert_all(&said.stdout, &["closed: ", "6 steps"]);

@@ -143,7 +143,7 @@ fn a_target_that_moves_is_met_and_replays() {
 fn what_is_out_of_reach_is_refused_before_power() {
     for (set, reason) in [
         ("goal.position_mm=[0.0, 60.0, 60.0]", "the target is out of reach"),
-        ("goal.position_mm=[0.0, 40.0, 10.0]", "mm from it"),
+        ("goal.position_mm=[0.0, 40.0, 10.0]", "mm from the target"),
         ("goal.position_mm=[0.0, 0.0, -20.0]", "outside goal.workspace_mm"),
         ("goal.position_mm=[0.0, 1.0, 45.0]", "inside an obstacle"),
         ("goal.position_mm=[0.0, 1.0, 48.5]", "from an obstacle"),
