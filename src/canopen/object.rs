@@ -43,7 +43,7 @@ pub mod communication {
     /// 1 changes nothing, 2 enters Stopped.
     pub const COMMUNICATION_ERROR_BEHAVIOUR: ObjectAddress = ObjectAddress::new(0x1029, 1);
 
-    /// u32: the errors, the newest at subindex 1; their number at 0.
+    /// u32: the errors, the newest at subindex 1. u8: their number, at subindex 0.
     pub const fn error_history(subindex: u8) -> ObjectAddress {
         ObjectAddress::new(0x1003, subindex)
     }

@@ -131,8 +131,9 @@ fn is_upright(header: &NiftiHeader) -> bool {
     } else {
         // These are sines of half the angle: a side tilts by twice as much.
         let half_sines = [header.quatern_b, header.quatern_c, header.quatern_d];
-        let is_turned = half_sines.iter().any(|sine| 2.0 * sine.abs() > TILT_MAX);
-        header.qform_code <= 0 || (qfac >= 0.0 && !is_turned)
+        // NaN is not upright.
+        let is_unturned = half_sines.iter().all(|sine| 2.0 * sine.abs() <= TILT_MAX);
+        header.qform_code <= 0 || (qfac >= 0.0 && is_unturned)
     }
 }
 
@@ -170,7 +171,7 @@ mod tests {
     /// A rotation by 1e-3 rad is allowed; the quaternion holds the sine of half of it.
     #[test]
     fn a_quaternion_tilts_a_voxel_by_twice_its_sine() {
-        let turned = |quatern_d: f32| {
+        let is_upright_with = |quatern_d: f32| {
             is_upright(&NiftiHeader {
                 sform_code: 0,
                 qform_code: 1,
@@ -178,8 +179,9 @@ mod tests {
                 ..NiftiHeader::default()
             })
         };
-        assert!(turned(0.49e-3) && turned(-0.49e-3));
-        assert!(!turned(0.51e-3) && !turned(-0.51e-3));
+        assert!(is_upright_with(0.49e-3) && is_upright_with(-0.49e-3));
+        assert!(!is_upright_with(0.51e-3) && !is_upright_with(-0.51e-3));
+        assert!(!is_upright_with(f32::NAN));
     }
 
     #[test]

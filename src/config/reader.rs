@@ -276,7 +276,7 @@ impl Reader {
             }
             let hint = match ancestors(key).find_map(|outer| self.known.get_key_value(outer)) {
                 Some((value, Some(allowed))) => {
-                    format!("{value} has no keys below it: allowed: {allowed}")
+                    format!("{value} has no keys below it; allowed as its value: {allowed}")
                 }
                 _ => nearest_key(key, self.known.keys().map(String::as_str)),
             };

@@ -91,7 +91,7 @@ impl Config {
     /// [`ConfigError`] if `[study]` leaves no room for an obstacle, or may draw a value that its key does not
     /// allow.
     pub fn drawn(&self, seed: u64) -> Result<Config, ConfigError> {
-        self.check_relative()?;
+        self.check_relative_errors()?;
         let mut toml = self.toml.clone();
         let emulator = &mut toml["emulator"];
         // Each range has its own number, so adding a range at the end does not change the draws of the others.
@@ -136,7 +136,7 @@ impl Config {
     /// Checks that no relative error takes a value out of the range of its key: the record of such a run could
     /// not be read. This is not checked as the configuration is read, since a drawn one has both the error and
     /// what it was drawn to.
-    fn check_relative(&self) -> Result<(), ConfigError> {
+    fn check_relative_errors(&self) -> Result<(), ConfigError> {
         let (study, emulator) = (&self.study, &self.emulator);
         let creep = [emulator.torsion.creep_mm, emulator.torsion.creep_mm_per_mm];
         let curvature_per_mm = emulator.arc.curvature_per_mm();

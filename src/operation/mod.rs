@@ -1,4 +1,4 @@
-//! Operations move the stage without steering a needle: home, jog, withdraw, prove, check of handedness.
+//! Operations use the stage without steering a needle: home, jog, withdraw, prove, check of handedness.
 //! Only the check of handedness needs a tracker; the others record what a tracker sends.
 //!
 //! An operation is a task of a [`Session`], as an insertion is: it has the same bring-up, supervision,
@@ -100,7 +100,7 @@ impl OperationConfig {
 pub enum RunConfig {
     /// Steers a needle.
     Insertion(Box<SessionConfig>),
-    /// Moves the stage without steering a needle.
+    /// Uses the stage without steering a needle.
     Operation(Box<OperationConfig>),
 }
 

@@ -97,11 +97,11 @@ pub fn plan(world: &World, problem: &Problem) -> Answer {
 /// As [`plan`], with the `route` to the target already known.
 pub(super) fn plan_thoroughly(field: &mut Field<'_>, problem: &Problem, route: &Route) -> Answer {
     // No path leaves the workspace, or comes nearer to an obstacle than the clearance.
-    let slack_mm = field.world.slack_at_most_mm(&problem.target_mm, problem.clearance_mm);
-    let is_closed = slack_mm < -problem.tolerance_mm;
-    let expansions_max = if is_closed { 0 } else { problem.expansions_max };
+    let slack_mm = field.world.slack_upper_bound_mm(&problem.target_mm, problem.clearance_mm);
+    let is_out_of_bounds = slack_mm < -problem.tolerance_mm;
+    let expansions_max = if is_out_of_bounds { 0 } else { problem.expansions_max };
     let mut answer = search_only(field, &Problem { expansions_max, ..problem.clone() }, route);
-    if is_closed {
+    if is_out_of_bounds {
         answer.status = Status::None;
     }
     // The search does not follow ways from which the target is out of reach, but those may come nearer to it.

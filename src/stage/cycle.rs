@@ -303,8 +303,8 @@ impl Stage {
         self.send_controlwords(now, |_| true);
     }
 
-    /// While the stage stops, reads the statusword and the position of a drive that sends no TPDO, because it
-    /// has left Operational: one object at a time, a few times a second.
+    /// While the stage stops, reads the statusword and the position of a drive that sends no TPDO, such as
+    /// one that has left Operational: one object at a time, a few times a second.
     fn read_by_sdo(&mut self, axis: Axis) {
         let stops = matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. });
         if !stops || self.drives[axis].fresh {

@@ -276,8 +276,8 @@ impl Drive {
         second.map(|frame| (self.conflicts, frame))
     }
 
-    /// To be called once for each statusword. True if it is the first to show an active limit inside the drive.
-    /// In homing that is normal: the axis may rest on a limit switch.
+    /// To be called for each statusword while the drive must follow. True if this is the first of them to show
+    /// an active limit inside the drive. In homing that is normal: the axis may rest on a limit switch.
     pub(super) fn internal_limit_begins(&mut self) -> bool {
         let is_limited = self.statusword.is_some_and(|word| word.has(Statusword::INTERNAL_LIMIT));
         let was_limited = std::mem::replace(&mut self.was_limited, is_limited);
@@ -310,8 +310,8 @@ impl Drive {
         self.flags().filter(move |flag| shown & *flag as u16 == 0)
     }
 
-    /// To be called once for each statusword. Returns how often bit 7 (warning) was set, if this statusword sets
-    /// it for the 1st, 2nd, 4th, 8th … time.
+    /// To be called for each statusword while the drive must follow. Returns how often bit 7 (warning) was set, if
+    /// this statusword sets it for the 1st, 2nd, 4th, 8th … time.
     pub(super) fn warning_begins(&mut self) -> Option<u64> {
         let is_warning = self.statusword.is_some_and(|word| word.has(Statusword::WARNING));
         let was_warning = std::mem::replace(&mut self.was_warning, is_warning);

@@ -176,8 +176,8 @@ pub enum StageEvent {
     },
     /// The stage stops for this reason. It never moves again: a new run needs a new stage.
     Fault(String),
-    /// The drives were commanded to take power off and to enter Pre-operational, and SYNC has ended. No event
-    /// follows except emergency messages.
+    /// The drives that the stage had identified were commanded to take power off and to enter Pre-operational,
+    /// and SYNC has ended. No event follows except emergency messages.
     Stopped {
         /// Both axes were seen to stand before power was taken off. False after a timeout, and when bring-up
         /// ended early.

@@ -293,8 +293,7 @@ impl Stage {
     }
 
     /// Sends no more heartbeats, like a bench that has died: drives that monitor them stop by themselves and
-    /// send emergency messages. From here on the stage reports no fault and stops the axes only by
-    /// [`quick_stop`](Self::quick_stop).
+    /// send emergency messages. From here on the stage reports no fault, and does not stop the axes by itself.
     pub fn fall_silent(&mut self) {
         self.faulted = true;
         for axis in Axis::BOTH {

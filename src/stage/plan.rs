@@ -68,7 +68,7 @@ impl Script {
                 answer => break answer,
             }
         };
-        self.note(|so_far| so_far.found = true);
+        self.note(|state| state.found = true);
         match self.accept(request, false, answer)? {
             Some(SdoReply::Uploaded(value)) if value.to_u32() as u16 != DRIVE_PROFILE => {
                 let profile = value.to_u32() as u16;
@@ -85,7 +85,7 @@ impl Script {
         self.begin("checking its identity");
         let vendor = self.read_identity(1, self.drive().vendor_id).await?;
         let product = self.read_identity(2, self.drive().product_code).await?;
-        self.note(|so_far| so_far.identified = true);
+        self.note(|state| state.identified = true);
         // The node is not reset: the drive may hold a load.
         self.sdo.leave_operational();
         let revision = self.read(optional(identity(3))).await?.map(SdoValue::to_u32);
@@ -122,15 +122,15 @@ impl Script {
         self.begin("taking power off, looking for faults");
         self.write_unchecked(drive::CONTROLWORD, Controlword::DISABLE_VOLTAGE.0.into()).await?;
         let statusword = self.wait_for_power_off().await?;
-        self.note(|so_far| so_far.disarmed = true);
+        self.note(|state| state.disarmed = true);
         if !statusword.is_fault() {
             return Ok(());
         }
         let mut fault = FoundFault { statusword, error_code: None };
-        self.note(|so_far| so_far.found_in_fault = Some(fault));
+        self.note(|state| state.found_in_fault = Some(fault));
         let error_code = self.read(optional(drive::ERROR_CODE)).await?;
         fault.error_code = error_code.map(|code| EmcyCode(code.to_u32() as u16));
-        self.note(|so_far| so_far.found_in_fault = Some(fault));
+        self.note(|state| state.found_in_fault = Some(fault));
         if self.config.power.fault_reset_on_start {
             return Ok(());
         }
@@ -198,7 +198,7 @@ impl Script {
         self.begin("setting heartbeats");
         let config = self.drive();
         let timeout_ms = u32::from(self.config.bus.heartbeat_timeout_ms);
-        self.note(|so_far| so_far.may_be_supervised = true);
+        self.note(|state| state.may_be_supervised = true);
         let watched = u32::from(self.config.bus.bench_node.get()) << 16 | timeout_ms;
         self.write(PRODUCER_HEARTBEAT, self.config.bus.heartbeat_ms).await?;
         self.write(consumer_heartbeat(1), watched).await?;
@@ -348,8 +348,8 @@ impl Script {
     }
 }
 
-/// The error of a `value`, in mm or rad, that `object` cannot hold in counts. [`StageConfig::validate`](super::StageConfig::validate) refuses
-/// such a configuration.
+/// The error of a `value`, in mm or rad, that `object` cannot hold in counts.
+/// [`StageConfig::validate`](super::StageConfig::validate) refuses such a configuration.
 fn unfit(object: ObjectAddress, value: f64) -> String {
     format!("{object} cannot hold {value} in counts")
 }

@@ -106,7 +106,7 @@ impl Stage {
         if self.drives[axis].note_emcy(emcy) {
             self.emit(StageEvent::Emergency(axis, emcy));
         }
-        // Errors from before bring-up took power off are ignored here: bring-up reads the statusword instead.
+        // Errors from before bring-up took power off stop nothing: bring-up reads the statusword instead.
         let is_watched = self.bring_ups[axis].as_ref().is_none_or(|drive| drive.state().disarmed)
             && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped);
         let is_of_found_fault = self.drives[axis].is_of_found_fault(emcy.code);

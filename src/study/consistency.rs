@@ -12,7 +12,7 @@ const POSITION_FREEDOM: f64 = 3.0;
 /// 95 % of a normal distribution lie within this many standard deviations.
 const WITHIN_95: f64 = 1.96;
 /// The same of Student's t with 1, 2 … degrees of freedom.
-const STUDENT_95: [f64; 9] = [12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262];
+const STUDENT_T_95: [f64; 9] = [12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262];
 
 /// The normalised estimation error squared, `εᵀ P⁻¹ ε`, with the left-invariant error `ε =
 /// log(X_est⁻¹ X_true)` and its covariance P; `None` for an estimate without covariance.
@@ -131,7 +131,7 @@ impl Nees {
 /// 95 % of Student's t with `freedom` degrees of freedom lie within this; from 10 on by its expansion for
 /// many (Abramowitz and Stegun 26.7.5), right to 0.2 %.
 fn student_95(freedom: usize) -> f64 {
-    let few = freedom.checked_sub(1).and_then(|at| STUDENT_95.get(at));
+    let few = freedom.checked_sub(1).and_then(|at| STUDENT_T_95.get(at));
     let part = 1.0 / freedom as f64;
     few.copied().unwrap_or(WITHIN_95 + 2.37 * part + 2.82 * part * part)
 }

@@ -223,7 +223,7 @@ impl Track {
         }
     }
 
-    /// True from when the tip is found until it is lost.
+    /// True while the tip is found and not lost.
     pub fn is_established(&self) -> bool {
         self.is_found && !self.is_lost
     }

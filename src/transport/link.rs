@@ -22,7 +22,7 @@ pub struct LinkSettings {
     pub tools: Vec<String>,
     /// The stream to request from an OpenIGTLink peer when it is connected.
     pub request: Option<ToolStream>,
-    /// Wait before the first attempt to reconnect; it doubles with each attempt.
+    /// Wait before the next attempt to connect; it doubles with each attempt.
     pub retry_first: Duration,
     /// A peer that is silent for this long may be gone. Then the bench reconnects to a server; a client is
     /// replaced by the next one that connects.
@@ -60,7 +60,7 @@ pub struct Link {
 struct Shared {
     /// Samples, statuses and refused messages received.
     messages: AtomicU64,
-    /// How many of them the sieve passed over, because they are of no use to the bench.
+    /// How many of them the sieve did not pass: of other tools, or too many at once.
     passed_over: AtomicU64,
     /// Samples dropped because the queue was full or because newer ones were waiting.
     dropped: AtomicU64,

@@ -139,7 +139,10 @@ impl SocketCan {
 impl CanBus for SocketCan {
     fn send(&mut self, frame: &Frame) -> Result<(), CanError> {
         // If the kernel does not count dropped frames, none are known to be dropped.
-        let dropped = self.dropped().unwrap_or_default();
+        let dropped = match self.unconfirmed {
+            Some(_) => self.dropped().unwrap_or_default(),
+            None => 0,
+        };
         if let Some(waiting) = &mut self.unconfirmed
             && let Some((frames, syncs)) = waiting.too_many()
         {

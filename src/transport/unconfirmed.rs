@@ -16,8 +16,8 @@ pub struct Unconfirmed {
     /// Maximum number of waiting SYNCs.
     syncs_max: usize,
     frames: VecDeque<Frame>,
-    /// The socket's count of dropped frames when the oldest waiting SYNC was sent.
-    dropped_before: u64,
+    /// For each waiting SYNC, the socket's count of dropped frames when it was sent.
+    dropped_before: VecDeque<u64>,
     /// Frames that were given up; their echoes may still come.
     given_up: VecDeque<Frame>,
     /// Frames whose echo is missing although the echo of a later frame has come: those since the last SYNC was
@@ -32,7 +32,7 @@ impl Unconfirmed {
         Unconfirmed {
             syncs_max: syncs_max.max(1),
             frames: VecDeque::new(),
-            dropped_before: 0,
+            dropped_before: VecDeque::new(),
             given_up: VecDeque::new(),
             overtaken: Default::default(),
         }
@@ -40,7 +40,7 @@ impl Unconfirmed {
 
     /// If so many SYNCs wait that no more frames may be sent: the numbers of waiting frames and SYNCs.
     pub fn too_many(&self) -> Option<(usize, usize)> {
-        let syncs = self.syncs();
+        let syncs = self.dropped_before.len();
         (syncs >= self.syncs_max).then_some((self.frames.len(), syncs))
     }
 
@@ -48,25 +48,17 @@ impl Unconfirmed {
     /// `dropped` is the socket's count of dropped frames now, which is then higher than when the oldest waiting
     /// SYNC was sent.
     pub fn may_be_dropped(&self, dropped: u64) -> bool {
-        dropped != self.dropped_before
+        self.dropped_before.front().is_some_and(|before| *before != dropped)
     }
 
     /// Adds a frame that the kernel accepted; `dropped` is the socket's count of dropped frames at that time.
     pub fn sent(&mut self, frame: Frame, dropped: u64) {
         if is_sync(&frame) {
-            // Frames that were dropped before do not explain an echo that is missing now.
-            if self.syncs() == 0 {
-                self.dropped_before = dropped;
-            }
+            self.dropped_before.push_back(dropped);
             let [newest, before] = &mut self.overtaken;
             *before = std::mem::take(newest);
         }
         self.frames.push_back(frame);
-    }
-
-    /// The number of waiting SYNCs.
-    fn syncs(&self) -> usize {
-        self.frames.iter().filter(|frame| is_sync(frame)).count()
     }
 
     /// Takes a received frame; true if it is the echo of an own frame, which is then confirmed. The frames sent
@@ -76,6 +68,8 @@ impl Unconfirmed {
     pub fn take_echo(&mut self, frame: &Frame) -> bool {
         let find = |frames: &VecDeque<Frame>| frames.iter().position(|sent| sent == frame);
         if let Some(index) = find(&self.frames) {
+            let syncs = self.frames.iter().take(index + 1).filter(|frame| is_sync(frame)).count();
+            self.dropped_before.drain(..syncs);
             self.overtaken[0].extend(self.frames.drain(..index));
             self.frames.pop_front();
             return true;
@@ -95,6 +89,7 @@ impl Unconfirmed {
 
     /// Stops waiting for all frames: the interface has dropped them, or their echoes were lost.
     pub fn give_up(&mut self) {
+        self.dropped_before.clear();
         self.given_up.append(&mut self.frames);
         let old = self.given_up.len().saturating_sub(GIVEN_UP_MAX);
         self.given_up.drain(..old);
@@ -147,6 +142,11 @@ mod tests {
         unconfirmed.sent(sync(), 6);
         unconfirmed.sent(sync(), 7);
         assert!(unconfirmed.may_be_dropped(7), "between the two");
+        // The first is confirmed late, while the second waits.
+        assert!(unconfirmed.take_echo(&sync()));
+        unconfirmed.sent(sync(), 7);
+        assert!(unconfirmed.too_many().is_some());
+        assert!(!unconfirmed.may_be_dropped(7), "before both that wait");
     }
 
     #[test]

@@ -121,7 +121,7 @@ impl Console {
         let keys = File::open("/dev/tty").ok().filter(|_| stderr().is_terminal());
         keys.ok_or_else(|| {
             Failure::configuration(
-                "--console needs a terminal for its screen (stderr) and its keys: over ssh use ssh -t, or leave it out",
+                "--console needs a terminal for its screen (stderr) and its keys; over ssh use ssh -t, or leave out --console",
             )
         })
     }

@@ -71,8 +71,13 @@ pub(super) fn review(arguments: &Arguments) -> Result<(), Failure> {
     let is_one_run = !changes_record && !is_campaign && paths.len() == 1;
     for (flag, is_given, applies, to) in [
         ("--by", arguments.by.is_some(), is_campaign, "a campaign: name a folder of runs"),
-        ("--html", arguments.html.is_some(), is_one_run, "the review of one run"),
-        ("--open", arguments.open, is_one_run, "the review of one run"),
+        (
+            "--html",
+            arguments.html.is_some(),
+            is_one_run,
+            "the review of one run: name one run folder",
+        ),
+        ("--open", arguments.open, is_one_run, "the review of one run: name one run folder"),
     ] {
         if is_given && !applies {
             return Err(Failure::configuration(format_args!("{flag} applies only to {to}")));

@@ -248,12 +248,12 @@ fn everything_at_once_in_the_order_of_the_file() {
 fn a_key_below_a_value() {
     assert_eq!(
         set_refusal(&["insertion.depth_mm.x=5"]),
-        "--set insertion.depth_mm.x: unknown key; insertion.depth_mm has no keys below it: allowed: \
-         over 0 to 1000 mm"
+        "--set insertion.depth_mm.x: unknown key; insertion.depth_mm has no keys below it; allowed as its \
+         value: over 0 to 1000 mm"
     );
     assert_eq!(
         set_refusal(&["name.foo=1"]),
-        "--set name.foo: unknown key; name has no keys below it: allowed: 1 to 64 letters, digits, \
+        "--set name.foo: unknown key; name has no keys below it; allowed as its value: 1 to 64 letters, digits, \
          '.', '_' or '-'"
     );
     for set in [

@@ -53,7 +53,7 @@ pub(super) struct InsertTask {
     /// The last hold by the tracker that ended by itself.
     ended_hold: Option<EndedHold>,
     /// Measurements that have not corrected the observers yet.
-    untold: Vec<Measurement>,
+    pending: Vec<Measurement>,
     /// The time of the feedback after which the observers still must be corrected.
     catch_up_to: Option<Time>,
     progress: Progress,
@@ -78,7 +78,7 @@ impl InsertTask {
             insertion: None,
             hold: None,
             ended_hold: None,
-            untold: Vec::new(),
+            pending: Vec::new(),
             catch_up_to: None,
             progress: Progress { depth_mm: config.insertion.depth_mm, ..Progress::default() },
             config,
@@ -126,7 +126,7 @@ impl InsertTask {
         if shell.is_running() {
             measurements.into_iter().for_each(|measurement| {
                 self.estimation.gather(&measurement);
-                self.untold.extend(insertion.take_measurement(measurement));
+                self.pending.extend(insertion.take_measurement(measurement));
             });
             inserted = self.insert(shell, feedback, at, &mut insertion);
         }
@@ -171,10 +171,10 @@ impl InsertTask {
         self.insertion = Some(insertion);
     }
 
-    /// Tells the observers what was measured until `time`. An error is the reason to stop for.
+    /// Corrects the observers with what was measured until `time`. An error is the reason to stop the run.
     fn correct(&mut self, time: Time) -> Result<(), String> {
-        let untold = std::mem::take(&mut self.untold);
-        for same_time in untold.chunk_by(|a, b| a.acquisition_time == b.acquisition_time) {
+        let pending = std::mem::take(&mut self.pending);
+        for same_time in pending.chunk_by(|a, b| a.acquisition_time == b.acquisition_time) {
             // Positions that are received at once are dated the same. The last is the newest.
             if let Some(newest) = same_time.last() {
                 self.estimation.take(newest, &self.history)?;
@@ -446,7 +446,7 @@ impl Task for InsertTask {
 
 /// How many SYNCs the history holds: those to which a measurement may refer, and a margin.
 fn history_points(config: &SessionConfig) -> usize {
-    // The check of handedness averages the positions of half of `hold_after` before it uses their mean.
+    // The handedness watch averages the positions of half of `hold_after` before it uses their mean.
     let span = config.tracker.hold.after * 2 + HISTORY_MARGIN;
     (span.as_nanos() / config.stage.bus.sync_period().as_nanos().max(1)) as usize + 2
 }

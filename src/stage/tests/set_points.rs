@@ -98,6 +98,16 @@ fn a_late_bench_skips_whole_periods_and_never_bursts() {
     assert_eq!(bench.stage.counters().syncs_skipped, 3);
     bench.run_for(Duration::from_millis(5));
     assert_eq!(syncs(&bench)[1], due + Duration::from_millis(40), "the beat is absolute");
+    // One more makes 4, another power of two; the next makes 5.
+    for (total, is_reported) in [(4, true), (5, false)] {
+        bench.events.clear();
+        bench.now = bench.stage.sync.deadline + Duration::from_millis(15);
+        bench.stage.handle_timeout(bench.now);
+        bench.settle();
+        assert_eq!(bench.stage.counters().syncs_skipped, total);
+        let event = StageEvent::SyncSkipped { periods: 1, total };
+        assert_eq!(bench.events.contains(&event), is_reported, "{total}");
+    }
 }
 
 /// Holding for one SYNC is no acceleration that was asked for: 10 mm/s² are 4.6 counts a SYNC, per
