@@ -45,9 +45,9 @@ section! {
         curvature_error: Option<[f64; 2]> [within(-0.9, 9.0)] = [0.0, 0.0];
         /// Half-width of the band of the emulated needle's torsion, degrees.
         torsion_half_width_deg: Option<[f64; 2]> [HALF_WIDTH];
-        /// Growth of that half-width with depth, degrees per mm.
+        /// Growth with depth of the half-width of the band of the emulated needle's torsion, degrees per mm.
         torsion_half_width_deg_per_mm: Option<[f64; 2]> [HALF_WIDTH_PER_MM];
-        /// Offset of that band, degrees.
+        /// Offset of the band of the emulated needle's torsion, degrees.
         torsion_offset_deg: Option<[f64; 2]> [OFFSET];
         /// Creep length of the emulated needle's shaft and its growth with depth, each relative to `[emulator]`.
         creep_error: Option<[f64; 2]> [within(-0.9, 9.0)];

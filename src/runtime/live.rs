@@ -23,7 +23,7 @@ const SPIN: Duration = Duration::from_micros(150);
 const ARRIVED_MAX: usize = 256;
 
 /// Interval between two readings of the counts of the tracker's link.
-const LOOK_PERIOD: Duration = Duration::from_millis(100);
+const READ_PERIOD: Duration = Duration::from_millis(100);
 /// More messages a second than this from the tracker are a flood.
 const FLOOD_PER_S: f64 = 5000.0;
 
@@ -38,7 +38,7 @@ struct Live<'a, W> {
     /// How long before a deadline the thread stops sleeping.
     spin: Duration,
     /// When the counts of the tracker's link were last read, and its messages then.
-    looked: Time,
+    counts_read: Time,
     counted: u64,
     /// A frame that was made before this is stale.
     stale_before: Option<Time>,
@@ -67,7 +67,7 @@ impl<'a, W: Witness> Live<'a, W> {
             witness,
             timing: TimingFigures::default(),
             spin: Duration::ZERO,
-            looked: last,
+            counts_read: last,
             counted,
             stale_before: None,
             last,
@@ -86,7 +86,7 @@ impl<'a, W: Witness> Live<'a, W> {
     /// and that were not sent yet are stale.
     fn check_gap(&mut self, since: Time) {
         let now = self.clock.now();
-        if let Some(reason) = self.held_up(now.since(since)) {
+        if let Some(reason) = self.stall_reason(now.since(since)) {
             self.stale_before = Some(now);
             self.handle(now, Input::Stop(reason));
         }
@@ -104,12 +104,13 @@ impl<'a, W: Witness> Live<'a, W> {
     }
 
     /// Why a run ends after a `gap` in which the bench did nothing; `None` if it is short enough.
-    fn held_up(&self, gap: Duration) -> Option<String> {
+    fn stall_reason(&self, gap: Duration) -> Option<String> {
         let max = self.session.stall_max().filter(|max| gap >= *max)?;
         let messages = self.tracker.as_ref().map_or(0, |link| link.messages() - self.counted);
-        let cause = flood(messages, self.clock.now().since(self.looked)).unwrap_or_else(|| {
-            "was the program suspended, or the machine busy? See --realtime".to_owned()
-        });
+        let cause =
+            flood(messages, self.clock.now().since(self.counts_read)).unwrap_or_else(|| {
+                "was the program suspended, or the machine busy? See --realtime".to_owned()
+            });
         Some(format!(
             "{STALLED}{} ms (limit {}, the drives' heartbeat time or tracker.hold_after_s), {cause}",
             gap.as_millis(),
@@ -142,12 +143,12 @@ impl<'a, W: Witness> Live<'a, W> {
     fn take_events(&mut self) {
         let now = self.clock.now();
         if let Some(link) = &mut self.tracker
-            && now.since(self.looked) >= LOOK_PERIOD
+            && now.since(self.counts_read) >= READ_PERIOD
         {
             let (messages, passed_over) = (link.messages(), link.passed_over());
             // A gap is explained by the messages since the last reading, so it is checked first.
             self.check_gap(self.session.deadline());
-            (self.looked, self.counted) = (now, messages);
+            (self.counts_read, self.counted) = (now, messages);
             if let Some(event) = passed_over {
                 self.give(Input::Tracker(event));
             }
@@ -246,7 +247,7 @@ impl<W: Witness> World for Live<'_, W> {
 
 /// Names so many messages from the tracker in this time as the cause of a gap, if they are a flood.
 fn flood(messages: u64, time: Duration) -> Option<String> {
-    let per_s = messages as f64 / time.max(LOOK_PERIOD).as_secs_f64();
+    let per_s = messages as f64 / time.max(READ_PERIOD).as_secs_f64();
     (per_s > FLOOD_PER_S)
         .then(|| format!("by a flood from the tracker? {messages} messages, {per_s:.0} a second"))
 }

@@ -160,12 +160,12 @@ impl Tracking {
                     position = Some((acquisition_time, tip_meas));
                 } else {
                     let judged = self.track.seek(fix(&record, acquisition_time, &tip_meas, None));
-                    self.settle(now, &mut record, judged.err());
+                    self.note_verdict(now, &mut record, judged.err());
                 }
             }
             Err(refusal) => {
                 self.track.note_refusal(&refusal);
-                self.settle(now, &mut record, Some(refusal));
+                self.note_verdict(now, &mut record, Some(refusal));
             }
         }
         self.waiting.push_back(Waiting { record, is_target: false, position });
@@ -219,7 +219,7 @@ impl Tracking {
                     positions: 1,
                 });
             }
-            self.settle(now, &mut sample.record, judged.err());
+            self.note_verdict(now, &mut sample.record, judged.err());
         }
         self.waiting = waiting;
         self.release_records();
@@ -246,7 +246,7 @@ impl Tracking {
     }
 
     /// Notes whether a sample was accepted, in its record and for the messages.
-    fn settle(&mut self, now: Time, record: &mut SampleRecord, refusal: Option<Refusal>) {
+    fn note_verdict(&mut self, now: Time, record: &mut SampleRecord, refusal: Option<Refusal>) {
         self.counts.count(refusal.as_ref());
         match refusal {
             None => {
@@ -318,7 +318,7 @@ impl Tracking {
         for sample in waiting.iter_mut().take(count) {
             if sample.position.take().is_some() {
                 let refusal = Refusal::new(GateName::Pairing, why);
-                self.settle(now, &mut sample.record, Some(refusal));
+                self.note_verdict(now, &mut sample.record, Some(refusal));
             }
         }
         self.waiting = waiting;

@@ -200,7 +200,7 @@ impl Stage {
         }
         for axis in Axis::BOTH {
             if let Some(statusword) =
-                self.drives[axis].overdue_transition(self.config.power.state_transition_timeout)
+                self.drives[axis].count_transition(self.config.power.state_transition_timeout)
             {
                 let fault = refused_to_switch_on(statusword);
                 return self.fail(now, format!("{axis}: {fault}"));

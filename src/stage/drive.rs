@@ -249,7 +249,7 @@ impl Drive {
 
     /// To be called once a SYNC. Returns the statusword if the drive has stayed for longer than `timeout` in a
     /// state on the way to Switched On that it is commanded to leave.
-    pub(super) fn overdue_transition(&mut self, timeout: Duration) -> Option<Statusword> {
+    pub(super) fn count_transition(&mut self, timeout: Duration) -> Option<Statusword> {
         let is_commanded_on = matches!(
             (self.state(), self.controlword),
             (Some(DriveState::SwitchOnDisabled), Controlword::SHUTDOWN)
@@ -278,7 +278,7 @@ impl Drive {
 
     /// To be called for each statusword while the drive must follow. True if this is the first of them to show
     /// an active limit inside the drive. In homing that is normal: the axis may rest on a limit switch.
-    pub(super) fn internal_limit_begins(&mut self) -> bool {
+    pub(super) fn note_internal_limit(&mut self) -> bool {
         let is_limited = self.statusword.is_some_and(|word| word.has(Statusword::INTERNAL_LIMIT));
         let was_limited = std::mem::replace(&mut self.was_limited, is_limited);
         is_limited && !was_limited && !self.homing_mode
@@ -312,7 +312,7 @@ impl Drive {
 
     /// To be called for each statusword while the drive must follow. Returns how often bit 7 (warning) was set, if
     /// this statusword sets it for the 1st, 2nd, 4th, 8th … time.
-    pub(super) fn warning_begins(&mut self) -> Option<u64> {
+    pub(super) fn note_warning(&mut self) -> Option<u64> {
         let is_warning = self.statusword.is_some_and(|word| word.has(Statusword::WARNING));
         let was_warning = std::mem::replace(&mut self.was_warning, is_warning);
         if !is_warning || was_warning {

@@ -160,10 +160,10 @@ impl Stage {
             );
         let has_power =
             matches!(state, Some(S::SwitchedOn | S::OperationEnabled | S::QuickStopActive));
-        if must_follow && self.drives[axis].internal_limit_begins() {
+        if must_follow && self.drives[axis].note_internal_limit() {
             self.emit(StageEvent::InternalLimit(axis));
         }
-        if must_follow && let Some(count) = self.drives[axis].warning_begins() {
+        if must_follow && let Some(count) = self.drives[axis].note_warning() {
             self.emit(StageEvent::Warns { axis, statusword, count });
         }
         let drive = &self.drives[axis];

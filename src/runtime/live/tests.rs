@@ -344,7 +344,7 @@ fn a_flood_during_a_gap_is_named_by_the_look_after_it() {
     }
     let (mut late, mut bus) = (Late(None, Vec::new()), Waiting(None));
     let mut run = Live::new(&mut late, &mut bus, Some(&mut link), Clock::start(), |_, _| {});
-    (run.looked, run.counted) = (run.last - Duration::from_secs(1), 0);
+    (run.counts_read, run.counted) = (run.last - Duration::from_secs(1), 0);
     run.take_events();
     let reason = late.0.as_ref().and_then(Outcome::stop_reason).unwrap();
     assert!(reason.contains("by a flood from the tracker? 60000 messages, "), "{reason}");

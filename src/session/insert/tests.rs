@@ -198,9 +198,9 @@ fn a_drive_that_keeps_power_from_elsewhere_is_told_at_the_end() {
         reason.starts_with("stage: insertion: the drive has power before the bench gave it any"),
         "{reason}"
     );
-    let left = bench.session.stage_at_end();
-    let unknown = left.unknown.unwrap_or("nothing");
-    assert!(left.had_power && unknown.contains("press the emergency stop"), "{unknown}");
+    let at_end = bench.session.stage_at_end();
+    let unknown = at_end.unknown.unwrap_or("nothing");
+    assert!(at_end.had_power && unknown.contains("press the emergency stop"), "{unknown}");
     assert!(bench.events.iter().any(|text| text == unknown), "{:?}", bench.events);
 }
 
@@ -217,7 +217,7 @@ fn power_from_elsewhere_that_the_stop_took_off_is_told_at_the_end() {
         reason.starts_with("stage: insertion: the drive has power before the bench gave it any"),
         "{reason}"
     );
-    let left = bench.session.stage_at_end();
-    assert!(left.had_power, "{left:?}");
-    assert_eq!(left.unknown, None);
+    let at_end = bench.session.stage_at_end();
+    assert!(at_end.had_power, "{at_end:?}");
+    assert_eq!(at_end.unknown, None);
 }
