@@ -61,7 +61,7 @@ pub(super) fn ending(config: &Config, report: &RunReport) -> String {
     lines.push(match (report.outcome.stop_reason(), plane_missed_by_mm(report)) {
         (None, _) if plan_status(config, report) == Some(PlanStatus::Missed) => format!(
             "completed, not at the target: {} mm from it by the estimate (limit goal.tolerance_mm = {}); \
-             in steps.csv, target_error_pred_mm shows where it was lost, and x_est_mm how far the tip was off the plane",
+             see target_error_pred_mm and, off the plane, x_est_mm in steps.csv",
             fixed(report.figures.report().target_error_est_mm, 3),
             config.goal.tolerance_mm
         ),
