@@ -1,10 +1,15 @@
 #!/usr/bin/env python3
 """How many targets does the exact Bayes filter reach in space while the roll at the start is not known?
 
+    python3 docs/start_roll_exact.py
+    python3 docs/start_roll_exact.py --wait 0.5      # the base stands until the resultant length is 0.5
+    python3 docs/start_roll_exact.py --slow 0.5      # it turns the slower, the more the length is under 0.5
+
 `start_roll_bound.py` gives a method what no real one can have. This one has what the bench has: 20 positions a mm
 with noise of +-1 mm, yaw known to 12 degrees and pitch to 8 at the start, the start position, the curvature, and each
 turn of the base. It keeps the whole posterior of yaw, pitch and roll on a grid, given how the needle was turned, and
-each mm turns the base toward the target by the posterior's mean, by 60 degrees a mm at most. After TOLD_MM the roll is
+each mm turns the base toward the target by the posterior's mean, by 60 degrees a mm at most. With `--wait` and
+`--slow` it turns less while the resultant length of the posterior of the roll is small. After TOLD_MM the roll is
 told to it, and one arc of the full curvature leads to the target. Angles are small in the likelihood, not in the path.
 
 Prints the RMS error of the roll and the share of the targets that are then reached within 1 mm and within 0.4 mm, for
@@ -12,6 +17,7 @@ Gaussian noise (as the bench takes it) and for the uniform noise that it is. Tar
 `bench-config/target-study.toml` with `goal.in_plane=false`. Needs numpy. docs/targets.md has what follows from it.
 """
 
+import argparse
 import math
 
 import numpy as np
@@ -24,7 +30,7 @@ from start_roll_bound import (
 DRAWS, TOLD_MM, TURN_MAX = 400, 24, math.pi / 3
 
 
-def insert(noise, random):
+def insert(noise, random, wait, slow):
     """Tip and heading after TOLD_MM, and the error of the roll's mean after each mm. The target is in direction 0."""
     step = 1.0 / POSITIONS_PER_MM
     true_roll = random.choice(ROLLS)
@@ -52,9 +58,14 @@ def insert(noise, random):
             off = positions[:, None, None] - of_roll - (sd * SLOPES)[None, None, :] * depths[:, None, None]
             log += noise.log_likelihood(off)
             weights *= np.exp(log - log.max()) @ SLOPE_PRIOR
-        mean = np.angle(np.sum(weights * np.exp(1j * ROLLS)))
+        resultant = np.sum(weights * np.exp(1j * ROLLS)) / weights.sum()
+        mean = np.angle(resultant)
         errors.append(wrapped(mean - true_roll))
         command = float(np.clip(-wrapped(mean + turn), -TURN_MAX, TURN_MAX))
+        if abs(resultant) < wait:
+            command = 0.0
+        elif abs(resultant) < slow:
+            command *= abs(resultant) / slow
     return tip, heading, errors
 
 
@@ -72,12 +83,16 @@ def wrapped(angle):
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--wait", type=float, default=0.0)
+    parser.add_argument("--slow", type=float, default=0.0)
+    given = parser.parse_args()
     target = draw_targets(TARGETS, SHARE_MAX, np.random.default_rng(1))
     aside = np.linalg.norm(target[:, :2], axis=1)
     target = np.column_stack([np.zeros(TARGETS), aside, target[:, 2]])
     for noise in (Gaussian(), Uniform()):
         random, name = np.random.default_rng(2), type(noise).__name__
-        ends = [insert(noise, random) for _ in range(DRAWS)]
+        ends = [insert(noise, random, given.wait, given.slow) for _ in range(DRAWS)]
         rms = np.degrees(np.sqrt(np.mean(np.array([errors for _, _, errors in ends]) ** 2, axis=0)))
         for mm in range(4, TOLD_MM + 1, 4):
             print(f"{name}: after {mm} mm the roll is known to {rms[mm - 1]:.0f} degrees")
