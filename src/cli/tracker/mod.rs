@@ -2,6 +2,10 @@
 //! without a run.
 
 mod commands;
+mod list;
+mod record;
+mod rest;
+mod watch;
 
 pub(super) use self::commands::{TrackerCommand, tracker};
 
