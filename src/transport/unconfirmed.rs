@@ -48,7 +48,7 @@ impl Unconfirmed {
     /// `dropped` is the socket's count of dropped frames now, which is then higher than when the oldest waiting
     /// SYNC was sent.
     pub fn may_be_dropped(&self, dropped: u64) -> bool {
-        self.dropped_before.front().is_some_and(|before| *before != dropped)
+        self.dropped_before.front().is_some_and(|before| *before < dropped)
     }
 
     /// Adds a frame that the kernel accepted; `dropped` is the socket's count of dropped frames at that time.
@@ -137,6 +137,7 @@ mod tests {
         unconfirmed.sent(sync(), 5);
         assert!(unconfirmed.too_many().is_some());
         assert!(!unconfirmed.may_be_dropped(5), "dropped before");
+        assert!(!unconfirmed.may_be_dropped(0), "the count could not be read");
         assert!(unconfirmed.may_be_dropped(6));
         unconfirmed.give_up();
         unconfirmed.sent(sync(), 6);
