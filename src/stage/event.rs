@@ -167,7 +167,8 @@ pub enum StageEvent {
         /// The newest.
         frame: Frame,
     },
-    /// The bench was late. Emitted whenever the total reaches another power of two.
+    /// The bench was late: emitted if more periods were skipped at once than ever before, and if the total has
+    /// reached another power of two.
     SyncSkipped {
         /// SYNC periods skipped this time.
         periods: u64,

@@ -76,6 +76,8 @@ pub struct Stage {
     pub(super) power_permitted: bool,
     pub(super) counters: Counters,
     pub(super) flood: FloodWatch,
+    /// The most SYNC periods that were skipped at once.
+    longest_skip: u64,
     outputs: VecDeque<Output>,
 }
 
@@ -127,6 +129,7 @@ impl Stage {
             power_permitted: true,
             counters: Counters::default(),
             flood: FloodWatch::new(now),
+            longest_skip: 0,
             outputs: VecDeque::new(),
             config,
         };
@@ -178,12 +181,7 @@ impl Stage {
         if self.sync_runs()
             && let Some(periods) = self.sync.handle_timeout(now).map(u64::from)
         {
-            let before = self.counters.syncs_skipped;
-            let total = before + periods;
-            self.counters.syncs_skipped = total;
-            if total.checked_ilog2() != before.checked_ilog2() {
-                self.emit(StageEvent::SyncSkipped { periods, total });
-            }
+            self.note_skipped(periods);
             self.cycle(now);
         }
         // Only after the SYNC, which must not wait.
@@ -352,6 +350,18 @@ impl Stage {
     /// Writes a controlword, without waiting for the reply.
     pub(super) fn send_controlword(&mut self, axis: Axis, word: Controlword) {
         self.send_sdo(axis, SdoRequest::Download(object::CONTROLWORD, word.0.into()));
+    }
+
+    /// Counts SYNC periods that were skipped. A slow machine skips one again and again, so not each is an event.
+    fn note_skipped(&mut self, periods: u64) {
+        let before = self.counters.syncs_skipped;
+        let total = before + periods;
+        let is_longest = periods > self.longest_skip;
+        self.counters.syncs_skipped = total;
+        self.longest_skip = self.longest_skip.max(periods);
+        if is_longest || total.checked_ilog2() != before.checked_ilog2() {
+            self.emit(StageEvent::SyncSkipped { periods, total });
+        }
     }
 
     pub(super) fn ignore(&mut self, why: Ignored, frame: &Frame) {

@@ -98,14 +98,15 @@ fn a_late_bench_skips_whole_periods_and_never_bursts() {
     assert_eq!(bench.stage.counters().syncs_skipped, 3);
     bench.run_for(Duration::from_millis(5));
     assert_eq!(syncs(&bench)[1], due + Duration::from_millis(40), "the beat is absolute");
-    // One more makes 4, another power of two; the next makes 5.
-    for (total, is_reported) in [(4, true), (5, false)] {
+    // The next makes 4, another power of two, and the last skips more at once than ever.
+    for (periods, total, is_reported) in [(1, 4, true), (1, 5, false), (4, 9, true), (5, 14, true)]
+    {
         bench.events.clear();
-        bench.now = bench.stage.sync.deadline + Duration::from_millis(15);
+        bench.now = bench.stage.sync.deadline + Duration::from_millis(10 * periods + 5);
         bench.stage.handle_timeout(bench.now);
         bench.settle();
         assert_eq!(bench.stage.counters().syncs_skipped, total);
-        let event = StageEvent::SyncSkipped { periods: 1, total };
+        let event = StageEvent::SyncSkipped { periods, total };
         assert_eq!(bench.events.contains(&event), is_reported, "{total}");
     }
 }
