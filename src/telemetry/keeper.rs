@@ -210,7 +210,7 @@ mod tests {
         let news = std::iter::from_fn(|| keeper.news(Instant::now()));
         let said: Vec<String> = news.map(|news| format!("{news:?}")).collect();
         assert!(
-            said.concat().contains("run folder: 1 manifests lost, its queue is full"),
+            said.concat().contains("run folder: manifests lost: 1, its queue is full"),
             "{said:?}"
         );
     }

@@ -157,7 +157,7 @@ impl Watch {
         let (writer, items) = (self.writer, self.items);
         if is_first && self.health < Health::GivenUp {
             return Some(RecordNews::Failed(TelemetryError::Recording(format!(
-                "{writer}: {dropped} {items} lost, its queue is full; is the disk too slow for this run?"
+                "{writer}: {items} lost: {dropped}, its queue is full; is the disk too slow for this run?"
             ))));
         }
         let text = format!("{writer}: {items} lost: {more} more, {dropped} in all");
@@ -250,7 +250,7 @@ mod tests {
         let mut watched = Watched::new(50);
         watched.vitals.beat();
         let heard = watched.hear(100, 3);
-        let said = "failed: text files: 3 records lost, its queue is full; is the disk too slow for \
+        let said = "failed: text files: records lost: 3, its queue is full; is the disk too slow for \
                     this run?";
         assert_eq!(heard, [(50, said.to_owned())]);
         let mut heard = Vec::new();
@@ -273,7 +273,7 @@ mod tests {
         assert_eq!(
             said,
             [
-                "failed: text files: 1 records lost, its queue is full; is the disk too slow for this \
+                "failed: text files: records lost: 1, its queue is full; is the disk too slow for this \
                  run?",
                 "text files: records lost: 10 more, 11 in all",
             ]

@@ -10,11 +10,10 @@ fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The two sheets of a stage with these settings, in a folder of their own.
+/// The two sheets of a stage with these settings, in a folder of their own, which is not there before.
 fn written(settings: &[&str]) -> PathBuf {
     let number = std::process::id() as usize + settings.len();
     let dir = std::env::temp_dir().join(format!("needle-bench-eds-{number}"));
-    std::fs::create_dir_all(&dir).expect("a folder");
     let mut command = Command::new(env!("CARGO_BIN_EXE_vcan-stage"));
     for setting in settings {
         command.args(["--set", setting]);

@@ -63,6 +63,12 @@ impl Simulated {
     }
 }
 
+/// An estimate with the curvature of `problem`, whose position and heading are well known.
+fn known(tip: Tip, problem: &Problem) -> TipEstimate {
+    let curvature_per_mm = problem.curvature_per_mm;
+    TipEstimate { tip, curvature_per_mm, position_sd_mm: 0.05, heading_sd_rad: 0.001 }
+}
+
 /// Steers a needle of `true_mm` radius that is believed to be of `RADIUS_MM`: the last step, and the
 /// least distance to an obstacle.
 fn run(world: &World, problem: &Problem, true_mm: f64) -> (Step, f64, Simulated) {
@@ -70,12 +76,7 @@ fn run(world: &World, problem: &Problem, true_mm: f64) -> (Step, f64, Simulated)
     let mut needle = Simulated::new(true_mm);
     let mut least_mm = f64::INFINITY;
     for step in 0..300 {
-        let estimate = TipEstimate {
-            tip: needle.tip,
-            curvature_per_mm: problem.curvature_per_mm,
-            position_sd_mm: 0.05,
-            heading_sd_rad: 0.001,
-        };
+        let estimate = known(needle.tip, problem);
         let inserted_mm = if step == 0 { 0.0 } else { STEP_MM };
         match planner.step(&estimate, inserted_mm, STEP_MM) {
             Step::Steer(steer) => needle.step(&steer, RADIUS_MM),
@@ -113,12 +114,7 @@ fn a_whole_turn_needs_a_path_after_it() {
     for ((target_mm, obstacles), may_turn) in cases {
         let problem = problem(target_mm, true);
         let mut planner = Replanner::new(world(obstacles.clone()), problem.clone(), 0.0, None);
-        let estimate = TipEstimate {
-            tip: problem.start,
-            curvature_per_mm: problem.curvature_per_mm,
-            position_sd_mm: 0.05,
-            heading_sd_rad: 0.001,
-        };
+        let estimate = known(problem.start, &problem);
         let step = planner.step(&estimate, 0.0, STEP_MM);
         let path = planner.path().cloned();
         assert!(path.is_some() && matches!(step, Step::Steer(_)), "{step:?}");
@@ -290,12 +286,7 @@ fn one_arc_that_is_too_long_does_not_replace_a_path_that_is_not() {
     let mut planner = Replanner::new(world, problem.clone(), 0.0, path);
     let mut needle = Simulated::new(RADIUS_MM);
     for step in 0..100 {
-        let estimate = TipEstimate {
-            tip: needle.tip,
-            curvature_per_mm: problem.curvature_per_mm,
-            position_sd_mm: 0.05,
-            heading_sd_rad: 0.001,
-        };
+        let estimate = known(needle.tip, &problem);
         let inserted_mm = if step == 0 { 0.0 } else { STEP_MM };
         let Step::Steer(steer) = planner.step(&estimate, inserted_mm, STEP_MM) else {
             panic!("no path at {step} mm");
@@ -313,12 +304,7 @@ fn beyond_the_longest_path_nothing_leads_back() {
     problem.start.position_mm.z = 10.0;
     let mut planner = Replanner::new(world(vec![]), problem.clone(), 0.0, None);
     for inserted_mm in [0.0, 1.5] {
-        let estimate = TipEstimate {
-            tip: problem.start,
-            curvature_per_mm: problem.curvature_per_mm,
-            position_sd_mm: 0.05,
-            heading_sd_rad: 0.001,
-        };
+        let estimate = known(problem.start, &problem);
         let step = planner.step(&estimate, inserted_mm, STEP_MM);
         let backwards = |path: &Path| path.arcs.iter().any(|arc| arc.length_mm < 0.0);
         assert!(!planner.path().is_some_and(backwards), "{step:?}, {:?}", planner.path());
@@ -329,12 +315,8 @@ fn beyond_the_longest_path_nothing_leads_back() {
 fn a_tip_that_is_no_number_is_held() {
     let problem = problem([0.0, 0.0, 120.0], false);
     let mut planner = Replanner::new(world(vec![]), problem.clone(), 0.0, None);
-    let estimate = TipEstimate {
-        tip: Tip { position_mm: Vector3::new(0.0, f64::NAN, 10.0), ..problem.start },
-        curvature_per_mm: problem.curvature_per_mm,
-        position_sd_mm: 0.05,
-        heading_sd_rad: 0.001,
-    };
+    let tip = Tip { position_mm: Vector3::new(0.0, f64::NAN, 10.0), ..problem.start };
+    let estimate = known(tip, &problem);
     assert_eq!(planner.step(&estimate, 1.0, STEP_MM), Step::Stop(StopReason::TipNotAllowed));
 }
 
