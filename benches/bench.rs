@@ -137,7 +137,7 @@ fn steps_to_targets(_: &mut Criterion) {
     print_quantiles("to a target among five spheres", ns);
 }
 
-/// The time of one command of each law.
+/// Measures the time that each law takes for one command.
 fn commands(c: &mut Criterion) {
     let mut group = c.benchmark_group("command");
     for kind in ["nested-saturation", "feedback-linearization"] {

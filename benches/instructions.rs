@@ -56,7 +56,7 @@ fn instructions(part: &str, kind: &str, insertions: u32) -> Option<u64> {
     count.split_whitespace().next()?.parse().ok()
 }
 
-/// Makes the steps of one insertion. The true needle is a small part of the count, the same for every kind.
+/// Runs the steps of one insertion. The true needle takes few of the counted instructions, as many for every kind.
 fn insert(session: &SessionConfig, start: u32) {
     let mut steering = Steering::new(session).expect("valid");
     let roll = f64::from(start);

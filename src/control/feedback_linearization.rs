@@ -182,7 +182,7 @@ mod tests {
         assert_eq!(law.command(&Estimate::of_pose(nan), 1.0), Err(ControlError::NotFinite));
     }
 
-    /// An observer with a constant error would make the law turn for ever: the law stops before a whole
+    /// An observer with a constant error would make the law turn without end: the law stops before a whole
     /// turn of the needle.
     #[test]
     fn it_never_spins_the_needle() {

@@ -64,7 +64,7 @@ pub fn make_recording(
     let reached_ns = Arc::new(AtomicI64::new(0));
     let (done_tx, done) = channel();
     let (reached_by_thread, path) = (Arc::clone(&reached_ns), dir.to_path_buf());
-    // If a stalled disk blocks the thread for ever, it is abandoned.
+    // If a stalled disk blocks the thread indefinitely, it is abandoned.
     let spawned = thread::Builder::new()
         .name("run-rrd".to_owned())
         .spawn(move || done_tx.send(make_and_note(&path, describe, &reached_by_thread)));

@@ -47,7 +47,7 @@ impl NoiseFit {
 
 /// Coordinates of positions at rest, without their mean and drift, and the times between them.
 pub(super) struct Residuals<'a> {
-    /// Time of each position after the one before, s; that of the first is not used.
+    /// Time from the previous position to each position, s. The first value is not used.
     pub(super) gaps_s: &'a [f64],
     /// One series for each coordinate, mm.
     pub(super) series: &'a [Vec<f64>],

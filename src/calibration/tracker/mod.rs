@@ -254,7 +254,7 @@ fn without_outliers(
 
 /// The coordinates of positions without their offset and drift.
 struct Detrended {
-    /// Time of each position after the one before, s; 0 for the first.
+    /// Time from the previous position to each position, s; 0 for the first.
     gaps_s: Vec<f64>,
     residuals_mm: [Vec<f64>; 3],
     drift_mm_per_s: [f64; 3],
