@@ -143,6 +143,7 @@ impl World {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::Pose;
     use proptest::prelude::*;
 
     fn point(reach_mm: f64) -> impl Strategy<Value = Vector3<f64>> {
@@ -168,6 +169,23 @@ mod tests {
     }
 
     proptest! {
+        /// What `plan` answers without a search follows from this. The voxels of a mask are larger than a step.
+        #[test]
+        fn no_point_near_has_more_slack_than_the_bound(
+            other in obstacle(), p in point(25.0), step in point(5.0),
+        ) {
+            let spacing_mm = Vector3::repeat(8.0);
+            let mask = Mask::new([3, 3, 3], spacing_mm, &[true; 27], &Pose::identity()).unwrap();
+            let workspace = Workspace {
+                min_mm: Vector3::repeat(-20.0),
+                max_mm: Vector3::repeat(20.0),
+                start_mm: None,
+            };
+            let world = World { obstacles: vec![other, Obstacle::Mask(mask)], workspace };
+            let bound_mm = world.slack_upper_bound_mm(&p, 2.0) + step.norm();
+            prop_assert!(world.slack_mm(&(p + step), 2.0) <= bound_mm + 1e-9);
+        }
+
         /// A distance: it changes by at most the way, and following it leads to the surface.
         #[test]
         fn distances_are_exact(obstacle in obstacle(), p in point(60.0), step in point(5.0)) {
