@@ -138,14 +138,15 @@ impl Tip {
 
     /// A lower bound of the length plus the remaining distance, mm, of any way that ends within `tolerance_mm`
     /// of `point_mm`, without obstacles. Outside the turning circle it is the length of
-    /// [`Tip::arc_then_straight_to`]. A way to a point that is inside by more than the tolerance takes at least
-    /// half a circle (Schur: a curve of curvature at most 1/r that touches a ball of radius r enters it only
-    /// after π r).
+    /// [`Tip::arc_then_straight_to`]. In space a way to a point that is inside by more than the tolerance takes at
+    /// least half a circle (Schur: a curve of curvature at most 1/r that touches a ball of radius r enters it only
+    /// after π r), in the plane more: it turns away first.
     pub fn shortest_mm(
         &self,
         point_mm: &Vector3<f64>,
         curvature_per_mm: f64,
         tolerance_mm: f64,
+        in_plane: bool,
     ) -> f64 {
         let relative = self.relative(point_mm);
         if let Some((turn_rad, straight_mm)) = relative.turn_then_straight(curvature_per_mm) {
@@ -154,9 +155,13 @@ impl Tip {
         let RelativePoint { off_axis_mm, ahead_mm, .. } = relative;
         let radius_mm = curvature_per_mm.recip();
         let from_centre_mm = math::hypot(radius_mm - off_axis_mm, ahead_mm);
-        match radius_mm - from_centre_mm <= tolerance_mm {
-            true => math::hypot(off_axis_mm, ahead_mm),
-            false => PI * radius_mm,
+        if radius_mm - from_centre_mm <= tolerance_mm {
+            return math::hypot(off_axis_mm, ahead_mm);
+        }
+        let half_circle_mm = PI * radius_mm;
+        match in_plane {
+            true => half_circle_mm.max(relative.away_then_toward_mm(radius_mm, tolerance_mm)),
+            false => half_circle_mm,
         }
     }
 }
@@ -179,6 +184,28 @@ impl RelativePoint {
         // Rounding must not turn "straight ahead" into a full turn.
         let turn_rad = if turn_rad < -1e-9 { turn_rad + TAU } else { turn_rad.max(0.0) };
         Some((turn_rad, straight_mm))
+    }
+
+    /// A lower bound of the length, mm, of any way in the plane that comes within `tolerance_mm` of a point that is
+    /// inside the turning circle by more than that. The shortest way to such a point is two arcs: the needle turns
+    /// away from the point and then around it the other way (Cockayne and Hall, SIAM J. Control 13, 1975).
+    ///
+    /// The centres A and B of the two circles and the point P make a triangle of sides AB = 2 r, AP = q and BP. The
+    /// first arc turns by ψ + γ, with γ the angle at A and ψ that of P at the start; the second by 2 π − ε, with ε
+    /// the angle at B, less the part within the tolerance. BP differs from r by at most the tolerance, which bounds
+    /// γ; over these γ the bound takes the largest ε. It is at a right angle at P, or at an end.
+    fn away_then_toward_mm(&self, radius_mm: f64, tolerance_mm: f64) -> f64 {
+        let (ahead_mm, off_a_mm) = (self.ahead_mm, self.off_axis_mm + radius_mm);
+        let psi_rad = math::atan2(ahead_mm, off_a_mm);
+        // All lengths in radii.
+        let q = math::hypot(ahead_mm, off_a_mm) / radius_mm;
+        let tolerance = tolerance_mm / radius_mm;
+        let gamma_cos = |bp: f64| ((q * q + 4.0 - bp * bp) / (4.0 * q)).clamp(-1.0, 1.0);
+        let [least_cos, largest_cos] = [1.0 + tolerance, 1.0 - tolerance].map(gamma_cos);
+        let cos = (0.5 * q).clamp(least_cos, largest_cos);
+        let epsilon_rad = math::atan2(q * (1.0 - cos * cos).sqrt(), 2.0 - q * cos);
+        let turn_rad = psi_rad + math::acos(largest_cos) + TAU - epsilon_rad;
+        (turn_rad - math::asin(tolerance)) * radius_mm
     }
 }
 
@@ -218,7 +245,7 @@ mod tests {
         #[test]
         fn arc_then_straight_ends_at_the_point(tip in tip(), point in point()) {
             let ways = tip.arc_then_straight_to(&point, CURVATURE_PER_MM);
-            let bound_mm = tip.shortest_mm(&point, CURVATURE_PER_MM, 1.0);
+            let bound_mm = tip.shortest_mm(&point, CURVATURE_PER_MM, 1.0, false);
             let Some([arc, straight]) = ways else {
                 prop_assert!(bound_mm <= PI * 50.0);
                 return Ok(());
@@ -228,7 +255,7 @@ mod tests {
             prop_assert!(arc.curvature_per_mm * arc.length_mm <= TAU + 1e-9);
             prop_assert!((arc.length_mm + straight.length_mm - bound_mm).abs() < 1e-9);
             // Less curvature is never shorter, and a single arc neither.
-            let wider = tip.shortest_mm(&point, 0.5 * CURVATURE_PER_MM, 0.0);
+            let wider = tip.shortest_mm(&point, 0.5 * CURVATURE_PER_MM, 0.0, false);
             prop_assert!(wider >= bound_mm - 1e-6 || wider == PI * 100.0, "{wider} {bound_mm}");
             if let Some(arc) = tip.arc_to(&point).filter(|arc| arc.curvature_per_mm <= CURVATURE_PER_MM) {
                 prop_assert!(arc.length_mm >= bound_mm - 1e-9);
@@ -238,7 +265,7 @@ mod tests {
         /// The bound falls by at most what is driven, on any arc: it never over-estimates.
         #[test]
         fn the_bound_is_consistent(tip in tip(), point in point(), side in -1.0..1.0f64, l in 0.0..3.0f64) {
-            let h = |tip: &Tip| tip.shortest_mm(&point, CURVATURE_PER_MM, 0.0);
+            let h = |tip: &Tip| tip.shortest_mm(&point, CURVATURE_PER_MM, 0.0, false);
             let [first, second] = tip.across();
             let (sin, cos) = math::sin_cos(PI * side);
             for curvature_per_mm in [0.0, CURVATURE_PER_MM] {
@@ -247,6 +274,21 @@ mod tests {
                 // From outside the turning circle to inside of it the bound may fall to half a circle.
                 prop_assert!(before <= l + after + 1e-6 || after == PI * 50.0, "{before} {after}");
             }
+        }
+
+        /// Without a tolerance the bound is the length of a way: away from the point, then around it.
+        #[test]
+        fn away_and_then_around_is_as_long_as_the_bound(away_rad in 0.01..1.0f64, around_rad in PI..TAU) {
+            let start = Tip { position_mm: Vector3::zeros(), heading: Vector3::z() };
+            let arc = |bend, turn_rad| {
+                Arc { bend, curvature_per_mm: CURVATURE_PER_MM, length_mm: turn_rad / CURVATURE_PER_MM }
+            };
+            let turned = start.after(&arc(-Vector3::y(), away_rad));
+            let back = Vector3::new(0.0, turned.heading.z, -turned.heading.y);
+            let end_mm = turned.after(&arc(back, around_rad)).position_mm;
+            prop_assume!((end_mm - Vector3::y() * 50.0).norm() < 49.9);
+            let bound_mm = start.shortest_mm(&end_mm, CURVATURE_PER_MM, 0.0, true);
+            prop_assert!((bound_mm - 50.0 * (away_rad + around_rad)).abs() < 1e-6, "{bound_mm}");
         }
 
         #[test]
@@ -259,6 +301,34 @@ mod tests {
             let again = middle.after(&Arc { bend, length_mm: l - part * l, ..arc });
             prop_assert!((again.position_mm - end.position_mm).norm() < 1e-9);
             prop_assert!((again.heading - end.heading).norm() < 1e-9);
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(3000))]
+        /// No way in the plane is shorter than the bound, wherever within the tolerance it ends.
+        #[test]
+        fn no_way_in_the_plane_is_shorter(
+            away_mm in 0.0..60.0f64, around_mm in 100.0..300.0f64,
+            others in prop::collection::vec(
+                (prop::sample::select(vec![-1.0, 0.0, 1.0]), 0.0..60.0f64), 0..3
+            ),
+            miss in prop::array::uniform2(-1.0..1.0f64), share in 0.0..0.49f64,
+        ) {
+            let start = Tip { position_mm: Vector3::zeros(), heading: Vector3::z() };
+            let (mut end, mut length_mm) = (start, 0.0);
+            for (side, mm) in [(-1.0, away_mm), (1.0, around_mm)].into_iter().chain(others) {
+                let bend = Vector3::new(0.0, end.heading.z, -end.heading.y) * side;
+                let curvature_per_mm = CURVATURE_PER_MM * side.abs();
+                end = end.after(&Arc { bend, curvature_per_mm, length_mm: mm });
+                length_mm += mm;
+            }
+            let inside_mm = 50.0 - (end.position_mm - Vector3::y() * 50.0).norm();
+            let tolerance_mm = share * inside_mm.max(0.0);
+            let miss_mm = Vector3::new(0.0, miss[0], miss[1]).cap_magnitude(1.0) * tolerance_mm;
+            let target_mm = end.position_mm + miss_mm;
+            let bound_mm = start.shortest_mm(&target_mm, CURVATURE_PER_MM, tolerance_mm, true);
+            prop_assert!(bound_mm <= length_mm + 1e-6, "{bound_mm} {length_mm}");
         }
     }
 
@@ -276,6 +346,6 @@ mod tests {
         );
         // The far side of the turning circle, half a turn on.
         let beside = Vector3::new(0.0, 100.0, 0.0);
-        assert!((tip.shortest_mm(&beside, CURVATURE_PER_MM, 0.0) - PI * 50.0).abs() < 1e-6);
+        assert!((tip.shortest_mm(&beside, CURVATURE_PER_MM, 0.0, false) - PI * 50.0).abs() < 1e-6);
     }
 }

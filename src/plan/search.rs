@@ -259,8 +259,9 @@ impl Search<'_, '_> {
 
     /// A lower bound of length plus remaining distance from `tip`, mm, and whether the direct way may be free.
     fn lower_bound_mm(&self, tip: &Tip) -> (f64, bool) {
-        let Problem { target_mm, curvature_per_mm, tolerance_mm, .. } = self.problem;
-        let unobstructed_mm = tip.shortest_mm(target_mm, *curvature_per_mm, *tolerance_mm);
+        let Problem { target_mm, curvature_per_mm, tolerance_mm, in_plane, .. } = self.problem;
+        let unobstructed_mm =
+            tip.shortest_mm(target_mm, *curvature_per_mm, *tolerance_mm, *in_plane);
         let moved_mm = self.route.moved_mm(target_mm);
         let route_mm = self.route.length_mm(&tip.position_mm) - moved_mm;
         match route_mm.is_finite() {
@@ -431,7 +432,8 @@ impl Search<'_, '_> {
                 .to_owned();
         }
         let curvature_per_mm = self.problem.curvature_per_mm;
-        let least_mm = start.shortest_mm(target_mm, curvature_per_mm, *tolerance_mm);
+        let least_mm =
+            start.shortest_mm(target_mm, curvature_per_mm, *tolerance_mm, self.problem.in_plane);
         if least_mm - tolerance_mm > *length_max_mm {
             return format!(
                 "the target is out of reach: with nothing in the way, a needle of {:.0} mm radius takes \

@@ -53,7 +53,7 @@ fn with_nothing_in_the_way_the_first_try_is_the_plan() {
         let answer = plan(&world, &problem);
         assert_eq!((answer.status, answer.expansions), (Status::Plan, 1));
         let path = path(&world, &problem, &answer);
-        let least_mm = problem.start.shortest_mm(&problem.target_mm, 1.0 / 122.0, 0.0);
+        let least_mm = problem.start.shortest_mm(&problem.target_mm, 1.0 / 122.0, 0.0, in_plane);
         assert!((path.length_mm() - least_mm).abs() < 1e-9);
     }
 }
