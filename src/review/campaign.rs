@@ -190,7 +190,7 @@ fn exclude_repeats(lines: &mut [Line], by: Option<&str>) {
         Some((seal, value))
     };
     exclude_equal(counted, insertion, |first| {
-        (Exclusion::Repeat, format!("as {first}: same seed, same tip positions"))
+        (Exclusion::Repeat, format!("as {first}: the same emulated insertion"))
     });
 }
 
@@ -353,7 +353,7 @@ mod tests {
         let (exclusion, why) = campaign.lines[5].excluded.clone().unwrap();
         assert_eq!(
             (exclusion, why.as_str()),
-            (Exclusion::Repeat, "as runs/0: same seed, same tip positions")
+            (Exclusion::Repeat, "as runs/0: the same emulated insertion")
         );
         assert!(
             campaign.to_text().unwrap().contains("the same run again: 5"),

@@ -13,6 +13,8 @@ use std::io;
 use std::time::Duration;
 
 const LINE_PERIOD: Duration = Duration::from_secs(1);
+/// Over less than this, a rate is not given.
+const LEAST_SECONDS: f64 = 0.1;
 
 #[derive(Debug, Args)]
 pub(in crate::cli) struct WatchArguments {
@@ -24,6 +26,7 @@ pub(in crate::cli) struct WatchArguments {
 }
 
 /// The tool's samples, each judged by itself as in a run.
+#[derive(Clone)]
 struct Watch {
     gate: Gate,
     /// The frame of the positions.
@@ -105,14 +108,19 @@ impl Watch {
     fn position_line(&mut self, now: Time, seconds: f64) -> Option<String> {
         let (time, p_mm) = self.last?;
         let at = now.as_secs_f64();
-        let rate_hz = std::mem::take(&mut self.positions) as f64 / seconds;
+        let positions = std::mem::take(&mut self.positions);
+        // A short recording is over at once: that is no rate.
+        let rate = match seconds < LEAST_SECONDS {
+            true => format!("{positions} positions"),
+            false => format!("{:.1} Hz", positions as f64 / seconds),
+        };
         let refusal = self.refusal.take().map(|refusal| format!("; {refusal}")).unwrap_or_default();
         let malformed = match self.malformed {
             0 => String::new(),
             count => format!(", {count} not readable"),
         };
         Some(format!(
-            "{at:7.1} s  x {:.2} y {:.2} z {:.2} mm ({})  {rate_hz:.1} Hz  age {:.3} s  {}{malformed}{refusal}",
+            "{at:7.1} s  x {:.2} y {:.2} z {:.2} mm ({})  {rate}  age {:.3} s  {}{malformed}{refusal}",
             p_mm.x,
             p_mm.y,
             p_mm.z,
@@ -136,7 +144,7 @@ pub(super) fn watch(arguments: &WatchArguments) -> Result<(), Failure> {
         }
         let now = listener.now();
         if now >= due || watch.positions > 0 {
-            print_stdout(watch.line(now, now.seconds_after(last_line).max(1e-3), &mut listener))?;
+            print_stdout(watch.line(now, now.seconds_after(last_line), &mut listener))?;
         }
         last_line = now;
     }
@@ -183,7 +191,11 @@ pub(super) mod tests {
         watch.gate = tracker.to_unregistered_gate();
         watch.take(&Event::Sample(sample(&tracker.tool)));
         watch.take(&Event::Malformed("line 2: garbage".to_owned()));
+        let mut at_once = watch.clone();
+        let line = at_once.position_line(Time::from_nanos(5), 1e-4).expect("a position was seen");
+        assert!(line.contains("  1 positions  age"), "{line}");
         let line = watch.position_line(Time::from_nanos(5), 1.0).expect("a position was seen");
+        assert!(line.contains("  1.0 Hz  age"), "{line}");
         let end =
             "1 accepted, 0 refused, 1 not readable; a message cannot be read: line 2: garbage";
         assert!(line.ends_with(end), "{line}");
