@@ -72,13 +72,18 @@ impl Table {
     /// The column `name`.
     ///
     /// # Errors
-    /// The header does not have it.
+    /// The header does not have it, or has it twice.
     pub fn column(&self, name: &str) -> Result<Column, TableError> {
-        self.columns().find(|column| column.name == name).ok_or_else(|| {
-            let columns = self.header.iter().collect::<Vec<_>>().join(", ");
-            let columns = clipped(&columns, SHOWN_MAX);
-            TableError(format!("line 1: no column \"{name}\"; there are {columns}"))
-        })
+        let mut columns = self.columns().filter(|column| column.name == name);
+        match (columns.next(), columns.next()) {
+            (Some(column), None) => Ok(column),
+            (Some(_), Some(_)) => Err(TableError(format!("line 1: column \"{name}\" twice"))),
+            (None, _) => {
+                let columns = self.header.iter().collect::<Vec<_>>().join(", ");
+                let columns = clipped(&columns, SHOWN_MAX);
+                Err(TableError(format!("line 1: no column \"{name}\"; there are {columns}")))
+            }
+        }
     }
 
     /// The rows.
@@ -104,31 +109,40 @@ impl Table {
     /// The finite numbers of the columns `names` in every row, in the order of `names`.
     ///
     /// # Errors
-    /// A column that is missing, or a field that is not a finite number.
+    /// A column that is missing, a row that is not as long as the header, or a field that is not a finite number.
     pub fn numbers<const N: usize>(&self, names: [&str; N]) -> Result<Vec<[f64; N]>, TableError> {
-        let columns: Vec<Column> =
-            names.iter().map(|name| self.column(name)).collect::<Result<_, _>>()?;
-        let numbers = |row: &Row| {
-            let mut numbers = [0.0; N];
-            for (number, column) in numbers.iter_mut().zip(&columns) {
-                *number = row.finite(column)?;
-            }
-            Ok(numbers)
-        };
-        self.rows.iter().map(numbers).collect()
+        self.check_row_lengths()?;
+        let columns = self.columns_of(names)?;
+        self.rows.iter().map(|row| row.finite_numbers(&columns)).collect()
     }
 
-    /// The orientation in every row, from the columns `qw,qx,qy,qz`; `None` in every row if the table has
-    /// none of them.
+    fn columns_of<const N: usize>(&self, names: [&str; N]) -> Result<Vec<Column>, TableError> {
+        names.iter().map(|name| self.column(name)).collect()
+    }
+
+    /// The orientation in every row, from the columns `qw,qx,qy,qz`; `None` in every row if the table has none of
+    /// them, or if they are empty in every row.
     ///
     /// # Errors
-    /// Some of the columns without the others, a field that is not a finite number, or a quaternion
-    /// that cannot be normalised.
+    /// Some of the columns or rows without the others, a field that is not a finite number, or a quaternion that
+    /// cannot be normalised.
     pub fn rotations(&self) -> Result<Vec<Option<Rotation3<f64>>>, TableError> {
         if !QUATERNION.iter().any(|name| self.column(name).is_ok()) {
             return Ok(vec![None; self.rows.len()]);
         }
-        let rotation = |(row, [w, x, y, z]): (&Row, [f64; 4])| {
+        let columns = self.columns_of(QUATERNION)?;
+        let is_empty = |row: &Row| columns.iter().all(|column| row.text(column).is_empty());
+        if self.rows.iter().all(is_empty) {
+            return Ok(vec![None; self.rows.len()]);
+        }
+        let rotation = |row: &Row| {
+            if is_empty(row) {
+                let line = row.line;
+                return Err(TableError(format!(
+                    "line {line}: no orientation (qw,qx,qy,qz), but other rows have one"
+                )));
+            }
+            let [w, x, y, z] = row.finite_numbers(&columns)?;
             let quaternion = Quaternion::new(w, x, y, z);
             let norm = quaternion.norm();
             if !(norm.is_finite() && norm > 1e-6) {
@@ -139,7 +153,8 @@ impl Table {
             }
             Ok(Some(UnitQuaternion::new_normalize(quaternion).to_rotation_matrix()))
         };
-        self.rows.iter().zip(self.numbers(QUATERNION)?).map(rotation).collect()
+        self.check_row_lengths()?;
+        self.rows.iter().map(rotation).collect()
     }
 }
 
@@ -162,6 +177,14 @@ impl Row {
     /// The field is not a number.
     pub fn number(&self, column: &Column) -> Result<f64, TableError> {
         self.text(column).parse().map_err(|_| self.error(column, "number"))
+    }
+
+    fn finite_numbers<const N: usize>(&self, columns: &[Column]) -> Result<[f64; N], TableError> {
+        let mut numbers = [0.0; N];
+        for (number, column) in numbers.iter_mut().zip(columns) {
+            *number = self.finite(column)?;
+        }
+        Ok(numbers)
     }
 
     fn finite(&self, column: &Column) -> Result<f64, TableError> {
@@ -198,12 +221,11 @@ mod tests {
             let csv = ["a,b", "", "1,2", "", "", "3,inf"].join(end);
             assert_eq!(message(&csv), "line 6: b is \"inf\", expected a finite number");
         }
-        assert_eq!(message("a,b\n1\n"), "line 2: b is \"\", expected a finite number");
-        let table = Table::parse("a,b\n1,2\n1,2,3\n");
-        assert_eq!(
-            table.check_row_lengths().unwrap_err().to_string(),
-            "line 3: 3 fields where the header has 2"
-        );
+        assert_eq!(message("a,b\n1,\n"), "line 2: b is \"\", expected a finite number");
+        assert_eq!(message("a,b\n1,2\n1\n"), "line 3: 1 fields where the header has 2");
+        // A decimal comma moves the numbers behind it to other columns.
+        assert_eq!(message("a,b\n1,2\n1,2,3\n"), "line 3: 3 fields where the header has 2");
+        assert_eq!(message("a,b,a\n1,2,3\n"), "line 1: column \"a\" twice");
     }
 
     #[test]
@@ -220,7 +242,11 @@ mod tests {
         let rotations = |csv: &str| Table::parse(csv).rotations().map_err(|e| e.to_string());
         assert_eq!(rotations("a\n1\n"), Ok(vec![None]));
         assert_eq!(rotations("qw,qx,qy,qz\n2,0,0,0\n"), Ok(vec![Some(Rotation3::identity())]));
+        assert_eq!(rotations("qw,qx,qy,qz\n,,,\n"), Ok(vec![None]));
         assert!(rotations("qw,qx\n").unwrap_err().contains("no column \"qy\""));
+        let message = rotations("qw,qx,qy,qz\n1,0,0,0\n,,,\n").unwrap_err();
+        let expected = "line 3: no orientation (qw,qx,qy,qz), but other rows have one";
+        assert_eq!(message, expected);
         for (row, norm) in [("0,0,0,0", "0"), ("1e308,1e308,0,0", "inf")] {
             let message = rotations(&format!("qw,qx,qy,qz\n1,0,0,0\n\n{row}\n")).unwrap_err();
             let expected = format!("line 4: qw,qx,qy,qz have the norm {norm}: no orientation");

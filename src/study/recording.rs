@@ -142,7 +142,7 @@ mod tests {
         );
         assert_eq!(
             message(&format!("{HEADER}\n0,0,0,0\n")),
-            "line 2: z_mm is \"\", expected a finite number"
+            "line 2: 4 fields where the header has 5"
         );
         let empty = TableError("no rows below the header".to_owned());
         assert_eq!(Recording::parse(HEADER), Err(empty));
