@@ -124,9 +124,15 @@ impl Stage {
             let PerAxis { insertion, rotation } = &self.drives;
             let is_rotation = rotation.missed_in_a_row > insertion.missed_in_a_row;
             let axis = if is_rotation { Axis::Rotation } else { Axis::Insertion };
-            let fault = format!(
-                "{axis}: no TPDO1 for {syncs} SYNCs in a row, check bus load, cable and the drive"
-            );
+            let fault = match self.drives[axis].tpdo_of_wrong_length {
+                Some(bytes) => format!(
+                    "{axis}: TPDO1 of {bytes} bytes after {syncs} SYNCs in a row, 6 are mapped; does \
+                     another node have the same ID, or another tool map it?"
+                ),
+                None => format!(
+                    "{axis}: no TPDO1 for {syncs} SYNCs in a row, check bus load, cable and the drive"
+                ),
+            };
             self.fail(now, fault);
         }
     }
@@ -155,14 +161,23 @@ impl Stage {
         }
     }
 
-    /// Enabling has timed out: names a drive that was not heard, else one that is not enabled, else one
-    /// without a heartbeat in Operational.
+    /// Enabling has timed out: names a drive that is not in NMT Operational, else one that was not heard, else one
+    /// that is not enabled, else one without a heartbeat.
     fn fail_enabling(&mut self, now: Time) {
         let timeout_ms = self.config.power.enable_timeout.as_millis();
         let first = |fails: &dyn Fn(&Drive) -> bool| {
             Axis::BOTH.into_iter().find(|axis| fails(&self.drives[*axis]))
         };
-        let fault = if let Some(axis) = first(&|drive| drive.statusword.is_none()) {
+        let other_state = Axis::BOTH.into_iter().find_map(|axis| {
+            let state = self.monitors[axis].state()?;
+            (state != NmtState::Operational).then_some((axis, state))
+        });
+        let fault = if let Some((axis, state)) = other_state {
+            format!(
+                "{axis}: NMT state {state} instead of operational {timeout_ms} ms after the start command, \
+                 is there another master?"
+            )
+        } else if let Some(axis) = first(&|drive| drive.statusword.is_none()) {
             format!(
                 "{axis}: not in operation enabled within {timeout_ms} ms (no TPDO1 was heard), check \
                  cable and the drive"
@@ -174,19 +189,13 @@ impl Stage {
                  check power stage, enable input and brake"
             )
         } else {
-            let operational = self.monitors.insertion.state() == Some(NmtState::Operational);
-            let axis = if operational { Axis::Rotation } else { Axis::Insertion };
-            match self.monitors[axis].state() {
-                None => format!(
+            match Axis::BOTH.into_iter().find(|axis| self.monitors[*axis].state().is_none()) {
+                Some(axis) => format!(
                     "{axis}: enabled, but no heartbeat within {timeout_ms} ms, is can.heartbeat_ms longer?"
                 ),
-                Some(NmtState::Operational) => format!(
+                None => format!(
                     "both drives were enabled only as {timeout_ms} ms ended; raise \
                      stage.enable_timeout_s"
-                ),
-                Some(state) => format!(
-                    "{axis}: enabled, but NMT state {state} instead of operational after {timeout_ms} ms, \
-                     is there another master?"
                 ),
             }
         };

@@ -47,6 +47,8 @@ pub(super) struct Sdo(Rc<RefCell<Line>>);
 struct Line {
     client: SdoClient,
     attempts_max: u8,
+    /// The node's NMT state, if a heartbeat was received.
+    nmt_state: Option<NmtState>,
     now: Time,
     /// When the script's pause ends.
     wake: Time,
@@ -59,6 +61,7 @@ impl Sdo {
         Sdo(Rc::new(RefCell::new(Line {
             client: SdoClient::new(config.axis(axis).node, config.bus.sdo_timeout()),
             attempts_max: config.bus.sdo_attempts,
+            nmt_state: None,
             now: Time::ZERO,
             wake: Time::NEVER,
             outputs: VecDeque::new(),
@@ -71,6 +74,11 @@ impl Sdo {
 
     pub(super) fn now(&self) -> Time {
         self.0.borrow().now
+    }
+
+    /// The drive's NMT state, if a heartbeat was received.
+    pub(super) fn nmt_state(&self) -> Option<NmtState> {
+        self.0.borrow().nmt_state
     }
 
     pub(super) fn send(&self, frame: Frame) {
@@ -193,14 +201,13 @@ pub(super) struct ScriptRunner<T> {
     sdo: Sdo,
     script: Pin<Box<dyn Future<Output = T>>>,
     outcome: Option<T>,
-    nmt_state: Option<NmtState>,
 }
 
 impl<T> ScriptRunner<T> {
     /// Begins `script` at `now`. A transfer of another script over `sdo` is cancelled.
     pub(super) fn begin(sdo: &Sdo, now: Time, script: impl Future<Output = T> + 'static) -> Self {
         let (sdo, script) = (sdo.clone(), Box::pin(script));
-        let mut runner = ScriptRunner { sdo, script, outcome: None, nmt_state: None };
+        let mut runner = ScriptRunner { sdo, script, outcome: None };
         runner.cancel();
         runner.resume(now);
         runner
@@ -210,7 +217,7 @@ impl<T> ScriptRunner<T> {
         if let Some((node, state)) = parse_heartbeat(frame)
             && node == self.sdo.node()
         {
-            self.nmt_state = Some(state);
+            self.sdo.0.borrow_mut().nmt_state = Some(state);
         }
         self.sdo.0.borrow_mut().client.handle_frame(now, frame);
         self.resume(now);
@@ -261,9 +268,9 @@ impl<T> ScriptRunner<T> {
         self.outcome.as_ref()
     }
 
-    /// The drive's NMT state, if a heartbeat was received while the script ran.
-    pub(super) fn nmt_state(&self) -> Option<NmtState> {
-        self.nmt_state
+    /// What the script talks by.
+    pub(super) fn sdo(&self) -> &Sdo {
+        &self.sdo
     }
 }
 

@@ -65,6 +65,8 @@ pub(super) struct Drive {
     pub(super) fresh: bool,
     /// SYNCs in a row without the drive's TPDO1.
     pub(super) missed_in_a_row: u32,
+    /// The length, bytes, of a TPDO1 that came since the last one that was taken.
+    pub(super) tpdo_of_wrong_length: Option<usize>,
     sequence: EnableSequence,
     reset: FaultReset,
     /// SYNCs that the drive has stayed in a state that it is commanded to leave.
@@ -113,6 +115,7 @@ impl Drive {
             statusword: None,
             fresh: false,
             missed_in_a_row: 0,
+            tpdo_of_wrong_length: None,
             sequence: EnableSequence::default(),
             reset: FaultReset::None,
             transition_syncs: 0,
@@ -146,6 +149,7 @@ impl Drive {
         self.take_statusword(Statusword(u16::from_le_bytes([s0, s1])));
         self.take_position(i32::from_le_bytes([p0, p1, p2, p3]), sync);
         self.fresh = true;
+        self.tpdo_of_wrong_length = None;
         // Until the drive follows its target, the target follows the drive.
         if self.armed.is_none() || self.homing_mode {
             self.commanded = Commanded { counts: self.position.counts(), step_counts: 0 };

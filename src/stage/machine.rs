@@ -349,6 +349,10 @@ impl Stage {
 
     /// Writes a controlword, without waiting for the reply.
     pub(super) fn send_controlword(&mut self, axis: Axis, word: Controlword) {
+        // In Stopped a node takes neither PDO nor SDO (CiA 301, 7.3.2.2).
+        if self.monitors[axis].state() == Some(NmtState::Stopped) {
+            self.send_nmt(NmtCommand::EnterPreOperational, axis);
+        }
         self.send_sdo(axis, SdoRequest::Download(object::CONTROLWORD, word.0.into()));
     }
 

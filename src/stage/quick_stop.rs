@@ -3,9 +3,10 @@
 //! Both nodes leave Operational first, so that no master's PDO can cancel the stop. Then both drives are
 //! commanded to quick stop by SDO. Their identities are not checked: any node with these numbers must stop. At
 //! the end power is taken off, whatever a drive reports, and even if it reports nothing. A command that is not
-//! obeyed is repeated.
+//! obeyed is repeated, and so is one whose effect cannot be read.
 //!
-//! [`QuickStop::watch`] reads the same objects and writes nothing: it shows whether drives stop by themselves.
+//! [`QuickStop::watch`] reads the same objects and writes nothing: it shows whether drives stop by themselves. It
+//! only leads a node out of NMT Stopped, where it could not be read.
 
 use std::time::Duration;
 
@@ -14,7 +15,7 @@ use super::drive::may_have_power;
 use super::standstill::Standstill;
 use super::{Axis, StageConfig, Unwrapper};
 use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};
-use crate::canopen::nmt::{NmtCommand, nmt_frame};
+use crate::canopen::nmt::{NmtCommand, NmtState, nmt_frame};
 use crate::canopen::sdo::codec::ClientFrame;
 use crate::canopen::sdo::{SdoRequest, SdoValue};
 use crate::units::Time;
@@ -68,6 +69,9 @@ struct AxisStop {
     /// When to give up waiting for power to be off.
     give_up_power_off: Time,
     standstill: Standstill,
+    position: Unwrapper,
+    /// When the position was last read.
+    last_read: Option<Time>,
 }
 
 impl AxisStop {
@@ -78,6 +82,8 @@ impl AxisStop {
             give_up,
             give_up_power_off: now + config.power.stop_timeout * 2,
             standstill: config.standstill(axis),
+            position: Unwrapper::new(0),
+            last_read: None,
         }
     }
 
@@ -91,35 +97,45 @@ impl AxisStop {
     }
 
     /// Waits until the axis has left Operation Enabled and stands; returns its position, counts. `command` is
-    /// repeated until the axis has left Operation Enabled.
+    /// given again whenever the axis was not seen to obey it.
     async fn come_to_stand(&mut self, command: Option<Controlword>) -> Result<i32, String> {
         let node = self.sdo.node();
+        let mut obeys = false;
         loop {
-            if let Some(word) = command {
+            if let Some(word) = command.filter(|_| !obeys) {
                 self.command(word).await?;
             }
-            let word = self.statusword().await?;
-            if word.state() != Some(DriveState::OperationEnabled) {
-                break;
-            }
-            let trouble = format!("node {node} stays in operation enabled ({word})");
+            let word = self.statusword().await;
+            obeys =
+                word.as_ref().is_ok_and(|word| word.state() != Some(DriveState::OperationEnabled));
+            let trouble = match word {
+                Err(error) => error,
+                Ok(word) if !obeys => format!("node {node} stays in operation enabled ({word})"),
+                Ok(_) => match self.read_position().await {
+                    Err(error) => error,
+                    Ok(counts) if self.standstill.stands() => return Ok(counts),
+                    Ok(counts) => format!("node {node} was not seen to stand, at {counts} counts"),
+                },
+            };
             self.wait_to_read_again(trouble).await?;
-        }
-        let (mut position, mut last_read) = (Unwrapper::new(0), None);
-        loop {
-            let position_actual = self.sdo.read_at_least(object::POSITION_ACTUAL, 4).await;
-            let counts = position_actual.inspect_err(|_| self.request_failed = true)? as i32;
-            let (position_counts, now) = (position.unwrap(counts), self.sdo.now());
-            match last_read.replace(now) {
-                Some(before) => self.standstill.take(position_counts, now.since(before)),
-                None => self.standstill.watch_from(position_counts),
+            let is_stopped = self.sdo.nmt_state() == Some(NmtState::Stopped);
+            if is_stopped || command.is_some() && !obeys {
+                // Another master may have started the node again. In Stopped a node answers no SDO.
+                self.sdo.leave_operational();
             }
-            if self.standstill.stands() {
-                return Ok(counts);
-            }
-            let trouble = format!("node {node} was not seen to stand, at {counts} counts");
-            self.wait_to_read_again(trouble).await?;
         }
+    }
+
+    /// Reads the position, counts, and judges by it whether the axis stands.
+    async fn read_position(&mut self) -> Result<i32, String> {
+        let counts = self.sdo.read_at_least(object::POSITION_ACTUAL, 4).await;
+        let counts = counts.inspect_err(|_| self.request_failed = true)? as i32;
+        let (position_counts, now) = (self.position.unwrap(counts), self.sdo.now());
+        match self.last_read.replace(now) {
+            Some(before) => self.standstill.take(position_counts, now.since(before)),
+            None => self.standstill.watch_from(position_counts),
+        }
+        Ok(counts)
     }
 
     /// Takes power off until it is seen to be off. `stood` is the result of [`AxisStop::come_to_stand`].

@@ -64,8 +64,15 @@ impl StatusReader {
     /// If the drive does not answer, has no statusword, or was not read to the end.
     pub fn status(&self, axis: Axis) -> Result<AxisStatus, String> {
         let interrupted = || Err(format!("{axis}: reading the status was interrupted"));
-        let status = self.outcome(axis).unwrap_or_else(interrupted)?;
-        Ok(AxisStatus { nmt_state: self.axis(axis).nmt_state(), ..status })
+        let nmt_state = self.axis(axis).sdo().nmt_state();
+        let status = self.outcome(axis).unwrap_or_else(interrupted);
+        match (status, nmt_state) {
+            (Err(_), Some(NmtState::Stopped)) => Err(format!(
+                "{axis}: the node is in NMT stopped, where it answers no SDO; needle-bench stage stop \
+                 leads it to Pre-operational"
+            )),
+            (status, nmt_state) => Ok(AxisStatus { nmt_state, ..status? }),
+        }
     }
 }
 

@@ -80,6 +80,10 @@ impl Stage {
         if matches!(self.phase, Phase::Listening { .. }) {
             return;
         }
+        if event == HeartbeatEvent::State(NmtState::Stopped) {
+            // A command that was sent to this drive by SDO was lost.
+            self.repeat_due = now;
+        }
         // The heartbeat may have been sent before the drive took the start command.
         let may_be_old =
             matches!(self.phase, Phase::BringUp | Phase::Standby { .. } | Phase::Enabling { .. });
@@ -123,6 +127,7 @@ impl Stage {
 
     pub(super) fn handle_tpdo(&mut self, now: Time, axis: Axis, frame: &Frame) {
         let Ok(payload) = frame.data().try_into() else {
+            self.drives[axis].tpdo_of_wrong_length = Some(frame.data().len());
             return self.ignore(Ignored::WrongLength, frame);
         };
         if !self.sync_runs() || self.sync_count == 0 || self.drives[axis].fresh {

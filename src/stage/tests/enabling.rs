@@ -132,6 +132,22 @@ fn a_heartbeat_from_before_the_bring_up_does_not_count() {
     assert!(!bench.events.contains(&StageEvent::Ready));
 }
 
+#[test]
+fn a_node_that_ignores_the_start_command_is_named_by_its_state() {
+    let mut bench = Bench::new(config());
+    bench.rotation.tpdos_lost = u32::MAX;
+    bench.rotation.heartbeat_off = true;
+    bench.run_until(|event| *event == StageEvent::Progress(Progress::Standby));
+    while !bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))) {
+        bench.receive(heartbeat_frame(bench.rotation.node, NmtState::PreOperational));
+        bench.run_for(Duration::from_millis(100));
+    }
+    let said = bench.until_fault();
+    let expected =
+        "rotation: NMT state pre-operational instead of operational 3000 ms after the start";
+    assert!(said.starts_with(expected), "{said}");
+}
+
 /// Both drives are enabled then, and neither is named for that.
 #[test]
 fn a_node_that_does_not_say_that_it_is_operational_is_named() {
@@ -139,8 +155,8 @@ fn a_node_that_does_not_say_that_it_is_operational_is_named() {
         (None, "rotation: enabled, but no heartbeat within 3000 ms, is can.heartbeat_ms longer?"),
         (
             Some(NmtState::PreOperational),
-            "rotation: enabled, but NMT state pre-operational instead of operational after 3000 ms, is \
-             there another master?",
+            "rotation: NMT state pre-operational instead of operational 3000 ms after the start command, \
+             is there another master?",
         ),
     ] {
         let mut config = config();

@@ -120,3 +120,13 @@ fn a_drive_found_in_fault_is_reset_when_power_is_permitted() {
     bench.run_until(|event| *event == StageEvent::Ready);
     assert_eq!(bench.rotation.resets, 1);
 }
+
+/// A drive refuses to read an error history that is empty.
+#[test]
+fn a_fault_without_a_history_is_named() {
+    let mut bench = Bench::new(config());
+    bench.insertion.state = DriveState::Fault;
+    bench.insertion.objects.remove(&ObjectAddress::new(0x1003, 1));
+    let said = bench.until_fault();
+    assert!(said.contains("drive found in fault") && said.contains("0x1003:01 empty"), "{said}");
+}

@@ -1,6 +1,7 @@
 //! Another master, and other senders.
 
 use super::*;
+use crate::canopen::cia402::DriveState;
 use crate::canopen::nmt::{NmtState, heartbeat_frame};
 
 /// While nothing was sent yet, nothing is, but for reading nobody minds.
@@ -55,6 +56,26 @@ fn another_master_stops_a_stage_at_its_first_word() {
             "{said}"
         );
         assert!(bench.until_stopped());
+    }
+}
+
+/// In Stopped a node takes neither PDO nor SDO, so a quick stop by SDO alone would be lost.
+#[test]
+fn drives_that_another_master_sends_to_nmt_stopped_are_stopped() {
+    let mut bench = Bench::ready();
+    bench.drive_on(5);
+    [&mut bench.insertion, &mut bench.rotation].map(|drive| drive.nmt = NmtState::Stopped);
+    bench.receive(Frame::new(0x000, &[2, 0]));
+    assert!(bench.until_fault().contains("an NMT command (000#0200)"));
+    let heartbeat = Duration::from_millis(110);
+    bench.run_for(heartbeat);
+    for drive in [&bench.insertion, &bench.rotation] {
+        assert_eq!(drive.state, DriveState::QuickStopActive);
+    }
+    assert!(bench.until_stopped());
+    for drive in [&bench.insertion, &bench.rotation] {
+        assert_eq!(drive.state, DriveState::SwitchOnDisabled);
+        assert_eq!(drive.nmt, NmtState::PreOperational);
     }
 }
 

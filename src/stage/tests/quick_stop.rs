@@ -1,7 +1,11 @@
 //! Stopping from outside a run: standing is a speed, whatever the scale.
 
 use super::*;
-use crate::canopen::cia402::DriveState;
+use crate::canopen::cia402::{Controlword, DriveState, object};
+use crate::canopen::cob;
+use crate::canopen::nmt::{NmtState, heartbeat_frame};
+use crate::canopen::sdo::SdoRequest;
+use crate::canopen::sdo::codec::ClientFrame;
 
 /// When an insertion of 100 counts/mm that moves at `mm_per_s` until `stops` is said to stand, and when power is
 /// taken off it.
@@ -50,16 +54,40 @@ fn a_moving_coarse_axis_is_not_taken_for_standing() {
     }
 }
 
-/// What is said of an insertion drive that obeys no controlword before `obeys`.
-fn halt_of_a_drive_that_obeys_late(obeys: Duration) -> (Result<i32, String>, TestDrive) {
+/// How a stop of an enabled insertion drive ended.
+struct Stopped {
+    result: Result<i32, String>,
+    drive: TestDrive,
+    /// The controlwords that were written to it, with the time since the beginning.
+    controlwords: Vec<(Duration, u32)>,
+}
+
+impl Stopped {
+    /// When `controlword` was first written after `since`.
+    fn first(&self, controlword: Controlword, since: Duration) -> Option<Duration> {
+        let is_it =
+            |(at, word): &&(Duration, u32)| *at > since && *word == u32::from(controlword.0);
+        self.controlwords.iter().find(is_it).map(|(at, _)| *at)
+    }
+}
+
+/// Stops or watches an enabled insertion drive; every 20 ms, and before each frame, `change` changes it.
+fn run(mut quick_stop: QuickStop, mut change: impl FnMut(Duration, &mut TestDrive)) -> Stopped {
     let begun = Time::from_secs_f64(1.0);
-    let (mut insertion, mut rotation) = (TestDrive::new(node(1), 7), TestDrive::new(node(2), 0));
-    insertion.state = DriveState::OperationEnabled;
-    let (mut quick_stop, mut now) = (QuickStop::new(&config(), begun), begun);
+    let (mut drive, mut rotation) = (TestDrive::new(node(1), 7), TestDrive::new(node(2), 0));
+    drive.state = DriveState::OperationEnabled;
+    let (mut now, mut controlwords) = (begun, Vec::new());
     while !quick_stop.is_over() {
-        insertion.ignores_sdo = now.since(begun) < obeys;
+        change(now.since(begun), &mut drive);
+        quick_stop.handle_frame(now, &heartbeat_frame(drive.node, drive.nmt));
         while let Some(frame) = quick_stop.poll_transmit() {
-            for drive in [&mut insertion, &mut rotation] {
+            if frame.cob_id() == Some(cob::sdo_rx(drive.node))
+                && let Some(ClientFrame::Request(SdoRequest::Download(object::CONTROLWORD, word))) =
+                    ClientFrame::decode(frame.data())
+            {
+                controlwords.push((now.since(begun), word.to_u32()));
+            }
+            for drive in [&mut drive, &mut rotation] {
                 let answers = drive.handle_frame(now, &frame);
                 answers.iter().for_each(|answer| quick_stop.handle_frame(now, answer));
             }
@@ -67,7 +95,72 @@ fn halt_of_a_drive_that_obeys_late(obeys: Duration) -> (Result<i32, String>, Tes
         now = now.max(quick_stop.deadline().min(now + Duration::from_millis(20)));
         quick_stop.handle_timeout(now);
     }
-    (quick_stop.result(Axis::Insertion).expect("it is over"), insertion)
+    let result = quick_stop.result(Axis::Insertion).expect("it is over");
+    Stopped { result, drive, controlwords }
+}
+
+fn stop(change: impl FnMut(Duration, &mut TestDrive)) -> Stopped {
+    run(QuickStop::new(&config(), Time::from_secs_f64(1.0)), change)
+}
+
+/// What is said of an insertion drive that obeys no controlword before `obeys`.
+fn halt_of_a_drive_that_obeys_late(obeys: Duration) -> (Result<i32, String>, TestDrive) {
+    let stopped = stop(|since, drive| drive.ignores_sdo = since < obeys);
+    (stopped.result, stopped.drive)
+}
+
+/// Without power the axis would coast.
+#[test]
+fn a_read_that_fails_does_not_take_power_off_while_the_axis_brakes() {
+    let braked = Duration::from_millis(800);
+    for read in [object::STATUSWORD, object::POSITION_ACTUAL] {
+        let mut lost = Some((read, 3));
+        let stopped = stop(|since, drive| {
+            if drive.state == DriveState::QuickStopActive && since < braked {
+                drive.mute = lost.take().or(drive.mute);
+                drive.counts += 100;
+            }
+        });
+        assert!(stopped.result.is_ok(), "{:?}", stopped.result);
+        let off = stopped.first(Controlword::DISABLE_VOLTAGE, Duration::ZERO);
+        assert!(off.is_some_and(|off| off > braked), "{read}: {off:?}");
+        // A statusword that cannot be read does not show that the drive obeyed.
+        let again = stopped.first(Controlword::QUICK_STOP, Duration::from_millis(100));
+        assert_eq!(again.is_some(), read == object::STATUSWORD);
+    }
+}
+
+#[test]
+fn a_drive_that_another_master_enables_again_is_stopped_again() {
+    let enabled = Duration::from_millis(200);
+    let mut enables = true;
+    let stopped = stop(|since, drive| {
+        if since >= enabled && std::mem::take(&mut enables) {
+            drive.nmt = NmtState::Operational;
+            drive.state = DriveState::OperationEnabled;
+        }
+        // Still moving, so that the stop goes on.
+        drive.counts += if since < 2 * enabled { 100 } else { 0 };
+    });
+    let again = stopped.first(Controlword::QUICK_STOP, enabled).expect("it is commanded again");
+    assert!(again < enabled + Duration::from_millis(100), "{again:?}");
+    assert_eq!(stopped.drive.nmt, NmtState::PreOperational);
+    assert!(stopped.result.is_ok(), "{:?}", stopped.result);
+}
+
+/// A drive may enter NMT Stopped when it misses the bench's heartbeat (0x1029 = 2); it answers no SDO then.
+#[test]
+fn a_drive_that_stops_by_itself_in_nmt_stopped_is_seen_to_stand() {
+    let begun = Time::from_secs_f64(1.0);
+    let watch = QuickStop::watch(&config(), begun, begun + Duration::from_secs(2));
+    let mut notices = true;
+    let watched = run(watch, |since, drive| {
+        if since >= Duration::from_millis(300) && std::mem::take(&mut notices) {
+            drive.state = DriveState::QuickStopActive;
+            drive.nmt = NmtState::Stopped;
+        }
+    });
+    assert_eq!((watched.result, watched.controlwords), (Ok(7), vec![]));
 }
 
 #[test]
@@ -93,7 +186,7 @@ fn a_drive_that_does_not_obey_is_told_again_and_then_named() {
 fn a_short_answer_is_neither_statusword_nor_position() {
     let begun = Time::from_secs_f64(1.0);
     let said_at = |answers: [&str; 3]| {
-        let mut quick_stop = QuickStop::watch(&config(), begun, begun + Duration::from_secs(1));
+        let mut quick_stop = QuickStop::watch(&config(), begun, begun);
         for answer in answers {
             quick_stop.handle_frame(begun, &answer.parse().expect("a frame"));
         }

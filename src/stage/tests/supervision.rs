@@ -45,6 +45,23 @@ fn the_drive_that_is_silent_for_longer_is_named() {
     );
 }
 
+#[test]
+fn a_tpdo1_of_another_length_is_named() {
+    let mut bench = Bench::ready();
+    bench.rotation.tpdos_lost = 2;
+    bench.receive(Frame::new(0x182, &[0; 8]));
+    let said = bench.until_fault();
+    let expected = "rotation: TPDO1 of 8 bytes after 2 SYNCs in a row, 6 are mapped; ";
+    assert!(said.starts_with(expected), "{said}");
+
+    // One long ago is no reason.
+    let mut bench = Bench::ready();
+    bench.receive(Frame::new(0x182, &[0; 8]));
+    bench.run_for(Duration::from_millis(50));
+    bench.rotation.tpdos_lost = 2;
+    assert!(bench.until_fault().starts_with("rotation: no TPDO1 for 2 SYNCs in a row"));
+}
+
 fn fault_in_mid_run(spoil: impl FnOnce(&mut Bench)) -> String {
     let mut bench = Bench::ready();
     bench.drive_on(10);
@@ -132,4 +149,17 @@ fn foreign_and_malformed_frames_are_counted_and_told_ever_more_rarely() {
     };
     assert_eq!((told(Ignored::Foreign), told(Ignored::WrongLength)), (4, 5));
     assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+}
+
+#[test]
+fn a_status_names_a_node_in_nmt_stopped() {
+    let mut reader = StatusReader::new(&config(), Time::ZERO);
+    while !reader.is_over() {
+        let now = reader.deadline();
+        reader.handle_frame(now, &heartbeat_frame(node(1), NmtState::Stopped));
+        reader.handle_timeout(now);
+    }
+    let said = Axis::BOTH.map(|axis| reader.status(axis).unwrap_err());
+    assert!(said[0].starts_with("insertion: the node is in NMT stopped, "), "{}", said[0]);
+    assert!(said[1].starts_with("rotation: node 2 0x6041:00: no SDO reply"), "{}", said[1]);
 }
