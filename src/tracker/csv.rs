@@ -235,12 +235,12 @@ mod tests {
         assert_eq!((first.tool.as_str(), first.source_unix_ns), ("Tip", Some(1_500_000)));
         assert_eq!(first.orientation, Some(nalgebra::UnitQuaternion::identity()));
         let second = &samples[1];
-        assert!(second.position_mm.x.is_nan(), "was sent, and is for the gate to refuse");
+        assert!(second.position_mm.x.is_nan(), "it was sent; the gate refuses it");
         assert_eq!((second.source_unix_ns, &second.validity), (None, &Validity::NotARotation));
     }
 
     #[test]
-    fn the_beginning_can_be_left_out() {
+    fn skip_leaves_out_the_beginning_of_a_recording() {
         let text = "sec,nanosec,x,y,z\n10,0,1,0,0\n10,500000000,2,0,0\n11,0,3,0,0\n";
         let skip = Duration::from_millis(500);
         let samples = samples(text, &CsvMapping { skip, ..mapping() });
@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_named_with_its_line() {
+    fn a_bad_recording_is_refused_with_line_and_column() {
         let header = "sec,nanosec,x,y,z\n";
         let refusal = |text: &str, mapping: &CsvMapping| {
             recording(text, mapping, "Tip").expect_err("refused")

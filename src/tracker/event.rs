@@ -169,20 +169,11 @@ pub(super) fn has_positions(message_type: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::super::sample::Validity;
     use super::*;
-    use crate::units::Time;
     use nalgebra::Vector3;
 
     fn sample(tool: &str) -> Event {
-        Event::Sample(Sample {
-            tool: tool.to_owned(),
-            receive_time: Time::ZERO,
-            source_unix_ns: None,
-            position_mm: Vector3::zeros(),
-            orientation: None,
-            validity: Validity::Valid,
-        })
+        Event::Sample(Sample::valid(tool, Vector3::zeros()))
     }
 
     fn connected() -> Event {
@@ -204,9 +195,9 @@ mod tests {
         );
     }
 
-    /// The census also counts what a link did not pass on.
+    /// A link reports how many messages it did not pass on.
     #[test]
-    fn a_tool_that_was_passed_over_is_explained() {
+    fn messages_that_a_link_passed_over_are_counted() {
         let mut census = Census::default();
         census.note(&connected());
         let (tool, message_type) = ("StylusToTracker".to_owned(), "TRANSFORM".to_owned());
@@ -222,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn types_that_are_not_read_are_named_too() {
+    fn tools_of_unread_message_types_are_named_with_the_type() {
         let mut census = Census::default();
         census.note(&connected());
         let saw = |tool: &str, message_type: &str| Event::SawTool {
@@ -240,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tool_that_was_seen_is_not_said_to_be_another() {
+    fn a_tool_that_was_seen_is_not_reported_as_another() {
         let mut census = Census::default();
         census.note(&connected());
         census.note(&sample("Needle"));
@@ -250,9 +241,9 @@ mod tests {
         );
     }
 
-    /// A name longer than what is shown of it, as NDJSON and version 2 send it.
+    /// NDJSON and OpenIGTLink version 2 send names that are longer than what a message shows of them.
     #[test]
-    fn a_tool_of_a_long_name_is_not_said_to_be_another() {
+    fn a_tool_whose_shown_name_is_shortened_is_not_reported_as_another() {
         let tool = "NeedleTipToTrackerBaseFrame";
         let mut census = Census::default();
         census.note(&connected());
@@ -264,9 +255,9 @@ mod tests {
         );
     }
 
-    /// A server whose tools are all out of view may send its status alone, or messages without tools.
+    /// A server whose tools are all out of view may send only its status, or messages without tools.
     #[test]
-    fn what_is_no_tool_is_not_advised_as_one() {
+    fn devices_without_tools_do_not_give_the_advice_to_set_tracker_tool() {
         let mut census = Census::default();
         census.note(&connected());
         for (device, message_type) in [("PlusServer", "STATUS"), ("Tracker", "TDATA without tools")]
@@ -284,7 +275,7 @@ mod tests {
         }
         assert!(
             census.explain_missing("Needle").ends_with("; set tracker.tool"),
-            "a tool after all"
+            "it has sent a position too"
         );
     }
 
@@ -292,7 +283,7 @@ mod tests {
         "openigtlink: header version 9 (1 or 2 expected); is that port an OpenIGTLink server?";
 
     #[test]
-    fn refused_messages_are_counted_and_the_last_one_told() {
+    fn refused_messages_are_counted_and_the_last_reason_is_given() {
         let mut census = Census::default();
         census.note(&connected());
         for error in ["openigtlink: header version 7", OTHER_PORT] {
@@ -306,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn silence_is_told_from_no_connection() {
+    fn a_silent_peer_is_distinguished_from_no_connection() {
         let mut census = Census::default();
         assert_eq!(
             census.explain_missing("Needle"),
@@ -314,7 +305,7 @@ mod tests {
         );
         census.note(&sample("Needle"));
         census.note(&connected());
-        assert!(!census.has("Needle"), "that was another connection");
+        assert!(!census.has("Needle"), "it was seen on another connection");
         assert!(
             census
                 .explain_missing("Needle")

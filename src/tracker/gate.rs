@@ -151,7 +151,6 @@ pub fn is_same_tool(sent: &str, wanted: &str) -> bool {
 mod tests {
     use super::*;
     use crate::geometry::Pose;
-    use crate::units::Time;
     use nalgebra::Quaternion;
     use proptest::prelude::*;
 
@@ -168,19 +167,12 @@ mod tests {
     }
 
     fn sample(x: f64, y: f64, z: f64) -> Sample {
-        Sample {
-            tool: "NeedleToTracker".to_owned(),
-            receive_time: Time::ZERO,
-            source_unix_ns: None,
-            position_mm: Vector3::new(x, y, z),
-            orientation: None,
-            validity: Validity::Valid,
-        }
+        Sample::valid("NeedleToTracker", Vector3::new(x, y, z))
     }
 
     proptest! {
         #[test]
-        fn nothing_but_finite_positions_in_the_workspace_come_through(x: f64, y: f64, z in -300.0..300.0f64) {
+        fn only_finite_positions_in_the_workspace_are_admitted(x: f64, y: f64, z in -300.0..300.0f64) {
             let result = gate().admit(&sample(x, y, z));
             let inside = x.abs() <= 50.0 && y.abs() <= 50.0 && (-1.0..=200.0).contains(&z);
             prop_assert_eq!(result.is_ok(), inside);
@@ -188,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn each_refusal_says_what_and_how_much() {
+    fn each_refusal_names_its_gate_and_the_value() {
         let gate = gate();
         let [long, unknown] = [1.1, f64::NAN]
             .map(|w| UnitQuaternion::new_unchecked(Quaternion::new(w, 0.0, 0.0, 0.0)));
@@ -227,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_asked_for_is_not_refused() {
+    fn a_check_that_is_off_refuses_nothing() {
         let mut gate = gate();
         let zero = sample(0.0, 0.0, 0.0);
         let missing = Sample { validity: Validity::Missing, ..sample(1.0, 2.0, 3.0) };
@@ -241,7 +233,7 @@ mod tests {
         assert!(gate.admit(&skewed).is_ok());
         gate.workspace = None;
         assert!(gate.admit(&sample(1.0, 2.0, 200.5)).is_ok());
-        assert!(gate.admit(&sample(1.0, 2.0, f64::NAN)).is_err(), "whatever is asked for");
+        assert!(gate.admit(&sample(1.0, 2.0, f64::NAN)).is_err(), "always refused");
     }
 
     #[test]
@@ -266,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn a_name_cut_by_the_protocol_is_still_the_tool() {
+    fn a_tool_name_truncated_by_the_protocol_still_matches() {
         assert!(is_same_tool("NeedleTipToTrackerBa", "NeedleTipToTrackerBase"));
         assert!(!is_same_tool("NeedleTipToTracker", "NeedleTipToTrackerBase"));
         assert!(!is_same_tool("NeedleTipToTrackerBase", "NeedleTipToTrackerBa"));

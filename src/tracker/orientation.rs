@@ -93,9 +93,9 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever was sent, what was made of it and recorded is read back bit for bit.
+        /// An orientation is recorded as a quaternion.
         #[test]
-        fn a_recorded_quaternion_is_read_as_it_was(
+        fn a_recorded_quaternion_is_read_bit_for_bit(
             wxyz in prop::array::uniform4(-1.0..1.0f64),
             angles in prop::array::uniform3(-3.0..3.0f64),
         ) {
@@ -110,7 +110,7 @@ mod tests {
 
         /// The reference is nalgebra's singular value decomposition: U Vᵀ.
         #[test]
-        fn a_matrix_of_few_digits_is_taken_for_the_nearest_rotation(
+        fn a_rounded_matrix_gives_the_nearest_rotation(
             angles in prop::array::uniform3(-3.0..3.0f64),
             noise in prop::array::uniform9(-1e-4..1e-4f64),
         ) {
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_rotation_is_marked() {
+    fn matrices_and_quaternions_that_are_not_rotations_are_marked() {
         let reflection = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, -1.0));
         let matrices = [
             Matrix3::zeros(),

@@ -170,14 +170,17 @@ mod tests {
 
     #[test]
     fn times_outside_are_refused_with_numbers() {
-        assert!(StageHistory::new(4).at(ms(0.0)).is_err());
+        assert_eq!(
+            StageHistory::new(4).at(ms(0.0)).expect_err("no position"),
+            "tracker: no stage position is known yet to pair a sample with"
+        );
         let mut history = history();
         assert_eq!(
             history.at(ms(50.0)).expect_err("too new"),
             "tracker: sample of 0.050 s is 0.020 s newer than the last stage position; the stage's \
              positions have stopped"
         );
-        history.push(point(40.0, 3.0, 0.0)).expect("in order"); // the oldest goes
+        history.push(point(40.0, 3.0, 0.0)).expect("in order"); // drops the oldest
         let old =
             "tracker: sample of 0.004 s is 0.006 s older than the oldest stage position kept; ";
         let error = history.at(ms(4.0)).expect_err("too old");
@@ -198,7 +201,9 @@ mod tests {
         assert_eq!(whole, [increment(2.0, 0.0)]);
         let still: Vec<_> = history.between(ms(30.0), ms(30.0)).expect("known").collect();
         assert_eq!(still, [increment(0.0, 0.0)]);
-        assert!(history.between(ms(2.0), ms(1.0)).is_err(), "back");
+        let back = history.between(ms(2.0), ms(1.0)).err();
+        let expected = "tracker: no stage motion from 0.002 s back to 0.001 s";
+        assert_eq!(back.as_deref(), Some(expected));
     }
 
     proptest! {

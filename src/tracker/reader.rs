@@ -156,7 +156,7 @@ mod tests {
 
     const AT: Time = Time::from_nanos(7);
 
-    /// A stream of both kinds that tools come in, a status, a type that is skipped, and a mistake.
+    /// A message that is too short, both message types that hold positions, a status, and a type that is skipped.
     fn openigtlink() -> Vec<u8> {
         let tool = |name: &str| Tool {
             name: name.to_owned(),
@@ -211,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn everything_that_comes_is_told_of() {
+    fn every_message_is_reported() {
         assert_eq!(
             summary(&read(Protocol::OpenIgtLink, [&openigtlink()[..]])),
             [
@@ -234,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn the_device_of_a_message_without_tools_is_told_from_a_tool() {
+    fn a_device_whose_message_has_no_tools_is_not_reported_as_a_tool() {
         let empty = encode(&Message::new("Tracker", None, Body::TrackingData(Vec::new())));
         let events = read(Protocol::OpenIgtLink, [&empty[..]]);
         assert_eq!(summary(&events), ["saw Tracker (TDATA without tools)"]);
@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn what_loses_the_framing_ends_the_reading() {
+    fn bytes_that_are_no_header_end_the_reading() {
         let mut reader = Reader::new(Protocol::OpenIgtLink);
         reader.push(AT, &[b'x'; 100]);
         let error = reader.poll().expect_err("no header");
@@ -276,7 +276,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn wherever_the_stream_is_cut_the_events_are_the_same(
+        fn any_split_gives_the_same_events(
             mut cuts in prop::collection::vec(any::<Index>(), 0..60),
             lines: bool,
         ) {

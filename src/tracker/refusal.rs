@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_are_told_by_gate() {
+    fn refusals_are_counted_by_gate() {
         let mut counts = GateCounts::default();
         counts.count(None);
         assert_eq!(counts.to_string(), "1 accepted, 0 refused");

@@ -52,19 +52,16 @@ impl StreamReplay {
 
 #[cfg(test)]
 mod tests {
-    use super::super::sample::{Sample, Validity};
+    use super::super::sample::Sample;
     use super::*;
     use nalgebra::Vector3;
 
     fn sample(ms: i64) -> (Time, Event) {
         let receive_time = Time::from_nanos(1_666_034_108_000_000_000 + ms * 1_000_000);
         let sample = Sample {
-            tool: "Tip".to_owned(),
             receive_time,
             source_unix_ns: Some(receive_time.as_nanos()),
-            position_mm: Vector3::x() * ms as f64,
-            orientation: None,
-            validity: Validity::Valid,
+            ..Sample::valid("Tip", Vector3::x() * ms as f64)
         };
         (receive_time, Event::Sample(sample))
     }
@@ -74,13 +71,13 @@ mod tests {
         let start = Time::from_secs_f64(2.0);
         let mut replay =
             StreamReplay::new("tip.csv", vec![sample(100), sample(125), sample(225)], start);
-        let mut told = Vec::new();
+        let mut events = Vec::new();
         while replay.deadline() < Time::NEVER {
             let now = replay.deadline();
             assert_eq!(replay.poll(now - Duration::from_nanos(1)), None);
-            told.extend(replay.poll(now).map(|event| match event {
+            events.extend(replay.poll(now).map(|event| match event {
                 Event::Sample(sample) => {
-                    assert_eq!(sample.receive_time, now, "the stamp is left as it was");
+                    assert_eq!(sample.receive_time, now, "it is received when it is due");
                     format!("{:.3} {}", now.as_secs_f64(), sample.position_mm.x)
                 }
                 Event::Connected { peer } => format!("connected to {peer}"),
@@ -89,7 +86,7 @@ mod tests {
             }));
         }
         assert_eq!(
-            told,
+            events,
             [
                 "connected to tip.csv",
                 "2.000 100",
@@ -102,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn one_that_is_late_is_given_with_the_time_it_was_due() {
+    fn a_late_sample_has_the_time_at_which_it_was_due() {
         let mut replay = StreamReplay::new("tip.csv", vec![sample(0), sample(10)], Time::ZERO);
         let late = Time::from_secs_f64(1.0);
         let due: Vec<Time> = std::iter::from_fn(|| replay.poll(late))

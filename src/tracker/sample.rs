@@ -178,6 +178,20 @@ mod tests {
     use super::super::openigtlink::{IgtlStamp, Tool};
     use super::*;
 
+    impl Sample {
+        /// A valid sample, received at time 0, without stamp and orientation.
+        pub(crate) fn valid(tool: &str, position_mm: Vector3<f64>) -> Self {
+            Sample {
+                tool: tool.to_owned(),
+                receive_time: Time::ZERO,
+                source_unix_ns: None,
+                position_mm,
+                orientation: None,
+                validity: Validity::Valid,
+            }
+        }
+    }
+
     const AT: Time = Time::from_nanos(5);
     const QUARTER_TURN: [f32; 12] = [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 4.0, 5.0, 6.0];
 
@@ -244,11 +258,11 @@ mod tests {
         }
         assert_eq!(samples[0].orientation, sample(Body::Transform(QUARTER_TURN)).orientation);
         assert!(samples[1].orientation.is_some());
-        assert_eq!(samples[2].orientation, None, "of a tool with three degrees of freedom");
+        assert_eq!(samples[2].orientation, None, "it has three degrees of freedom");
     }
 
     #[test]
-    fn qtdata_has_its_quaternion_w_last() {
+    fn qtdata_quaternions_have_w_last() {
         let half = std::f32::consts::FRAC_1_SQRT_2;
         let pose = [4.0, 5.0, 6.0, 0.0, 0.0, half, half];
         let tool = Tool { name: "Needle".to_owned(), kind: tool_kind::SIX_D, pose };
@@ -259,11 +273,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_rotation_makes_a_sample_invalid() {
+    fn a_matrix_that_is_not_a_rotation_makes_a_sample_invalid() {
         let zero = sample(Body::Transform([0.0; 12]));
         assert_eq!((zero.orientation, zero.validity), (None, Validity::NotARotation));
         let missing = samples(Body::Transform([0.0; 12]), &[("TransformStatus", "MISSING")]);
-        assert_eq!(validities(&missing), [Validity::Missing], "the tracker's own word stands");
+        assert_eq!(validities(&missing), [Validity::Missing], "as the tracker says");
     }
 
     #[test]
@@ -286,10 +300,10 @@ mod tests {
     }
 
     #[test]
-    fn metadata_says_so_of_each_tool_by_its_whole_name() {
-        let said = [("NeedleStatus", "OK"), ("ReferenceToTrackerBaseStatus", "MISSING")];
+    fn metadata_says_whether_each_tool_was_seen_by_its_whole_name() {
+        let metadata = [("NeedleStatus", "OK"), ("ReferenceToTrackerBaseStatus", "MISSING")];
         assert_eq!(
-            validities(&tools(&said)),
+            validities(&tools(&metadata)),
             [Validity::Valid, Validity::Missing, Validity::Valid]
         );
         let of_all = [("TransformStatus", "OUT_OF_VIEW"), ("BallStatus", "OK")];
@@ -300,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn each_validity_has_its_word() {
+    fn each_validity_is_read_back_from_its_status() {
         let validities = [
             Validity::Valid,
             Validity::Missing,

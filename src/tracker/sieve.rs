@@ -89,23 +89,16 @@ impl Sieve {
 
 #[cfg(test)]
 mod tests {
-    use super::super::sample::{Sample, Validity};
+    use super::super::sample::Sample;
     use super::*;
     use nalgebra::Vector3;
 
     fn sample(tool: &str) -> Event {
-        Event::Sample(Sample {
-            tool: tool.to_owned(),
-            receive_time: Time::ZERO,
-            source_unix_ns: None,
-            position_mm: Vector3::zeros(),
-            orientation: None,
-            validity: Validity::Valid,
-        })
+        Event::Sample(Sample::valid(tool, Vector3::zeros()))
     }
 
     #[test]
-    fn other_tools_are_told_of_once_and_counted() {
+    fn other_tools_are_reported_once_and_counted() {
         let mut sieve = Sieve::new(&["Needle".to_owned(), "Target".to_owned()]);
         let mut pass = |event| sieve.pass(Time::ZERO, event);
         let saw = |tool: &str, message_type: &str| Event::SawTool {
@@ -116,8 +109,8 @@ mod tests {
         for _ in 0..5 {
             assert_eq!(pass(sample("Stylus")), None);
         }
-        assert_eq!(pass(saw("Probe", "STATUS")), Some(saw("Probe", "STATUS")), "it may be no tool");
-        assert_eq!(pass(sample("Probe")), Some(saw("Probe", "NDJSON")), "of a recording");
+        assert_eq!(pass(saw("Probe", "STATUS")), Some(saw("Probe", "STATUS")));
+        assert_eq!(pass(sample("Probe")), Some(saw("Probe", "NDJSON")), "now it is a tool");
         assert_eq!(pass(sample("Probe")), None);
         assert_eq!(pass(sample("Needle")), Some(sample("Needle")));
         assert_eq!(pass(sample("Target")), Some(sample("Target")));

@@ -73,7 +73,6 @@ impl AcquisitionClock {
 
 #[cfg(test)]
 mod tests {
-    use super::super::sample::Validity;
     use super::*;
     use nalgebra::Vector3;
     use proptest::prelude::*;
@@ -83,12 +82,9 @@ mod tests {
 
     fn sample(receive_ms: i64, source_ms: Option<i64>) -> Sample {
         Sample {
-            tool: "Tip".to_owned(),
             receive_time: Time::from_nanos(receive_ms * MS),
             source_unix_ns: source_ms.map(|ms| UNIX_NS + ms * MS),
-            position_mm: Vector3::zeros(),
-            orientation: None,
-            validity: Validity::Valid,
+            ..Sample::valid("Tip", Vector3::zeros())
         }
     }
 
@@ -103,7 +99,7 @@ mod tests {
 
     const LEARNING: &str = "stamp: the sender's clock is still being learnt, from 1 samples so far";
 
-    /// A clock that has learnt, at 1000 ms, that the sender's clock is 1000 ms ahead.
+    /// A clock at 1000 ms that has learnt that the sender's clock is 1000 ms ahead.
     fn settled(latency_ms: u64) -> AcquisitionClock {
         let mut clock = AcquisitionClock::new(StampPolicy::Auto, Duration::from_millis(latency_ms));
         let dated: Vec<_> =
@@ -114,8 +110,8 @@ mod tests {
     }
 
     #[test]
-    fn jitter_of_delivery_is_taken_out() {
-        // Measured every 25 ms, delivered after 12, 3, 40 ms; quickest until now: at once.
+    fn jitter_of_delivery_does_not_change_the_acquisition_time() {
+        // Measured every 25 ms, delivered 12, 3 and 40 ms later than the quickest so far.
         let mut clock = settled(20);
         assert_eq!(at_ms(&mut clock, 1037, Some(2025)), Ok(1005));
         assert_eq!(at_ms(&mut clock, 1053, Some(2050)), Ok(1030));
@@ -143,18 +139,18 @@ mod tests {
         assert_eq!(at_ms(&mut clock, 1010, Some(2001)), Ok(1001));
     }
 
-    /// If it counted, every later sample would be 10 s old.
+    /// If it set the offset, every later sample would be dated 10 s too old.
     #[test]
-    fn one_stamp_ahead_changes_nothing_for_those_after_it() {
+    fn one_stamp_ahead_does_not_change_the_dating_of_later_samples() {
         let mut clock = settled(0);
         let ahead = at_ms(&mut clock, 1025, Some(12_025)).unwrap_err();
-        let told = "stamp: 10.000 s ahead of the sender's clock so far; was it set?";
-        assert_eq!(ahead, told);
+        let expected = "stamp: 10.000 s ahead of the sender's clock so far; was it set?";
+        assert_eq!(ahead, expected);
         assert_eq!(at_ms(&mut clock, 1050, Some(2050)), Ok(1050));
     }
 
     #[test]
-    fn a_new_connection_starts_anew() {
+    fn a_new_connection_learns_the_offset_again() {
         let mut clock = settled(0);
         clock.reconnected();
         let first = at_ms(&mut clock, 2000, Some(-500));
@@ -163,7 +159,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn nothing_is_measured_after_its_receipt(
+        fn no_acquisition_time_is_after_the_receipt(
             policy in prop::sample::select(vec![StampPolicy::Auto, StampPolicy::Receive]),
             stamps in prop::collection::vec((any::<i64>(), prop_oneof![any::<i64>(), -9..9i64]), 1..50),
         ) {

@@ -202,11 +202,11 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Depth at which a stream whose tip is at `position` of the depth is contradicted, mm; a position
-    /// each 0.05 mm, with noise of ±`noise_mm`.
+    /// The depth, mm, at which the check contradicts a stream. The stream has a position each 0.05 mm of depth:
+    /// `position(depth)`, with noise of ±`noise_mm`.
     fn contradicted_mm(noise_mm: f64, position: impl Fn(f64) -> Vector3<f64>) -> Option<f64> {
         let mut check = TravelCheck::new(0.6, 1.0 / 122.0);
-        // Uniform noise by a Weyl sequence of each coordinate.
+        // A Weyl sequence for each coordinate gives uniform noise.
         let noise = |k: u32, step: f64| 2.0 * (f64::from(k) * step).fract() - 1.0;
         for k in 0..4000 {
             let depth_mm = 0.05 * f64::from(k);
@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stream_of_another_travel_is_contradicted_in_time() {
+    fn a_frozen_scaled_or_drifting_stream_is_contradicted_in_time() {
         let z = Vector3::<f64>::z();
         let frozen = |depth_mm: f64| z * depth_mm.min(40.0);
         assert!(matches!(contradicted_mm(1.0, frozen), Some(40.0..=43.3)));
@@ -234,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn a_needle_is_never_contradicted() {
+    fn positions_along_a_needles_arc_are_never_contradicted() {
         let arc = |radius_mm: f64| {
             move |depth_mm: f64| {
                 let angle = depth_mm / radius_mm;
@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn a_contradiction_is_told_with_its_numbers() {
+    fn a_contradiction_is_reported_with_its_numbers() {
         let mut check = TravelCheck::new(0.6, 1.0 / 122.0);
         (0..100).for_each(|k| check.take(0.05 * f64::from(k), &Vector3::zeros()));
         let text = check.check().unwrap_err();
@@ -260,9 +260,9 @@ mod tests {
     }
 
     proptest! {
-        /// Gaps, steps back and positions all at one depth do no harm.
+        /// The depths may have gaps, go back, or all be equal.
         #[test]
-        fn any_depths_are_taken(depths in prop::collection::vec(-1e4..1e4f64, 0..200)) {
+        fn any_depths_are_taken_in_bounded_memory(depths in prop::collection::vec(-1e4..1e4f64, 0..200)) {
             let mut check = TravelCheck::new(0.6, 1.0 / 122.0);
             for depth_mm in depths {
                 check.take(depth_mm, &(Vector3::z() * depth_mm));

@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn a_recording_keeps_its_times_and_tells_of_its_bad_lines() {
+    fn a_recording_keeps_its_times_and_reports_its_bad_lines() {
         let good = |ns: i64| {
             format!(r#"{{"tool":"N","position_tracker_mm":[{ns},0,0],"receive_time_ns":{ns}}}"#)
         };
@@ -311,11 +311,11 @@ mod tests {
         assert_eq!(sample.position_mm.y.to_bits(), (-0.0f64).to_bits());
         let given = recording(line).unwrap();
         let Event::Sample(sample) = &given[0].1 else { panic!("{given:?}") };
-        assert_eq!(sample.source_unix_ns, None, "to a stream 0 is none");
+        assert_eq!(sample.source_unix_ns, None, "in a stream, 0 means no stamp");
     }
 
     #[test]
-    fn a_file_of_something_else_is_refused() {
+    fn a_file_without_a_sample_is_refused() {
         assert_eq!(recording("\n").unwrap_err(), "no line");
         assert_eq!(
             recording("step,time_s\n0,1.5\n").unwrap_err(),

@@ -243,7 +243,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_length_of_a_position_has_its_form() {
+    fn a_position_is_decoded_by_its_length() {
         let bytes: Vec<u8> = (1..=7).flat_map(|i| (i as f32).to_be_bytes()).collect();
         let quaternion = |len: usize| match Body::decode(b"POSITION", &bytes[..len]) {
             Ok(Body::Position { position_mm: [1.0, 2.0, 3.0], quaternion }) => Ok(quaternion),
@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn tools_come_whole_or_not_at_all() {
+    fn tools_are_decoded_whole_or_refused() {
         let sent = [tool_kind::SIX_D, tool_kind::THREE_D, 9];
         let sent =
             sent.map(|kind| Tool { name: format!("Tool{kind}"), kind, pose: [1.0; 7] }).to_vec();
@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn a_start_is_36_bytes() {
+    fn a_start_request_has_36_bytes_of_content() {
         let stream = ToolStream { name: "QTDATA", period_ms: 25 };
         let bytes = stream.start();
         assert_eq!(bytes.len(), 58 + 36);

@@ -174,7 +174,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn a_header_is_58_bytes_and_comes_back() {
+    fn a_header_of_58_bytes_is_read_as_it_was_written() {
         let stamp = IgtlStamp::from_unix_ns(1_700_000_000_123_456_789);
         let bytes = encode(&Message::new("NeedleToTracker", stamp, Body::Transform([0.0; 12])));
         let header = Header::parse(bytes.first_chunk().expect("58 bytes")).expect("a header");
@@ -193,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn something_else_on_the_port_is_named_by_its_version() {
+    fn another_protocol_on_the_port_is_refused_by_its_header_version() {
         let bytes = [b'G'; HEADER_LEN];
         let error = Header::parse(&bytes).unwrap_err().to_string();
         assert!(
@@ -203,14 +203,14 @@ mod tests {
     }
 
     #[test]
-    fn the_check_value_of_the_catalogue() {
+    fn crc64_gives_the_check_value_of_the_catalogue() {
         // CRC-64/ECMA-182 in the RevEng catalogue of parametrised CRC algorithms.
         assert_eq!(crc64(b"123456789"), 0x6C40_DF5F_0B49_7347);
     }
 
     proptest! {
         #[test]
-        fn nanoseconds_survive(ns in 1..=i64::from(u32::MAX) * 1_000_000_000 + 999_999_999) {
+        fn a_stamp_keeps_its_nanoseconds(ns in 1..=i64::from(u32::MAX) * 1_000_000_000 + 999_999_999) {
             let stamp = IgtlStamp::from_unix_ns(ns).expect("in range");
             prop_assert_eq!(stamp.unix_ns(), ns);
         }
@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn half_a_second_is_half_the_range() {
+    fn half_a_second_is_half_the_range_of_the_fraction() {
         let stamp = IgtlStamp::from_unix_ns(1_500_000_000).expect("in range");
         assert_eq!(stamp.bits(), 0x0000_0001_8000_0000);
     }

@@ -89,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn a_longer_extended_header_is_stepped_over() {
+    fn a_longer_extended_header_is_skipped() {
         let body = [&[0, 14, 0, 0, 0, 0, 0, 0, 0, 0, 0, 7, 0xAA, 0xBB][..], b"content"].concat();
         assert_eq!(split(&body).expect("well formed"), (&b"content"[..], Vec::new()));
     }
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn sizes_that_go_beyond_the_body_are_refused_by_name() {
+    fn sizes_that_go_beyond_the_body_are_refused_with_numbers() {
         let extended = |size: u8, index: u8, text: u32| {
             let mut body = vec![0, size, 0, index];
             body.extend_from_slice(&text.to_be_bytes());

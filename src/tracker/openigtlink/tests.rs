@@ -1,4 +1,4 @@
-//! Whole messages against bytes made by others, and streams cut and damaged anywhere.
+//! Whole messages against bytes of other implementations, and streams that are cut or damaged anywhere.
 //!
 //! Frozen bytes, do not edit. `TRANSFORM_*` and `STRING` are `pack()` of pyigtl 0.3.4 (PyPI) with
 //! timestamp 1700000000.5; `STATUS` and `POSITION_24` are the specification's tables written with
@@ -126,7 +126,7 @@ fn frozen() -> [(&'static str, Message); 11] {
 }
 
 #[test]
-fn bytes_of_others_are_read_and_written_the_same() {
+fn bytes_of_other_implementations_are_read_and_written_alike() {
     for (hex, message) in frozen() {
         assert_eq!(decode(&bytes(hex)).as_ref(), Ok(&message));
         if !matches!(message.body, Body::Other(_)) && message.metadata.is_empty() {
@@ -149,9 +149,8 @@ fn a_name_too_long_for_the_header_is_whole_in_version_2() {
     assert_eq!(read.full_device_name(), "NeedleTipToTrackerBase");
 }
 
-/// A server reads what the bench asks for as the reference library's own.
 #[test]
-fn requests_are_those_of_the_reference_library() {
+fn requests_equal_those_of_the_reference_library() {
     let stream = ToolStream { name: "QTDATA", period_ms: 0 };
     for (sent, hex) in [(stream.start(), STT_QTDATA_V1), (stream.stop(), STP_QTDATA_V1)] {
         let reference = bytes(hex);
@@ -174,8 +173,8 @@ fn a_damaged_body_loses_the_framing_for_good() {
 }
 
 #[test]
-fn a_message_wrong_inside_is_refused_and_the_next_is_read() {
-    // 47 bytes of a TRANSFORM with a good checksum, as a careless script would send them.
+fn a_message_of_wrong_length_is_refused_and_the_next_is_read() {
+    // 47 of the 48 bytes of a TRANSFORM, with a correct checksum, as a faulty script would send them.
     let (hex, next) = &frozen()[6];
     let good = bytes(hex);
     let body = &good[HEADER_LEN..HEADER_LEN + 47];
@@ -210,7 +209,7 @@ fn lengths_that_a_peer_states_are_bounded() {
         assert!(error.to_string().ends_with(&text), "{error}");
     }
     assert_eq!(with_size(TRANSFORM_V1, BODY_LIMIT), Ok(None));
-    // An image is skipped as it comes, and can be larger. Nothing of it is kept.
+    // A type that is not read, such as an image, may be larger: it is skipped as it comes, and none of it is kept.
     let mut decoder = StreamDecoder::default();
     let mut image = bytes(STRING_V1);
     image[42..50].copy_from_slice(&SKIPPED_BODY_LIMIT.to_be_bytes());
@@ -221,11 +220,12 @@ fn lengths_that_a_peer_states_are_bounded() {
         decoder.push(&[0; 4096]);
     }
     assert_eq!(with_size(STRING_V1, SKIPPED_BODY_LIMIT), Ok(None));
-    assert!(with_size(STRING_V1, SKIPPED_BODY_LIMIT + 1).is_err());
+    let error = with_size(STRING_V1, SKIPPED_BODY_LIMIT + 1).expect_err("too large");
+    assert!(error.to_string().ends_with(&format!("(limit {SKIPPED_BODY_LIMIT})")), "{error}");
 }
 
 #[test]
-fn a_stream_that_ends_within_a_message_says_so() {
+fn a_stream_that_ends_within_a_message_is_reported_as_cut_off() {
     for (hex, _) in frozen() {
         let whole = bytes(hex);
         for cut in 0..=whole.len() {
@@ -242,7 +242,7 @@ fn a_stream_that_ends_within_a_message_says_so() {
     }
 }
 
-/// Polls until nothing is left: messages and errors as they come.
+/// Polls until nothing is left; returns the messages and errors in order.
 fn drain(decoder: &mut StreamDecoder) -> Vec<Result<Message, DecodeError>> {
     let mut out = Vec::new();
     loop {
@@ -273,7 +273,7 @@ proptest! {
         let (mut messages, mut from) = (Vec::new(), 0);
         for to in cuts.iter().map(|cut| cut.index(stream.len())).chain([stream.len()]) {
             decoder.push(&stream[from..to]);
-            prop_assert!(decoder.unread().len() <= stream.len(), "kept what never came");
+            prop_assert!(decoder.unread().len() <= stream.len(), "more bytes are kept than were sent");
             messages.extend(drain(&mut decoder));
             from = to;
         }
@@ -296,7 +296,7 @@ proptest! {
         }
         let intact = message == bytes(hex);
         if repair_crc {
-            // The checksum is made good, so that the inside is looked at too.
+            // With a correct checksum the content is decoded too.
             let crc = crc64(&message[HEADER_LEN..]);
             message[50..58].copy_from_slice(&crc.to_be_bytes());
         }
@@ -304,15 +304,15 @@ proptest! {
         let mut decoder = StreamDecoder::default();
         decoder.push(&message);
         for read in drain(&mut decoder).into_iter().flatten() {
-            // The type itself may be damaged, and the body be skipped.
+            // If the type is damaged, the body is skipped.
             let is_read = !matches!(read.body, Body::Other(_));
-            prop_assert!(!is_read || repair_crc || body_intact, "a damaged body came through");
+            prop_assert!(!is_read || repair_crc || body_intact, "a damaged body was accepted");
             prop_assert!(!intact || &read == original);
         }
     }
 
     #[test]
-    fn what_is_written_is_read(
+    fn an_encoded_message_is_decoded_to_the_same_message(
         name in "[A-Za-z]{0,20}",
         unix_ns in 1..i64::from(u32::MAX) * 1_000_000_000,
         elements: [f32; 12],

@@ -105,7 +105,7 @@ mod tests {
     use super::*;
     use nalgebra::Vector3;
 
-    /// What fits a tip whose travel is `travel` of the depth, over 8 mm, in a direction that is no axis.
+    /// The change that fits a tip that moves by `travel(depth)` over 8 mm of depth, along a direction that is no axis.
     fn fitted(tenths: Tenths, travel: impl Fn(f64) -> f64) -> Option<ScaleChange> {
         let heading = Vector3::new(1.0, 2.0, 2.0) / 3.0;
         let bins = (0..32).rev().map(|bin| {
@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn a_change_is_found_with_its_scale_and_where_it_came() {
+    fn a_change_is_found_with_its_scale_and_depth() {
         let change = |since_mm, scale| Some(ScaleChange { since_mm, scale });
         let after_5 = |scale: f64| move |mm: f64| mm.min(5.0) + scale * (mm - 5.0).max(0.0);
         assert_eq!(fitted(SLOWER, after_5(0.0)), change(3.0, 0.0));
@@ -132,15 +132,15 @@ mod tests {
     }
 
     #[test]
-    fn without_positions_nothing_is_said() {
+    fn without_positions_no_change_is_found() {
         assert_eq!(ScaleChange::fitted([].iter(), SLOWER, 0.36), None);
         assert_eq!(ScaleChange::fitted([Sums::default()].iter(), SLOWER, 0.36), None);
     }
 
     #[test]
-    fn a_change_is_told_with_its_numbers() {
-        let said = |scale| ScaleChange { since_mm: 3.04, scale }.to_string();
-        assert_eq!(said(0.0), "frozen for the last 3.0 mm");
-        assert_eq!(said(0.5), "of scale 0.5 for the last 3.0 mm");
+    fn a_change_is_reported_with_its_numbers() {
+        let text = |scale| ScaleChange { since_mm: 3.04, scale }.to_string();
+        assert_eq!(text(0.0), "frozen for the last 3.0 mm");
+        assert_eq!(text(0.5), "of scale 0.5 for the last 3.0 mm");
     }
 }
