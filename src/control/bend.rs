@@ -153,7 +153,6 @@ mod tests {
     use crate::geometry::{FixedAngles, Pose};
     use crate::needle::{Increment, Play, Torsion, TorsionConfig};
     use crate::observer::{Belief, Shaft, Slack};
-    use nalgebra::Matrix6;
     use proptest::prelude::*;
 
     const CURVATURE_PER_MM: f64 = 1.0 / 122.0;
@@ -172,25 +171,17 @@ mod tests {
         }
     }
 
-    /// The estimate of a tip of which all is known.
+    /// An estimate without uncertainty.
     fn estimate(tip: Pose, shaft: Shaft) -> Estimate {
-        let belief = Belief {
-            covariance: Matrix6::zeros(),
-            roll_agreement: 1.0,
-            roll_seen_rad: 0.5 * PI,
-            curvature_per_mm: CURVATURE_PER_MM,
-            nis: None,
-            shaft,
-        };
-        Estimate::of_belief(tip, belief)
+        Estimate::of_belief(tip, Belief::certain(CURVATURE_PER_MM, shaft))
     }
 
     fn known(tip: Pose) -> Estimate {
         estimate(tip, Shaft::RIGID)
     }
 
-    /// Follows an arc of `share` of the needle's curvature toward `toward`, the state known: the tip at the
-    /// end of it, from the start and the roll given, and the largest turn of the base.
+    /// Follows an arc of `share` of the needle's curvature toward `toward` with the state known. Returns the tip at
+    /// its end and the largest turn of the base.
     fn follow(
         share: f64,
         toward: Vector3<f64>,
@@ -215,7 +206,7 @@ mod tests {
                     ..Shaft::RIGID
                 },
             };
-            // The arc turns with the depth, as the path does that a planner gives.
+            // The arc turns with the depth, as a planned path does.
             let angle = share * CURVATURE_PER_MM * f64::from(step);
             let toward = toward * angle.cos() - Vector3::z() * angle.sin();
             let heading = tip.rotation * Vector3::z();
@@ -238,10 +229,10 @@ mod tests {
         (tip, most_rad)
     }
 
-    /// A target straight ahead gives no direction to turn to. The base turns to and fro, and does not wind
-    /// up a cable.
+    /// A target straight ahead gives no direction to bend to. The base turns back and forth, so the cable is not
+    /// wound up.
     #[test]
-    fn a_target_straight_ahead_winds_nothing_up() {
+    fn a_target_straight_ahead_does_not_wind_up_the_base() {
         let needle = Needle::new(CURVATURE_PER_MM).unwrap();
         for aside_mm in [0.0, 0.1, 0.5, 2.0] {
             let (mut tip, mut law) = (Pose::identity(), BendLaw::new(needle, config()));
@@ -267,9 +258,9 @@ mod tests {
         }
     }
 
-    /// Whatever has summed up, the roll is held until the path leaves room for a turn.
+    /// However much the demand has summed up, the roll is held until the path has room for a turn.
     #[test]
-    fn a_turn_waits_for_room() {
+    fn a_turn_starts_only_where_the_path_has_room_for_it() {
         let needle = Needle::new(CURVATURE_PER_MM).unwrap();
         let mut law = BendLaw::new(needle, config());
         let estimate = known(Pose::identity());
@@ -291,11 +282,10 @@ mod tests {
 
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(64))]
-        /// Any curvature up to that of the needle, to any side, from any roll, through creep or play: the
-        /// heading ends where the arc ends, but for half of what a whole turn leaves out. A straight path
-        /// through play drifts, and is left to the planning.
+        /// From any roll, through creep or play, the final heading is that of the arc, within what the turns of the
+        /// base cost. A straight path through play drifts; replanning corrects that, so `share` starts at 0.1.
         #[test]
-        fn bends_by_any_curvature(
+        fn follows_an_arc_of_any_curvature_to_any_side(
             share in 0.1..0.95f64, side in 0.0..TAU, roll in -3.0..3.0f64, kind in 0..3u32, in_plane in any::<bool>(),
         ) {
             let torsion = match kind {
@@ -311,7 +301,7 @@ mod tests {
             let angle = share * CURVATURE_PER_MM * LENGTH_MM;
             let wanted = toward * angle.sin() + Vector3::z() * angle.cos();
             let off_rad = (tip.rotation * Vector3::z()).angle(&wanted);
-            // Half a turn at the start takes 3 mm, and each turn 6 mm; to hold the plane costs more.
+            // Half a turn at the start takes 3 mm, and each turn 6 mm. Keeping to the plane costs more.
             let most_mm = if in_plane { 30.0 } else { 15.0 };
             prop_assert!(off_rad < most_mm * CURVATURE_PER_MM, "{off_rad}");
             prop_assert!(most_rad < 3.0 * TAU, "{most_rad}");

@@ -182,10 +182,9 @@ mod tests {
         assert_eq!(law.command(&Estimate::of_pose(nan), 1.0), Err(ControlError::NotFinite));
     }
 
-    /// An observer with a constant error would make the law turn without end: the law stops before a whole
-    /// turn of the needle.
+    /// With a constant error of the observer the law would turn the needle without end.
     #[test]
-    fn it_never_spins_the_needle() {
+    fn a_constant_error_stops_the_law_within_a_turn() {
         let mut law = law();
         let mut turned = 0.0;
         let stopped = (0..500).find_map(|_| match law.command(&at(0.0, 0.0, 1.0), 1.0) {

@@ -214,7 +214,7 @@ mod tests {
     use crate::geometry::{FixedAngles, Pose};
     use crate::needle::{Fibre, Increment, Play, Torsion, TorsionConfig, shortest_into_plane_mm};
     use crate::observer::Belief;
-    use nalgebra::{Matrix6, Vector3};
+    use nalgebra::Vector3;
     use proptest::prelude::*;
 
     fn needle() -> Needle {
@@ -239,7 +239,7 @@ mod tests {
         Reduced { x_mm, pitch_rad, roll_rad }.join(&Fibre::default())
     }
 
-    /// The estimate of an observer that knows the state.
+    /// An estimate without uncertainty.
     fn known(tip: Pose, torsion: &Torsion, play: &Play) -> Estimate {
         let (lower, upper) = torsion.band_rad(play.insertion_mm());
         let slack = |mean_rad: f64| Slack { mean_rad, sd_rad: 0.0 };
@@ -248,15 +248,7 @@ mod tests {
             slack_backward: slack(upper - play.lag_rad()),
             ..Shaft::RIGID
         };
-        let belief = Belief {
-            covariance: Matrix6::zeros(),
-            roll_agreement: 1.0,
-            roll_seen_rad: 0.5 * PI,
-            curvature_per_mm: needle().curvature_per_mm(),
-            nis: None,
-            shaft,
-        };
-        Estimate::of_belief(tip, belief)
+        Estimate::of_belief(tip, Belief::certain(needle().curvature_per_mm(), shaft))
     }
 
     /// Steers from `tip` with the state known; returns the distance from the plane at each mm.
@@ -289,7 +281,7 @@ mod tests {
 
         /// The same holds with a band of known width.
         #[test]
-        fn comes_into_the_plane_through_a_band(
+        fn comes_into_the_plane_through_a_torsion_band(
             x in -8.0..8.0f64, pitch in -0.2..0.2f64, roll in -3.1..3.1f64,
             width in 0.0..1.0f64, growth in 0.0..0.01f64,
         ) {
@@ -372,9 +364,9 @@ mod tests {
         assert!((sure + 0.5).abs() < 1e-9 && (unsure - 0.5 * sure).abs() < 1e-9);
     }
 
-    /// Nearer than 1e-14 mm, where the arc into the plane rounds to nothing.
+    /// Nearer to the plane than 1e-14 mm the arc into it rounds to nothing.
     #[test]
-    fn commands_as_near_to_the_plane_as_may_be() {
+    fn the_command_is_continuous_at_the_plane() {
         let at = |x_mm, pitch_rad| {
             let estimate = Estimate::of_pose(pose(x_mm, pitch_rad, 0.1));
             law().command(&estimate, 1.0).map(|command| command.rotation_rad_per_mm)

@@ -197,7 +197,7 @@ mod tests {
         }
 
         #[test]
-        fn hostile_but_legal_arguments_stay_finite(g in pose(), k in prop::sample::select(vec![0.0, 1e-300, 1e-12, 1.0, 1e3]),
+        fn extreme_arguments_give_finite_poses(g in pose(), k in prop::sample::select(vec![0.0, 1e-300, 1e-12, 1.0, 1e3]),
             l in prop::sample::select(vec![0.0, 1e-300, 1e-12, 1.0, 1e4]), r in prop::sample::select(vec![0.0, 1e-300, -1e-12, 7.0, 1e6])) {
             prop_assert!(Needle::new(k).unwrap().step(&g, increment(l, r)).is_finite());
         }
@@ -234,9 +234,9 @@ mod tests {
         }
     }
 
-    /// The bicycle's tip is the point a ahead of a unicycle that starts a behind the tip.
+    /// The tip is the point `a_mm` ahead of the point on the shaft that moves along its own axis.
     #[test]
-    fn a_tip_ahead_is_carried_by_the_rear_wheel() {
+    fn a_tip_ahead_moves_as_in_the_bicycle_model() {
         let (rear, a_mm) = (Needle::new(0.011).unwrap(), 6.5);
         let needle = rear.with_tip_ahead(a_mm).unwrap();
         let ahead = Pose { translation: Vector3::z() * a_mm, ..Pose::identity() };
@@ -255,22 +255,22 @@ mod tests {
     }
 
     #[test]
-    fn refuses_by_name() {
-        let said = |error: NeedleError| error.to_string();
+    fn arguments_out_of_range_are_refused_with_the_limit() {
+        let text = |error: NeedleError| error.to_string();
         let needle = Needle::new(0.01).unwrap();
         for error in [
             needle.with_tip_ahead(f64::NAN).unwrap_err(),
             Needle::new(f64::NAN).unwrap_err(),
             Increment::new(0.0, f64::INFINITY).unwrap_err(),
         ] {
-            assert!(said(error).contains("not a finite number"));
+            assert!(text(error).contains("not a finite number"));
         }
-        assert!(said(Needle::new(-0.01).unwrap_err()).starts_with("needle curvature is -0.01/mm"));
-        assert!(said(Needle::new(1.1e6).unwrap_err()).contains("up to 1e6"));
-        assert!(said(Increment::new(1e308, 0.0).unwrap_err()).contains("up to 1e6"));
-        assert!(said(Increment::new(-1e-9, 0.0).unwrap_err()).contains("the least is 0"));
+        assert!(text(Needle::new(-0.01).unwrap_err()).starts_with("needle curvature is -0.01/mm"));
+        assert!(text(Needle::new(1.1e6).unwrap_err()).contains("up to 1e6"));
+        assert!(text(Increment::new(1e308, 0.0).unwrap_err()).contains("up to 1e6"));
+        assert!(text(Increment::new(-1e-9, 0.0).unwrap_err()).contains("the least is 0"));
         assert_eq!(
-            said(Increment::new(0.0, -1e308).unwrap_err()),
+            text(Increment::new(0.0, -1e308).unwrap_err()),
             "rotation increment in rad is -1e308, allowed is up to 1e6 in magnitude"
         );
     }

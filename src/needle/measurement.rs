@@ -33,10 +33,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn takes_positions_within_bounds_only() {
-        assert!(TipPosition::new(Vector3::new(1.0, 2.0, 3.0)).is_some());
+    fn only_finite_positions_within_1e6_mm_are_taken() {
+        let at = |x_mm| TipPosition::new(Vector3::new(x_mm, 2.0, 3.0));
+        assert!(at(1.0).is_some() && at(-1e6).is_some());
         assert!(TipPosition::new(Vector3::new(1.0, f64::NAN, 3.0)).is_none());
         assert!(TipPosition::new(Vector3::new(1.0, 2.0, f64::NEG_INFINITY)).is_none());
-        assert!(TipPosition::new(Vector3::new(1e308, 2.0, 3.0)).is_none());
+        assert!(at(1_000_001.0).is_none() && at(-1e308).is_none());
     }
 }

@@ -79,7 +79,7 @@ mod tests {
         Cut { tip: Pose::identity(), roll_rad: 0.0 }
     }
 
-    /// However slow it is: 0.1 mm in steps of a count of 0.0002 mm.
+    /// 0.1 mm in steps of one count, 0.0002 mm.
     #[test]
     fn a_slow_needle_leaves_few_poses() {
         let mut path = InsertedPath::default();
@@ -98,9 +98,9 @@ mod tests {
     }
 
     proptest! {
-        /// Between the recorded depths the retraced pose is the one the needle cut there.
+        /// Between two recorded depths the pose is the one that the needle had there.
         #[test]
-        fn withdrawal_retraces(rates in prop::collection::vec(-1.0..1.0f64, 1..40), f in 0.0..1.0f64) {
+        fn withdrawal_retraces_the_inserted_path(rates in prop::collection::vec(-1.0..1.0f64, 1..40), f in 0.0..1.0f64) {
             let needle = Needle::new(1.0 / 122.0).unwrap();
             let mut path = InsertedPath::default();
             let mut cut = start();

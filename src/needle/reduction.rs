@@ -81,9 +81,9 @@ mod tests {
             prop_assert!(close(f.yaw_rad, yaw, k * roll.cos() / pitch.cos()));
         }
 
-        /// The reduced half of the motion does not depend on the fibre (the symmetry of the task).
+        /// This is the symmetry of the plane task.
         #[test]
-        fn the_plane_task_does_not_see_the_fibre(yaw in -3.0..3.0f64, y in -50.0..50.0f64, z in -50.0..50.0f64, pitch in -1.2..1.2f64, roll in -3.0..3.0f64) {
+        fn the_reduced_motion_does_not_depend_on_the_fibre(yaw in -3.0..3.0f64, y in -50.0..50.0f64, z in -50.0..50.0f64, pitch in -1.2..1.2f64, roll in -3.0..3.0f64) {
             let needle = Needle::new(1.0 / 122.0).unwrap();
             let reduced = Reduced { x_mm: 3.0, pitch_rad: pitch, roll_rad: roll };
             let i = Increment::new(1.0, 0.1).unwrap();

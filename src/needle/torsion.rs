@@ -282,7 +282,7 @@ mod tests {
 
         /// The pieces add up to the step: insertion, and roll = rotation + change of the lag.
         #[test]
-        fn pieces_add_up(torsion in any_torsion(), lag in -3.0..3.0f64, l in prop_oneof![Just(0.0), 0.0..3.0f64], turned in -3.0..3.0f64) {
+        fn the_pieces_add_up_to_the_step(torsion in any_torsion(), lag in -3.0..3.0f64, l in prop_oneof![Just(0.0), 0.0..3.0f64], turned in -3.0..3.0f64) {
             let mut play = self::play(10.0, lag);
             let pieces: Vec<Increment> = play.advance(&torsion, increment(l, turned)).collect();
             let inserted: f64 = pieces.iter().map(|piece| piece.insertion_mm()).sum();
@@ -327,8 +327,8 @@ mod tests {
         assert_eq!(play.lag_rad(), 0.0);
     }
 
-    /// From the middle of the band the base turns 40° before the tip moves; back, it crosses the whole
-    /// band first.
+    /// From the middle of the band the base turns 40° before the tip moves. On the way back it crosses the whole band
+    /// first.
     #[test]
     fn a_reversal_crosses_the_whole_band() {
         let torsion = torsion(0.7, 0.0, 0.0, 0.0);
@@ -341,10 +341,10 @@ mod tests {
 
     /// In one step the base crosses what is left of the band, then drags the tip along.
     #[test]
-    fn the_kink_lies_within_the_step() {
+    fn a_step_is_split_where_the_lag_meets_the_edge() {
         let mut play = Play::default();
         let torsion = torsion(0.2, 0.1, 0.1, 0.0);
-        // Towards the lower edge, c − w₀ − w₁ ℓ: met at 0.1 + 0.1 s = 0.5 s.
+        // After s of the step the lag −0.5 s meets the lower edge, c − w₀ − w₁ s, where 0.1 + 0.1 s = 0.5 s.
         let pieces: Vec<Increment> = play.advance(&torsion, increment(1.0, 0.5)).collect();
         let [free, dragged] = pieces[..] else { panic!("{pieces:?}") };
         assert!((free.insertion_mm() - 0.25).abs() < 1e-12 && free.rotation_rad().abs() < 1e-15);
@@ -365,7 +365,7 @@ mod tests {
         assert!((play.lag_rad() + 0.2 + decay).abs() < 1e-12);
     }
 
-    /// The creep against small steps of its differential equation.
+    /// The reference integrates the differential equation in small steps.
     #[test]
     fn creep_solves_its_equation() {
         let torsion = torsion(0.1, 0.02, 0.05, 1.5);
@@ -386,7 +386,7 @@ mod tests {
     }
 
     #[test]
-    fn refuses_by_name() {
+    fn parameters_out_of_range_are_refused_by_name() {
         let refused = |w0, w1, c, creep, growth| {
             let config = TorsionConfig {
                 half_width_rad: w0,

@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn edges() {
+    fn a_start_in_the_plane_has_length_0_and_one_without_a_path_none() {
         let needle = Needle::new(1.0 / 122.0).unwrap();
         assert_eq!(shortest_into_plane_mm(&needle, &Reduced::default()), Some(0.0));
         let off = |x_mm: f64| Reduced { x_mm, ..Reduced::default() };
@@ -115,7 +115,7 @@ mod tests {
         assert_eq!(shortest_into_plane_mm(&needle, &off(f64::NAN)), None);
     }
 
-    /// Two quarters of a circle, and a straight across where these do not reach: from 244 mm on.
+    /// From 244 mm on, two quarters of a circle do not reach the plane.
     #[test]
     fn a_tip_far_from_the_plane_goes_straight_between_the_arcs() {
         let needle = Needle::new(1.0 / 122.0).unwrap();
@@ -129,7 +129,7 @@ mod tests {
 
     /// The point that moves along the axis is 6.5 mm behind the tip.
     #[test]
-    fn a_tip_ahead_swings_with_the_heading() {
+    fn a_tip_ahead_of_the_rear_point_is_counted() {
         let rear = Needle::new(1.0 / 122.0).unwrap();
         let needle = rear.with_tip_ahead(6.5).unwrap();
         let start = Reduced { x_mm: 20.0, pitch_rad: -0.1, roll_rad: -FRAC_PI_2 };

@@ -151,10 +151,24 @@ mod tests {
     use nalgebra::{Vector3, Vector6};
     use proptest::prelude::*;
 
+    impl Belief {
+        /// The belief of an observer without uncertainty.
+        pub(crate) fn certain(curvature_per_mm: f64, shaft: Shaft) -> Self {
+            Belief {
+                covariance: Matrix6::zeros(),
+                roll_agreement: 1.0,
+                roll_seen_rad: 0.5 * std::f64::consts::PI,
+                curvature_per_mm,
+                nis: None,
+                shaft,
+            }
+        }
+    }
+
     proptest! {
         /// For the covariance e eᵀ the deviations are the changes of the coordinates along e.
         #[test]
-        fn deviations_are_those_of_the_coordinates(
+        fn standard_deviations_are_those_of_the_coordinates(
             p in prop::array::uniform3(-50.0..50.0f64), yaw in -3.0..3.0f64, pitch in -1.3..1.3f64,
             roll in -3.0..3.0f64, e in prop::array::uniform6(-1.0..1.0f64),
         ) {

@@ -152,8 +152,7 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(64))]
 
-        /// Without noise the frame is right to the second order in the baseline, while the needle
-        /// is turned and from any pose.
+        /// Without noise the error of the frame is of second order in the baseline.
         #[test]
         fn recovers_the_frame_without_noise(yaw in -3.0..3.0f64, pitch in -1.2..1.2f64, roll in -3.0..3.0f64, omega in -0.02..0.02f64) {
             let needle = Needle::new(1.0 / 122.0).unwrap();
@@ -173,7 +172,7 @@ mod tests {
             prop_assert!((estimate.x_pb.translation - truth.translation).norm() < 1e-3);
         }
 
-        /// At any speed: between two positions there may be one increment or a hundred.
+        /// At a low speed there are many increments between two positions.
         #[test]
         fn the_number_of_increments_does_not_matter(omega in -0.05..0.05f64, parts in 2..100u32) {
             let needle = Needle::new(1.0 / 122.0).unwrap();
@@ -209,7 +208,7 @@ mod tests {
 
     /// 1 mm with a position every 0.0002 mm.
     #[test]
-    fn of_a_slow_needle_few_positions_are_kept() {
+    fn few_positions_of_a_slow_needle_are_kept() {
         let needle = Needle::new(0.01).unwrap();
         let mut observer = FiniteDifference::new(needle, 10.0).unwrap();
         for n in 1..=5000 {

@@ -61,9 +61,9 @@ mod tests {
     use crate::geometry::Pose;
     use nalgebra::Matrix3;
 
-    /// Against the turns of the tip by a small change of each angle.
+    /// The reference is the turn of the tip by a small change of each angle.
     #[test]
-    fn the_angles_at_the_start_are_as_uncertain_at_every_pitch() {
+    fn the_start_covariance_is_that_of_the_angles_at_every_pitch() {
         let sd = FixedAngles { yaw: 0.1, pitch: 0.2, roll: 0.3 };
         for (pitch, roll) in [(0.0, 0.0), (0.6, 0.0), (-1.2, 2.0), (0.4, -0.7)] {
             let start = FixedAngles { yaw: 0.5, pitch, roll };

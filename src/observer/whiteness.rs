@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn half_of_the_positions_count_before_any_is_seen() {
+    fn half_of_the_positions_count_before_any_is_measured() {
         assert_eq!(Whiteness::new(1.0).inflation(SPACING_S), PRIOR_INFLATION);
     }
 
@@ -212,10 +212,10 @@ mod tests {
         assert!((4.0..5.5).contains(&inflation), "{inflation}");
     }
 
-    /// Half of the variance is correlated over 0.2 s: of positions 25 ms apart 8.5 say as much as one,
-    /// of positions 1 s apart 1.007.
+    /// Half of the variance is correlated over 0.2 s: as much as one independent position is worth 8.5 positions
+    /// that are 25 ms apart, or 1.007 that are 1 s apart.
     #[test]
-    fn noise_that_is_told_counts_at_once_and_is_never_forgotten() {
+    fn configured_noise_counts_at_once_and_always() {
         let noise = PositionNoise {
             white_sd_mm: 0.5f64.sqrt(),
             correlated_sd_mm: 0.5f64.sqrt(),
@@ -227,21 +227,20 @@ mod tests {
         let close = |seen: f64, expected: f64| (seen / expected - 1.0).abs() < 1e-9;
         assert!(close(whiteness.inflation(0.025), expected), "{expected}");
         assert!((whiteness.inflation(1.0) - 1.007).abs() < 1e-3);
-        assert!(close(whiteness.inflation(f64::INFINITY), 1.0), "the first is a whole one");
+        assert!(close(whiteness.inflation(f64::INFINITY), 1.0), "the first counts in full");
         assert!(whiteness.inflation(0.0).is_finite());
         (0..4000).for_each(|_| whiteness.take(Vector3::zeros()));
         assert!(
             close(whiteness.inflation(0.025), expected),
-            "never more confidence than configured"
+            "less noise than configured does not count"
         );
         let white = PositionNoise { correlation_time: Duration::ZERO, ..noise };
         let whiteness = Whiteness::new(1.0).with_noise(Some(white), 0.5);
         assert!(close(whiteness.inflation(0.025), 4.0), "the observer assumes a quarter");
     }
 
-    /// What is measured counts where it is more than what is configured.
     #[test]
-    fn noise_over_what_is_told_counts() {
+    fn measured_noise_over_the_configured_counts() {
         let mut rng = Pcg64::seed_from_u64(5);
         let white = PositionNoise {
             white_sd_mm: 0.1,

@@ -237,10 +237,9 @@ mod tests {
         TipPosition::new(p).unwrap()
     }
 
-    /// Near the plane the sampled error is multiplied by the configured poles: from any error the
-    /// characteristic polynomial of the poles annihilates it.
+    /// Near the plane each sample multiplies the error by a matrix. Its eigenvalues are the configured poles.
     #[test]
-    fn the_error_decays_by_the_configured_poles() {
+    fn the_reduced_error_decays_by_the_configured_poles() {
         for spacing_mm in [0.1, 1.0, 3.0] {
             let mut poles = config();
             poles.reduced_poles_per_mm = [0.05, 0.08, 0.11];
@@ -321,7 +320,6 @@ mod tests {
             prop_assert!(wrap_angle(angles.roll - true_angles.roll).abs() < 1e-5);
         }
 
-        /// Whatever is measured and however the needle is turned, the estimate stays a pose.
         #[test]
         fn stays_finite(steps in prop::collection::vec((0.0..3.0f64, -7.0..7.0f64, prop::array::uniform3(-1e6..1e6f64)), 1..60)) {
             let mut observer = observer();
@@ -346,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn refuses_by_name() {
+    fn a_straight_needle_a_zero_pole_and_a_steep_start_are_refused() {
         let straight = Needle::new(0.0).unwrap();
         assert_eq!(Coupled::new(straight, config()).unwrap_err(), CoupledError::StraightNeedle);
         let mut bad = config();

@@ -1,4 +1,4 @@
-//! The coupled observer from every start, and its likeness to the paper's.
+//! Tests of the coupled observer: every start, and agreement with the paper's gains.
 
 use super::bank::CoupledBank;
 use super::{Coupled, CoupledConfig, Gains};
@@ -30,8 +30,8 @@ fn bank(roll_sd: f64) -> CoupledBank {
     CoupledBank::new(needle(), config(FixedAngles { yaw: 0.2, pitch: 0.15, roll: roll_sd }))
 }
 
-/// Steps of 1 mm from `tip`, with `offset` added to each measured position. The base turns back and
-/// forth by up to `turn_rad_per_mm`.
+/// Inserts `steps` mm from `tip` and measures each position with `offset` added. The base turns back and forth by
+/// up to `turn_rad_per_mm`.
 fn follow(
     observer: &mut dyn Observer,
     mut tip: Pose,
@@ -88,15 +88,15 @@ fn y_and_z_do_not_correct_the_reduced_state() {
         let (reduced, fibre) = Reduced::split(&observer.estimate().unwrap().x_pb);
         (Vector3::new(reduced.x_mm, reduced.pitch_rad, reduced.roll_rad), fibre.yaw_rad)
     };
-    let ((true_to_it, yaw), (off, yaw_off)) = (reduced(0.0), reduced(2.0));
-    assert!((true_to_it - off).norm() < 1e-9, "{true_to_it} {off}");
+    let ((exact, yaw), (off, yaw_off)) = (reduced(0.0), reduced(2.0));
+    assert!((exact - off).norm() < 1e-9, "{exact} {off}");
     assert!((yaw - yaw_off).abs() > 1e-3, "{yaw} {yaw_off}");
 }
 
-/// In the plane the gains become those of the paper's observer with its poles at the memory's rate.
-/// Their poles have that modulus but are not all real, so the gains differ by up to 8%.
+/// The reference is the paper's observer in the plane, with its poles at the rate of the memory. The poles of the
+/// fading gains have the same modulus but are not all real, so the gains differ by up to 8%.
 #[test]
-fn the_gains_settle_to_placed_ones() {
+fn the_fading_gains_settle_to_the_placed_ones() {
     let change = |observer: &mut dyn Observer| {
         let tip = follow(observer, Pose::identity(), 200, 0.0, |_| Vector3::zeros());
         let off = Vector3::new(0.1, 0.0, 0.0);
@@ -117,7 +117,6 @@ fn the_gains_settle_to_placed_ones() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(32))]
-    /// Whatever is measured and however the needle is turned, the estimate stays a pose.
     #[test]
     fn stays_finite(steps in prop::collection::vec((0.0..3.0f64, -7.0..7.0f64, prop::array::uniform3(-1e6..1e6f64)), 1..60)) {
         let mut observer = bank(PI);

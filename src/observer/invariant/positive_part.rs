@@ -60,7 +60,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// E f(a), numerically.
+    /// E f(a) for a normal `a`, by numerical integration.
     fn expect(mean: f64, sd: f64, f: impl Fn(f64) -> f64) -> f64 {
         let n = 20_000;
         let width = 20.0 / f64::from(n);

@@ -1,4 +1,4 @@
-//! The invariant observer against emulated needles, and against itself in another frame.
+//! Tests of the invariant observer: emulated needles, and the same needle in another frame.
 
 use super::*;
 use crate::geometry::{FixedAngles, Pose};
@@ -75,6 +75,7 @@ fn follow(
     tip
 }
 
+/// The error of the estimated position, mm, and of the orientation, rad.
 fn apart(estimate: &Estimate, tip: &Pose) -> (f64, f64) {
     let error = (estimate.x_pb.inverse() * *tip).log();
     (error.v.norm(), error.w.norm())
@@ -108,17 +109,16 @@ fn reports_the_roll_as_unknown_at_first() {
     assert!(!estimate.is_roll_known() && estimate.belief.unwrap().roll_agreement < 0.5);
 }
 
-/// The state does not depend on how finely the path is divided.
 #[test]
 fn the_division_of_the_path_makes_no_difference() {
-    let told = torsion(TorsionConfig {
+    let shaft = torsion(TorsionConfig {
         half_width_rad: 0.3,
         half_width_rad_per_mm: 0.004,
         ..TorsionConfig::default()
     });
     let ends = [1, 7].map(|parts| {
-        let mut observer = Invariant::new(needle(), told, config());
-        follow(&mut observer, needle(), &told, Pose::identity(), 80, parts);
+        let mut observer = Invariant::new(needle(), shaft, config());
+        follow(&mut observer, needle(), &shaft, Pose::identity(), 80, parts);
         observer.estimate().unwrap()
     });
     let (mm, rad) = apart(&ends[0], &ends[1].x_pb);
@@ -128,21 +128,21 @@ fn the_division_of_the_path_makes_no_difference() {
 /// Curvature, half-width, its growth and offset are found although they are configured wrongly.
 #[test]
 fn finds_parameters_that_are_configured_wrongly() {
-    let told = TorsionConfig {
+    let configured = TorsionConfig {
         half_width_rad: 0.7,
         half_width_rad_per_mm: 0.006,
         ..TorsionConfig::default()
     };
-    let really = TorsionConfig {
+    let actual = TorsionConfig {
         half_width_rad: 0.55,
         half_width_rad_per_mm: 0.0075,
         offset_rad: 0.3,
         ..TorsionConfig::default()
     };
     let config = InvariantConfig { curvature_sd: 0.17, ..config() };
-    let mut observer = Invariant::new(needle(), torsion(told), config);
-    let bent = Needle::new(1.2 / 122.0).unwrap();
-    let tip = follow(&mut observer, bent, &torsion(really), Pose::identity(), 300, 1);
+    let mut observer = Invariant::new(needle(), torsion(configured), config);
+    let true_needle = Needle::new(1.2 / 122.0).unwrap();
+    let tip = follow(&mut observer, true_needle, &torsion(actual), Pose::identity(), 300, 1);
     let estimate = observer.estimate().unwrap();
     let belief = estimate.belief.unwrap();
     let (mm, rad) = apart(&estimate, &tip);
@@ -156,20 +156,20 @@ fn finds_parameters_that_are_configured_wrongly() {
 /// A shaft that creeps: the observer follows the tip and finds the offset.
 #[test]
 fn follows_a_viscous_shaft() {
-    let told = TorsionConfig {
+    let configured = TorsionConfig {
         creep_mm: 0.8,
         creep_mm_per_mm: 0.006,
         offset_rad: 0.4,
         ..TorsionConfig::default()
     };
-    let really = TorsionConfig { offset_rad: 0.55, ..told };
+    let actual = TorsionConfig { offset_rad: 0.55, ..configured };
     let config = InvariantConfig {
         start_sd: FixedAngles { yaw: 0.05, pitch: 0.05, roll: 0.05 },
         torsion_offset_sd_rad: 0.15,
         ..config()
     };
-    let mut observer = Invariant::new(needle(), torsion(told), config);
-    let tip = follow(&mut observer, needle(), &torsion(really), Pose::identity(), 150, 5);
+    let mut observer = Invariant::new(needle(), torsion(configured), config);
+    let tip = follow(&mut observer, needle(), &torsion(actual), Pose::identity(), 150, 5);
     let (mm, rad) = apart(&observer.estimate().unwrap(), &tip);
     assert!(mm < 0.1 && rad < 0.05, "{mm} {rad}");
 }
@@ -179,7 +179,7 @@ fn follows_a_viscous_shaft() {
 #[test]
 fn a_twist_too_small_to_detect_widens_the_standard_deviation() {
     let rigid = Torsion::default();
-    let [sure, doubting] = [0.0, 0.01].map(|torsion_search_rad_per_mm| {
+    let [rigid_sd, searching_sd] = [0.0, 0.01].map(|torsion_search_rad_per_mm| {
         let config = InvariantConfig { torsion_search_rad_per_mm, ..config() };
         let mut observer = Invariant::new(needle(), rigid, config);
         let tip = follow(&mut observer, needle(), &rigid, Pose::identity(), 150, 1);
@@ -188,7 +188,7 @@ fn a_twist_too_small_to_detect_widens_the_standard_deviation() {
         assert!(error_rad < 0.01, "{error_rad}");
         estimate.sd.unwrap()[5]
     });
-    assert!(doubting > 3.0 * sure, "{doubting} {sure}");
+    assert!(searching_sd > 3.0 * rigid_sd, "{searching_sd} {rigid_sd}");
 }
 
 #[test]
@@ -265,7 +265,7 @@ proptest! {
     fn the_transition_is_the_derivative_of_the_prediction(
         turn in 0.0..1.5f64, before in 0.1..1.0f64, nudged in 0..error_state::STATES,
     ) {
-        let told = torsion(TorsionConfig {
+        let shaft = torsion(TorsionConfig {
             half_width_rad: 0.2,
             half_width_rad_per_mm: 0.003,
             creep_mm: 1.5,
@@ -277,7 +277,7 @@ proptest! {
             ..config()
         };
         let tip_meas = TipPosition::new(Vector3::zeros()).unwrap();
-        let bank = config.bank(&needle(), &told, &tip_meas);
+        let bank = config.bank(&needle(), &shaft, &tip_meas);
         // No reversal, which would start another stroke and replace the anchor.
         let path = [before, turn].map(|turn| Increment::new(1.0, turn).unwrap());
         let moved = |nudge: f64| {
