@@ -262,7 +262,7 @@ mod tests {
             }
         }
 
-        /// The bound falls by at most what is driven, on any arc: it never over-estimates.
+        /// On any arc the bound falls by at most the length of the arc, so it never over-estimates.
         #[test]
         fn the_bound_is_consistent(tip in tip(), point in point(), side in -1.0..1.0f64, l in 0.0..3.0f64) {
             let h = |tip: &Tip| tip.shortest_mm(&point, CURVATURE_PER_MM, 0.0, false);
@@ -271,12 +271,12 @@ mod tests {
             for curvature_per_mm in [0.0, CURVATURE_PER_MM] {
                 let arc = Arc { bend: first * cos + second * sin, curvature_per_mm, length_mm: l };
                 let (before, after) = (h(&tip), h(&tip.after(&arc)));
-                // From outside the turning circle to inside of it the bound may fall to half a circle.
+                // On the way into the turning circle the bound may fall to half a circle.
                 prop_assert!(before <= l + after + 1e-6 || after == PI * 50.0, "{before} {after}");
             }
         }
 
-        /// Without a tolerance the bound is the length of a way: away from the point, then around it.
+        /// Without a tolerance there is a way as long as the bound: away from the point, then around it.
         #[test]
         fn away_and_then_around_is_as_long_as_the_bound(away_rad in 0.01..1.0f64, around_rad in PI..TAU) {
             let start = Tip { position_mm: Vector3::zeros(), heading: Vector3::z() };
@@ -306,9 +306,9 @@ mod tests {
 
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(3000))]
-        /// No way in the plane is shorter than the bound, wherever within the tolerance it ends.
+        /// The ways end anywhere within the tolerance.
         #[test]
-        fn no_way_in_the_plane_is_shorter(
+        fn no_way_in_the_plane_is_shorter_than_the_bound(
             away_mm in 0.0..60.0f64, around_mm in 100.0..300.0f64,
             others in prop::collection::vec(
                 (prop::sample::select(vec![-1.0, 0.0, 1.0]), 0.0..60.0f64), 0..3
@@ -333,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn edges() {
+    fn points_without_an_arc_give_none() {
         let tip = Tip { position_mm: Vector3::zeros(), heading: Vector3::z() };
         let ahead = Vector3::new(0.0, 0.0, 80.0);
         let [arc, straight] = tip.arc_then_straight_to(&ahead, CURVATURE_PER_MM).unwrap();
@@ -344,7 +344,7 @@ mod tests {
         assert!(
             tip.arc_then_straight_to(&Vector3::new(0.0, 50.0, 0.0), CURVATURE_PER_MM).is_none()
         );
-        // The far side of the turning circle, half a turn on.
+        // The point on the far side of the turning circle is half a turn away.
         let beside = Vector3::new(0.0, 100.0, 0.0);
         assert!((tip.shortest_mm(&beside, CURVATURE_PER_MM, 0.0, false) - PI * 50.0).abs() < 1e-6);
     }

@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_mask_ends_where_the_grid_does() {
+    fn the_depth_in_a_full_mask_is_that_to_the_edge_of_the_grid() {
         let mask = Mask::new(SIZE, SPACING_MM, &[true; 210], &Pose::identity()).unwrap();
         let depth_mm = -mask.distance_mm(&Vector3::new(3.0, 4.0, 1.5));
         assert!((1.5..4.0).contains(&depth_mm), "{depth_mm}");
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_mask_is_refused() {
+    fn a_mask_of_impossible_size_is_refused() {
         let refused = |size, spacing: f64, count: usize| {
             let occupied = vec![false; count];
             Mask::new(size, Vector3::repeat(spacing), &occupied, &Pose::identity()).unwrap_err()

@@ -198,10 +198,10 @@ mod tests {
         vec![Obstacle::Sphere { centre_mm: centre_mm.into(), radius_mm }]
     }
 
-    /// The nearest point with the clearance is 8.4 mm away, on the far side of a ball with the target in it;
-    /// straight ahead the ball is met 14 mm away.
+    /// The target is in a ball. The nearest point with the clearance is 8.4 mm away, on the far side; straight ahead
+    /// it is 14 mm away.
     #[test]
-    fn a_target_in_an_obstacle_is_neared_around_it() {
+    fn the_nearest_point_to_a_target_in_an_obstacle_is_on_its_far_side() {
         for in_plane in [true, false] {
             let world = world(ball([0.0, 3.0, 118.0], 10.0));
             let sharp = problem([0.0, 0.0, 120.0], in_plane);
@@ -224,7 +224,7 @@ mod tests {
         }
     }
 
-    /// The cells of the search are too coarse for the one way past this ball.
+    /// The cells of the search are too coarse for the only path past this ball.
     #[test]
     fn a_nearest_point_within_the_tolerance_is_a_plan() {
         let world = world(ball([0.0, 0.0, 60.0], 8.0));

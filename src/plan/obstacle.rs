@@ -169,7 +169,7 @@ mod tests {
     }
 
     proptest! {
-        /// What `plan` answers without a search follows from this. The voxels of a mask are larger than a step.
+        /// `plan` refuses targets without a search by this bound. The mask's voxels are larger than a step.
         #[test]
         fn no_point_near_has_more_slack_than_the_bound(
             other in obstacle(), p in point(25.0), step in point(5.0),
@@ -186,7 +186,7 @@ mod tests {
             prop_assert!(world.slack_mm(&(p + step), 2.0) <= bound_mm + 1e-9);
         }
 
-        /// A distance: it changes by at most the way, and following it leads to the surface.
+        /// A distance changes by at most the step, and following its slope leads to the surface.
         #[test]
         fn distances_are_exact(obstacle in obstacle(), p in point(60.0), step in point(5.0)) {
             let d = |p: &Vector3<f64>| obstacle.distance_mm(p);
@@ -197,7 +197,7 @@ mod tests {
                 let step = Vector3::ith(i, h);
                 (d(&(p + step)) - d(&(p - step))) / (2.0 * h)
             });
-            // Away from edges, where two surfaces are equally near.
+            // The slope is 1 except where two surfaces are equally near.
             if (slope.norm() - 1.0).abs() < 1e-6 {
                 prop_assert!(d(&(p - slope * here_mm)).abs() < 1e-4, "{here_mm}");
             } else {
@@ -206,7 +206,7 @@ mod tests {
         }
 
         #[test]
-        fn a_cylinder_of_an_axis_is_the_same_either_way(cylinder in cylinder(), p in point(60.0)) {
+        fn a_cylinder_is_the_same_with_its_ends_swapped(cylinder in cylinder(), p in point(60.0)) {
             let Obstacle::Cylinder { from_mm, to_mm, radius_mm } = cylinder.clone() else { return Ok(()) };
             let other = Obstacle::Cylinder { from_mm: to_mm, to_mm: from_mm, radius_mm };
             prop_assert!((cylinder.distance_mm(&p) - other.distance_mm(&p)).abs() < 1e-9);
@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn by_hand() {
+    fn distances_equal_those_found_by_hand() {
         let at = Vector3::new;
         let cylinder = Obstacle::Cylinder {
             from_mm: at(0.0, 0.0, 0.0),
@@ -235,14 +235,13 @@ mod tests {
         let workspace = Workspace { min_mm, max_mm, start_mm: None };
         let world = World { obstacles: vec![], workspace };
         assert_eq!(world.distance_mm(&at(5.0, 5.0, 5.0)), f64::INFINITY);
-        assert_eq!(world.slack_mm(&at(5.0, 9.0, 5.0), 2.0), 1.0, "no clearance to the walls");
+        assert_eq!(world.slack_mm(&at(5.0, 9.0, 5.0), 2.0), 1.0, "walls need no clearance");
         assert_eq!(world.slack_mm(&at(5.0, 11.0, 5.0), 2.0), -1.0);
         assert_eq!(world.slack_mm(&at(5.0, f64::NAN, 5.0), 2.0), f64::NEG_INFINITY);
     }
 
-    /// A start on a wall has room beyond it; the wall has none elsewhere.
     #[test]
-    fn the_room_at_the_start_is_there_alone() {
+    fn room_beyond_a_wall_is_at_the_start_alone() {
         let at = Vector3::new;
         let [min_mm, max_mm] = [at(0.0, 0.0, 0.0), at(10.0, 10.0, 10.0)];
         let workspace = Workspace { min_mm, max_mm, start_mm: Some(at(5.0, 5.0, 0.0)) };

@@ -56,7 +56,7 @@ mod tests {
     use crate::plan::Obstacle;
     use crate::plan::search::tests::{problem, world};
 
-    /// A ball on one side of the straight way.
+    /// A ball is on one side of the straight path.
     #[test]
     fn points_are_clear_obstructed_or_out_of_reach() {
         let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, 8.0, 50.0), radius_mm: 5.0 };
@@ -74,7 +74,7 @@ mod tests {
         }
     }
 
-    /// The arc swings 6.8 mm aside, and the wall is 5 mm beside its ends.
+    /// The arc swings 6.8 mm aside. A wall is 5 mm beside its ends.
     #[test]
     fn an_arc_that_leaves_the_workspace_on_its_way_is_obstructed() {
         let problem = problem([0.0, 70.0, 90.0], true);

@@ -89,8 +89,8 @@ mod tests {
     use crate::plan::{Obstacle, plan};
     use nalgebra::Vector3;
 
-    /// The path between two balls, with a gap of `gap_mm` between each and the axis, found with so many
-    /// expansions, and how near it comes to them. Around them there is no path.
+    /// The path between two balls, each `gap_mm` from the axis, and its distance to them. Around them there is no
+    /// path.
     fn planned(
         gap_mm: f64,
         least_mm: f64,
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_with_less_than_the_least_reserve_is_none() {
+    fn a_path_with_less_than_the_least_reserve_is_refused() {
         let clearance_mm = problem([0.0, 0.0, 120.0], true).clearance_mm;
         let (distance_mm, roomy) = planned(clearance_mm + 0.6, 0.5, MANY).expect("it keeps more");
         assert!(distance_mm >= clearance_mm + 0.5 - 1e-3 && roomy.reserve_mm == 0.5);
@@ -134,9 +134,9 @@ mod tests {
         assert!(!reason.contains("goal.reserve_mm"), "{reason}");
     }
 
-    /// The first expansions find a path. Only a whole search shows that no path keeps more.
+    /// The first expansions find a path. Only a complete search shows that no path keeps more.
     #[test]
-    fn a_spent_budget_is_not_taken_for_no_path() {
+    fn a_spent_budget_is_not_reported_as_no_path() {
         let clearance_mm = problem([0.0, 0.0, 120.0], true).clearance_mm;
         let NoRoomyPath { status, reason } =
             planned(clearance_mm + 0.4, 0.5, 10).expect_err("it keeps less");

@@ -209,8 +209,7 @@ mod tests {
     }
 
     proptest! {
-        /// Every way ends where it is to end, and a place ahead that is aside by no more than two arcs
-        /// can turn has one.
+        /// Every way ends at its goal. A goal ahead that two arcs can reach has a way.
         #[test]
         fn ways_end_at_place_and_heading(
             y in -2.0..2.0f64, z in 60.0..100.0f64, turned in -0.05..0.05f64, heading in -1.0..1.0f64,

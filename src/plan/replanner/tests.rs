@@ -1,6 +1,7 @@
-//! A simulated needle that follows what is planned anew each step.
+//! A simulated needle that follows a path that is planned again at each step.
 
-use super::super::{Obstacle, Workspace, plan};
+use super::super::search::tests::world;
+use super::super::{Obstacle, plan, search};
 use super::*;
 use crate::geometry::Pose;
 use crate::needle::{Increment, Needle};
@@ -11,24 +12,10 @@ const RADIUS_MM: f64 = 122.0;
 const STEP_MM: f64 = 1.0;
 
 fn problem(target_mm: [f64; 3], in_plane: bool) -> Problem {
-    Problem {
-        start: Tip { position_mm: Vector3::zeros(), heading: Vector3::z() },
-        target_mm: target_mm.into(),
-        tolerance_mm: 1.0,
-        curvature_per_mm: 1.0 / RADIUS_MM,
-        clearance_mm: 2.0,
-        length_max_mm: 300.0,
-        in_plane,
-        expansions_max: 20_000,
-    }
+    Problem { expansions_max: 20_000, ..search::tests::problem(target_mm, in_plane) }
 }
 
-fn world(obstacles: Vec<Obstacle>) -> World {
-    let [min_mm, max_mm] = [[-50.0, -75.0, 0.0], [50.0, 75.0, 150.0]].map(Vector3::from);
-    World { obstacles, workspace: Workspace { min_mm, max_mm, start_mm: None } }
-}
-
-/// An exact needle that flips between the two branches of the roll.
+/// A needle without errors that bends either toward `bend` or away from it.
 struct Simulated {
     tip: Tip,
     needle: Needle,
@@ -40,7 +27,7 @@ impl Simulated {
         Simulated { tip, needle: Needle::new(radius_mm.recip()).unwrap() }
     }
 
-    /// Inserts `length_mm` with the needle bent toward `bend`: an unturned one bends toward -y.
+    /// Inserts `length_mm` with the needle bent toward `bend`. An unturned needle bends toward -y.
     fn insert(&mut self, bend: &Vector3<f64>, length_mm: f64) {
         let Tip { position_mm, heading } = self.tip;
         let y = -bend;
@@ -51,9 +38,9 @@ impl Simulated {
         self.tip = Tip { position_mm: pose.translation, heading: pose.rotation * Vector3::z() };
     }
 
-    /// One step with `steer`, of which the bench believes the radius to be `believed_mm`.
-    fn step(&mut self, steer: &Steer, believed_mm: f64) {
-        let share = 0.5 * (1.0 + (steer.curvature_per_mm * believed_mm).clamp(-1.0, 1.0));
+    /// One step of `steer`, by a bench that assumes the radius `assumed_mm`.
+    fn step(&mut self, steer: &Steer, assumed_mm: f64) {
+        let share = 0.5 * (1.0 + (steer.curvature_per_mm * assumed_mm).clamp(-1.0, 1.0));
         let step_mm = steer.remaining_mm.min(STEP_MM);
         for (side, part) in [(1.0, share), (-1.0, 1.0 - share)] {
             let heading = self.tip.heading;
@@ -63,14 +50,20 @@ impl Simulated {
     }
 }
 
-/// An estimate with the curvature of `problem`, whose position and heading are well known.
+/// An estimate with a small uncertainty and the curvature of `problem`.
 fn known(tip: Tip, problem: &Problem) -> TipEstimate {
     let curvature_per_mm = problem.curvature_per_mm;
     TipEstimate { tip, curvature_per_mm, position_sd_mm: 0.05, heading_sd_rad: 0.001 }
 }
 
-/// Steers a needle of `true_mm` radius that is believed to be of `RADIUS_MM`: the last step, and the
-/// least distance to an obstacle.
+/// An estimate of a position without uncertainty.
+fn exact(tip: Tip) -> TipEstimate {
+    let curvature_per_mm = RADIUS_MM.recip();
+    TipEstimate { tip, curvature_per_mm, position_sd_mm: 0.0, heading_sd_rad: 0.001 }
+}
+
+/// Steers a needle of radius `true_mm` that the bench assumes to be `RADIUS_MM`. Returns the last step, the least
+/// distance to an obstacle and the needle.
 fn run(world: &World, problem: &Problem, true_mm: f64) -> (Step, f64, Simulated) {
     let mut planner = Replanner::new(world.clone(), problem.clone(), 0.0, None);
     let mut needle = Simulated::new(true_mm);
@@ -101,7 +94,7 @@ fn a_whole_turn_needs_a_path_after_it() {
     let aside = |share: f64| ([0.0, share * reach_mm, 100.0], vec![]);
     let sphere = |y, z| Obstacle::Sphere { centre_mm: Vector3::new(0.0, y, z), radius_mm: 3.0 };
     let ball = |z| sphere(1.0, z);
-    // 6 mm of 100 are a share of 12% of what is reached.
+    // A turn takes 6 mm of the 100 mm, and with them 12% of the reach.
     let cases = [
         (([0.0, 0.1, 5.0], vec![]), true),
         (([0.0, 0.1, 5.0], vec![sphere(-5.05, 5.0)]), false),
@@ -126,9 +119,9 @@ fn a_whole_turn_needs_a_path_after_it() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
-    /// Of what one arc can reach, at most 90%: the curvature believed is right.
+    /// Targets at up to 90% of what one arc can reach, with the right curvature.
     #[test]
-    fn targets_within_reach_are_met(
+    fn targets_within_reach_are_reached(
         z in 80.0..140.0f64, share in 0.0..0.9f64, turn in 0.0..6.3f64, in_plane in any::<bool>(),
     ) {
         let reach_mm = share * (RADIUS_MM - (RADIUS_MM * RADIUS_MM - z * z).max(0.0).sqrt());
@@ -136,12 +129,12 @@ proptest! {
         let turn = if in_plane { 0.5 * std::f64::consts::PI } else { turn };
         let target_mm = [reach_mm * turn.cos() * f64::from(!in_plane), reach_mm * turn.sin(), z];
         let (end, ..) = run(&world(vec![]), &problem(target_mm, in_plane), RADIUS_MM);
-        // It ends at a whole step, up to half a step away along the path.
+        // The path ends at a whole step, up to half a step from the target.
         prop_assert!(error_mm(&end) <= 0.5 * STEP_MM + 0.15, "{end:?}");
     }
 
     #[test]
-    fn a_curvature_that_is_wrong_is_made_good(
+    fn a_wrong_curvature_is_corrected_on_the_way(
         z in 80.0..140.0f64, share in 0.0..0.7f64, wrong in 0.85..1.15f64,
     ) {
         let reach_mm = share * (RADIUS_MM - (RADIUS_MM * RADIUS_MM - z * z).max(0.0).sqrt());
@@ -150,17 +143,17 @@ proptest! {
         prop_assert!(error_mm(&end) <= 1.0, "within the tolerance: {end:?}");
     }
 
-    /// Never nearer than the clearance less what the tip is known, whatever comes.
+    /// The needle may come nearer than the clearance only by the uncertainty of the tip.
     #[test]
-    fn obstacles_are_kept_clear_of(
+    fn the_clearance_to_obstacles_is_kept(
         spheres in prop::collection::vec((-15.0..15.0f64, 30.0..100.0f64, 3.0..10.0f64), 1..4),
         wrong in 0.7..1.4f64,
     ) {
         let sphere = |(y, z, radius_mm)| Obstacle::Sphere { centre_mm: Vector3::new(0.0, y, z), radius_mm };
         let world = world(spheres.into_iter().map(sphere).collect());
         let (_, least_mm, _) = run(&world, &problem([0.0, 5.0, 130.0], true), RADIUS_MM * wrong);
-        // Within one step an estimate of the curvature that is wrong by 40% leads astray by less.
-        // It may come nearer by two standard deviations.
+        // 0.05 mm: within one step a curvature that is wrong by 40% leads astray by less. Then two standard
+        // deviations of the position.
         prop_assert!(least_mm > 2.0 - 0.05 - SDS * 0.05, "{least_mm}");
     }
 }
@@ -174,11 +167,11 @@ fn a_way_around_is_found_and_kept() {
         let (end, least_mm, _) = run(&world, &problem, RADIUS_MM);
         assert!(error_mm(&end) < 0.7, "{end:?}");
         assert!(least_mm >= 2.0, "{least_mm}");
-        assert_eq!(run(&world, &problem, RADIUS_MM).0, end, "the same again");
+        assert_eq!(run(&world, &problem, RADIUS_MM).0, end, "a second run is the same");
     }
 }
 
-/// The plan with which a run begins is carried on, without the expansions to find it again.
+/// A run begins with a plan, and has no expansions to find it again.
 #[test]
 fn a_plan_that_is_given_is_followed() {
     let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, 1.0, 60.0), radius_mm: 4.0 };
@@ -187,12 +180,7 @@ fn a_plan_that_is_given_is_followed() {
     problem.clearance_mm += 0.5;
     let path = plan(&world, &problem).path;
     (problem.clearance_mm, problem.expansions_max) = (2.0, 0);
-    let estimate = TipEstimate {
-        tip: problem.start,
-        curvature_per_mm: 1.0 / RADIUS_MM,
-        position_sd_mm: 0.05,
-        heading_sd_rad: 0.001,
-    };
+    let estimate = known(problem.start, &problem);
     let first = |path: Option<Path>| {
         Replanner::new(world.clone(), problem.clone(), 0.0, path).step(&estimate, 0.0, STEP_MM)
     };
@@ -200,13 +188,13 @@ fn a_plan_that_is_given_is_followed() {
         Step::Steer(steer) => steer,
         other => panic!("{other:?}"),
     };
-    // Without a path the needle goes on at the target for a few millimetres.
+    // Without a path the needle goes on toward the target for a few millimetres.
     assert_eq!(steer(first(None)).curvature_per_mm, 0.0);
     assert!(steer(first(path)).curvature_per_mm > 0.0);
 }
 
-/// A heading that is not known yet may be off by 6 degrees: then the plan still leads to the target, as
-/// far as anyone knows, and toward the target there is an obstacle.
+/// The estimated heading is off by 6 degrees, within its uncertainty, so the plan may still lead to the target. An
+/// obstacle is on the direct path.
 #[test]
 fn a_plan_is_followed_while_the_heading_is_hardly_known() {
     let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, -1.0, 60.0), radius_mm: 6.0 };
@@ -232,17 +220,17 @@ fn a_plan_is_followed_while_the_heading_is_hardly_known() {
     assert!(toward_y(path) > 0.0 && toward_y(None) < 0.0);
 }
 
-/// A needle that does not bend is held before it comes nearer than the clearance.
+/// The needle does not bend. It stops before it comes nearer than the clearance.
 #[test]
-fn when_no_way_is_left_the_insertion_is_held() {
+fn when_no_path_is_left_the_insertion_stops() {
     let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, 1.0, 60.0), radius_mm: 6.0 };
     let (end, least_mm, needle) = run(&world(vec![ball]), &problem([0.0, 0.0, 130.0], true), 1e5);
     assert_eq!(end, Step::Stop(StopReason::NoPath));
     assert!(least_mm >= 2.0 && needle.tip.position_mm.z > 10.0, "{least_mm}");
 }
 
-/// A ball beside the way, so that a step straight ahead comes 0.15 mm nearer than the clearance: the needle is
-/// held before, unless a standard deviation of the position is more than that.
+/// A step straight ahead would come 0.15 mm nearer to a ball than the clearance. The run stops unless a standard
+/// deviation of the position is larger than that.
 #[test]
 fn a_step_ahead_that_is_nearer_than_the_clearance_is_not_made() {
     for in_plane in [true, false] {
@@ -261,7 +249,7 @@ fn a_step_ahead_that_is_nearer_than_the_clearance_is_not_made() {
     }
 }
 
-/// 120 mm are left to insert, or 118: less than the way to the target by more than the tolerance.
+/// The target is 120 mm away.
 #[test]
 fn a_start_from_which_the_path_is_too_long_is_refused() {
     let problem = problem([0.0, 0.0, 120.0], true);
@@ -278,11 +266,11 @@ fn a_start_from_which_the_path_is_too_long_is_refused() {
 
 /// One arc to the target is 128.7 mm long, and a sharper one with a straight after it 127 mm.
 #[test]
-fn one_arc_that_is_too_long_does_not_replace_a_path_that_is_not() {
+fn one_arc_that_is_too_long_does_not_replace_a_path_that_fits() {
     let world = world(vec![]);
     let problem = Problem { length_max_mm: 127.5, ..problem([0.0, 40.0, 120.0], true) };
     let path = plan(&world, &problem).path;
-    assert!(path.is_some(), "it is short enough");
+    assert!(path.is_some(), "a path of two pieces is short enough");
     let mut planner = Replanner::new(world, problem.clone(), 0.0, path);
     let mut needle = Simulated::new(RADIUS_MM);
     for step in 0..100 {
@@ -297,9 +285,9 @@ fn one_arc_that_is_too_long_does_not_replace_a_path_that_is_not() {
     }
 }
 
-/// The insertion may end a little deeper than it was to: then there is no way left, and none backwards.
+/// The insertion may end a little deeper than allowed. Then no length is left for a path.
 #[test]
-fn beyond_the_longest_path_nothing_leads_back() {
+fn beyond_the_allowed_length_no_path_goes_backwards() {
     let mut problem = Problem { length_max_mm: 1.0, ..problem([0.0, 60.0, 60.0], true) };
     problem.start.position_mm.z = 10.0;
     let mut planner = Replanner::new(world(vec![]), problem.clone(), 0.0, None);
@@ -312,7 +300,7 @@ fn beyond_the_longest_path_nothing_leads_back() {
 }
 
 #[test]
-fn a_tip_that_is_no_number_is_held() {
+fn a_tip_that_is_not_finite_stops_the_insertion() {
     let problem = problem([0.0, 0.0, 120.0], false);
     let mut planner = Replanner::new(world(vec![]), problem.clone(), 0.0, None);
     let tip = Tip { position_mm: Vector3::new(0.0, f64::NAN, 10.0), ..problem.start };
@@ -320,9 +308,9 @@ fn a_tip_that_is_no_number_is_held() {
     assert_eq!(planner.step(&estimate, 1.0, STEP_MM), Step::Stop(StopReason::TipNotAllowed));
 }
 
-/// No step goes beyond the target, to what is behind it.
+/// No step goes beyond the target, where the obstacle is.
 #[test]
-fn a_target_right_before_an_obstacle_is_met() {
+fn a_target_right_in_front_of_an_obstacle_is_reached() {
     for in_plane in [true, false] {
         let target_mm = [0.0, 0.0, 100.4];
         let centre_mm = Vector3::from(target_mm) + Vector3::z() * (6.0 + 2.1);
@@ -332,29 +320,28 @@ fn a_target_right_before_an_obstacle_is_met() {
     }
 }
 
+/// The target moves 3 mm in 90 steps.
 #[test]
-fn a_target_that_moves_is_followed_and_a_tip_at_an_obstacle_is_held() {
+fn a_target_that_moves_is_followed() {
     let mut planner = Replanner::new(world(vec![]), problem([0.0, 0.0, 120.0], true), 0.0, None);
     let mut needle = Simulated::new(RADIUS_MM);
-    let estimate = |needle: &Simulated| TipEstimate {
-        tip: needle.tip,
-        curvature_per_mm: 1.0 / RADIUS_MM,
-        position_sd_mm: 0.0,
-        heading_sd_rad: 0.001,
-    };
     let mut mm = 0.0;
     loop {
-        // 3 mm on the way.
         planner.set_target(Vector3::new(0.0, 3.0 * f64::min(mm / 90.0, 1.0), 120.0));
-        match planner.step(&estimate(&needle), 1.0, 1.0) {
+        match planner.step(&exact(needle.tip), 1.0, 1.0) {
             Step::Steer(steer) => needle.step(&steer, RADIUS_MM),
             end => break assert!(error_mm(&end) < 0.6, "{end:?}"),
         }
         mm += 1.0;
     }
+}
+
+#[test]
+fn a_tip_at_an_obstacle_stops_the_insertion() {
     let ball = Obstacle::Sphere { centre_mm: Vector3::zeros(), radius_mm: 1.0 };
-    let mut planner =
-        Replanner::new(world(vec![ball]), problem([0.0, 0.0, 120.0], true), 0.0, None);
-    let first = planner.step(&estimate(&Simulated::new(RADIUS_MM)), 0.0, 1.0);
+    let problem = problem([0.0, 0.0, 120.0], true);
+    let estimate = exact(problem.start);
+    let mut planner = Replanner::new(world(vec![ball]), problem, 0.0, None);
+    let first = planner.step(&estimate, 0.0, STEP_MM);
     assert_eq!(first, Step::Stop(StopReason::TipNotAllowed));
 }

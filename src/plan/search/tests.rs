@@ -26,7 +26,7 @@ fn sphere(centre_mm: [f64; 3], radius_mm: f64) -> Obstacle {
     Obstacle::Sphere { centre_mm: centre_mm.into(), radius_mm }
 }
 
-/// The path, which is one that the needle can follow.
+/// The path of `answer`, after checking that the needle can follow it.
 fn path(world: &World, problem: &Problem, answer: &Answer) -> Path {
     let path = answer.path.clone().unwrap_or_else(|| panic!("{answer:?}"));
     assert_eq!(path.start, problem.start);
@@ -46,7 +46,7 @@ fn path(world: &World, problem: &Problem, answer: &Answer) -> Path {
 }
 
 #[test]
-fn with_nothing_in_the_way_the_first_try_is_the_plan() {
+fn without_obstacles_the_first_try_is_the_plan() {
     let world = world(vec![]);
     for in_plane in [true, false] {
         let problem = problem([0.0, 20.0, 120.0], in_plane);
@@ -58,9 +58,9 @@ fn with_nothing_in_the_way_the_first_try_is_the_plan() {
     }
 }
 
-/// However near the target is: short of it by the tolerance the path would cost the same.
+/// A path that ended short of the target by the tolerance would cost the same.
 #[test]
-fn a_target_straight_ahead_is_the_end() {
+fn a_path_straight_ahead_ends_at_the_target() {
     for (in_plane, z_mm) in [(true, 1.5), (false, 1.5), (true, 3.0), (false, 3.0), (true, 4.7)] {
         let problem = problem([0.0, 0.0, z_mm], in_plane);
         let answer = plan(&world(vec![]), &problem);
@@ -69,9 +69,8 @@ fn a_target_straight_ahead_is_the_end() {
     }
 }
 
-/// In space the needle passes a wall that has no way through in the plane.
 #[test]
-fn what_the_plane_does_not_allow_space_may() {
+fn a_wall_that_blocks_the_plane_is_passed_in_space() {
     let wall = Obstacle::Box {
         min_mm: Vector3::new(-3.0, -100.0, 60.0),
         max_mm: Vector3::new(100.0, 100.0, 65.0),
@@ -103,7 +102,7 @@ fn a_target_out_of_bounds_needs_no_search() {
 }
 
 #[test]
-fn why_there_is_none() {
+fn each_answer_without_a_path_gives_its_reason() {
     let mut reasons = String::new();
     let mut none = |obstacles: Vec<Obstacle>, change: &dyn Fn(&mut Problem)| {
         let world = world(obstacles);
@@ -138,7 +137,7 @@ fn why_there_is_none() {
     insta::assert_snapshot!(reasons);
 }
 
-/// A search that is cut short says so, and what it found by then is a path.
+/// A search that ends early says so. A path that it has found by then can be followed.
 #[test]
 fn a_budget_ends_the_search() {
     let world = world(vec![sphere([0.0, 1.0, 70.0], 5.0)]);
@@ -158,9 +157,9 @@ fn a_budget_ends_the_search() {
     assert_eq!(plan(&world, &problem).status, Status::Plan);
 }
 
-/// The first arc is as long as the way to this ball, and ends beyond it.
+/// The first arc of the search would end beyond this ball.
 #[test]
-fn a_small_obstacle_right_ahead_is_kept_clear_of() {
+fn a_small_obstacle_right_ahead_is_not_passed_through() {
     for (in_plane, z_mm) in [(true, 1.0), (false, 6.0)] {
         let small = sphere([0.0, 0.0, z_mm], 0.3);
         let world = world(vec![small]);
@@ -168,13 +167,9 @@ fn a_small_obstacle_right_ahead_is_kept_clear_of() {
         let answer = plan(&world, &problem);
         assert!(answer.path.is_none(), "{answer:?}");
         assert!(answer.nearest_mm.is_some_and(|at| at.z < z_mm), "{answer:?}");
-        let aside = plan_world_with([0.0, 2.0, z_mm + 3.0]);
+        let aside = self::world(vec![sphere([0.0, 2.0, z_mm + 3.0], 0.8)]);
         path(&aside, &problem, &plan(&aside, &problem));
     }
-}
-
-fn plan_world_with(centre_mm: [f64; 3]) -> World {
-    world(vec![sphere(centre_mm, 0.8)])
 }
 
 proptest! {
@@ -190,12 +185,11 @@ proptest! {
         let world = world(spheres.collect());
         let problem = problem([x, y, z], false);
         let answer = plan(&world, &problem);
-        prop_assert_eq!(&answer, &plan(&world, &problem), "the same again");
+        prop_assert_eq!(&answer, &plan(&world, &problem), "a second search is the same");
         prop_assert_eq!(answer.path.is_none(), answer.reason.is_some());
         if answer.path.is_some() {
             path(&world, &problem, &answer);
         } else {
-            // Seldom, and seldom without a reason at hand.
             prop_assert!(answer.status != Status::Plan);
         }
     }
