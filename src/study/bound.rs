@@ -222,7 +222,7 @@ mod tests {
         bound
     }
 
-    /// n positions at one place: the variance is that of their mean.
+    /// The variance is that of the mean of the positions.
     #[test]
     fn positions_at_standstill_average() {
         let mut bound = InformationBound::new(
@@ -242,7 +242,7 @@ mod tests {
     /// apart, with variance `12 σ² / (n (n² − 1))`. The end of the line has the variance `σ² (4 n −
     /// 2) / (n (n + 1))`.
     #[test]
-    fn a_straight_needle_is_a_regression() {
+    fn the_bound_of_a_straight_needle_is_that_of_a_regression() {
         let straight = Needle::new(0.0).unwrap();
         let unknown = Prior { angles_rad2: Vector3::repeat(1e4), ..prior(Vector4::zeros()) };
         let start = Pose::identity();
@@ -257,7 +257,7 @@ mod tests {
         let [x_mm, _, z_mm, _, pitch_rad, _] = bound.standard_deviations();
         assert!((pitch_rad.powi(2) / (12.0 * 0.25 / (n * (n * n - 1.0))) - 1.0).abs() < 1e-3);
         assert!((x_mm.powi(2) / (0.25 * (4.0 * n - 2.0) / (n * (n + 1.0))) - 1.0).abs() < 1e-3);
-        assert!((z_mm.powi(2) / (0.25 / n) - 1.0).abs() < 1e-3, "positions average along the path");
+        assert!((z_mm.powi(2) / (0.25 / n) - 1.0).abs() < 1e-3, "averaged along the path");
     }
 
     proptest! {
@@ -288,9 +288,9 @@ mod tests {
         }
     }
 
-    /// Unknown parameters of the needle raise the bound; a parameter with variance 0 does not.
+    /// A parameter with variance 0 does not raise it.
     #[test]
-    fn parameters_that_are_not_known_widen_the_bound() {
+    fn unknown_parameters_raise_the_bound() {
         let start = Pose::identity();
         let known = along(start, Vector4::zeros()).standard_deviations();
         let curvature = along(start, Vector4::new(1e-6, 0.0, 0.0, 0.0)).standard_deviations();
@@ -306,7 +306,7 @@ mod tests {
         assert!(torsion[5] > 5.0 * known[5], "torsion shows in the roll: {torsion:?} {known:?}");
     }
 
-    /// The Jacobian's columns agree with the end of a step at more curvature and more roll.
+    /// The reference is a step with a little more curvature.
     #[test]
     fn sensitivities_are_derivatives_of_the_step() {
         let increment = Increment::new(1.0, 0.3).unwrap();
@@ -317,15 +317,13 @@ mod tests {
         assert!((column - moved).norm() < 1e-4, "{column} {moved}");
     }
 
-    /// On an edge the lag follows the parameters that move the edge; within the band it follows
-    /// none.
     #[test]
-    fn the_lag_depends_on_its_band_where_it_touches() {
+    fn the_lag_depends_on_the_band_at_its_edges_only() {
         let config = TorsionConfig { half_width_rad: 0.2, ..TorsionConfig::default() };
         let mut sensitivity = TorsionSensitivity::new(Torsion::new(config).unwrap());
         let base = |turn| Increment::new(1.0, turn).unwrap();
         assert_eq!(sensitivity.advance(base(0.1)), [0.0; 3]);
-        // At the lower edge, c − w₀ − w₁ ℓ, 2 mm deep.
+        // The lag is at the lower edge, c − w₀ − w₁ ℓ, with ℓ = 2 mm.
         let [width, growth, offset] = sensitivity.advance(base(0.5));
         assert!(
             (width + 1.0).abs() < 1e-6

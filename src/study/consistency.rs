@@ -141,10 +141,10 @@ mod tests {
     use super::*;
     use crate::emulator::WhiteNoise;
     use crate::geometry::Twist;
-    use crate::observer::{Belief, Shaft, Slack};
+    use crate::observer::{Belief, Shaft};
     use nalgebra::{Matrix6, Vector6};
 
-    /// One trial has no spread, and tells nothing.
+    /// One trial has no spread.
     #[test]
     fn one_trial_is_never_judged() {
         let verdict = |values: &[f64]| Consistency::of_innovations(values).map(|c| c.verdict);
@@ -152,9 +152,9 @@ mod tests {
         assert_eq!(verdict(&[9.0, 9.1]), Some(Verdict::OverConfident));
     }
 
-    /// Of consistent observers 95 % are found so, also by few trials.
+    /// 95 % of consistent observers are found to be consistent, also with few trials.
     #[test]
-    fn bounds_hold_for_few_trials() {
+    fn the_bounds_hold_for_few_trials() {
         for trials in [2, 5, 15] {
             let is_consistent = |study: u64| {
                 let draw = |trial| 3.0 + WhiteNoise::Gaussian(1.0).draw(study, trial).x;
@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_that_are_no_numbers_are_not_consistent() {
+    fn an_error_that_is_not_finite_counts_as_over_confident() {
         let nees = Consistency::of_independent(&[6.0, f64::NAN]).unwrap();
         assert_eq!(nees.verdict, Verdict::OverConfident);
     }
@@ -178,20 +178,7 @@ mod tests {
         let factor =
             Matrix6::from_fn(|i, j| if i >= j { 0.01 * (i + 2 * j + 1) as f64 } else { 0.0 });
         let covariance = factor * factor.transpose();
-        let shaft = Shaft {
-            slack_forward: Slack::default(),
-            slack_backward: Slack::default(),
-            backlog_rad: 0.0,
-            creep_mm: 0.0,
-        };
-        let belief = Belief {
-            covariance,
-            roll_agreement: 1.0,
-            roll_seen_rad: 0.0,
-            curvature_per_mm: 0.01,
-            nis: None,
-            shaft,
-        };
+        let belief = Belief { covariance, ..Belief::certain(0.01, Shaft::RIGID) };
         let x_pb = Pose::exp(&Twist::from_vector(&Vector6::new(1.0, 2.0, 3.0, 0.1, 0.2, 0.3)));
         let estimate = Estimate::of_belief(x_pb, belief);
         let trials = (0..500).filter_map(|trial| {

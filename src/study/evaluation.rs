@@ -291,7 +291,7 @@ mod tests {
         }
     }
 
-    /// A tracker that sends positions may put any orientation beside them.
+    /// A tracker that measures positions only may send a constant orientation with them.
     #[test]
     fn orientations_that_never_change_are_not_scored() {
         let r_sb = mount(Vector3::z(), Vector3::x()).unwrap();
@@ -305,7 +305,7 @@ mod tests {
         let score = evaluate(&mut observer, &recording, &scoring(r_sb, 1.0, 8.0)).unwrap();
         assert!(score.roll_rms_deg.is_none() && score.position_rms_mm.is_some(), "{score:?}");
         recording.rows.iter_mut().for_each(|row| row.sensor_orientation = None);
-        assert!(!recording.lacks_roll(), "there are none");
+        assert!(!recording.lacks_roll(), "it has no orientations");
     }
 
     /// An observer that counts its calls and always predicts the origin.
@@ -360,9 +360,8 @@ mod tests {
         );
     }
 
-    /// A wrong assumed roll appears in the score with its size.
     #[test]
-    fn a_roll_that_is_off_is_scored_as_such() {
+    fn a_roll_error_is_scored_with_its_size() {
         let truth = FixedAngles { yaw: 0.3, pitch: 1.2, roll: -2.0 }.to_rotation();
         for off in [0.5, -3.1, 3.0] {
             let estimate = Pose {

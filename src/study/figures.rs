@@ -289,7 +289,7 @@ mod tests {
     use crate::observer::Estimate;
     use crate::session::Decision;
     use crate::stage::SetPoint;
-    use crate::tracker::{GateName, Refusal, Sample, Validity};
+    use crate::tracker::{GateName, Refusal, Sample};
     use nalgebra::Vector3;
 
     fn step(depth: f64, x: f64) -> StepRecord {
@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn the_last_third_is_scored_and_settling_is_the_last_way_in() {
+    fn the_last_third_is_scored_and_settling_is_the_last_entry() {
         let mut figures = RunFigures::default();
         let xs = [5.0, 0.5, 2.0, 0.9, 0.3, 0.3, 0.3, 0.4, 0.4, 0.4];
         for (n, x) in xs.into_iter().enumerate() {
@@ -318,7 +318,7 @@ mod tests {
 
     /// The true tip is in the plane, the estimated one is not: a live run has only the estimate.
     #[test]
-    fn the_plane_is_missed_by_the_estimate() {
+    fn the_miss_of_the_plane_is_that_of_the_estimate() {
         let mut figures = RunFigures::default();
         assert_eq!(figures.plane_missed_by_mm(), None);
         for n in 0..10 {
@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn the_report_has_the_worst_of_each_and_is_read_back() {
+    fn the_report_has_the_worst_of_each_figure_and_is_read_back() {
         let mut figures = RunFigures::default();
         let late = |age_s, at_mm| StepRecord {
             tip_meas_age_s: Some(age_s),
@@ -357,22 +357,15 @@ mod tests {
         assert_eq!(serde_json::from_str::<FigureReport>(&text).unwrap(), report);
     }
 
-    /// At 1 mm/s, with a position each 0.1 s until 1 s and a refused one afterwards, the figures
-    /// include the hold that stops the run at 1.4 s, although it has no step.
+    /// At 1 mm/s, a position is accepted each 0.1 s until 1 s, and refused afterwards. The hold that stops the run at
+    /// 1.4 s has no step, but it counts.
     #[test]
     fn depth_inserted_blind_counts_between_the_steps() {
         let mut figures = RunFigures::default();
         for n in 0..=14 {
             let time = Time::from_secs_f64(0.1 * f64::from(n));
             figures.take_sample(&SampleRecord {
-                received: Sample {
-                    receive_time: time,
-                    source_unix_ns: None,
-                    tool: String::new(),
-                    position_mm: Vector3::zeros(),
-                    orientation: None,
-                    validity: Validity::Valid,
-                },
+                received: Sample { receive_time: time, ..Sample::valid("Tip", Vector3::zeros()) },
                 position_plane_mm: None,
                 acquisition_time: (n <= 10).then_some(time),
                 refused: (n > 10).then(|| Refusal::new(GateName::Zero, "not seen")),

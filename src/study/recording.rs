@@ -104,7 +104,7 @@ mod tests {
         assert_eq!(posed.rows[0].position_meas_mm, Vector3::new(1.0, 2.0, 3.0));
     }
 
-    /// The base turns by 20 degrees a mm, and a sensor with it, or not.
+    /// The base turns by 20 degrees a mm, and the sensor by `turns` times that.
     #[test]
     fn orientations_that_do_not_turn_with_the_base_lack_roll() {
         let recording = |depth_mm: u32, turns: f64| {
@@ -125,9 +125,9 @@ mod tests {
         };
         assert!(recording(100, 0.0).lacks_roll());
         assert!(!recording(100, 1.0).lacks_roll());
-        // The base has turned by too little to tell.
+        // The base has turned by too little to see it.
         assert!(!recording(7, 0.0).lacks_roll());
-        // All but half a radian of the turn has come.
+        // The sensor lacks half a radian of the turn.
         assert!(!recording(10, 0.85).lacks_roll());
     }
 

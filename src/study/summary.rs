@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn figures_over_trials() {
+    fn stopped_trials_count_as_infinitely_far_off() {
         let trials = [
             trial(0.1, 0.05, Outcome::Completed),
             trial(0.2, 0.1, Outcome::Completed),
@@ -272,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn seeds_are_exact_in_json_and_apart() {
+    fn trial_seeds_are_exact_in_json_and_distinct() {
         let mut seeds: Vec<u64> = (0..1000).map(|trial| trial_seed(1, trial)).collect();
         assert!(seeds.iter().all(|&seed| seed < 1 << 53 && seed as f64 as u64 == seed));
         seeds.sort_unstable();

@@ -191,7 +191,7 @@ mod tests {
     use crate::config::Config;
 
     #[test]
-    fn the_depth_is_that_between_two_syncs_and_stays_after_the_last() {
+    fn the_depth_is_interpolated_between_syncs_and_stays_after_the_last() {
         let config = Config::from_sources(&[], &[]).unwrap();
         let (session, stage) = (config.session().unwrap(), config.virtual_stage().unwrap());
         let mut builder = TimetableBuilder::new(&session.insertion, stage.tracker);

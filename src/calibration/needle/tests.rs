@@ -1,4 +1,4 @@
-//! Known needles are recorded and found again.
+//! Insertions of known needles are simulated, and their parameters are found from them.
 
 use super::*;
 use crate::geometry::{FixedAngles, Pose};
@@ -24,7 +24,7 @@ fn needle() -> Needle {
     Needle::new(0.011).unwrap().with_tip_ahead(6.5).unwrap()
 }
 
-/// Insertions of 50 mm, the base turning to and fro at 0.5 rad/mm.
+/// Four insertions of 50 mm. The base turns back and forth at 0.5 and 0.4 rad/mm.
 fn recorded(config: TorsionConfig, sd_mm: f64) -> Vec<Vec<PosedRow>> {
     let torsion = Torsion::new(config).unwrap();
     let mut rng = Pcg64::seed_from_u64(7);
@@ -62,7 +62,7 @@ const CREEPING: TorsionConfig = TorsionConfig {
 };
 
 #[test]
-fn a_needle_is_found_again() {
+fn the_parameters_of_a_known_needle_are_found() {
     let fit = NeedleFit::of(&recorded(CREEPING, 0.01), &NOISE).unwrap();
     let axis = mount() * Vector3::z();
     assert!((fit.axis - axis).norm() < 1e-3, "{fit:?}");
@@ -80,7 +80,7 @@ fn a_needle_is_found_again() {
 }
 
 #[test]
-fn a_band_is_found_again() {
+fn the_band_of_a_known_needle_is_found() {
     let banded = TorsionConfig {
         half_width_rad: 0.3,
         half_width_rad_per_mm: 0.004,
@@ -99,7 +99,7 @@ fn a_band_is_found_again() {
 }
 
 #[test]
-fn what_says_too_little_is_refused() {
+fn insertions_that_determine_no_needle_are_refused() {
     let mut rows = recorded(CREEPING, 0.0);
     let message = |rows: &[Vec<PosedRow>]| NeedleFit::of(rows, &NOISE).unwrap_err().to_string();
     assert_eq!(
@@ -132,9 +132,9 @@ fn what_says_too_little_is_refused() {
     assert!(message(&rows).contains("turn the base both ways"), "{}", message(&rows));
 }
 
-/// For a mean, with one residual for each insertion, this is the standard error of the mean.
+/// Each insertion has one residual from the mean.
 #[test]
-fn of_a_mean_it_is_the_standard_error() {
+fn the_sandwich_covariance_of_a_mean_is_its_standard_error() {
     let values = [1.0, 2.0, 4.0, 9.0];
     let gradients = values.map(|value| SVector::<f64, 1>::new(value - 4.0));
     let squares: f64 = gradients.iter().map(|g| g.x * g.x).sum();
@@ -143,7 +143,7 @@ fn of_a_mean_it_is_the_standard_error() {
 }
 
 #[test]
-fn parameters_that_cannot_be_told_apart_have_none() {
+fn parameters_that_cannot_be_separated_have_no_covariance() {
     let gradients = [SVector::<f64, 2>::new(1.0, 1.0); 3];
     assert_eq!(
         sandwich_covariance(&SMatrix::<f64, 2, 2>::new(1.0, 1.0, 1.0, 1.0), &gradients),

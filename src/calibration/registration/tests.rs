@@ -33,13 +33,13 @@ fn refusal(pairs: &[FiducialPair]) -> String {
     RegistrationFit::of(pairs, 1.0).expect_err("refused").to_string()
 }
 
-/// Rounding error allowed to a rotation. The decomposition works on fourth powers of lengths
-/// (covariance, then its square), so a set of the smallest breadth that is taken, 2% of its length,
-/// has 1e-16 / 0.02^4 = 1e-9, and a point 1 m away a thousandth of a micrometre.
+/// Rounding error allowed in a rotation. The decomposition works on fourth powers of lengths (covariance, then its
+/// square). The narrowest set that is accepted has a breadth of 2% of its length, so its error is
+/// 1e-16 / 0.02^4 = 1e-9, a thousandth of a micrometre at 1 m.
 const TURN_MAX: f64 = 1e-8;
 
 proptest! {
-    /// Any motion is found again, from solid sets, flat sets and triangles.
+    /// The sets are solid or flat, down to triangles. Thin sets are refused.
     #[test]
     fn a_rigid_motion_is_recovered(
         x_wt in pose(),
@@ -66,7 +66,7 @@ proptest! {
 
     /// No input makes it panic, and every result is a rotation.
     #[test]
-    fn whatever_comes_is_taken_or_refused(
+    fn any_pairs_are_fitted_or_refused(
         coordinates in prop::collection::vec(prop_oneof![any::<f64>(), -9.0..9.0f64], 0..60),
         rms_max_mm in any::<f64>(),
     ) {
@@ -86,7 +86,7 @@ proptest! {
     }
 }
 
-/// Flat sets with noise: without the choice of sign half of them would be reflections.
+/// Without the choice of sign half of these flat, noisy sets would give reflections.
 #[test]
 fn flat_sets_give_no_reflection() {
     let noise = WhiteNoise::Gaussian(0.2);
@@ -110,7 +110,7 @@ fn flat_sets_give_no_reflection() {
 
 /// FRE and target error agree with the formulas for the added noise.
 #[test]
-fn noise_gives_the_errors_that_are_predicted() {
+fn fre_and_target_error_are_as_predicted() {
     let (sd_mm, sets) = (0.3, 400u32);
     let x_wt = Pose { rotation: so3::exp(&Vector3::new(0.3, -1.2, 0.4)), ..Pose::identity() };
     let points_mm: Vec<_> =
@@ -133,9 +133,9 @@ fn noise_gives_the_errors_that_are_predicted() {
     assert!((error2 / predicted2 - 1.0).abs() < 0.1, "TRE² {error2} for {predicted2}");
 }
 
-/// A tracker whose millimetre is 1% too long, among points that are located to 0.3 mm.
+/// The tracker's scale is 1% off, and each point is located to 0.3 mm.
 #[test]
-fn a_wrong_scale_is_named_and_chance_is_not() {
+fn a_wrong_scale_is_reported_and_noise_is_not() {
     let points_mm: Vec<_> =
         (0..12u64).map(|point| WhiteNoise::Uniform(80.0).draw(5, point)).collect();
     let fit = |set: u64, scale: f64| {
@@ -155,7 +155,7 @@ fn a_wrong_scale_is_named_and_chance_is_not() {
 }
 
 #[test]
-fn points_in_a_plane_are_named() {
+fn points_in_a_plane_are_reported() {
     let remarks = |points_mm: &[Vector3<f64>]| {
         RegistrationFit::of(&pairs(&Pose::identity(), points_mm), 1.0).expect("fits").remarks()
     };
@@ -178,12 +178,12 @@ fn the_error_at_a_target_grows_with_its_distance() {
     let fit = RegistrationFit::of(&noisy, 1.0).expect("fits");
     let sd_mm = |z_mm: f64| fit.target_sd_mm(&Vector3::new(50.0, 50.0, z_mm));
     let least_mm = fit.localisation_error_mm() / (3.0 * 4.0f64).sqrt();
-    assert!((sd_mm(0.0) - least_mm).abs() < 1e-3, "at the centroid only the mean is left");
+    assert!((sd_mm(0.0) - least_mm).abs() < 1e-3, "at the centroid it is that of the mean");
     assert!(sd_mm(0.0) < sd_mm(100.0) && sd_mm(100.0) < sd_mm(250.0));
 }
 
 #[test]
-fn what_determines_nothing_is_refused() {
+fn points_that_determine_no_pose_are_refused() {
     let good = pairs(&Pose::identity(), &square(100.0));
     assert_eq!(
         refusal(&good[..2]),
@@ -202,7 +202,7 @@ fn what_determines_nothing_is_refused() {
         "registration: points 2 and 4 have the same tracker position; remove the copy, or give the \
          mean of repeated measurements as one pair"
     );
-    for (x_mm, said) in
+    for (x_mm, text) in
         [(f64::NAN, "NaN"), (f64::INFINITY, "inf"), (5000.1, "5000.1"), (1e100, "1e100")]
     {
         let mut far = good.clone();
@@ -210,7 +210,7 @@ fn what_determines_nothing_is_refused() {
         assert_eq!(
             refusal(&far),
             format!(
-                "registration: point 3 is {said} mm from the bench's origin (limit 5000); give \
+                "registration: point 3 is {text} mm from the bench's origin (limit 5000); give \
                  positions in mm"
             )
         );
@@ -224,9 +224,9 @@ fn what_determines_nothing_is_refused() {
     );
 }
 
-/// Points on a line with errors as large as their distances from it.
+/// The points are on a line, and their errors are as large as their distances from it.
 #[test]
-fn noise_does_not_pass_for_breadth() {
+fn noise_across_a_line_does_not_count_as_breadth() {
     let line: Vec<_> = (0..8).map(|n| Vector3::new(5.0 * f64::from(n), 0.0, 0.0)).collect();
     let mut pairs = pairs(&Pose::identity(), &line);
     for (point, pair) in pairs.iter_mut().enumerate() {
@@ -234,7 +234,7 @@ fn noise_does_not_pass_for_breadth() {
         pair.tracker_mm += Vector3::new(0.0, beside_mm.y, beside_mm.z);
         pair.bench_mm += 1.5 * WhiteNoise::Uniform(1.0).draw(4, point as u64);
     }
-    let error = RegistrationFit::of(&pairs, 3.0).expect_err("no turn to be known");
+    let error = RegistrationFit::of(&pairs, 3.0).expect_err("the turn is unknown");
     assert!(error.to_string().contains(" RMS off a line "), "{error}");
 }
 
@@ -254,15 +254,15 @@ fn the_worst_point_is_named() {
 }
 
 #[test]
-fn an_axis_the_wrong_way_is_recognised() {
+fn an_axis_that_points_the_wrong_way_is_recognised() {
     let mut points_mm = square(100.0);
     points_mm.push(Vector3::new(50.0, 50.0, 80.0));
     let mut pairs = pairs(&Pose::identity(), &points_mm);
     pairs.iter_mut().for_each(|pair| pair.bench_mm.z = -pair.bench_mm.z);
-    let said = refusal(&pairs);
+    let text = refusal(&pairs);
     assert!(
-        said.ends_with("the sets are mirror images: one axis of one frame points the other way"),
-        "{said}"
+        text.ends_with("the sets are mirror images: one axis of one frame points the other way"),
+        "{text}"
     );
 }
 
@@ -275,5 +275,6 @@ fn a_file_of_pairs_is_read_by_its_header() {
         bench_mm: Vector3::new(1.0, 2.0, 3.0),
     };
     assert_eq!(FiducialPair::parse(csv), Ok(vec![pair]));
-    assert!(FiducialPair::parse("x_bench_mm\n1\n").is_err());
+    let error = FiducialPair::parse("x_bench_mm\n1\n").expect_err("too few columns");
+    assert!(error.to_string().contains("no column "), "{error}");
 }

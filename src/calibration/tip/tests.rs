@@ -11,7 +11,8 @@ const X_SB: Pose = Pose {
     translation: Vector3::new(-1.2, 0.5, 0.0),
 };
 
-/// A needle standing at `x_tw`, its tip at `x_sb` in the sensor, turned `turn_rad` in `n` steps.
+/// The positions of a sensor while the base turns by `turn_rad` in `n` steps. The needle is at `x_tw`, its tip at
+/// `x_sb` in the sensor.
 fn turned(x_tw: &Pose, x_sb: &Pose, turn_rad: f64, n: u32) -> Vec<TurnSample> {
     (0..n)
         .map(|k| {
@@ -44,27 +45,27 @@ fn standing() -> Pose {
     }
 }
 
-/// Over little more than half a turn the direction is known half as well as over a whole one.
+/// The axis from little more than half a turn is about half as certain as from a whole turn.
 #[test]
-fn the_standard_errors_are_those_that_noise_makes() {
+fn the_standard_errors_match_the_scatter_of_noisy_fits() {
     let x_tw = standing();
     let true_axis = x_tw.rotation * Vector3::z();
     let mut axis_sds = Vec::new();
     for turn_rad in [TAU, 1.15 * PI] {
-        let (mut centre, mut axis, mut told) = (0.0, 0.0, (0.0, 0.0));
+        let (mut centre, mut axis, mut stated) = (0.0, 0.0, (0.0, 0.0));
         for seed in 0..200 {
             let samples = noisy(turned(&x_tw, &X_SB, turn_rad, 60), 0.05, seed);
             let fit = TipFit::of(&samples, 0.5).expect("a circle");
             let off_mm = fit.centre_mm - x_tw.translation;
             centre += (off_mm - true_axis * true_axis.dot(&off_mm)).norm_squared();
             axis += fit.axis.angle(&true_axis).powi(2);
-            told = (told.0 + fit.centre_sd_mm.powi(2), told.1 + fit.axis_sd_rad.powi(2));
+            stated = (stated.0 + fit.centre_sd_mm.powi(2), stated.1 + fit.axis_sd_rad.powi(2));
         }
         // The error has two directions; the standard error is that of the less certain one.
-        for ratio in [(centre / told.0).sqrt(), (axis / told.1).sqrt()] {
+        for ratio in [(centre / stated.0).sqrt(), (axis / stated.1).sqrt()] {
             assert!((0.9..1.6).contains(&ratio), "{ratio} at {turn_rad}");
         }
-        axis_sds.push((told.1 / 200.0).sqrt());
+        axis_sds.push((stated.1 / 200.0).sqrt());
     }
     assert!(axis_sds[1] > 1.5 * axis_sds[0], "{axis_sds:?}");
 }
@@ -111,7 +112,7 @@ proptest! {
 
     /// No input makes it panic.
     #[test]
-    fn whatever_comes_is_taken_or_refused(
+    fn any_samples_are_fitted_or_refused(
         numbers in prop::collection::vec(prop_oneof![any::<f64>(), -9.0..9.0f64], 0..80),
         rms_max_mm in any::<f64>(),
     ) {
@@ -132,7 +133,7 @@ proptest! {
 /// Noise gives an RMS of √2 standard deviations, within the plane and out of it, and changes the
 /// result little.
 #[test]
-fn noise_gives_the_rms_that_is_predicted() {
+fn the_rms_of_noise_is_as_predicted() {
     let sd_mm = 0.05;
     for turn_rad in [TAU, 3.5] {
         let samples = noisy(turned(&standing(), &X_SB, turn_rad, 400), sd_mm, 1);
@@ -173,7 +174,7 @@ fn a_sensor_without_roll_gives_the_axis_and_no_mount() {
 }
 
 #[test]
-fn what_determines_nothing_is_refused() {
+fn turns_that_determine_no_tip_are_refused() {
     let whole = || turned(&standing(), &X_SB, TAU, 100);
     assert_eq!(refusal(&whole()[..7]), "tip: 7 positions, at least 8 needed; record a whole turn");
     assert_eq!(
@@ -194,26 +195,26 @@ fn what_determines_nothing_is_refused() {
     (0..100u32)
         .zip(&mut inserted)
         .for_each(|(k, sample)| sample.position_meas_mm += axis * (0.05 * f64::from(k)));
-    let said = refusal(&inserted);
-    assert!(said.contains("mm RMS off a circle (limit 0.50)"), "{said}");
+    let text = refusal(&inserted);
+    assert!(text.contains("mm RMS off a circle (limit 0.50)"), "{text}");
     assert!(
-        said.ends_with("turn only the base, in air, with the insertion axis at rest"),
-        "{said}"
+        text.ends_with("turn only the base, in air, with the insertion axis at rest"),
+        "{text}"
     );
 
     let coaxial = noisy(turned(&standing(), &Pose::identity(), TAU, 100), 0.05, 2);
-    let said = refusal(&coaxial);
-    assert!(said.contains("no offset from the needle's axis can be seen"), "{said}");
+    let text = refusal(&coaxial);
+    assert!(text.contains("no offset from the needle's axis can be seen"), "{text}");
 
     let mut in_degrees = whole();
     in_degrees.iter_mut().for_each(|s| s.rotation_meas_rad = s.rotation_meas_rad.to_degrees());
-    let said = refusal(&in_degrees);
-    assert!(said.contains("is rotation_rad in rad"), "{said}");
+    let text = refusal(&in_degrees);
+    assert!(text.contains("is rotation_rad in rad"), "{text}");
 
     let mut unknown = whole();
     unknown[50].rotation_meas_rad = f64::NAN;
-    let said = refusal(&unknown);
-    assert!(said.contains("their angles agree to NaN"), "{said}");
+    let text = refusal(&unknown);
+    assert!(text.contains("their angles agree to NaN"), "{text}");
 
     let mut far = whole();
     far[4].position_meas_mm.x = f64::NAN;
