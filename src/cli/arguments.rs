@@ -177,8 +177,9 @@ pub(super) fn parse_seed(text: &str) -> Result<u64, String> {
 mod tests {
     use super::*;
 
+    /// The priority ends with the thread.
     #[test]
-    fn a_priority_ends_with_the_run() {
+    fn a_real_time_run_has_a_thread_of_its_own() {
         let ran_on = |realtime| {
             RealTimeArguments { realtime, cpu: None }.run_isolated(|| thread::current().id())
         };

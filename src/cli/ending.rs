@@ -319,14 +319,14 @@ mod tests {
         let mut report = report(Outcome::Completed, &[]);
         let source = std::io::ErrorKind::NotFound.into();
         report.record = Err(TelemetryError::File { path: "runs/a/manifest.json".into(), source });
-        let said = ending(&Config::from_sources(&[], &[]).unwrap(), &report);
-        let said: Vec<&str> = said.lines().collect();
-        assert!(said[0].starts_with("record      runs/a, left open: "), "{said:?}");
-        assert!(said[0].ends_with("; close it: needle-bench review runs/a --repair"), "{said:?}");
-        assert_eq!(said[1], "completed");
+        let text = ending(&Config::from_sources(&[], &[]).unwrap(), &report);
+        let lines: Vec<&str> = text.lines().collect();
+        assert!(lines[0].starts_with("record      runs/a, left open: "), "{text}");
+        assert!(lines[0].ends_with("; close it: needle-bench review runs/a --repair"), "{text}");
+        assert_eq!(lines[1], "completed");
     }
 
-    /// With `record.on_failure = "stop"` a run without a whole record is no success.
+    /// With `record.on_failure = "stop"` a run without a complete record does not succeed.
     #[test]
     fn a_completed_run_without_its_record_is_a_failure() {
         let mut config = Configured::default().load(None).unwrap();
@@ -360,7 +360,7 @@ mod tests {
         StageAtEnd { had_power: true, unknown: None, drives, position: Some(position) }
     }
 
-    /// As [`stood`], with the rotation drive in Fault.
+    /// Like [`stood`], with the rotation drive in Fault.
     fn in_fault() -> StageAtEnd {
         let mut stage = stood();
         stage.drives.rotation =
@@ -377,30 +377,30 @@ mod tests {
         );
         let out = possible_withdrawal(&real, &stopped(0.01, stood()));
         assert_eq!(out.unwrap_err(), "the needle is out, at 0.01 mm");
-        let said = after_insertion(&real, Some(Path::new(RIG)), &stopped(5.0, stood())).unwrap();
+        let text = after_insertion(&real, Some(Path::new(RIG)), &stopped(5.0, stood())).unwrap();
         assert!(
-            said.starts_with(
+            text.starts_with(
                 "needle      5.0 mm in; both axes stand, power is off\n\
                  next        needle-bench stage withdraw rig.toml --by 5.0mm"
             ),
-            "{said}"
+            "{text}"
         );
     }
 
     #[test]
-    fn drives_that_may_move_are_looked_at_first() {
+    fn drives_that_may_move_call_for_stage_status_first() {
         let real = config(&[]);
         let unknown = Some("the axes were not seen to stand");
         let stopped = stopped(5.0, StageAtEnd { unknown, ..in_fault() });
         let why = possible_withdrawal(&real, &stopped).unwrap_err();
         assert_eq!(why, "the drives are not known to stand; look at the stage");
         let path = Some(Path::new(RIG));
-        for said in [
+        for text in [
             after_insertion(&real, path, &stopped).unwrap(),
             after_operation(&real, path, Some(""), &stopped).unwrap(),
         ] {
-            assert!(said.contains("; the axes were not seen to stand; rotation is in"), "{said}");
-            assert!(said.ends_with("\nnext        needle-bench stage status rig.toml"), "{said}");
+            assert!(text.contains("; the axes were not seen to stand; rotation is in"), "{text}");
+            assert!(text.ends_with("\nnext        needle-bench stage status rig.toml"), "{text}");
         }
     }
 
@@ -417,44 +417,44 @@ mod tests {
         let why = possible_withdrawal(&real, &stopped).unwrap_err();
         assert_eq!(why, "a drive is in fault: find why, then stage reset");
         let resets = config(&["stage.fault_reset_on_start=true"]);
-        let said = after_insertion(&resets, Some(Path::new(RIG)), &stopped).unwrap();
+        let text = after_insertion(&resets, Some(Path::new(RIG)), &stopped).unwrap();
         assert!(
-            said.contains("\nnext        needle-bench stage withdraw rig.toml --by 5"),
-            "{said}"
+            text.contains("\nnext        needle-bench stage withdraw rig.toml --by 5"),
+            "{text}"
         );
     }
 
     #[test]
     fn an_operation_says_where_it_left_the_axes() {
         let real = config(&[]);
-        let said = |report: &RunReport| after_operation(&real, Some(Path::new(RIG)), None, report);
+        let text = |report: &RunReport| after_operation(&real, Some(Path::new(RIG)), None, report);
         assert_eq!(
-            said(&stopped(5.0, stood())).unwrap(),
+            text(&stopped(5.0, stood())).unwrap(),
             "stage       insertion at 5.000 mm, rotation at 90.000 deg; both axes stand, power is \
              off\nnext        needle-bench stage status rig.toml"
         );
         assert_eq!(
-            said(&stopped(0.0, StageAtEnd::default())).unwrap(),
+            text(&stopped(0.0, StageAtEnd::default())).unwrap(),
             "stage       not known where the axes stand; no power was given\n\
              next        needle-bench stage status rig.toml"
         );
         let withdrawal = stopped(5.0, stood());
-        let said_of_it =
+        let rest =
             after_operation(&real, Some(Path::new(RIG)), Some(" --by 5.0mm"), &withdrawal).unwrap();
         assert!(
-            said_of_it.ends_with("\nnext        needle-bench stage withdraw rig.toml --by 5.0mm"),
-            "{said_of_it}"
+            rest.ends_with("\nnext        needle-bench stage withdraw rig.toml --by 5.0mm"),
+            "{rest}"
         );
         let done = RunReport { outcome: Outcome::Completed, ..stopped(5.0, stood()) };
-        assert_eq!(said(&done), None);
+        assert_eq!(text(&done), None);
         let proved = RunReport { stage_at_end: in_fault(), ..done };
         let next = "\nnext        needle-bench stage reset rig.toml";
-        assert!(said(&proved).unwrap().ends_with(next));
+        assert!(text(&proved).unwrap().ends_with(next));
     }
 
-    /// An axis that reads 0 wherever it starts may not go as far back as the needle went in.
+    /// The limits of an axis that reads 0 at its start may not let it go back as far as the needle went in.
     #[test]
-    fn the_withdrawal_that_is_named_is_one_that_the_limits_allow() {
+    fn the_suggested_withdrawal_is_within_the_limits() {
         let options = |sets: &[&str]| {
             let sets = sets.iter().map(|set| (*set).to_owned()).collect();
             let config = Configured::new(None, sets).load(None).unwrap();

@@ -305,7 +305,6 @@ mod tests {
         }
     }
 
-    /// Nothing is measured, turned, replayed or planned for a file that cannot be written.
     #[test]
     fn a_file_that_exists_is_refused_before_anything_is_done() {
         for line in [
@@ -339,7 +338,6 @@ mod tests {
         rehearsed.unwrap().command.execute().unwrap();
     }
 
-    /// What the help shows can be typed.
     #[test]
     fn each_command_has_examples_that_it_understands() {
         let mut commands: Vec<_> = command_line().get_subcommands().cloned().collect();

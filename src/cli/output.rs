@@ -110,7 +110,7 @@ mod tests {
     use serde_json::json;
 
     #[test]
-    fn a_pipe_without_a_reader_is_unread() {
+    fn a_pipe_without_a_reader_is_recognised() {
         let (reader, writer) = nix::unistd::pipe().unwrap();
         assert!(!has_no_reader(&writer));
         drop(reader);
@@ -119,10 +119,10 @@ mod tests {
     }
 
     #[test]
-    fn nothing_that_a_terminal_acts_upon_is_printed() {
+    fn control_characters_are_escaped() {
         let text = "a\u{1b}[2J\r\u{9b}1m\u{7f}\u{202e}b\n\tc";
         assert_eq!(plain(text, "\n\t"), "a\\u001b[2J\\u000d\\u009b1m\\u007f\\u202eb\n\tc");
-        assert_eq!(plain("a\nb", ""), "a\\u000ab", "in a line of the run's events");
+        assert_eq!(plain("a\nb", ""), "a\\u000ab", "a line end in an event");
         let object = json!({ "tool": text });
         let read: Value = serde_json::from_str(&plain(&object, "\n\t")).unwrap();
         assert_eq!(read, object, "it is still the same object");

@@ -359,9 +359,9 @@ fn emulated_json(emulated: &EmulationReport) -> Value {
 mod tests {
     use super::*;
 
-    /// Its record names the operator, and an emulated needle takes as long to come out as a real one.
+    /// Its record names the operator, and an emulated needle is withdrawn as slowly as a real one.
     #[test]
-    fn a_withdrawal_after_a_run_has_what_the_run_was_given() {
+    fn a_withdrawal_after_a_run_keeps_its_operator_and_pace() {
         let operator = Some("Ann".to_owned());
         let about = About { operator: operator.clone(), ..About::default() };
         let live = "127.0.0.1:9876".parse().ok();

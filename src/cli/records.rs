@@ -286,25 +286,18 @@ fn rows(
 mod tests {
     use super::*;
     use crate::geometry::Pose;
-    use crate::tracker::Validity;
     use nalgebra::Vector3;
 
-    /// Samples that were refused have lines in the file too.
+    /// Refused samples have lines in the file too, so a row's number is not its place among the rows.
     #[test]
     fn a_row_has_the_number_of_its_line() {
         let at = |s: f64, insertion_mm: f64| {
             (Time::from_secs_f64(s), SetPoint { insertion_mm, rotation_rad: 0.0 })
         };
-        let sample = Sample {
-            receive_time: Time::from_secs_f64(1.0),
-            source_unix_ns: None,
-            tool: String::new(),
-            position_mm: Vector3::zeros(),
-            orientation: None,
-            validity: Validity::Valid,
-        };
+        let receive_time = Time::from_secs_f64(1.0);
+        let sample = Sample { receive_time, ..Sample::valid("Tip", Vector3::zeros()) };
         let registration = Registration::new(Pose::identity());
-        let seen = [(4, sample.receive_time, sample)].into_iter();
+        let seen = [(4, receive_time, sample)].into_iter();
         let rows = rows(&[at(0.0, 0.0), at(2.0, 4.0)], &registration, seen);
         assert_eq!((rows[0].line, rows[0].insertion_meas_mm), (4, 2.0));
     }

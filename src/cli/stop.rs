@@ -122,9 +122,9 @@ fn report(quick_stop: &QuickStop, trouble: &BusTrouble, as_json: bool) -> Result
 mod tests {
     use super::*;
 
-    /// As an editor that writes Latin-1 saves a degree sign.
+    /// An editor that writes Latin-1 saves a degree sign as this byte.
     #[test]
-    fn a_byte_that_is_no_text_does_not_keep_a_stop_from_being_sent() {
+    fn a_byte_that_is_not_utf8_does_not_prevent_a_stop() {
         let path = std::env::temp_dir().join(format!("needle-bench-stop-{}", std::process::id()));
         let text = b"# 90\xb0\n[can]\ninterface = \"can7\"\n[stage.insertion]\nnode = 3\n\
                      [stage.rotation]\nnode = 4\n";

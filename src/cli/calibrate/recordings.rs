@@ -274,7 +274,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_place_is_three_numbers() {
+    fn a_position_is_three_numbers() {
         assert_eq!(parse_position(" 1 -2.5,3\n"), Some([1.0, -2.5, 3.0]));
         for wrong in ["1 2", "1 2 3 4", "a b c", "1 2 NaN", "1;2;3"] {
             assert_eq!(parse_position(wrong), None, "{wrong}");
@@ -284,13 +284,13 @@ mod tests {
     #[test]
     fn a_point_is_the_mean_of_the_first_second_at_rest() {
         let mut last_second = LastSecond { begun: Time::ZERO, window: VecDeque::new() };
-        // It comes to rest after half a second; positions are 0.05 mm to either side.
+        // The tip comes to rest after half a second. Positions are 0.05 mm to either side.
         let mut first_still = None;
         for k in 1..=80 {
             let now = Time::from_secs_f64(f64::from(k) * 0.025);
             let way_mm = f64::from((20 - k).max(0)) + if k % 2 == 0 { 0.05 } else { -0.05 };
             match last_second.take(now, Vector3::new(7.0, way_mm, 0.0)) {
-                None => assert!(k < 40, "a whole second at {k}"),
+                None => assert!(k < 40, "no mean after a whole second, at {k}"),
                 Some((mean_mm, sd_mm)) if sd_mm < 0.06 => {
                     first_still.get_or_insert((k, mean_mm));
                 }
@@ -298,7 +298,7 @@ mod tests {
             }
         }
         let (k, mean_mm) = first_still.expect("it rests");
-        assert!((60..=61).contains(&k), "no position of its way counts: {k}");
+        assert!((60..=61).contains(&k), "a position on the way counts: {k}");
         assert!((mean_mm - Vector3::new(7.0, 0.0, 0.0)).norm() < 0.05, "{mean_mm}");
     }
 }

@@ -1,4 +1,4 @@
-//! A run on the console, as its records fill the screen.
+//! Tests of the console, with a screen that the records of a run have filled.
 
 mod bell;
 mod keys;
@@ -17,7 +17,7 @@ use crate::observer::Estimate;
 use crate::session::stage_news;
 use crate::session::{Approach, Decision, Direction, SampleRecord, State, StepRecord};
 use crate::stage::{Axis, Feedback, SetPoint, StageEvent};
-use crate::tracker::{GateName, Refusal, Sample, Validity};
+use crate::tracker::{GateName, Refusal, Sample};
 use nalgebra::Vector3;
 use ratatui::backend::TestBackend;
 
@@ -38,7 +38,7 @@ fn at(s: f64) -> Time {
     Time::from_nanos((s * 1e9) as i64)
 }
 
-/// A screen after 40 mm of an insertion of 100 mm at 2 mm/s, as its records fill it.
+/// A screen after 40 mm of an insertion of 100 mm at 2 mm/s.
 fn inserted() -> Screen {
     let mut screen = Screen::new(setup());
     screen.take(&Record::State { time: at(0.0), state: State::Inserting });
@@ -56,12 +56,8 @@ fn inserted() -> Screen {
         screen.take(&Record::Stage(Feedback { time, sync: n as u64, measured, commanded }));
         if n % 4 == 0 {
             let mut sample = SampleRecord::received(Sample {
-                tool: "N".to_owned(),
                 receive_time: time,
-                source_unix_ns: None,
-                position_mm: Vector3::zeros(),
-                orientation: None,
-                validity: Validity::Valid,
+                ..Sample::valid("N", Vector3::zeros())
             });
             let refusal = Refusal::new(GateName::Innovation, "3.1 mm off the model");
             sample.refused = (n % 400 == 0).then_some(refusal);
@@ -101,7 +97,7 @@ fn inserted() -> Screen {
     screen
 }
 
-/// The operator asks for something.
+/// Records a command of the operator.
 fn ask(screen: &mut Screen, s: f64, command: OperatorCommand) {
     screen.take(&Record::Input { time: at(s), input: Input::Operator(command) });
 }
@@ -123,8 +119,8 @@ fn stopped() -> Screen {
     let emcy = Emcy { code: EmcyCode(0x3210), register: 0x04, manufacturer: [0; 5] };
     let frame = emcy.to_frame(NodeId::new(1).expect("a node"));
     screen.take(&Record::Can { time: at(20.0), direction: Direction::Received, frame });
-    let told = StageEvent::Emergency(Axis::Insertion, emcy);
-    let (severity, text) = stage_news(&told).expect("news");
+    let event = StageEvent::Emergency(Axis::Insertion, emcy);
+    let (severity, text) = stage_news(&event).expect("news");
     screen.event(at(20.0), Lane::Stage, severity, &text);
     screen.event(at(20.0), Lane::Session, Severity::Fault, why);
     screen.is_over = true;

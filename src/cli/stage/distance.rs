@@ -96,13 +96,14 @@ mod tests {
         assert_eq!(Distance::parse("1e1deg"), Ok(distance(10.0, DEG)));
         assert_eq!(Distance::parse_speed("20deg/s"), Ok(distance(20.0, DEG)));
         for wrong in ["2", "mm", "2m", "2 cm", "NaNmm", "infdeg", "1,5mm", "", "2mm/s"] {
-            assert!(Distance::parse(wrong).is_err(), "{wrong}");
+            let refused = Distance::parse(wrong).unwrap_err();
+            assert_eq!(refused, "a number with its unit, such as 2mm, -0.5mm or 10deg", "{wrong}");
             assert!(Distance::parse_speed(wrong).is_err() || wrong == "2mm/s", "{wrong}");
         }
     }
 
     #[test]
-    fn a_distance_is_one_of_a_stage() {
+    fn a_distance_beyond_any_stage_is_refused() {
         assert_eq!(Distance::parse("-1000mm"), Ok(distance(-1000.0, MM)));
         for far in ["1e300mm", "-1000.1mm", "1e9deg"] {
             let message = Distance::parse(far).unwrap_err();
@@ -116,11 +117,12 @@ mod tests {
         assert_eq!(distance(180.0, DEG).along(DEG), Ok(std::f64::consts::PI));
         let error = distance(2.0, MM).along(DEG).unwrap_err();
         assert_eq!(error, "the rotation axis does not move by 2mm: give deg, as in 10deg");
-        assert!(distance(2.0, DEG).along(MM).is_err());
+        let error = distance(2.0, DEG).along(MM).unwrap_err();
+        assert_eq!(error, "the insertion axis does not move by 2deg: give mm, as in 10mm");
     }
 
     #[test]
-    fn what_moves_no_count_is_refused_with_the_smallest_step() {
+    fn a_move_under_half_a_count_is_refused_with_the_smallest_step() {
         let ratio = CountsRatio::new(4646, 1).unwrap();
         assert_eq!(distance(-0.0002, MM).nonzero_along(MM, ratio), Ok(-0.0002));
         assert_eq!(

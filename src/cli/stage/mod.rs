@@ -464,7 +464,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_highest_speed_is_told_as_configured() {
+    fn a_speed_over_the_limit_is_refused_with_the_configured_limit() {
         let config = Config::from_sources(&[], &[]).unwrap();
         let mut stage = config.stage.to_stage(&config.can).unwrap();
         stage.rotation.limits.speed_max = 3_f64.to_radians();

@@ -158,16 +158,13 @@ pub(super) fn watch(arguments: &WatchArguments) -> Result<(), Failure> {
 pub(super) mod tests {
     use super::*;
     use crate::config::Config;
-    use crate::tracker::{Sample, Validity};
+    use crate::tracker::Sample;
 
     pub(in crate::cli::tracker) fn sample(tool: &str) -> Sample {
         Sample {
             receive_time: Time::from_nanos(5),
-            source_unix_ns: None,
-            tool: tool.to_owned(),
-            position_mm: Vector3::new(1.0, 2.0, 3.0),
             orientation: Some(Default::default()),
-            validity: Validity::Valid,
+            ..Sample::valid(tool, Vector3::new(1.0, 2.0, 3.0))
         }
     }
 

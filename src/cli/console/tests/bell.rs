@@ -1,4 +1,4 @@
-//! When the bell rings.
+//! Tests of the bell.
 
 use super::*;
 use ratatui::{TerminalOptions, Viewport};
@@ -18,7 +18,7 @@ impl Write for Written {
     }
 }
 
-/// The bells among what a console writes that is redrawn after each of these messages.
+/// How often a console rings the bell that is redrawn after each of `messages`.
 fn bells(messages: Vec<Message>, is_interrupted: bool) -> usize {
     let shared = Shared::new(setup(), Interrupt::default());
     if is_interrupted {
@@ -72,7 +72,7 @@ fn the_bell_rings_once_for_what_holds_or_ends_the_run_and_never_for_success() {
     let ended = held().into_iter().chain([fault(), state(State::Stopped)]).collect();
     assert_eq!(bells(ended, false), 1, "a hold that ends the run");
     let twice = held().into_iter().chain(held()).collect();
-    assert_eq!(bells(twice, false), 2, "it went on in between");
+    assert_eq!(bells(twice, false), 2, "two holds");
     let stopped = vec![state(State::Inserting), event(Severity::Fault, "operator: interrupted")];
-    assert_eq!(bells(stopped, true), 0, "the operator knows");
+    assert_eq!(bells(stopped, true), 0, "the operator stopped the run");
 }

@@ -1,4 +1,4 @@
-//! What the keys ask for.
+//! Tests of the keys.
 
 use super::*;
 
@@ -16,7 +16,7 @@ fn keys_are_commands_and_escape_sequences_are_none() {
             .join(", ")
     };
     assert_eq!(asked(b"rs-"), "resume, step of 1 mm, speed 0.800 mm/s");
-    // Those that come together add up.
+    // Keys that are read together add up.
     assert_eq!(asked(b"++"), "speed 1.200 mm/s, speed 1.400 mm/s");
     // F3, page down, an arrow in two parts, F5 in three.
     for sequence in [
@@ -32,16 +32,16 @@ fn keys_are_commands_and_escape_sequences_are_none() {
     ] {
         assert_eq!(asked(sequence), "");
     }
-    // A key behind a sequence counts.
+    // A key after a sequence counts.
     assert_eq!(asked(b"\x1b[Ar\x1b[6~r\x1bOSr\x1br"), "resume, resume, resume, resume");
     assert!(!shared.interrupt.is_raised());
     asked(b"\x03");
     assert!(shared.interrupt.is_raised());
 }
 
-/// Text that was pasted by mistake lets nothing go on; what stops is obeyed wherever it comes from.
+/// The paste may be a mistake, so only keys that hold or stop are obeyed.
 #[test]
-fn a_paste_holds_and_stops_and_lets_nothing_go_on() {
+fn a_paste_can_hold_or_stop_but_resumes_nothing() {
     let shared = Shared::new(setup(), Interrupt::default());
     let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
     let mut keyboard = Keys::default();
@@ -62,8 +62,7 @@ fn a_paste_holds_and_stops_and_lets_nothing_go_on() {
     assert!(!shared.wants_withdrawal.load(Ordering::Relaxed));
 }
 
-/// A key at the limit is a command like any other: the session refuses it with the limit, and the screen
-/// and the log say so.
+/// The key gives a command like any other; the session refuses it, and the screen shows the limit.
 #[test]
 fn a_speed_at_its_limit_is_refused_on_the_screen() {
     let shared = Shared::new(setup(), Interrupt::default());
@@ -86,7 +85,7 @@ fn a_speed_at_its_limit_is_refused_on_the_screen() {
     }
 }
 
-/// The screen has no speed before the first news of the insertion.
+/// The screen has no speed before the first progress of the insertion.
 #[test]
 fn a_speed_asked_for_at_once_counts_from_the_highest() {
     let shared = Shared::new(setup(), Interrupt::default());
@@ -97,7 +96,7 @@ fn a_speed_asked_for_at_once_counts_from_the_highest() {
     assert_eq!(commands.pop().expect("a command").to_string(), "speed 1.800 mm/s");
 }
 
-/// A y alone, or after another key, withdraws nothing.
+/// A y without a w just before it withdraws nothing.
 #[test]
 fn the_needle_is_withdrawn_after_a_w_and_a_y() {
     let pressed = |keys: &[u8], can_withdraw: bool| {
@@ -116,5 +115,5 @@ fn the_needle_is_withdrawn_after_a_w_and_a_y() {
         assert_eq!(pressed(keys, true)[0], keys == b"w\x1b[Ay y", "{keys:?}");
     }
     assert_eq!(pressed(b"q", true), [false, true]);
-    assert_eq!(pressed(b"wy", false), [false, false], "an emulated stage is gone");
+    assert_eq!(pressed(b"wy", false), [false, false], "no withdrawal is possible");
 }

@@ -1,13 +1,13 @@
-//! What the screen keeps of the records and events.
+//! Tests of what the screen keeps of the records and events.
 
 use super::*;
 
-/// What the operator asks for while the needle is held, and what the tracker says, is not why it is held.
+/// Later events of the tracker, and the answers to the operator, do not replace the reason.
 #[test]
 fn the_reason_of_a_hold_stays_on_the_screen() {
     let mut screen = inserted();
     let why = "last tip 0.51 s old (limit 0.50)";
-    // As the session says it.
+    // The order in which the session reports a hold.
     screen.event(at(19.0), Lane::Tracker, Severity::Warning, "1 sample refused");
     screen.take(&Record::State { time: at(20.0), state: State::Holding });
     screen.event(at(20.0), Lane::Tracker, Severity::Warning, why);
@@ -26,9 +26,9 @@ fn the_reason_of_a_hold_stays_on_the_screen() {
     assert_eq!(screen.why, fault);
 }
 
-/// A hold by the operator is explained by the answer to it, however that is worded, and by no later one.
+/// The wording of the answer does not matter. Later answers do not replace it.
 #[test]
-fn the_operators_hold_is_told_by_what_was_asked_for() {
+fn the_operators_hold_is_explained_by_the_answer_to_it() {
     let mut screen = inserted();
     let info = |screen: &mut Screen, text| {
         screen.event(at(20.0), Lane::Session, Severity::Info, text);
@@ -52,7 +52,7 @@ fn the_operators_hold_is_told_by_what_was_asked_for() {
     assert_eq!(info(&mut screen, "operator: speed 1.000 mm/s").0, "");
 }
 
-/// Of two drives in trouble the newest message is shown.
+/// Two drives send an emergency each.
 #[test]
 fn the_newest_emergency_is_on_the_screen() {
     let mut screen = inserted();
@@ -66,7 +66,7 @@ fn the_newest_emergency_is_on_the_screen() {
     assert!(tell(21.0, 1, 0x3210).contains("EMCY 0x3210"));
 }
 
-/// Frames that the screen missed are no SYNCs that the bench skipped, and no text is a figure.
+/// Frames that the screen missed do not count as skipped SYNCs either.
 #[test]
 fn figures_are_not_read_from_the_text_of_events() {
     let mut screen = inserted();

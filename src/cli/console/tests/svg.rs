@@ -6,12 +6,12 @@ use ratatui::style::{Color, Modifier};
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-/// A cell is so wide and so high.
+/// Width and height of a cell.
 const CELL: [f64; 2] = [8.0, 16.0];
 const BACKGROUND: &str = "#16181d";
 const FOREGROUND: &str = "#d5d8de";
 
-/// A colour as a terminal shows it; `None` is its own.
+/// A colour as a terminal shows it; `None` for the terminal's own colour.
 fn colour(colour: Color) -> Option<&'static str> {
     Some(match colour {
         Color::Reset => return None,
@@ -33,14 +33,14 @@ fn colours(cell: &Cell) -> [&'static str; 2] {
     if cell.modifier.contains(Modifier::REVERSED) { [bg, fg] } else { [fg, bg] }
 }
 
-/// What is drawn in one colour.
+/// The shapes of one colour, as SVG paths.
 #[derive(Default)]
 struct Shapes {
     areas: String,
     lines: String,
 }
 
-/// Draws the character of a cell whose corner is at `x`, `y`; false of one that is text.
+/// Draws the character of a cell whose corner is at `x`, `y`; false if the character is text.
 fn draw(c: char, [x, y]: [f64; 2], shapes: &mut Shapes) -> bool {
     let [width, height] = CELL;
     let mut area = |x: f64, y: f64, w: f64, h: f64| {
@@ -57,7 +57,7 @@ fn draw(c: char, [x, y]: [f64; 2], shapes: &mut Shapes) -> bool {
                 area(x + 1.0 + 4.0 * column, y + 1.0 + 4.0 * row, 2.0, 2.0);
             }
         }
-        // A bar of eighths.
+        // Bars in eighths of a cell.
         '\u{2588}'..='\u{258f}' => {
             area(x, y, f64::from(0x2590 - u32::from(c)) / 8.0 * width, height);
         }
@@ -85,7 +85,7 @@ fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
 }
 
-/// The picture of what is on `screen`.
+/// The picture of `screen`.
 pub(super) fn svg(screen: &Buffer) -> String {
     let [cell_width, cell_height] = CELL;
     let size = [f64::from(screen.area.width), f64::from(screen.area.height)];
@@ -99,7 +99,7 @@ pub(super) fn svg(screen: &Buffer) -> String {
     let mut texts = String::new();
     for row in 0..screen.area.height {
         let y = f64::from(row) * cell_height;
-        // Text that goes on: its first column, its colour and its characters.
+        // The run of text so far: its first column, its colour and its characters.
         let mut run: Option<(u16, &str, String)> = None;
         for column in 0..=screen.area.width {
             let cell = screen.cell((column, row));

@@ -1,11 +1,11 @@
-//! Threads that stand still, draw late or die.
+//! Tests with threads that stall, draw late or panic.
 
 use super::*;
 
-/// Without threads that serve it: what finds a queue full is dropped, the caller does not wait, and a
-/// hold overtakes what was asked for before.
+/// No threads serve the console. Messages to a full queue are dropped, the caller does not wait, and a hold overtakes
+/// the commands before it.
 #[test]
-fn a_console_that_stands_still_delays_nothing() {
+fn a_stalled_console_delays_nothing() {
     let shared = Arc::new(Shared::new(setup(), Interrupt::default()));
     let (messages, _queue) = RingBuffer::new(2);
     let (mut orders, commands) = RingBuffer::new(COMMANDS);
@@ -25,9 +25,9 @@ fn a_console_that_stands_still_delays_nothing() {
     assert_eq!(console.command(), None);
 }
 
-/// A terminal that shrinks and grows between two redraws has lost what the bench believes to be on it.
+/// A terminal that shrinks and grows between two redraws has lost part of what the bench drew.
 #[test]
-fn a_size_that_comes_and_goes_is_redrawn_whole() {
+fn a_terminal_that_shrinks_and_grows_back_is_redrawn_whole() {
     let shared = Shared::new(setup(), Interrupt::default());
     *lock(&shared.screen) = inserted();
     let mut terminal = Terminal::new(TestBackend::new(80, 24)).expect("a screen");
@@ -42,13 +42,13 @@ fn a_size_that_comes_and_goes_is_redrawn_whole() {
     let clear_every = CLEAR_EVERY as usize;
     let screens: Vec<String> = (1..clear_every).map(|_| redraw(&mut terminal)).collect();
     let (last, before) = screens.split_last().expect("redraws");
-    assert!(before.iter().all(|screen| *screen != whole), "the test shows nothing");
+    assert!(before.iter().all(|screen| *screen != whole), "the resizing lost nothing");
     assert_eq!(*last, whole);
 }
 
-/// The other thread reads the keys on, and the operator is not waited for on a screen that is gone.
+/// The other thread still reads the keys, and the end of the run does not wait for a key.
 #[test]
-fn a_drawing_thread_that_panics_gives_the_terminal_back() {
+fn a_drawing_thread_that_panics_restores_the_terminal() {
     let shared = Arc::new(Shared::new(setup(), Interrupt::default()));
     let (messages, mut queue) = RingBuffer::new(2);
     let (mut orders, commands) = RingBuffer::new(COMMANDS);
@@ -61,7 +61,7 @@ fn a_drawing_thread_that_panics_gives_the_terminal_back() {
     give_back_on_panic();
     let died = thread::spawn(move || {
         let _drawing = drawing;
-        panic!("drawing failed, as this test wants it");
+        panic!("drawing fails on purpose in this test");
     });
     assert!(died.join().is_err());
     assert!(!TAKEN.load(Ordering::Relaxed), "the terminal is given back");

@@ -1,4 +1,4 @@
-//! What is drawn.
+//! Tests of what is drawn.
 
 use super::*;
 use insta::assert_snapshot;
@@ -48,16 +48,15 @@ fn the_pictures_of_the_documentation_are_of_this_console() {
             std::fs::write(&path, &picture).expect("written");
         }
         let shown = std::fs::read_to_string(&path).unwrap_or_default();
-        assert!(shown == picture, "{path} is old: INSTA_UPDATE=always cargo test --lib pictures");
+        assert!(shown == picture, "{path} differs: INSTA_UPDATE=always cargo test --lib pictures");
     }
 }
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// No size and no number is too much for the screen.
     #[test]
-    fn no_size_panics(
+    fn any_size_and_number_can_be_drawn(
         width in 1..200u16,
         height in 1..60u16,
         number in prop::sample::select(vec![0.0, f64::NAN, f64::INFINITY, -1e300, 1e300, 1e-300]),
@@ -74,7 +73,7 @@ proptest! {
     }
 }
 
-/// No key is left out where there is room for its letter.
+/// From 17 columns on there is room for each letter.
 #[test]
 fn every_key_is_named_at_any_width() {
     for width in 17..=80 {
@@ -87,9 +86,9 @@ fn every_key_is_named_at_any_width() {
     }
 }
 
-/// A state of a drive is whole, however narrow its panel.
+/// The state is shown in full, however narrow the panel.
 #[test]
-fn a_drive_that_is_disabled_is_not_said_to_be_on() {
+fn a_disabled_drive_is_shown_as_disabled() {
     let mut screen = inserted();
     let disabled = Frame::new(0x182, &[0x50, 0x02, 0, 0, 0, 0]);
     screen.take(&Record::Can { time: at(20.0), direction: Direction::Received, frame: disabled });
@@ -99,7 +98,7 @@ fn a_drive_that_is_disabled_is_not_said_to_be_on() {
 }
 
 #[test]
-fn the_way_to_a_target_is_shown() {
+fn the_distance_to_a_target_is_shown() {
     let mut screen = inserted();
     let target_mm = Vector3::new(0.0, 20.0, 100.0);
     let approach =
@@ -112,7 +111,6 @@ fn the_way_to_a_target_is_shown() {
     assert!(shown.contains("target 61.2 mm, 0.12 off, path -"), "{shown}");
 }
 
-/// Where the needle is not withdrawn, the last line says why.
 #[test]
 fn why_a_needle_is_not_withdrawn_is_on_the_screen() {
     let keys = |screen: &Screen| {
