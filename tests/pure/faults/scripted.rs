@@ -372,6 +372,15 @@ fn another_master_s_set_point() {
     hazard("another_master_s_set_point", &[fault], &[], 0.0, reason);
 }
 
+/// A quick stop by SDO alone would be lost: in NMT Stopped a node takes none.
+#[test]
+fn nodes_that_another_master_sends_to_nmt_stopped() {
+    let fault = r#"kind = "foreign", frame = "000#0200""#;
+    let reason = "stage: another master on the bus: an NMT command (000#0200); stop it, or give it \
+                  other nodes: two masters cannot share an axis";
+    hazard("nodes_that_another_master_sends_to_nmt_stopped", &[fault], &[], 0.0, reason);
+}
+
 #[test]
 fn supervision_switched_off_by_another() {
     let fault = r#"kind = "foreign", frame = "601#2316100100000000""#;
