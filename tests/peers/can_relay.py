@@ -1,22 +1,21 @@
-"""Stands between a bench and its drives, each on a bus of its own, and changes what the drives say and what
-they are told. A bus is a SocketCAN interface, or the udp_multicast of python-can.
+"""Relays frames between a bench and its drives, each on a bus of its own, and changes some of them on their way. A
+bus is a SocketCAN interface, or the udp_multicast of python-can.
 
     can_relay.py --bench udp:239.75.1.1:43114 --drives udp:239.75.1.1:43113 \
         --rule 'node=1 from=4mm clear=0x0200' --rule 'node=2 from=4mm emcy=0x8611'
 
-A rule is a list of KEY=VALUE: node, from and until, and one thing to do.
-    from, until    a depth (4mm, as node 1 reports it, from where it was first), a time (2.5s, since
-                   the relay began) or a number of SYNCs (1sync); always, where they are left out
-    set, clear     these bits of the statusword, in TPDO1 and where it is read by SDO
-    emcy           the node sends an emergency message with this code, once
-    edit           its emergency messages have this code instead of theirs
-    drop=emcy      its emergency messages are lost
-    hold           the drive is given this controlword, whatever it is sent; what is written by SDO is
-                   confirmed and lost
+A rule is a list of KEY=VALUE: node, from and until, and one action. Without from or until it has no beginning or end.
+    from, until    a depth (4mm, from node 1's first position on), a time (2.5s, from the relay's start on) or a
+                   number of SYNCs (1sync)
+    set, clear     sets or clears these bits of the statusword, in TPDO1 and in SDO answers
+    emcy           sends an emergency message of the node with this code, once
+    edit           replaces the code of the node's emergency messages
+    drop=emcy      loses the node's emergency messages
+    hold           replaces the controlword to the drive in RPDO1; confirms and loses a controlword written by SDO
 
-Every other frame passes as it is. What the rules do, and each new controlword on its way to a drive, is
-printed with time and depth: "12.345 s 4.003 mm node 1: controlword 0x0002 by SDO". Ends on SIGINT. Messages
-over UDP are python-can's (4.6.1), packed and unpacked by its own functions.
+Every other frame passes unchanged. The relay prints what the rules do, and each new controlword to a drive, with time
+and depth: "12.345 s 4.003 mm node 1: controlword 0x0002 by SDO". It ends on SIGINT. Messages over UDP are packed and
+unpacked by python-can (4.6.1).
 """
 
 import argparse
@@ -38,7 +37,7 @@ EMCY_REGISTER = 0x21
 
 
 class UdpBus:
-    """One side over UDP: a socket that hears the group, and one of its own port to send from."""
+    """One side over UDP: a socket that receives the group, and one with its own port that sends."""
 
     def __init__(self, address):
         # Not needed over SocketCAN, and slow to load in an emulated machine.
@@ -63,7 +62,7 @@ class UdpBus:
         return self.receiver.fileno()
 
     def receive(self):
-        """The next frame: identifier, data, and as it came; None for one that this relay sent."""
+        """The next frame: identifier, data, and raw bytes; None if this relay sent it."""
         datagram, (_, port) = self.receiver.recvfrom(4096)
         if port == self.own_port:
             return None
@@ -81,8 +80,8 @@ class UdpBus:
 
 
 class CanBus:
-    """One side over SocketCAN, which does not hear what this relay sends. Its frames are struct can_frame, not
-    python-can's messages: an emulated machine has no time for those."""
+    """One side over SocketCAN, which does not receive what this relay sends. It reads struct can_frame itself:
+    python-can is too slow for an emulated machine."""
 
     FRAME = struct.Struct("=IB3x8s")
 
@@ -94,7 +93,7 @@ class CanBus:
         return self.socket.fileno()
 
     def receive(self):
-        """The next frame: identifier, data, and as it came."""
+        """The next frame: identifier, data, and raw bytes."""
         raw = self.socket.recv(CanBus.FRAME.size)
         cob_id, length, data = CanBus.FRAME.unpack(raw)
         return cob_id, data[:length], raw
@@ -112,7 +111,7 @@ def open_bus(name):
 
 @dataclass
 class Moment:
-    """How far the run is."""
+    """The progress of the run: time, depth and SYNCs."""
 
     began: float
     counts_per_mm: float
@@ -143,7 +142,7 @@ def limit(text):
     for unit in ("sync", "mm", "s"):
         if text.endswith(unit):
             return float(text.removesuffix(unit)), unit
-    raise ValueError(f"{text}: a number and mm, s or sync")
+    raise ValueError(f"{text}: expected a number with mm, s or sync")
 
 
 def number(text):
@@ -152,7 +151,7 @@ def number(text):
 
 @dataclass
 class Rule:
-    """What happens to one node, and when."""
+    """A fault of one node, and when it applies."""
 
     node: int
     begins: tuple | None = None
@@ -163,7 +162,7 @@ class Rule:
     edit: int | None = None
     drop: bool = False
     hold: int | None = None
-    struck: bool = field(default=False, init=False)
+    is_done: bool = field(default=False, init=False)
 
     @classmethod
     def parse(cls, text):
@@ -182,14 +181,14 @@ class Rule:
         for pair in text.split():
             key, _, value = pair.partition("=")
             if key not in kinds:
-                raise argparse.ArgumentTypeError(f"{key}: none of {', '.join(kinds)}")
+                raise argparse.ArgumentTypeError(f"{key}: expected one of {', '.join(kinds)}")
             name, parse = kinds[key]
             try:
                 values[name] = parse(value)
             except ValueError as error:
                 raise argparse.ArgumentTypeError(f"{pair}: {error}") from error
         if "node" not in values:
-            raise argparse.ArgumentTypeError(f"{text}: whose node?")
+            raise argparse.ArgumentTypeError(f"{text}: node is missing")
         rule = cls(**values)
         rule.drop = "drop" in values
         return rule
@@ -210,8 +209,8 @@ class Relay:
     def edited(self, node, statusword):
         for rule in self.rules_of(node):
             word = (statusword | rule.set) & ~rule.clear
-            if word != statusword and not rule.struck:
-                rule.struck = True
+            if word != statusword and not rule.is_done:
+                rule.is_done = True
                 self.moment.say(node, f"statusword {statusword:#06x} becomes {word:#06x}")
             statusword = word
         return statusword
@@ -244,28 +243,28 @@ class Relay:
         if cob_id == SYNC:
             self.moment.syncs += 1
         elif kind == RPDO1 and len(data) == 6:
-            self.tell_controlword(node, data, "RPDO", held)
+            self.print_controlword(node, data, "RPDO", held)
             if held:
                 data = struct.pack("<H", held[-1]) + data[2:]
                 return self.drives.send_frame(cob_id, data)
         elif kind == SDO_REQUEST and data.startswith(CONTROLWORD_WRITTEN):
             self.controlwords.pop((node, "SDO"), None)
-            self.tell_controlword(node, data[4:6], "SDO", held)
+            self.print_controlword(node, data[4:6], "SDO", held)
             if held:
                 return self.bench.send_frame(SDO_ANSWER + node, CONTROLWORD_CONFIRMED)
         self.drives.send(raw)
 
-    def tell_controlword(self, node, data, way, held):
+    def print_controlword(self, node, data, way, held):
         (word,) = struct.unpack_from("<H", data)
         if self.controlwords.get((node, way)) != word:
             self.controlwords[node, way] = word
             lost = " lost" if held else ""
             self.moment.say(node, f"controlword {word:#06x} by {way}{lost}")
 
-    def strike(self):
+    def send_emergencies(self):
         for rule in self.rules:
-            if rule.emcy is not None and not rule.struck and rule.is_on(self.moment):
-                rule.struck = True
+            if rule.emcy is not None and not rule.is_done and rule.is_on(self.moment):
+                rule.is_done = True
                 data = struct.pack("<HB5x", rule.emcy, EMCY_REGISTER)
                 self.bench.send_frame(EMCY + rule.node, data)
                 self.moment.say(rule.node, f"emergency {rule.emcy:#06x}")
@@ -294,7 +293,7 @@ def main():
             frame = bus.receive()
             if frame is not None:
                 ways[bus](*frame)
-            relay.strike()
+            relay.send_emergencies()
     return 0
 
 

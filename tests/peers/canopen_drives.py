@@ -1,10 +1,9 @@
 #!/usr/bin/env python3
-"""Two drives nobody here wrote: python-canopen LocalNodes with a CiA 402 axis behind each.
+"""Two third-party drives: LocalNodes of python-canopen, each with a CiA 402 axis.
 
-NMT, SDO server, object dictionary and heartbeat are python-canopen's (2.4.1); the axis is the least
-that follows a master in cyclic synchronous position: at each SYNC it reports where it is and takes
-the target that was received before. Prints "ready" once both have booted; on SIGINT says of each
-what it was told and where it stands, and ends.
+NMT, SDO server, object dictionary and heartbeat are python-canopen's (2.4.1). The axis implements the minimum of cyclic
+synchronous position: at each SYNC it reports its position and takes the target that it received before. Prints "ready"
+once both have booted. On SIGINT it prints position, statusword and settings of each drive, and ends.
 """
 
 import argparse
@@ -21,7 +20,7 @@ U8, U16, U32 = datatypes.UNSIGNED8, datatypes.UNSIGNED16, datatypes.UNSIGNED32
 I8, I16, I32 = datatypes.INTEGER8, datatypes.INTEGER16, datatypes.INTEGER32
 
 CSP = 8
-# Controlwords (CiA 402-2, table of commands): what to do with the bits that matter.
+# Bits of the controlword (CiA 402-2, table of commands).
 DISABLE_VOLTAGE, QUICK_STOP = 0x02, 0x04
 # Statuswords of the states, with "voltage enabled" and "remote".
 SWITCH_ON_DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP_ACTIVE = 0x250, 0x231, 0x233, 0x237, 0x217
@@ -86,7 +85,7 @@ class Drive:
         self.position = self.target = 0
         self.enabled_syncs = 0
         self.watched = []
-        # Whether TPDO1 is mapped as it is sent here; none until the next look.
+        # Whether TPDO1 has the mapping that is sent here; None if not checked since it was written.
         self.is_mapped = None
         network.add_node(self.node)
         network.subscribe(0x200 + node_id, self.take_rpdo)
@@ -112,7 +111,7 @@ class Drive:
                 self.change_state()
 
     def mapped(self, index):
-        """What the master has mapped, as index, subindex, bits in one number each."""
+        """The objects that the master has mapped, each as index, subindex and bits in one number."""
         count = self.node.sdo[index][0].raw
         return [self.node.sdo[index][n].raw for n in range(1, count + 1)]
 
@@ -136,7 +135,7 @@ class Drive:
         self.network.send_message(0x180 + self.node.id, answer)
 
     def change_state(self):
-        """One step of the CiA 402 state machine towards what the controlword asks for."""
+        """Makes one transition of the CiA 402 state machine towards the state that the controlword requests."""
         word, state = self.controlword, self.statusword & ~DRIVE_FOLLOWS
         if not word & DISABLE_VOLTAGE:
             state = SWITCH_ON_DISABLED

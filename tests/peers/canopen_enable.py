@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""A CANopen master nobody here wrote takes an emulated drive through a small motion.
+"""A third-party CANopen master makes a small motion with an emulated drive.
 
 python-canopen maps the PDOs, brings the drive to OPERATION ENABLED in cyclic synchronous position
-(CSP), moves it a little and back on its own SYNC, drives it into a following error and resets the
-fault, lets it home, and disables it. What it did is printed line by line; the exit status is 0 when
-all of it worked, else 1 with the reason on the last line.
+(CSP), moves it a little and back on its own SYNC, causes a following error and resets the fault,
+homes the drive, and disables it. It prints each action on a line. The exit status is 0 if all
+succeeded, else 1 with the reason on the last line.
 
     canopen_enable.py --interface socketcan --channel vcan0 --node 1
 """
@@ -38,12 +38,12 @@ INDEX_PULSE_BELOW = 33  # CiA 402-2, homing methods
 
 TOLERANCE_COUNTS = 2
 
-# In an emulated machine a second is soon gone; nothing waits this long unless it fails.
+# Timeout of a wait, for a slow emulated machine. Only a test that fails waits this long.
 PATIENCE_S = 10.0
 
 
 class Failed(Exception):
-    """What the drive did not do."""
+    """The drive did not do what it was told."""
 
 
 def object_dictionary() -> canopen.ObjectDictionary:
@@ -99,7 +99,7 @@ def wait_until(what: str, condition) -> None:
 
 
 class Master:
-    """One drive, driven by python-canopen's own CiA 402 node."""
+    """Commands one drive by python-canopen's CiA 402 node."""
 
     def __init__(self, network: canopen.Network, node_id: int, period_ms: int):
         self.network = network
@@ -110,7 +110,7 @@ class Master:
         self.drive.TIMEOUT_SWITCH_STATE_FINAL = PATIENCE_S
         self.drive.TIMEOUT_SWITCH_STATE_SINGLE = PATIENCE_S
         self.drive.TIMEOUT_CHECK_TPDO = PATIENCE_S
-        # Its wait for a reset is in vain: the rising edge comes after it, with the next transition.
+        # python-canopen waits for the reset before it sends the rising edge, so the wait is in vain.
         self.drive.TIMEOUT_RESET_FAULT = 0.0
         network.add_node(self.drive)
 
@@ -146,14 +146,14 @@ class Master:
     def choose_csp(self) -> None:
         period = self.drive.sdo[INTERPOLATION_PERIOD]
         period[1].raw, period[2].raw = round(self.period_s * 1000), -3
-        # The setter only logs what fails.
+        # The setter only logs a failure.
         self.drive.op_mode = CSP
         if self.drive.op_mode != CSP:
             raise Failed(f"0x6060 set to CSP, 0x6061 says {self.drive.op_mode}")
         say(f"mode: {CSP.lower()}, every {period[1].raw} ms")
 
     def start_cycle(self) -> None:
-        # A drive told to hold where it is cannot jump when it is enabled.
+        # A drive whose target is its position cannot jump when it is enabled.
         self.command(self.drive.sdo[ACTUAL_POSITION].raw)
         self.drive.nmt.state = "OPERATIONAL"
         self.drive.rpdo[1].start(self.period_s)
@@ -163,7 +163,7 @@ class Master:
 
     def enable(self) -> None:
         if self.drive.is_faulted():
-            say("it is in FAULT: reset")
+            say("the drive is in FAULT: reset")
             self.drive.reset_from_fault()
         self.drive.state = "OPERATION ENABLED"
         wait_until("bit 12 of 6041, drive follows", lambda: self.drive.statusword & DRIVE_FOLLOWS)
@@ -190,14 +190,14 @@ class Master:
         return abs(self.position - target) <= TOLERANCE_COUNTS
 
     def fail_and_reset(self, window_counts: int) -> None:
-        """A target far outside the following-error window, and the way back."""
+        """Causes a following error, and resets the fault."""
         self.drive.sdo[FOLLOWING_ERROR_WINDOW].raw = window_counts
         start = self.position
         self.command(start + 100 * window_counts)
         wait_until("state FAULT", self.drive.is_faulted)
         wait_until("emergency 8611", lambda: self.emergencies() == [EMCY_FOLLOWING_ERROR])
         say(f"{self.drive.state}: {self.drive.emcy.log[-1]}")
-        # Without power, towards no target: it must not move when it is enabled again.
+        # The target becomes the position: the drive must not move when it is enabled again.
         self.command(self.position)
         self.drive.reset_from_fault()
         wait_until("emergency 0000", lambda: self.emergencies()[-1] == EMCY_NO_ERROR)
@@ -211,8 +211,8 @@ class Master:
 
     def home(self) -> None:
         self.drive.sdo[HOMING_METHOD].raw = INDEX_PULSE_BELOW
-        # It may look before the drive has acted on the start, and takes a drive that stands for an
-        # interrupted one: then it is told to look again.
+        # python-canopen may read the statusword before the drive has started, and take a drive that stands for an
+        # interrupted homing. Then it must read it again.
         end = time.monotonic() + PATIENCE_S
         while not self.drive.homing(PATIENCE_S):
             if time.monotonic() > end:
@@ -225,7 +225,7 @@ class Master:
         say(f"{self.drive.state}: statusword {self.drive.statusword:#06x}")
 
     def leave(self) -> None:
-        """Disables the drive if it still is enabled, whatever happened, and ends the cycle."""
+        """Disables the drive, also after a failure, and ends the cycle."""
         if CONTROLWORD in self.drive.rpdo_pointers:
             self.drive.rpdo_pointers[CONTROLWORD].raw = 0
             time.sleep(3 * self.period_s)

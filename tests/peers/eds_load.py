@@ -1,4 +1,4 @@
-"""Loads electronic data sheets with python-canopen and says what is in them, as JSON."""
+"""Loads electronic data sheets with python-canopen and prints their content as JSON."""
 
 import json
 import sys

@@ -1,9 +1,9 @@
-"""Stops one thread of a process, as a disk that takes nothing stops the one that writes to it.
+"""Stops one thread of a process, as a disk that stalls stops the thread that writes to it.
 
 usage: hold_thread.py PID NAME
 
-The thread is held by ptrace from the line "holding" on until SIGINT, or the end of this program.
-Where that is not allowed (kernel.yama.ptrace_scope over 0, and not root) it says so and exits 77.
+Prints "holding" once ptrace has stopped the thread, and resumes it at SIGINT or at the end of this program. Without
+the permission to trace (kernel.yama.ptrace_scope over 0, and not root) it prints "not allowed" and exits with 77.
 """
 
 import ctypes

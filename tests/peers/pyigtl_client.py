@@ -1,6 +1,6 @@
 """Reads TRANSFORMs of one device with pyigtl (0.3.4) and prints each as a line of JSON.
 
-Exit 0 once COUNT have come, 1 if they have not within TIMEOUT s.
+Exits with 0 after COUNT messages, with 1 if they do not come within TIMEOUT s.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Pushes a fixed pose to an OpenIGTLink server as a client, with pyigtl (0.3.4), for DURATION s."""
+"""Sends a fixed pose as a client to an OpenIGTLink server, with pyigtl (0.3.4), for DURATION s."""
 
 import argparse
 import sys

@@ -1,9 +1,9 @@
-"""Hands the tip positions of one OpenIGTLink server on as another, with pyigtl (0.3.4) both ways.
+"""Relays the tip positions of one OpenIGTLink server as another server, with pyigtl (0.3.4) on both sides.
 
-Prints "listening PORT" once it serves; port 0 lets the system choose. Every new position goes on
-with the stamp it came with. Ends with its only client, or after DURATION s; with --stay it serves
-one client after the other until then. While the file CARRIED is there, the tool is where it says,
-"x y z" in mm, with 0.1 mm of noise: a hand has it.
+Prints "listening PORT" once it serves; with port 0 the system chooses the port. Every new position keeps its stamp.
+The relay ends with its only client, or after DURATION s; with --stay it serves one client after the other until then.
+While the file CARRIED exists, the tool is at the position "x y z" (mm) in it, with 0.1 mm of noise, as if an operator
+held it there.
 """
 
 import argparse
@@ -24,9 +24,9 @@ def main():
     parser.add_argument("--device", default="NeedleToTracker")
     parser.add_argument("--duration", type=float, default=300.0, help="s, at most")
     parser.add_argument("--stay", action="store_true", help="serve one client after the other")
-    parser.add_argument("--carried", type=Path, help="file of the place that the tool is carried to")
+    parser.add_argument("--carried", type=Path, help="file with the position of the tool")
     args = parser.parse_args()
-    # pyigtl takes a client that ends for an error.
+    # pyigtl logs the end of a client as an error.
     logging.disable(logging.ERROR)
 
     source = pyigtl.OpenIGTLinkClient(host=args.from_host, port=args.from_port)
@@ -49,7 +49,7 @@ def main():
             served += 1
         elif served > 0 and not server.is_connected() and not args.stay:
             break
-    print(f"{served} positions handed on", flush=True)
+    print(f"{served} positions relayed", flush=True)
     return 0 if served > 0 else 1
 
 

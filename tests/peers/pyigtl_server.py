@@ -1,8 +1,8 @@
 """Serves tip positions along a curve as OpenIGTLink TRANSFORMs, with pyigtl (0.3.4).
 
-The curve is the arc of a needle of radius 122 mm that is inserted along z at SPEED mm/s and bends
-towards x. Prints "listening PORT" once it does; serves one client, for DURATION s from its
-connection. Port 0 lets the system choose.
+The curve is the arc of a needle of radius 122 mm that is inserted along z at 5 mm/s and bends
+towards x. Prints "listening PORT" once it listens; with port 0 the system chooses the port. Serves
+one client, for DURATION s from its connection.
 """
 
 import argparse

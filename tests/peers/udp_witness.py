@@ -1,6 +1,6 @@
-"""Writes what passes on a udp_multicast bus as python-can (4.6.1) reads it, one frame a line.
+"""Prints the frames on a udp_multicast bus as python-can (4.6.1) reads them, one per line.
 
-Each line is `id#data`, as candump -L has it. Prints "listening" once it does; ends on SIGINT.
+Each line is `id#data`, as in candump -L. Prints "listening" first; ends on SIGINT.
 """
 
 import argparse
