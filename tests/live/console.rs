@@ -1,28 +1,26 @@
-//! `run --console` on a pseudoterminal: its keys, and what becomes of a run whose terminal is tiny, takes no
-//! output, or is gone.
+//! `run --console` on a pseudoterminal: its keys, and runs whose terminal is tiny, takes no output, or is closed.
 #![cfg(target_os = "linux")]
 
 use crate::support::needed;
-use crate::support::programs::{self, LONG, Scratch, beside_others};
+use crate::support::programs::{self, LONG, Scratch, beside_others, send_signal};
 use crate::support::recorded;
 use crate::support::replays::assert_it_replays;
 use crate::support::terminal::OnTerminal;
 use crate::support::udp_stage::Stage;
-use needle_bench::transport::can::{BusEvent, CanBus};
-use needle_bench::transport::udp::UdpBus;
-use std::fs;
+use crate::support::witness::Witness;
 use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// What gives the terminal back: the other screen is left.
+/// The console leaves the alternate screen.
 const LEFT: &str = "\x1b[?1049l";
 
+/// Permits an insertion that is too short to reach the plane.
 const FAR: &str = "insertion.plane_out_of_reach=\"insert\"";
 
 const BELL: char = '\x07';
 
-/// Starts an insertion to this depth on a terminal of so many rows and columns; `None` without `script`.
+/// Starts an insertion to `depth_mm` on a terminal of `size` (rows, columns); `None` without `script`.
 fn on_terminal(
     scratch: &Scratch,
     stage: &Stage,
@@ -34,57 +32,42 @@ fn on_terminal(
     OnTerminal::start(&bench, &scratch.path("keyboard"), size)
 }
 
-/// Waits until the run's `events.log` has `text`.
-#[track_caller]
-fn wait_for(scratch: &Scratch, text: &str) {
-    let end = Instant::now() + 3 * LONG;
-    let said = || {
-        let runs = fs::read_dir(scratch.path("runs")).into_iter().flatten().flatten();
-        let logs = runs.map(|run| fs::read_to_string(run.path().join("events.log")));
-        logs.filter_map(Result::ok).collect::<String>()
-    };
-    while !said().contains(text) {
-        assert!(Instant::now() < end, "not recorded: {text:?}, but:\n{}", said());
-        thread::sleep(Duration::from_millis(20));
-    }
-}
-
 #[test]
 fn the_keys_hold_step_slow_down_resume_and_stop() {
     let _machine = beside_others();
     let scratch = Scratch::new("console");
     let stage = Stage::start(&[]);
     let Some(mut bench) = on_terminal(&scratch, &stage, [24, 80], 100) else { return };
-    wait_for(&scratch, "inserting");
+    scratch.wait_for_event("inserting");
     thread::sleep(Duration::from_millis(300));
     bench.press("-");
-    wait_for(&scratch, "operator: speed 4.500 mm/s, was 5.000");
+    scratch.wait_for_event("operator: speed 4.500 mm/s, was 5.000");
     thread::sleep(Duration::from_millis(300));
     bench.press("+");
-    wait_for(&scratch, "operator: speed 5.000 mm/s, was 4.500");
-    // A resume before the hold is void; so is an arrow.
+    scratch.wait_for_event("operator: speed 5.000 mm/s, was 4.500");
+    // Resume has no effect before the hold, nor has an arrow key.
     bench.press("r\x1b[A ");
-    wait_for(&scratch, "operator: hold at ");
+    scratch.wait_for_event("operator: hold at ");
     thread::sleep(Duration::from_millis(300));
     bench.press("s");
-    wait_for(&scratch, "the step ends; held, ");
+    scratch.wait_for_event("the step ends; held, ");
     bench.press("+");
-    wait_for(&scratch, "operator: speed 5.500 mm/s refused: allowed: over 0 and up to 5 mm/s");
+    scratch.wait_for_event("operator: speed 5.500 mm/s refused: allowed: over 0 and up to 5 mm/s");
     bench.press("---");
-    wait_for(&scratch, "operator: speed 3.500 mm/s, was 4.000");
+    scratch.wait_for_event("operator: speed 3.500 mm/s, was 4.000");
     thread::sleep(Duration::from_millis(300));
     bench.press("r");
-    wait_for(&scratch, "operator: resume at ");
+    scratch.wait_for_event("operator: resume at ");
     let run_dir = scratch.run_dir();
     bench.press("q");
-    wait_for(&scratch, "operator: interrupted");
-    // The screen stays, and the needle is withdrawn as after a completed run.
+    scratch.wait_for_event("operator: interrupted");
+    // The console stays open, and the needle is withdrawn as after a completed run.
     bench.press_to_the_end(&["w", "y"]);
     let ended = bench.program.end();
     ended.assert_status(1);
     assert!(ended.stdout.contains(LEFT), "{}", ended.stdout);
     assert!(ended.stdout.contains("insertion   from 0.000 to -"), "{}", ended.stdout);
-    assert!(!ended.stdout.contains(BELL), "what the operator does is no alarm");
+    assert!(!ended.stdout.contains(BELL), "a bell without a fault");
     let manifest = programs::manifest(&run_dir);
     assert_eq!(manifest["stop_reason"], "operator: interrupted");
     assert_it_replays(&run_dir);
@@ -92,9 +75,9 @@ fn the_keys_hold_step_slow_down_resume_and_stop() {
     recorded::keep(&run_dir, "operator");
 }
 
-/// An operator practises on the file of the rig, at the pace of the rig.
+/// An operator practises with the configuration of the rig.
 #[test]
-fn a_rehearsal_takes_the_keys_at_the_pace_of_the_rig() {
+fn a_rehearsal_on_the_console_runs_in_real_time_and_obeys_the_keys() {
     let _machine = beside_others();
     let scratch = Scratch::new("console-rehearsal");
     let mut bench = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
@@ -108,13 +91,13 @@ fn a_rehearsal_takes_the_keys_at_the_pace_of_the_rig() {
     let Some(mut bench) = OnTerminal::start(&bench, &scratch.path("keyboard"), [24, 80]) else {
         return;
     };
-    wait_for(&scratch, "inserting");
+    scratch.wait_for_event("inserting");
     bench.press(" ");
-    wait_for(&scratch, "operator: hold at ");
+    scratch.wait_for_event("operator: hold at ");
     thread::sleep(Duration::from_secs(1));
     bench.press("r");
-    wait_for(&scratch, "operator: resume at ");
-    wait_for(&scratch, "completed");
+    scratch.wait_for_event("operator: resume at ");
+    scratch.wait_for_event("completed");
     let took_s = begun.elapsed().as_secs_f64();
     let run_dir = scratch.run_dir();
     bench.press_to_the_end(&["w", "y"]);
@@ -122,8 +105,8 @@ fn a_rehearsal_takes_the_keys_at_the_pace_of_the_rig() {
     ended.assert_status(0);
     assert!(ended.stdout.contains("insertion   from 3.0"), "{}", ended.stdout);
     let duration_s = programs::manifest(&run_dir)["duration_s"].as_f64().expect("a duration");
-    println!("{duration_s:.1} s of the rig took {took_s:.1} s");
-    // 3 mm at 1 mm/s and a hold of a second.
+    println!("a run of {duration_s:.1} s took {took_s:.1} s");
+    // 3 mm at 1 mm/s and a hold of 1 s.
     assert!(duration_s > 4.0 && took_s >= duration_s - 0.1, "{duration_s} s took {took_s} s");
     assert_it_replays(&run_dir);
 }
@@ -135,7 +118,7 @@ fn a_fault_rings_the_bell_once() {
     let stage =
         Stage::start(&["--set", "emulator.fault=[{ at_mm = 3, kind = \"emergency-stop\" }]"]);
     let Some(mut bench) = on_terminal(&scratch, &stage, [24, 80], 20) else { return };
-    wait_for(&scratch, "stopped");
+    scratch.wait_for_event("stopped");
     thread::sleep(Duration::from_millis(500));
     bench.press_to_the_end(&["q"]);
     let ended = bench.program.end();
@@ -143,17 +126,16 @@ fn a_fault_rings_the_bell_once() {
     assert_eq!(ended.stdout.matches(BELL).count(), 1, "{}", ended.stdout);
 }
 
-/// After its end the screen stays until the operator leaves it or a signal comes, to the command that
-/// withdraws.
+/// After the run the console stays open. SIGTERM closes it, and the output ends with the command to withdraw the
+/// needle.
 #[test]
-fn a_terminal_of_one_character() {
+fn a_run_completes_on_a_terminal_of_one_character() {
     let _machine = beside_others();
     let scratch = Scratch::new("console-tiny");
     let stage = Stage::start(&[]);
     let Some(bench) = on_terminal(&scratch, &stage, [1, 1], 3) else { return };
-    wait_for(&scratch, "completed");
-    let terminate = format!("kill -s TERM {}", bench.process());
-    assert!(Command::new("sh").args(["-c", &terminate]).status().expect("sh").success());
+    scratch.wait_for_event("completed");
+    send_signal(bench.process(), "TERM");
     let ended = bench.program.end();
     ended.assert_status(0);
     let config = scratch.run_dir().join("config.toml");
@@ -161,14 +143,14 @@ fn a_terminal_of_one_character() {
     assert!(ended.stdout.contains(&next), "{}", ended.stdout);
 }
 
-/// The needle is pulled out of a stage whose axis reads 0 wherever it starts, by what its limits allow.
+/// With `zero = "start"` the axis reads 0 where the withdrawal begins, so it goes to −3 mm.
 #[test]
 fn the_needle_is_withdrawn_after_the_run() {
     let _machine = beside_others();
     let scratch = Scratch::new("console-withdraw");
     let stage = Stage::start(&[]);
     let Some(mut bench) = on_terminal(&scratch, &stage, [24, 80], 3) else { return };
-    wait_for(&scratch, "completed");
+    scratch.wait_for_event("completed");
     bench.press_to_the_end(&["w", "y"]);
     let ended = bench.program.end();
     ended.assert_status(0);
@@ -176,14 +158,14 @@ fn the_needle_is_withdrawn_after_the_run() {
     assert!(stage.assert_it_stands().abs() < 0.1);
 }
 
-/// Ctrl-S at the terminal itself, and a window that is made tiny and large again, in the midst of a run.
+/// Ctrl-S with and without the terminal's own flow control, and a window that is made tiny and large again.
 #[test]
-fn a_terminal_that_is_stopped_and_resized() {
+fn a_run_completes_after_ctrl_s_and_resizing_of_its_terminal() {
     let _machine = beside_others();
     let scratch = Scratch::new("console-resized");
     let stage = Stage::start(&[]);
     let Some(mut bench) = on_terminal(&scratch, &stage, [24, 80], 20) else { return };
-    wait_for(&scratch, "inserting");
+    scratch.wait_for_event("inserting");
     let terminal = bench.terminal();
     let stty = |settings: &[&str]| {
         let set = Command::new("stty").arg("-F").arg(&terminal).args(settings).status();
@@ -193,60 +175,52 @@ fn a_terminal_that_is_stopped_and_resized() {
         stty(&["rows", size[0], "cols", size[1]]);
         thread::sleep(Duration::from_millis(250));
     }
-    // In raw mode Ctrl-S is a key without a meaning; with the terminal's own flow control it stops the
-    // output until Ctrl-Q.
+    // In raw mode the console ignores Ctrl-S. With flow control by the terminal it stops the output until Ctrl-Q.
     bench.press("\x13");
     stty(&["ixon"]);
     bench.press("\x13");
     thread::sleep(Duration::from_secs(1));
     bench.press(" ");
-    wait_for(&scratch, "operator: hold at ");
+    scratch.wait_for_event("operator: hold at ");
     thread::sleep(Duration::from_millis(500));
     bench.press("r");
-    wait_for(&scratch, "operator: resume at ");
-    wait_for(&scratch, "completed");
+    scratch.wait_for_event("operator: resume at ");
+    scratch.wait_for_event("completed");
     bench.press("\x11");
     bench.press_to_the_end(&["q"]);
     let ended = bench.program.end();
     ended.assert_status(0);
-    assert!(ended.stdout.contains(LEFT), "the terminal is given back");
+    assert!(ended.stdout.contains(LEFT), "the alternate screen stays: {}", ended.stdout);
     assert_it_replays(&scratch.run_dir());
 }
 
-/// The drives miss its heartbeat, as without a console. The terminal stays as it was left.
 #[test]
-fn a_bench_that_is_killed_with_its_console() {
+fn drives_stop_when_the_bench_is_killed_with_its_console() {
     let _machine = beside_others();
     let scratch = Scratch::new("console-killed");
     let stage = Stage::start(&[]);
     let Some(bench) = on_terminal(&scratch, &stage, [24, 80], 100) else { return };
-    wait_for(&scratch, "inserting");
-    let mut witness = UdpBus::join(stage.group).expect("the bus");
-    let kill = format!("kill -s KILL {}", bench.process());
-    assert!(Command::new("sh").args(["-c", &kill]).status().expect("sh").success());
+    scratch.wait_for_event("inserting");
+    let mut witness = Witness::of(&stage);
+    send_signal(bench.process(), "KILL");
     let ended = bench.program.end();
     assert_ne!(ended.status.code(), Some(0), "killed");
-    assert!(!ended.stdout.contains(LEFT), "nobody gives the terminal back");
-    // The drives say that they miss it.
-    loop {
-        let event = witness.receive(LONG).expect("the bus").expect("an emergency message");
-        if matches!(event, BusEvent::Frame(frame) if frame.cob_id() == Some(0x081)) {
-            break;
-        }
-    }
+    assert!(!ended.stdout.contains(LEFT), "a killed bench cannot leave the alternate screen");
+    // The drives report the missing heartbeat.
+    witness.wait_for_emergency();
     stage.assert_it_stands();
 }
 
-/// A terminal that takes no output (Ctrl-S at its far end, a link that hangs) delays nothing.
+/// As with Ctrl-S in a terminal program, or a remote connection that hangs.
 #[test]
-fn a_terminal_that_is_frozen() {
+fn a_run_completes_while_its_terminal_takes_no_output() {
     let _machine = beside_others();
     let scratch = Scratch::new("console-frozen");
     let stage = Stage::start(&[]);
     let Some(mut bench) = on_terminal(&scratch, &stage, [40, 120], 15) else { return };
-    wait_for(&scratch, "inserting");
+    scratch.wait_for_event("inserting");
     bench.program.signal("STOP");
-    wait_for(&scratch, "completed");
+    scratch.wait_for_event("completed");
     bench.program.signal("CONT");
     bench.press_to_the_end(&["q"]);
     let ended = bench.program.end();
@@ -256,22 +230,21 @@ fn a_terminal_that_is_frozen() {
     println!("{timing}");
 }
 
-/// The terminal is closed, or its connection ends: the run stops, as without a console.
 #[test]
-fn a_terminal_that_is_gone() {
+fn a_closed_terminal_stops_the_run() {
     let _machine = beside_others();
     let scratch = Scratch::new("console-gone");
     let stage = Stage::start(&[]);
     let Some(bench) = on_terminal(&scratch, &stage, [24, 80], 100) else { return };
-    wait_for(&scratch, "inserting");
+    scratch.wait_for_event("inserting");
     bench.program.signal("KILL");
-    wait_for(&scratch, "operator: interrupted");
-    wait_for(&scratch, "stopped");
+    scratch.wait_for_event("operator: interrupted");
+    scratch.wait_for_event("stopped");
     assert_it_replays(&scratch.run_dir());
     stage.assert_it_stands();
 }
 
-/// A server of its own, which ends with the test.
+/// A tmux server of its own, which ends with the test.
 struct Tmux {
     socket: String,
 }
@@ -285,14 +258,14 @@ impl Tmux {
         String::from_utf8(ran.stdout).expect("UTF-8")
     }
 
-    /// Waits until the screen has `text`, and gives the screen.
+    /// Waits until the screen contains `text`, and returns the screen.
     #[track_caller]
     fn wait_for(&self, text: &str) -> String {
         self.wait_until(|screen| screen.contains(text))
     }
 
-    /// The same of any condition. A test of a whole screen waits for what is drawn last: tmux also shows a
-    /// screen that is half drawn.
+    /// Waits until `is_shown`, and returns the screen. A test of a whole screen must wait for what is drawn last,
+    /// because tmux also returns a screen that is half drawn.
     #[track_caller]
     fn wait_until(&self, is_shown: impl Fn(&str) -> bool) -> String {
         let end = Instant::now() + LONG;
@@ -313,9 +286,9 @@ impl Drop for Tmux {
     }
 }
 
-/// What another terminal program makes of the screens, at several sizes and while they change.
+/// Reads the screens as another terminal program shows them.
 #[test]
-fn the_console_in_tmux() {
+fn tmux_shows_the_console_at_several_sizes() {
     let _machine = beside_others();
     if Command::new("tmux").arg("-V").output().is_err() {
         return needed::skip("tmux", "install it: apt-get install tmux");
@@ -327,7 +300,7 @@ fn the_console_in_tmux() {
     let words: Vec<_> = words.map(|word| word.to_str().expect("UTF-8")).collect();
     let tmux = Tmux { socket: format!("needle-bench-{}", std::process::id()) };
     let folder = env!("CARGO_MANIFEST_DIR");
-    // What the bench says in the end stays on the screen.
+    // Keeps the last output of the bench on the screen.
     let shell = ["sh", "-c", "\"$@\"; echo status $?; exec sleep 600", "sh"];
     let start = ["new-session", "-d", "-x", "80", "-y", "24", "-c", folder];
     tmux.run(&[&start[..], &shell, &words].concat());
@@ -338,9 +311,10 @@ fn the_console_in_tmux() {
 
     tmux.wait_for(" INSERTING");
     press("Space");
-    let is_told =
+    let has_event =
         |screen: &str| screen.lines().skip(19).any(|line| line.contains("operator: hold at "));
-    let screen = tmux.wait_until(|screen| screen.contains(" HELD BY OPERATOR") && is_told(screen));
+    let screen =
+        tmux.wait_until(|screen| screen.contains(" HELD BY OPERATOR") && has_event(screen));
     let lines: Vec<&str> = screen.lines().collect();
     assert_eq!(lines.len(), 24, "{screen}");
     assert!(lines[1].contains(" of 100.0 mm "), "{screen}");

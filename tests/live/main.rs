@@ -1,7 +1,7 @@
-//! Tests in real time, over the host's sockets, files and processes. Each holds
-//! `support::programs::beside_others()`: it mostly waits, on a bus of its own, and runs beside others. A test
-//! that floods the machine, or whose peer hears every bus over UDP, holds `alone()`. `protocol` takes as long as all
-//! others and holds neither.
+//! Tests in real time, over the host's sockets, files and processes. Most tests mostly wait, on a bus of their
+//! own, and run beside others: they hold `support::programs::beside_others()`. A test that floods the machine, or
+//! whose peer hears every bus over UDP, holds `alone()`. `protocol` takes as long as all others together and holds
+//! neither.
 
 mod console;
 mod openigtlink_peers;

@@ -1,9 +1,9 @@
-//! The tracker's connection against the reference library's own example programs, as Debian's
-//! package `openigtlink-examples` has them: servers of every message type that carries positions,
-//! and a client that prints what the bench's server sends.
+//! The tracker link against the example programs of the reference library, from Debian's package
+//! `openigtlink-examples`: servers of every message type that carries positions, and a client that prints what the
+//! bench's server sends.
 
 use crate::support::needed::skip;
-use crate::support::programs::beside_others;
+use crate::support::programs::{Program, beside_others, free_address};
 use needle_bench::tracker::openigtlink::{
     Body, IgtlStamp, Message, Quaternion, Status, Tool, ToolStream, tool_kind,
 };
@@ -11,86 +11,45 @@ use needle_bench::tracker::{Event, Sample, Validity};
 use needle_bench::transport::link::{Link, LinkSettings};
 use needle_bench::transport::tcp::TransformServer;
 use needle_bench::units::Time;
-use std::io::{BufRead, BufReader};
-use std::net::TcpListener;
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::Command;
 use std::time::{Duration, Instant};
 use tokio::runtime::Runtime;
 use tokio::time::timeout;
 
 const HANGING: Duration = Duration::from_secs(60);
 
-/// A program of the examples, ended with the test.
-struct Peer(Child);
-
-impl Peer {
-    /// Starts it where its folder is named.
-    fn start(program: &str, args: &[&str]) -> Option<Peer> {
-        let Some(folder) = std::env::var_os("NEEDLE_PEERS_OPENIGTLINK") else {
-            let remedy =
-                "set NEEDLE_PEERS_OPENIGTLINK to the folder that tests/run.sh builds them in";
-            skip("OpenIGTLink examples", remedy);
-            return None;
-        };
-        let program = Path::new(&folder).join(program);
-        let child = Command::new(&program)
-            .args(args)
-            .stderr(Stdio::piped())
-            .spawn()
-            .unwrap_or_else(|error| panic!("{}: {error}", program.display()));
-        Some(Peer(child))
-    }
-
-    /// What it prints, up to and with a line that holds `last`.
-    fn lines(&mut self, last: &str) -> Vec<String> {
-        let stderr = self.0.stderr.take().expect("piped");
-        let mut lines = Vec::new();
-        for line in BufReader::new(stderr).lines() {
-            lines.push(line.expect("text"));
-            if lines.last().is_some_and(|line| line.contains(last)) {
-                return lines;
-            }
-        }
-        panic!("no line with {last:?} in {lines:#?}")
-    }
-}
-
-impl Drop for Peer {
-    fn drop(&mut self) {
-        // It may have ended by itself.
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
+/// Starts an example program; `None` without the folder of the programs.
+fn peer(program: &str, args: &[&str]) -> Option<Program> {
+    let Some(folder) = std::env::var_os("NEEDLE_PEERS_OPENIGTLINK") else {
+        let remedy = "set NEEDLE_PEERS_OPENIGTLINK to the folder that tests/run.sh builds them in";
+        skip("OpenIGTLink examples", remedy);
+        return None;
+    };
+    Some(Program::start(Command::new(Path::new(&folder).join(program)).args(args)))
 }
 
 fn runtime() -> Runtime {
     tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap()
 }
 
-/// A port that nobody listens on: the programs cannot be asked for the one they chose.
-fn free_port() -> u16 {
-    let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
-    listener.local_addr().expect("bound").port()
-}
-
-/// The events of the server `program` until `wanted` are samples or statuses.
+/// The first `wanted` samples and statuses of the server `program`.
 fn served(
     program: &str,
     more_args: &[&str],
     request: Option<ToolStream>,
     wanted: usize,
 ) -> Option<Vec<Event>> {
-    let port = free_port();
-    let port_arg = port.to_string();
-    let args = [&[&port_arg[..]], more_args].concat();
-    let _server = Peer::start(program, &args)?;
+    // The programs cannot print a port that the system chose.
+    let address = free_address();
+    let port = address.port().to_string();
+    let _server = peer(program, &[&[&port[..]], more_args].concat())?;
     let settings = LinkSettings { request, ..LinkSettings::default() };
     let start = Instant::now();
     let runtime = runtime();
     let _in_runtime = runtime.enter();
     let clock = move || Time::ZERO + start.elapsed();
-    let mut link = Link::connect(&format!("127.0.0.1:{port}"), settings, clock);
+    let mut link = Link::connect(&address.to_string(), settings, clock);
     let mut events = Vec::new();
     while events.len() < wanted {
         let event = runtime.block_on(async { timeout(HANGING, link.next()).await });
@@ -112,7 +71,7 @@ fn samples(events: Vec<Event>) -> Vec<Sample> {
     events.into_iter().map(sample).collect()
 }
 
-/// All of them send points of one circle, 50 (cos φ, sin φ, cos φ) mm.
+/// All servers send points of the circle 50 (cos φ, sin φ, cos φ) mm.
 fn assert_on_the_circle(sample: &Sample) {
     let p_mm = sample.position_mm;
     assert!((p_mm.x.hypot(p_mm.y) - 50.0).abs() < 1e-4 && p_mm.x == p_mm.z, "{p_mm}");
@@ -127,18 +86,18 @@ fn positions_of_the_tracker_server_arrive() {
     for sample in &samples {
         assert_eq!(sample.tool, "Tracker");
         assert_on_the_circle(sample);
-        // Its quaternion is 0.88 long, which says nothing.
+        // The server sends a quaternion of length 0.88, which the reader normalizes.
         assert!(sample.orientation.is_some());
     }
     for pair in samples.windows(2) {
         let step_rad = (pair[0].position_mm.xy()).angle(&pair[1].position_mm.xy());
-        assert!((step_rad - 0.2).abs() < 1e-4, "each is the next: {step_rad}");
+        assert!((step_rad - 0.2).abs() < 1e-4, "not the next point: {step_rad} rad");
     }
 }
 
-/// These servers send nothing until they are asked to.
+/// These servers send nothing before a request.
 #[test]
-fn a_stream_that_is_asked_for_arrives() {
+fn a_requested_stream_arrives() {
     let _machine = beside_others();
     let streams = [("TrackingDataServer", "TDATA"), ("QuaternionTrackingDataServer", "QTDATA")];
     for (program, name) in streams {
@@ -169,12 +128,12 @@ fn statuses_of_the_status_server_arrive() {
 }
 
 #[test]
-fn what_the_bench_serves_is_printed_by_the_receiving_client() {
+fn the_receiving_client_prints_every_message_that_the_bench_serves() {
     let _machine = beside_others();
     let runtime = runtime();
     let server = runtime.block_on(TransformServer::bind("127.0.0.1:0")).expect("loopback");
     let port = server.local_addr().port().to_string();
-    let Some(mut client) = Peer::start("ReceiveClient", &["127.0.0.1", &port]) else { return };
+    let Some(mut client) = peer("ReceiveClient", &["127.0.0.1", &port]) else { return };
     let wait = async {
         while server.clients() == 0 {
             tokio::task::yield_now().await;
@@ -211,8 +170,9 @@ fn what_the_bench_serves_is_printed_by_the_receiving_client() {
         server.send(&Message::new("Needle", stamp, body));
     }
 
-    // It checks the sums itself, and prints nothing of a message whose sum is wrong.
-    let printed = client.lines(" Status    : ").join("\n");
+    // The client prints no message whose checksum is wrong.
+    client.wait_for(" Status    : ");
+    let printed = client.said();
     let expected = [
         "Time stamp: 1700000000.25",
         "Receiving TRANSFORM data type.",

@@ -5,9 +5,9 @@ use crate::support::protocol::{Change, follow};
 use crate::support::udp_stage::group;
 use std::net::SocketAddrV4;
 
-/// What differs on this bus, and why; docs/rig.md says so too.
+/// The changes of the operator's file on this bus, with their reasons, as in docs/rig.md.
 const CHANGES: [Change; 3] = [
-    // A bus for tests is refused with hardware = true. The emulated stage has its own quick-stop deceleration.
+    // The bench refuses hardware = true on a UDP bus. The emulated stage has its own quick-stop deceleration.
     ("hardware = true\n", "hardware = false\n"),
     (
         "[[stage.insertion.sdo]]\nindex = 0x6085\nsubindex = 0\nvalue = 10_000                        # \
@@ -17,10 +17,10 @@ const CHANGES: [Change; 3] = [
     ("[[stage.rotation.sdo]]\nindex = 0x6085\nsubindex = 0\nvalue = 10_000\nbits = 32\n", ""),
 ];
 
-/// It takes as long as all other tests here, so it runs beside each of them, also those that are alone: it mostly
-/// waits, and no peer of theirs hears this port.
+/// This takes as long as all other tests here together, so it runs beside each of them, also beside those that are
+/// alone: it mostly waits, and no peer of theirs hears this port.
 #[test]
-fn the_worked_protocol_from_power_on_to_the_calibrated_needle() {
+fn every_command_of_the_worked_protocol_succeeds() {
     let group = SocketAddrV4::new(*group().ip(), 43_114);
     let done = follow(&format!("udp:{group}"), &CHANGES, |_| true);
     assert_eq!(done.len(), 24, "{done:#?}");

@@ -1,23 +1,22 @@
-//! `needle-bench tracker` against servers on the loopback: the bench's own, and pyigtl's.
+//! `needle-bench tracker` against servers on the loopback: the bench's own server and one of pyigtl.
 
-use crate::support::peers::peer;
+use crate::support::peers::serving_peer;
 use crate::support::program::{Said, Scratch, needle_bench};
-use crate::support::programs::{Program, beside_others};
+use crate::support::programs::{Program, beside_others, free_address};
 use needle_bench::emulator::WhiteNoise;
 use needle_bench::tracker::openigtlink::{Body, IgtlStamp, Message};
 use needle_bench::transport::tcp::TransformServer;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
-use std::net::TcpListener;
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime};
 
-/// A server of two tools at rest, 100 messages of each a second, ended with the test.
+/// A server of two tools at rest with 100 messages of each per second. It ends with the test.
 struct Server {
     port: u16,
-    /// Where the tools are carried to.
+    /// Position of the tools, mm.
     at: Arc<Mutex<[f32; 3]>>,
     ends: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
@@ -31,7 +30,7 @@ impl Server {
         let ends = Arc::new(AtomicBool::new(false));
         let ended = Arc::clone(&ends);
         let at = Arc::new(Mutex::new([0.0; 3]));
-        let carried = Arc::clone(&at);
+        let position = Arc::clone(&at);
         let thread = std::thread::spawn(move || {
             runtime.block_on(async {
                 let mut period = tokio::time::interval(Duration::from_millis(10));
@@ -45,7 +44,7 @@ impl Server {
                     for (n, tool) in (0u16..).zip(["NeedleToTracker", "StylusToTracker"]) {
                         let noise =
                             WhiteNoise::Gaussian(0.1).draw(u64::from(n), k).map(|mm| mm as f32);
-                        let [x, y, z] = *carried.lock().unwrap();
+                        let [x, y, z] = *position.lock().unwrap();
                         let (x, y, z) = (x + noise.x, y + noise.y, z + noise.z);
                         let x = x + 10.0 * f32::from(n) + 10.0;
                         let pose = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, x, y, z];
@@ -83,7 +82,9 @@ fn the_tools_are_listed_with_type_and_rate() {
     let said = server.tracker(&scratch, &["list", "--seconds", "2", "--json"]);
     assert_eq!(said.status, 0, "{}", said.stderr);
     let json = said.json();
-    for (tool, name) in json["tools"].as_array().expect("tools").iter().zip(["Needle", "Stylus"]) {
+    let tools = json["tools"].as_array().expect("tools");
+    assert_eq!(tools.len(), 2, "{json}");
+    for (tool, name) in tools.iter().zip(["Needle", "Stylus"]) {
         assert_eq!(tool["tool"], format!("{name}ToTracker"));
         assert_eq!(
             (&tool["type"], &tool["is_configured"]),
@@ -100,7 +101,7 @@ fn the_tools_are_listed_with_type_and_rate() {
 }
 
 #[test]
-fn a_line_a_second_is_watched() {
+fn watch_prints_a_line_a_second() {
     let _machine = beside_others();
     let (server, scratch) = (Server::start(), Scratch::new());
     let said = server.tracker(&scratch, &["watch", "--seconds", "2.5"]);
@@ -114,9 +115,9 @@ fn a_line_a_second_is_watched() {
     }
 }
 
-/// What is recorded is what `calibrate tracker` reads, and `rest` measures the same.
+/// `calibrate tracker` reads both formats of `record`.
 #[test]
-fn a_recording_is_calibrated_as_at_rest() {
+fn recordings_and_rest_measure_the_same_noise() {
     let _machine = beside_others();
     let (server, scratch) = (Server::start(), Scratch::new());
     let rest = std::thread::scope(|scope| {
@@ -150,7 +151,7 @@ fn a_recording_is_calibrated_as_at_rest() {
     }
 }
 
-/// The tool goes from point to point, and the operator says where each is.
+/// The tool touches one point after the other, and the operator types the position of each.
 #[test]
 fn a_registration_is_collected_point_by_point() {
     let _machine = beside_others();
@@ -161,7 +162,7 @@ fn a_registration_is_collected_point_by_point() {
         .args(["--set", &format!("tracker.address=\"127.0.0.1:{}\"", server.port)])
         .args(["--set", "can.interface=vcan0", "--set", "tracker.source=openigtlink"])
         .args(["--set", "tracker.gates.noise_sd_mm=0.1"])
-        // The point that is touched is touched by the tip.
+        // The tip touches the points, not the sensor.
         .args(["--set", "tracker.tip_offset_mm=[0.0, 0.0, 7.0]"])
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
@@ -183,7 +184,7 @@ fn a_registration_is_collected_point_by_point() {
         *server.at.lock().unwrap() = [x, y, z];
         std::thread::sleep(Duration::from_millis(300));
         if n == 1 {
-            // Nothing is lost by a line that says nothing, or by a place that was mistyped.
+            // A malformed line takes no point, and `undo` removes a mistyped one.
             writeln!(operator, "fifty").unwrap();
             until("not three numbers: fifty");
             until("point 2: touch it");
@@ -195,7 +196,7 @@ fn a_registration_is_collected_point_by_point() {
         }
         writeln!(operator, "{} {}, {}", x + 110.0, y + 20.0, z - 3.0).unwrap();
         if n == 2 {
-            // It slips while it should rest, and is put back.
+            // The tool slips while it should rest, and is put back.
             std::thread::sleep(Duration::from_millis(400));
             *server.at.lock().unwrap() = [x + 9.0, y, z];
             until("the tool moves: hold it still");
@@ -220,7 +221,7 @@ fn a_registration_is_collected_point_by_point() {
 }
 
 #[test]
-fn what_cannot_be_listened_to_is_said() {
+fn commands_without_a_tracker_or_its_tool_fail_with_the_reason() {
     let _machine = beside_others();
     let (server, scratch) = (Server::start(), Scratch::new());
     let fails = |said: Said, status: i32, part: &str| {
@@ -235,8 +236,7 @@ fn what_cannot_be_listened_to_is_said() {
     let emulated =
         ["tracker", "list", "--set", "tracker.source=emulated", "--set", "can.interface=memory"];
     fails(needle_bench(&scratch, &emulated), 2, "is \"emulated\", which is part of a run");
-    let closed =
-        TcpListener::bind("127.0.0.1:0").expect("loopback").local_addr().expect("a port").port();
+    let closed = free_address().port();
     let gone = ["--seconds", "1", "--set", "tracker.timeout_s=1"];
     for command in [&["list"][..], &["watch"], &["record", "a.csv"]] {
         fails(tracker(&scratch, closed, &[command, &gone].concat()), 3, "refused");
@@ -246,15 +246,14 @@ fn what_cannot_be_listened_to_is_said() {
         let said = server.tracker(&scratch, &[command, &other].concat());
         fails(said, 3, "saw \"NeedleToTracker\", \"StylusToTracker\"; set tracker.tool");
     }
-    assert!(!scratch.path().join("a.csv").exists(), "a file without a sample");
+    assert!(!scratch.path().join("a.csv").exists(), "an empty file is left behind");
     fails(server.tracker(&scratch, &["record", "a.txt"]), 2, "ends in .csv or .ndjson");
     scratch.write("a.csv", "precious");
     fails(server.tracker(&scratch, &["record", "a.csv"]), 2, "is not overwritten");
 }
 
-/// Without `--seconds` a recording goes on until Ctrl-C, and is whole then.
 #[test]
-fn a_recording_ends_at_ctrl_c() {
+fn a_recording_without_end_is_whole_after_ctrl_c() {
     let _machine = beside_others();
     let (server, scratch) = (Server::start(), Scratch::new());
     let file = scratch.path().join("rest.csv");
@@ -278,7 +277,7 @@ fn a_recording_ends_at_ctrl_c() {
     assert!(ended.stderr.contains(&said), "no {said:?} in {}", ended.stderr);
 }
 
-/// A file that may not grow is as a disk that is full.
+/// A limit of the file size has the effect of a full disk.
 #[test]
 fn a_disk_that_is_full_ends_a_recording() {
     let _machine = beside_others();
@@ -298,17 +297,13 @@ fn a_disk_that_is_full_ends_a_recording() {
     );
 }
 
-/// A server that nobody here wrote; its tool moves, so it is not at rest.
 #[test]
-fn the_tool_of_pyigtl_is_listed_and_moves() {
+fn rest_refuses_a_tool_of_pyigtl_that_moves() {
     let _machine = beside_others();
     let args = ["--port", "0", "--device", "NeedleToTracker", "--rate", "50", "--duration", "60"];
-    let Some(mut server) = peer("pyigtl_server.py", &args) else { return };
-    server.wait_for("listening ");
-    let said = server.said();
-    let port = said.lines().find_map(|line| line.strip_prefix("listening ")?.trim().parse().ok());
-    let port: u16 = port.expect("a port");
+    let Some((_server, port)) = serving_peer("pyigtl_server.py", &args) else { return };
     let scratch = Scratch::new();
+    let port = port.parse().expect("a port");
     let said = tracker(&scratch, port, &["rest", "--seconds", "6"]);
     assert_eq!(said.status, 2, "{}", said.stderr);
     assert!(said.stderr.contains("the sensor moves by "), "{}", said.stderr);

@@ -1,7 +1,7 @@
-//! A run whose tracker connection is flooded, between two processes: SYNC goes on.
+//! Runs whose tracker link is flooded: SYNC stays on time.
 //!
-//! A relay stands between the virtual stage's tracker and the bench, and puts messages of its own
-//! between those of the tracker, over TCP or, as NDJSON, into the bench's standard input.
+//! A relay between the virtual stage's tracker and the bench adds messages to those of the tracker, over TCP or,
+//! as NDJSON, into the bench's standard input.
 #![cfg(target_os = "linux")]
 
 use crate::support::peers::hold;
@@ -17,18 +17,18 @@ use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// Bytes of a message's header, and where in it the body's length stands.
+/// Length of a message's header, and offset of the body's length in it, bytes.
 const HEADER_LEN: usize = 58;
 const BODY_LEN_AT: usize = 42;
 
-/// What the relay sends besides: `messages` so many `times` at once, each `period`, for `duration`.
+/// What the relay adds: `messages`, `times` over at once, every `period`, for `duration`.
 #[derive(Clone)]
 struct Flood {
     messages: Vec<u8>,
     times: usize,
     period: Duration,
     duration: Duration,
-    /// Each message of the tracker is sent so often.
+    /// How often each message of the tracker is sent.
     repeats: usize,
 }
 
@@ -38,7 +38,7 @@ impl Flood {
     }
 }
 
-/// The insertion goes on by then, and for longer than any flood here.
+/// Start of the flood after the connection: the insertion goes on by then, and for longer than any flood here.
 const BEGINS_AFTER: Duration = Duration::from_millis(3000);
 
 /// Relays the tracker at `from` to one client, whole message by whole message.
@@ -48,14 +48,14 @@ fn relay(from: SocketAddr, flood: Flood) -> SocketAddr {
     thread::spawn(move || {
         let (bench, _) = listener.accept().expect("the bench connects");
         bench.set_nodelay(true).expect("a socket");
-        // It ends when either side closes.
-        let _ = hand_on(from, bench, &flood, <[u8]>::to_vec);
+        // The relay ends with an error when either side closes.
+        let _ = forward(from, bench, &flood, <[u8]>::to_vec);
     });
     address
 }
 
-/// Hands on what the tracker at `from` sends, whole message by whole message, each `as_sent`.
-fn hand_on(
+/// Forwards what the tracker at `from` sends, whole message by whole message, each converted by `as_sent`.
+fn forward(
     from: SocketAddr,
     mut bench: impl Write,
     flood: &Flood,
@@ -85,7 +85,7 @@ fn hand_on(
     }
 }
 
-/// The position in an OpenIGTLink `message` as a line of NDJSON; nothing of any other message.
+/// The position in an OpenIGTLink `message` as a line of NDJSON; empty for any other message.
 fn ndjson(message: &[u8]) -> Vec<u8> {
     let mut reader = Reader::new(Protocol::OpenIgtLink);
     reader.push(Time::ZERO, message);
@@ -101,7 +101,7 @@ fn line(tool: &str, [x, y, z]: [f64; 3]) -> String {
     format!("{{\"tool\":\"{tool}\",\"position_tracker_mm\":[{x},{y},{z}]}}\n")
 }
 
-/// The length of the message that `bytes` begin with, once it is whole.
+/// The length of the message at the start of `bytes`, once it is whole.
 fn whole_message(bytes: &[u8]) -> Option<usize> {
     let body: [u8; 8] = bytes.get(BODY_LEN_AT..BODY_LEN_AT + 8)?.try_into().ok()?;
     let len = HEADER_LEN + usize::try_from(u64::from_be_bytes(body)).ok()?;
@@ -118,7 +118,7 @@ fn flooded(name: &str, flood: Flood) -> (Ended, Scratch) {
     let _alone = alone();
     let scratch = Scratch::new(name);
     let stage = Stage::start(&[]);
-    let address = format!("tracker.address=\"{}\"", relay(stage.tracker(), flood));
+    let address = format!("tracker.address=\"{}\"", relay(stage.tracker, flood));
     let bench = scratch.bench(&["--json"], &stage.settings(&[&SLOW[..], &[&address]].concat()));
     (timed(name, &scratch, bench.end()), scratch)
 }
@@ -126,7 +126,7 @@ fn flooded(name: &str, flood: Flood) -> (Ended, Scratch) {
 const SLOW: [&str; 2] =
     ["insertion={ depth_mm = 7, plane_out_of_reach = \"insert\" }", "insertion.speed_mm_per_s=1"];
 
-/// Prints how late SYNCs were.
+/// Prints how late the SYNCs were.
 fn timed(name: &str, scratch: &Scratch, bench: Ended) -> Ended {
     let timing = &programs::manifest(&scratch.run_dir())["timing"];
     let late_ms = |key: &str| timing[key].as_f64().unwrap_or(f64::NAN) * 1e-3;
@@ -142,11 +142,12 @@ fn timed(name: &str, scratch: &Scratch, bench: Ended) -> Ended {
     bench
 }
 
-/// The run was completed, and little of the flood reached the session. A machine that others work on delays
-/// SYNCs without any flood: in one of three runs less than one in twenty is skipped, and none is late by 40 ms.
-/// Where the flood went before the deadlines, they were late by 56 to 85 ms.
+/// Asserts that every run completes, that SYNC is on time in one of three runs, and that little of the flood
+/// reaches the session. A busy machine delays SYNCs without any flood too, so on time means: fewer than one in
+/// twenty is skipped, and none is late by 40 ms. When the bench still served the flood before its deadlines, SYNCs
+/// were late by 56 to 85 ms.
 #[track_caller]
-fn assert_it_goes_on(run: impl Fn() -> (Ended, Scratch)) -> (Ended, Scratch) {
+fn assert_sync_on_time(run: impl Fn() -> (Ended, Scratch)) -> (Ended, Scratch) {
     let is_on_time = |(_, scratch): &(Ended, Scratch)| {
         let timing = &programs::manifest(&scratch.run_dir())["timing"];
         let count = |key: &str| timing[key].as_u64().unwrap();
@@ -161,10 +162,10 @@ fn assert_it_goes_on(run: impl Fn() -> (Ended, Scratch)) -> (Ended, Scratch) {
     let (bench, scratch) =
         runs.take(3).find(is_on_time).expect("SYNC on time in one of three runs");
     let samples = programs::read(&scratch.run_dir().join("tracker.ndjson"));
-    assert!(!samples.contains("StylusToTracker"), "another tool's samples were handed on");
+    assert!(!samples.contains("StylusToTracker"), "another tool's samples reached the session");
     let inputs = programs::read(&scratch.run_dir().join("inputs.log"));
     let notices = inputs.lines().filter(|line| line.contains(" status ")).count();
-    assert!(notices < 300, "statuses at a bounded rate: {notices}");
+    assert!(notices < 300, "{notices} statuses reached the session");
     (bench, scratch)
 }
 
@@ -172,28 +173,28 @@ fn assert_it_goes_on(run: impl Fn() -> (Ended, Scratch)) -> (Ended, Scratch) {
 fn bursts_of_another_tool_delay_no_sync() {
     let (period, duration) = (Duration::from_millis(700), Duration::from_secs(3));
     let flood = || Flood::of(position("StylusToTracker"), 60_000, period, duration);
-    assert_it_goes_on(|| flooded("flood-bursts", flood()));
+    assert_sync_on_time(|| flooded("flood-bursts", flood()));
 }
 
 #[test]
 fn a_flood_of_another_tool_that_lasts_delays_no_sync() {
     let (period, duration) = (Duration::from_millis(1), Duration::from_secs(2));
     let flood = || Flood::of(position("StylusToTracker"), 2000, period, duration);
-    assert_it_goes_on(|| flooded("flood-lasting", flood()));
+    assert_sync_on_time(|| flooded("flood-lasting", flood()));
 }
 
-/// The positions come as NDJSON through a pipe, which waits where the bench does not read.
+/// The positions come as NDJSON through a pipe, which blocks while the bench does not read.
 #[test]
 fn a_flood_on_standard_input_delays_no_sync() {
     let _alone = alone();
     let (period, duration) = (Duration::from_millis(1), Duration::from_secs(2));
-    assert_it_goes_on(|| {
+    assert_sync_on_time(|| {
         let scratch = Scratch::new("flood-pipe");
         let stage = Stage::start(&[]);
         let (stdin, bench) = io::pipe().expect("a pipe");
         let messages = line("StylusToTracker", [1.0, 2.0, 3.0]).into_bytes();
-        let (from, flood) = (stage.tracker(), Flood::of(messages, 2000, period, duration));
-        thread::spawn(move || hand_on(from, bench, &flood, ndjson));
+        let (from, flood) = (stage.tracker, Flood::of(messages, 2000, period, duration));
+        thread::spawn(move || forward(from, bench, &flood, ndjson));
         let from_there = ["tracker.source=\"ndjson\"", "tracker.address=\"-\""];
         let settings = stage.settings(&[SLOW, from_there].concat());
         let bench = Program::start_on(&mut scratch.command(&["--json"], &settings), stdin).end();
@@ -208,32 +209,32 @@ fn a_flood_of_statuses_delays_no_sync() {
     let messages = encode(&Message::new("Server", None, Body::Status(status)));
     let (period, duration) = (Duration::from_millis(1), Duration::from_secs(2));
     let flood = || Flood::of(messages.clone(), 200, period, duration);
-    assert_it_goes_on(|| flooded("flood-statuses", flood()));
+    assert_sync_on_time(|| flooded("flood-statuses", flood()));
 }
 
-/// Each position comes 125 times, all at once: 5000 samples a second of its own tool. Of those that
-/// wait together the control thread takes the newest 64.
+/// Each position comes 125 times at once. Of the samples that wait, the control thread takes the newest 64.
 #[test]
-fn its_own_tool_at_five_thousand_a_second_delays_no_sync() {
+fn five_thousand_samples_a_second_of_the_needle_delay_no_sync() {
     let none = || Flood { repeats: 125, ..Flood::of(Vec::new(), 0, Duration::MAX, Duration::ZERO) };
-    let run = assert_it_goes_on(|| flooded("flood-own", none()));
+    let run = assert_sync_on_time(|| flooded("flood-own", none()));
     let accepted = run.0.json()["tracker_samples"]["accepted"].as_u64().unwrap();
     assert!(accepted > 5000, "{accepted}");
     let events = programs::read(&run.1.run_dir().join("events.log"));
-    let told = events.matches("samples dropped so far: they come faster").count();
-    assert!((1..20).contains(&told), "told at the first, and when there are twice as many: {told}");
+    // The first drop is reported, then each doubling.
+    let reports = events.matches("samples dropped so far: they come faster").count();
+    assert!((1..20).contains(&reports), "{reports} reports of dropped samples");
 }
 
-/// The control thread does not run for two seconds while the tracker floods, as on a machine that has nothing left
-/// for it: the run ends with the flood as its likely cause, and sends no set-point any more.
+/// The control thread stalls for two seconds during the flood, as on a machine that has no time left for it. After
+/// that it sends no set-point.
 #[test]
-fn a_bench_that_a_flood_holds_up_names_it() {
+fn a_stall_during_a_flood_stops_the_run_and_names_the_flood() {
     let _alone = alone();
     let scratch = Scratch::new("flood-named");
     let stage = Stage::start(&[]);
     let (period, duration) = (Duration::from_millis(1), Duration::from_secs(20));
     let flood = Flood::of(position("StylusToTracker"), 100, period, duration);
-    let address = format!("tracker.address=\"{}\"", relay(stage.tracker(), flood));
+    let address = format!("tracker.address=\"{}\"", relay(stage.tracker, flood));
     let mut bench = scratch.bench(&[], &stage.settings(&[&SLOW[..], &[&address]].concat()));
     bench.wait_for("enabling both axes");
     thread::sleep(BEGINS_AFTER);
@@ -250,9 +251,9 @@ fn a_bench_that_a_flood_holds_up_names_it() {
     assert_no_set_point_after_the_gap(&scratch.run_dir());
 }
 
-/// A name and a text that clear the screen and begin a line of their own.
+/// The tool's name and the status text clear the screen and forge a line of the record.
 #[test]
-fn names_and_texts_of_a_peer_reach_no_terminal_raw() {
+fn control_characters_of_a_peer_are_escaped_in_every_output() {
     const FORGED: &str = "x\x1b[2J\n  9.9 s";
     let (error_name, message) = ("\x1b[1m".to_owned(), format!("{FORGED}  session: \u{202e}done"));
     let status = Status { code: 1, subcode: 0, error_name, message };
@@ -270,7 +271,7 @@ fn names_and_texts_of_a_peer_reach_no_terminal_raw() {
     text.assert_status(0);
     json.json();
     let file = |name: &str| programs::read(&dir.join(name));
-    let shown = [
+    let outputs = [
         &run.0.stderr,
         &file("events.log"),
         &file("inputs.log"),
@@ -279,7 +280,7 @@ fn names_and_texts_of_a_peer_reach_no_terminal_raw() {
         &text.stderr,
         &json.stdout,
     ];
-    for text in shown {
+    for text in outputs {
         assert!(!text.contains(is_raw), "{text}");
         assert!(!text.lines().any(|line| line.starts_with("  9.9 s")), "{text}");
     }

@@ -1,8 +1,7 @@
-//! The tracker's connection against servers that do not behave. Each says what it sends to one
-//! connection after another; the link must come through with every position that was sent whole,
-//! say what was wrong, and connect anew where it has to.
+//! The tracker link against misbehaving servers. The link must deliver every position that was sent whole, report
+//! what was wrong, and reconnect where it has to.
 //!
-//! The limits of time here only end a test that hangs.
+//! The timeouts here only end a test that hangs.
 
 use crate::support::programs::beside_others;
 use needle_bench::tracker::Event;
@@ -32,7 +31,7 @@ fn status_ok() -> Vec<u8> {
 /// What a server does with a connection before it closes it.
 type Treatment = fn(&mut TcpStream);
 
-/// A server that treats its connections one after another as told.
+/// A server that treats its connections one after another in these ways.
 fn server<const N: usize>(connections: [Treatment; N]) -> SocketAddr {
     let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
     let address = listener.local_addr().expect("bound");
@@ -47,12 +46,12 @@ fn server<const N: usize>(connections: [Treatment; N]) -> SocketAddr {
 }
 
 fn send(stream: &mut TcpStream, bytes: &[u8]) {
-    // The bench may have hung up already, as it should.
+    // The link may have closed the connection already, as it should.
     let _ = stream.write_all(bytes);
 }
 
-/// What the link says up to and with the position at x = `last_mm`.
-fn told(address: SocketAddr, last_mm: f64) -> Vec<Event> {
+/// The events of the link up to the position at x = `last_mm`.
+fn events_until(address: SocketAddr, last_mm: f64) -> Vec<Event> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     runtime.block_on(async {
         let settings =
@@ -79,7 +78,7 @@ fn positions(events: &[Event]) -> Vec<f64> {
     events.iter().filter_map(x_mm).collect()
 }
 
-/// Why connections ended.
+/// The reasons for which connections ended.
 fn reasons(events: &[Event]) -> Vec<&str> {
     events
         .iter()
@@ -91,7 +90,7 @@ fn reasons(events: &[Event]) -> Vec<&str> {
 }
 
 #[test]
-fn a_slow_drip_comes_out_whole() {
+fn messages_that_come_byte_by_byte_are_read() {
     let _machine = beside_others();
     let address = server([|stream: &mut TcpStream| {
         for byte in [position(1.0), status_ok(), position(2.0)].concat() {
@@ -99,18 +98,18 @@ fn a_slow_drip_comes_out_whole() {
             thread::yield_now();
         }
     }]);
-    assert_eq!(positions(&told(address, 2.0)), [1.0, 2.0]);
+    assert_eq!(positions(&events_until(address, 2.0)), [1.0, 2.0]);
 }
 
 #[test]
-fn a_message_cut_in_its_body_is_not_believed() {
+fn a_message_cut_in_its_body_is_dropped_with_the_reason() {
     let _machine = beside_others();
     let cut = |stream: &mut TcpStream| {
         send(stream, &position(1.0));
         send(stream, &position(66.0)[..65]);
     };
     let whole = |stream: &mut TcpStream| send(stream, &position(2.0));
-    let events = told(server([cut, whole]), 2.0);
+    let events = events_until(server([cut, whole]), 2.0);
     assert_eq!(positions(&events), [1.0, 2.0]);
     let reason = reasons(&events)[0];
     assert!(
@@ -120,7 +119,7 @@ fn a_message_cut_in_its_body_is_not_believed() {
 }
 
 #[test]
-fn two_gigabytes_are_neither_awaited_nor_allocated() {
+fn a_header_that_announces_two_gigabytes_ends_the_connection() {
     let _machine = beside_others();
     let huge = |stream: &mut TcpStream| {
         let mut message = position(66.0);
@@ -128,7 +127,7 @@ fn two_gigabytes_are_neither_awaited_nor_allocated() {
         send(stream, &message);
     };
     let good = |stream: &mut TcpStream| send(stream, &position(1.0));
-    let events = told(server([huge, good]), 1.0);
+    let events = events_until(server([huge, good]), 1.0);
     assert_eq!(positions(&events), [1.0]);
     let reason = reasons(&events)[0];
     assert!(
@@ -140,22 +139,22 @@ fn two_gigabytes_are_neither_awaited_nor_allocated() {
 }
 
 #[test]
-fn keep_alives_alone_are_no_positions() {
+fn statuses_before_a_position_keep_the_connection() {
     let _machine = beside_others();
     let address = server([|stream: &mut TcpStream| {
         (0..100).for_each(|_| send(stream, &status_ok()));
         send(stream, &position(1.0));
     }]);
-    let events = told(address, 1.0);
+    let events = events_until(address, 1.0);
     assert_eq!(positions(&events), [1.0]);
     let is_ok =
         |event: &&Event| matches!(event, Event::Status { status, .. } if status.code == Status::OK);
     assert_eq!(events.iter().filter(is_ok).count(), 100);
-    assert_eq!(reasons(&events), [] as [&str; 0], "one connection all along");
+    assert_eq!(reasons(&events), [] as [&str; 0], "the connection ended");
 }
 
 #[test]
-fn garbage_ends_its_connection_and_the_next_one_is_read() {
+fn garbage_ends_its_connection_and_the_next_connection_is_read() {
     let _machine = beside_others();
     let page = |stream: &mut TcpStream| send(stream, "HTTP/1.1 200 OK\r\n".repeat(8).as_bytes());
     let after_a_good_one = |stream: &mut TcpStream| {
@@ -170,7 +169,7 @@ fn garbage_ends_its_connection_and_the_next_one_is_read() {
     };
     let good = |stream: &mut TcpStream| send(stream, &position(2.0));
     let address = server([page, after_a_good_one, flipped, good]);
-    let events = told(address, 2.0);
+    let events = events_until(address, 2.0);
     assert_eq!(positions(&events), [1.0, 2.0]);
     let reasons = reasons(&events);
     assert_eq!(reasons.len(), 3);
@@ -182,7 +181,7 @@ fn garbage_ends_its_connection_and_the_next_one_is_read() {
 }
 
 #[test]
-fn a_type_nobody_reads_is_skipped_however_large() {
+fn a_large_message_of_another_type_is_skipped() {
     let _machine = beside_others();
     let address = server([|stream: &mut TcpStream| {
         let mut image = encode(&Message::new("Probe", None, Body::Other("IMAGE".to_owned())));
@@ -191,5 +190,5 @@ fn a_type_nobody_reads_is_skipped_however_large() {
         (0..128).for_each(|_| send(stream, &[7; 64 * 1024]));
         send(stream, &position(1.0));
     }]);
-    assert_eq!(positions(&told(address, 1.0)), [1.0]);
+    assert_eq!(positions(&events_until(address, 1.0)), [1.0]);
 }

@@ -1,13 +1,14 @@
-//! Whole runs between two processes on a machine without CAN: `needle-bench run` and `vcan-stage`
-//! over UDP multicast, with python-can and python-canopen on the same bus.
+//! Whole runs of `needle-bench run` and `vcan-stage` over UDP multicast, with python-can and python-canopen on the
+//! same bus.
 #![cfg(target_os = "linux")]
 
 use crate::support::peers::peer;
-use crate::support::programs::{self, LONG, Program, Scratch, alone, beside_others};
+use crate::support::programs::{self, LONG, Program, Scratch, alone, beside_others, send_signal};
 use crate::support::python_drives;
 use crate::support::recorded;
 use crate::support::replays::assert_it_replays;
-use crate::support::udp_stage::{COUNTS_PER_MM, Stage, group};
+use crate::support::udp_stage::{Stage, group};
+use crate::support::witness::Witness;
 use needle_bench::transport::can::{BusEvent, CanBus};
 use needle_bench::transport::udp::UdpBus;
 use serde_json::Value;
@@ -17,17 +18,17 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Half as fast as the tests on vcan: those have a machine to themselves.
+/// Half the speed of the tests on vcan, which have a machine to themselves.
 const SLOW: &str = "insertion.speed_mm_per_s=2.5";
 
-/// The frames of a log of candump -L -x that end in `direction`, in order.
+/// The frames of a log of `candump -L -x` in this direction.
 fn frames<'a>(log: &'a str, direction: &str) -> Vec<&'a str> {
     let lines = log.lines().filter(|line| line.ends_with(direction));
     lines.filter_map(|line| line.split(' ').nth(2)).collect()
 }
 
 #[test]
-fn a_run_between_two_processes_as_python_can_sees_it() {
+fn python_can_and_both_logs_agree_on_the_frames_of_a_run() {
     let _alone = alone();
     let scratch = Scratch::new("udp");
     let log = scratch.path("stage.log");
@@ -52,7 +53,6 @@ fn a_run_between_two_processes_as_python_can_sees_it() {
     let steps = programs::csv(&scratch.run_dir().join("steps.csv"));
     assert_eq!(steps.len(), 16);
 
-    // How well SYNC was kept is in the result and in the record.
     let run_dir = scratch.run_dir();
     let timing = &programs::manifest(&run_dir)["timing"];
     assert_eq!(&result["timing"], timing);
@@ -60,12 +60,12 @@ fn a_run_between_two_processes_as_python_can_sees_it() {
     let can_log = programs::read(&run_dir.join("can.log"));
     let (sent, received) = (frames(&can_log, "T"), frames(&can_log, "R"));
     let syncs = sent.iter().filter(|frame| **frame == "080#").count();
-    assert!(syncs > 400, "6 s at 10 ms, less what a busy machine skips: {syncs}");
+    assert!(syncs > 400, "{syncs} SYNCs in 6 s at 10 ms; a busy machine skips some");
     assert_eq!(timing["syncs"], syncs);
     assert_eq!(timing["realtime"], Value::Null);
 
-    // What one side sent the other has received, by its own account; the stage spoke before the
-    // bench listened, and was asked by `check` after it.
+    // The log of each side holds what the other side sent. The stage's log is longer: its drives sent before the
+    // bench listened, and `check` asked them after the run.
     let stage_log = programs::read(&log);
     let (stage_sent, stage_received) = (frames(&stage_log, "T"), frames(&stage_log, "R"));
     assert!(received.len() > 500 && stage_received.starts_with(&sent));
@@ -82,8 +82,6 @@ fn a_run_between_two_processes_as_python_can_sees_it() {
     assert!(by_the_bench.starts_with(&sent));
 }
 
-/// In real time, with threads that come late: what the session was given is recorded, and gives the
-/// same run again.
 #[test]
 fn a_live_run_replays_bit_for_bit() {
     let _machine = beside_others();
@@ -102,57 +100,36 @@ fn a_live_run_replays_bit_for_bit() {
 }
 
 #[test]
-fn a_bench_killed_leaves_drives_that_stop_by_themselves() {
+fn drives_stop_by_themselves_when_the_bench_is_killed() {
     let _machine = beside_others();
     let scratch = Scratch::new("udp-killed");
     let stage = Stage::start(&[]);
-    let mut witness = UdpBus::join(stage.group).unwrap();
+    let mut witness = Witness::of(&stage);
     let bench = scratch.bench(&[], &stage.settings(&["can.heartbeat_timeout_ms=400", SLOW]));
-    let (mut reported_mm, end) = (0.0, Instant::now() + LONG);
-    let mut next = |reported_mm: &mut f64| {
-        assert!(Instant::now() < end, "{reported_mm} mm in, and no more");
-        let event = witness.receive(LONG).unwrap();
-        let Some(BusEvent::Frame(frame)) = event else { panic!("silent, or {event:?}") };
-        if let (Some(0x181), &[_, _, a, b, c, d]) = (frame.cob_id(), frame.data()) {
-            *reported_mm = f64::from(i32::from_le_bytes([a, b, c, d])) / COUNTS_PER_MM;
-        }
-        frame.cob_id()
-    };
-    while reported_mm < 5.0 {
-        next(&mut reported_mm);
-    }
+    witness.wait_until_inserted(5.0);
     bench.signal("KILL");
     assert_eq!(bench.end().status.code(), None, "killed by a signal");
-    while next(&mut reported_mm) != Some(0x081) {}
-    let further_mm = stage.assert_it_stands() - reported_mm;
-    assert!((-0.01..0.5).contains(&further_mm), "{further_mm} mm on after the last SYNC");
+    witness.wait_for_emergency();
+    let further_mm = stage.assert_it_stands() - witness.inserted_mm;
+    assert!((-0.01..0.5).contains(&further_mm), "{further_mm} mm after the last SYNC");
     stage.program.signal("INT");
     stage.program.end().assert_status(0);
 }
 
-/// What a run could not begin with does not keep a stop from being sent; and the record of a run names
-/// its rig to an operator who does not.
+/// A stop without a configuration is refused, with the command that stops the rig of the last run.
 #[test]
-fn a_stop_needs_the_bus_and_the_nodes_alone() {
+fn a_stop_is_sent_with_a_configuration_that_no_run_accepts() {
     let _machine = beside_others();
     let scratch = Scratch::new("udp-stop");
     let stage = Stage::start(&[]);
-    let mut witness = UdpBus::join(stage.group).unwrap();
+    let mut witness = Witness::of(&stage);
     let stop = |arguments: &[&str]| {
         let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
         command.current_dir(scratch.path("")).args(arguments);
         Program::start(&mut command).end()
     };
     let bench = scratch.bench(&["--quiet"], &stage.settings(&[SLOW]));
-    let (mut reported_mm, end) = (0.0, Instant::now() + LONG);
-    while reported_mm < 2.0 {
-        assert!(Instant::now() < end, "it does not come to 2 mm: {}", bench.said());
-        let event = witness.receive(LONG).unwrap();
-        let Some(BusEvent::Frame(frame)) = event else { panic!("silent, or {event:?}") };
-        if let (Some(0x181), &[_, _, a, b, c, d]) = (frame.cob_id(), frame.data()) {
-            reported_mm = f64::from(i32::from_le_bytes([a, b, c, d])) / COUNTS_PER_MM;
-        }
-    }
+    witness.wait_until_inserted(2.0);
     let config = scratch.path("rig.toml");
     let text = format!(
         "[can]\ninterface = \"udp:{}\"\nsync = 3\n[stage]\nstop_timeout_s = -1\n\
@@ -177,7 +154,7 @@ fn a_stop_needs_the_bus_and_the_nodes_alone() {
     assert!(named.starts_with("stop --config runs/2") && named.ends_with("-vcan/config.toml"));
     let stopped = stop(&named.split(' ').collect::<Vec<_>>());
     stopped.assert_status(0);
-    assert_eq!(stopped.stderr, "", "that configuration is whole");
+    assert_eq!(stopped.stderr, "", "the run's own configuration is valid");
     let bus = format!("can.interface=udp:{}", stage.group);
     let stopped = stop(&["stage", "--set", &bus, "stop", "--json"]);
     stopped.assert_status(0);
@@ -187,7 +164,7 @@ fn a_stop_needs_the_bus_and_the_nodes_alone() {
     assert!(unnamed.stderr.ends_with("-vcan/config.toml\n"), "{}", unnamed.stderr);
 }
 
-/// Without the tool, and without a tracker: nothing moves, and the record is closed.
+/// The tracker does not see the tool, or does not answer. The record is closed in both cases.
 #[test]
 fn without_a_tip_nothing_moves() {
     let _machine = beside_others();
@@ -200,26 +177,15 @@ fn without_a_tip_nothing_moves() {
         assert!(bench.last_line().starts_with(reason), "{}", bench.last_line());
         let run_dir = scratch.run_dir();
         assert_eq!(programs::manifest(&run_dir)["outcome"], "stopped");
-        assert!(programs::csv(&run_dir.join("steps.csv")).is_empty(), "{setting}: it has begun");
+        assert!(
+            programs::csv(&run_dir.join("steps.csv")).is_empty(),
+            "{setting}: the insertion has begun"
+        );
     }
     assert_eq!(stage.assert_it_stands(), 0.0);
 }
 
-/// Waits until the record of the only run says that the needle is being inserted.
-fn wait_until_inserting(scratch: &Scratch) {
-    let begun = Instant::now();
-    let is_inserting = || {
-        let there = std::fs::read_dir(scratch.path("runs")).into_iter().flatten().flatten();
-        let logs = there.map(|run| std::fs::read_to_string(run.path().join("events.log")));
-        logs.flatten().any(|log| log.contains("inserting"))
-    };
-    while !is_inserting() {
-        assert!(begun.elapsed() < LONG, "it does not insert");
-        std::thread::sleep(Duration::from_millis(20));
-    }
-}
-
-/// The bench sent nothing for 2 s, and no set-point after that.
+/// Asserts that the bench sent nothing for 2 s, and no set-point after that.
 #[track_caller]
 pub(crate) fn assert_no_set_point_after_the_gap(run_dir: &Path) {
     let can_log = programs::read(&run_dir.join("can.log"));
@@ -234,7 +200,7 @@ pub(crate) fn assert_no_set_point_after_the_gap(run_dir: &Path) {
         .collect();
     let gap = sent.windows(2).position(|pair| pair[1].0 - pair[0].0 > 2.0).expect("a gap");
     let (before, after) = sent.split_at(gap + 1);
-    // What was sent after the last SYNC never took effect.
+    // A target that was sent after the last SYNC never took effect.
     let last_sync = before.iter().rposition(|(_, frame)| *frame == "080#").expect("SYNCs");
     for axis in ["201#", "202#"] {
         let of_axis = |(_, frame): &&(f64, &str)| frame.starts_with(axis);
@@ -247,15 +213,15 @@ pub(crate) fn assert_no_set_point_after_the_gap(run_dir: &Path) {
     }
 }
 
-/// The bench is suspended for longer than the drives bear: when it goes on no set-point leaves, only
-/// the stop, and the record of it replays.
+/// The bench is suspended for longer than the drives' heartbeat time. After that it sends only the stop, and the
+/// record replays.
 #[test]
-fn a_bench_that_was_suspended_sends_no_set_point_when_it_goes_on() {
+fn a_bench_that_was_suspended_sends_no_set_point_when_it_resumes() {
     let _machine = beside_others();
     let scratch = Scratch::new("udp-suspended");
     let stage = Stage::start(&[]);
     let bench = scratch.bench(&[], &stage.settings(&["insertion.depth_mm=100", SLOW]));
-    wait_until_inserting(&scratch);
+    scratch.wait_for_event("inserting");
     std::thread::sleep(Duration::from_secs(2));
     bench.signal("STOP");
     std::thread::sleep(Duration::from_millis(2500));
@@ -269,28 +235,26 @@ fn a_bench_that_was_suspended_sends_no_set_point_when_it_goes_on() {
     assert_it_replays(&scratch.run_dir());
 }
 
-/// A pipe that is full and never read stands for a terminal with its output held (Ctrl-S).
+/// A full pipe that nothing reads stands for a terminal after Ctrl-S.
 #[test]
-fn a_terminal_that_reads_nothing_does_not_keep_ctrl_c_from_the_run() {
+fn ctrl_c_stops_a_run_whose_stderr_is_blocked() {
     let _machine = beside_others();
     let scratch = Scratch::new("udp-unread");
     let stage = Stage::start(&[]);
     let (_unread, mut full) = std::io::pipe().unwrap();
     let stderr = full.try_clone().unwrap();
-    // Writes until nothing more goes in, and then waits for as long as the test goes on.
+    // Fills the pipe, and then blocks until the test ends.
     std::thread::spawn(move || full.write_all(&[b'.'; 4 << 20]));
     let mut command =
         scratch.command(&["--json"], &stage.settings(&["insertion.depth_mm=100", SLOW]));
     command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(stderr);
     let bench = command.spawn().unwrap();
     drop(command);
-    wait_until_inserting(&scratch);
-    let asked = Instant::now();
-    let interrupted =
-        Command::new("sh").args(["-c", &format!("kill -s INT {}", bench.id())]).status();
-    assert!(interrupted.unwrap().success());
+    scratch.wait_for_event("inserting");
+    let interrupted = Instant::now();
+    send_signal(bench.id(), "INT");
     let ended = bench.wait_with_output().unwrap();
-    assert!(asked.elapsed() < LONG);
+    assert!(interrupted.elapsed() < LONG);
     assert_eq!(ended.status.code(), Some(1));
     let result: Value = serde_json::from_slice(&ended.stdout).unwrap();
     assert_eq!(result["stop_reason"], "operator: interrupted");
@@ -324,7 +288,7 @@ fn the_bench_moves_drives_of_python_canopen() {
 }
 
 #[test]
-fn real_time_needs_a_clock() {
+fn realtime_is_refused_for_a_run_in_virtual_time() {
     let _machine = beside_others();
     let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
     let ended = Program::start(command.args(["run", "--realtime", "--json"])).end();
@@ -333,24 +297,29 @@ fn real_time_needs_a_clock() {
     assert_eq!(ended.json()["error"], error);
 }
 
-/// `stage jog` beside a tracker, and beside none: only the record differs.
+/// `needle-bench stage` on this bus with these settings; its words follow.
+fn stage_command(scratch: &Scratch, settings: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+    command.current_dir(scratch.path("")).args(["stage", "--config"]);
+    command.arg(concat!(env!("CARGO_MANIFEST_DIR"), "/bench-config/vcan.toml"));
+    for set in settings {
+        command.args(["--set", set]);
+    }
+    command
+}
+
+/// Without a tracker the jog succeeds all the same.
 #[test]
-fn an_operation_records_a_tracker_that_is_there() {
+fn a_jog_records_the_samples_of_a_tracker_that_answers() {
     let _machine = beside_others();
     let stage = Stage::start(&[]);
-    for (name, tracker, has_samples) in [("there", None, true), ("gone", Some(1), false)] {
+    let slow = ["can.missed_feedback_max=30", "can.heartbeat_timeout_ms=1000"];
+    let absent = ["tracker.address=\"127.0.0.1:1\""];
+    for (name, tracker, has_samples) in [("there", &[][..], true), ("absent", &absent, false)] {
         let scratch = Scratch::new(&format!("udp-jog-{name}"));
-        let gone = tracker.map(|port| format!("tracker.address=\"127.0.0.1:{port}\""));
-        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
-        command.current_dir(scratch.path("")).args(["stage", "--config"]);
-        command.arg(concat!(env!("CARGO_MANIFEST_DIR"), "/bench-config/vcan.toml"));
-        for set in stage.settings(&["can.missed_feedback_max=30", "can.heartbeat_timeout_ms=1000"])
-        {
-            command.args(["--set", set]);
-        }
-        gone.iter().for_each(|set| _ = command.args(["--set", set]));
-        let ended =
-            Program::start(command.args(["jog", "--axis", "rotation", "--by", "30deg"])).end();
+        let mut jog = stage_command(&scratch, &stage.settings(&[&slow, tracker].concat()));
+        jog.args(["jog", "--axis", "rotation", "--by", "30deg"]);
+        let ended = Program::start(&mut jog).end();
         ended.assert_status(0);
         assert!(!ended.stderr.contains("refused"), "{}", ended.stderr);
         let run_dir = scratch.run_dir();
@@ -360,16 +329,16 @@ fn an_operation_records_a_tracker_that_is_there() {
     }
 }
 
-/// A sensor 3 mm off the axis, whose tracker follows the drive's own position messages.
+/// The tracker here computes the sensor's position from the drive's TPDO1.
 #[test]
-fn a_sensor_off_the_axis_proves_the_hand_of_the_rig() {
+fn a_sensor_3_mm_off_the_axis_proves_or_refutes_handedness() {
     const COUNTS_PER_TURN: f64 = 75_766.0;
     let _machine = beside_others();
     let stage = Stage::start(&[]);
     let mut witness = UdpBus::join(stage.group).unwrap();
     let tracker = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = format!("tracker.address=\"{}\"", tracker.local_addr().unwrap());
-    // One bench with the sensor's own hand, one with a mirrored x axis.
+    // The first proof sees the true x axis, the second a mirrored one.
     std::thread::spawn(move || {
         for mirrored in [1.0, -1.0] {
             let (mut link, _) = tracker.accept().unwrap();
@@ -393,16 +362,11 @@ fn a_sensor_off_the_axis_proves_the_hand_of_the_rig() {
         }
     });
     let scratch = Scratch::new("udp-hand");
-    // What is proved does not depend on the period, and a busy machine keeps a long one.
+    // The proof does not depend on the period, and a busy machine can keep a long one.
     let settings = stage.settings(&["tracker.source=\"ndjson\"", "can.sync_ms=50", &address]);
     let prove = || {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
-        command.current_dir(scratch.path("")).args(["stage", "--config"]);
-        command.arg(concat!(env!("CARGO_MANIFEST_DIR"), "/bench-config/vcan.toml"));
-        for set in &settings {
-            command.args(["--set", set]);
-        }
-        Program::start(command.args(["prove", "--handedness"])).end()
+        let mut prove = stage_command(&scratch, &settings);
+        Program::start(prove.args(["prove", "--handedness"])).end()
     };
     let right = prove();
     right.assert_status(0);
@@ -417,9 +381,9 @@ fn a_sensor_off_the_axis_proves_the_hand_of_the_rig() {
     stage.assert_it_stands();
 }
 
-/// Ctrl-C while the preflight listens is the operator's answer to it, `--yes` or not.
+/// Ctrl-C while the preflight listens counts as "no", also with `--yes`.
 #[test]
-fn a_signal_during_the_preflight_lets_nothing_begin() {
+fn ctrl_c_during_the_preflight_starts_no_run() {
     let _machine = beside_others();
     let scratch = Scratch::new("preflight-signal");
     let tracker = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
@@ -434,19 +398,19 @@ fn a_signal_during_the_preflight_lets_nothing_begin() {
         bench.args(["--set", set]);
     }
     let bench = Program::start(&mut bench);
-    // It listens for 2 s from here on.
+    // The preflight listens for 2 s from here on.
     let _connection = tracker.accept().unwrap();
     bench.signal("INT");
     let ended = bench.end();
     let said = ended.stderr.trim_end();
     assert!(said.ends_with("stopped: operator: interrupted; nothing has moved"), "{said}");
-    assert!(!scratch.path("runs").exists(), "no record of a run that did not begin");
+    assert!(!scratch.path("runs").exists(), "a record of a run that did not begin");
 }
 
-/// Ctrl-C at ten moments, from listening to inserting: the axes stand without power.
 #[test]
-fn ctrl_c_at_ten_moments() {
+fn ctrl_c_in_each_phase_leaves_both_axes_without_power() {
     let _machine = beside_others();
+    // Without a tip the bench waits before it enables the axes.
     let blind = ["tracker.tool=Another", "tracker.timeout_s=60"];
     let moments = [
         ("listening for another master", &blind[..], 0.0),
@@ -463,26 +427,18 @@ fn ctrl_c_at_ten_moments() {
     for (number, (said, settings, depth_mm)) in moments.into_iter().enumerate() {
         let scratch = Scratch::new(&format!("udp-ctrl-c-{number}"));
         let stage = Stage::start(&[]);
-        let mut witness = UdpBus::join(stage.group).unwrap();
+        let mut witness = Witness::of(&stage);
         let settings = [&[SLOW], settings].concat();
         let mut bench = scratch.bench(&[], &stage.settings(&settings));
         bench.wait_for(said);
-        let (mut reported_mm, end) = (0.0, Instant::now() + LONG);
-        while reported_mm < depth_mm {
-            assert!(Instant::now() < end, "{reported_mm} mm in, and no more");
-            if let Some(BusEvent::Frame(frame)) = witness.receive(LONG).unwrap()
-                && let (Some(0x181), &[_, _, a, b, c, d]) = (frame.cob_id(), frame.data())
-            {
-                reported_mm = f64::from(i32::from_le_bytes([a, b, c, d])) / COUNTS_PER_MM;
-            }
-        }
+        witness.wait_until_inserted(depth_mm);
         bench.signal("INT");
         let bench = bench.end();
         bench.assert_status(1);
         assert_eq!(bench.last_line(), "stopped: operator: interrupted", "{said} {depth_mm}");
         let stands_at_mm = stage.assert_it_stands();
         println!("{said}, {depth_mm} mm: stands at {stands_at_mm:.3} mm");
-        // Half a second at that speed, on a busy machine.
+        // A busy machine takes half a second at that speed.
         assert!(stands_at_mm < depth_mm + 1.25, "{said}, {depth_mm} mm: {stands_at_mm} mm");
         let was_enabled = settings.len() == 1;
         assert!(was_enabled || stands_at_mm.abs() < 0.001, "{said}: {stands_at_mm} mm");

@@ -1,10 +1,9 @@
-"""run.rrd and steps.csv of a run folder, read by rerun's own reader and by pandas, are one run.
+"""Checks that run.rrd and steps.csv of a run folder agree, read by rerun's own reader and by pandas.
 
-usage: recording_values.py RUN_DIR [MISSING_MAX]
+usage: recording_values.py RUN_DIR MISSING_MAX
 
-Checks that `rerun rrd verify` finds nothing, that every row of steps.csv that the recording holds
-has the same values there, and that it holds all of them, or, of a run that was killed, all but the
-last MISSING_MAX rows. Prints the number of rows and of values that were compared.
+`rerun rrd verify` must succeed. The recording must hold all rows of steps.csv but the last MISSING_MAX, with the same
+values. Prints the number of rows and of values that were compared.
 """
 
 import math
@@ -16,7 +15,7 @@ import pandas
 from rerun.experimental import RrdReader
 
 run_dir = pathlib.Path(sys.argv[1])
-missing_max = int(sys.argv[2]) if len(sys.argv) > 2 else 0
+missing_max = int(sys.argv[2])
 
 rerun = pathlib.Path(sys.executable).parent / "rerun"
 subprocess.run([rerun, "rrd", "verify", run_dir / "run.rrd"], check=True, capture_output=True)
@@ -24,7 +23,7 @@ subprocess.run([rerun, "rrd", "verify", run_dir / "run.rrd"], check=True, captur
 steps = pandas.read_csv(run_dir / "steps.csv").set_index("step")
 assert steps.index.is_unique and list(steps.index) == list(range(len(steps)))
 
-# The columns of the recording, with angles in degrees, by those of steps.csv.
+# The column of the recording, which has angles in degrees, for each column of steps.csv.
 columns = {}
 for name in steps.columns:
     quantity, unit = name.rsplit("_", 1)
@@ -37,8 +36,8 @@ for chunk in RrdReader(run_dir / "run.rrd").stream().to_chunks():
     if str(chunk.entity_path) == "/steps":
         batch = chunk.to_record_batch().to_pydict()
         for n, step in enumerate(batch["step"]):
-            assert step not in rows, f"step {step} is there twice"
-            # What is never known has no column: the truth of a run on a real stage.
+            assert step not in rows, f"step {step} occurs twice"
+            # A quantity that is never known has no column, such as the truth on a real stage.
             unknown = {name: math.nan for name in columns.values() if name not in batch}
             known = {name: batch[name][n][0] for name in columns.values() if name in batch}
             rows[step] = unknown | known
@@ -57,7 +56,7 @@ for step, row in rows.items():
         difference = recorded - expected
         if name.startswith("roll_") and not name.startswith("roll_sd"):
             difference = math.remainder(difference, 360.0)
-        # steps.csv has as many digits as it takes to tell two numbers apart; degrees are rounded.
+        # steps.csv has all significant digits; the conversion to degrees rounds.
         assert abs(difference) <= 1e-9 * max(1.0, abs(expected)), (
             f"step {step}: {recorded_name} is {recorded}, {name} says {expected}"
         )

@@ -1,4 +1,4 @@
-//! A whole run in virtual time, with a place on every way where things can go wrong.
+//! A whole run in virtual time. Tests can change, delay or lose everything between bench, drives and tracker.
 
 use needle_bench::canopen::Frame;
 use needle_bench::config::Config;
@@ -11,10 +11,10 @@ use needle_bench::tracker::{Event, Sample, Validity};
 use needle_bench::units::Time;
 use std::time::Duration;
 
-/// No run of these tests takes longer, in virtual time.
+/// A run that takes longer than this virtual time fails its test.
 const END_BY: Time = Time::from_nanos(200_000_000_000);
 
-/// What becomes of something on its way to the bench.
+/// What happens to an input on its way to the bench.
 pub(crate) enum Fate {
     Arrives(Input),
     Late(Duration, Input),
@@ -24,22 +24,22 @@ pub(crate) enum Fate {
 /// True depth, mm, and rotation, rad.
 pub(crate) type Position = (f64, f64);
 
-/// The moment at which the run was first held or stopped.
+/// When and where the run was first held or stopped.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Detection {
     pub(crate) time: Time,
     pub(crate) position: Position,
 }
 
-/// The moment at which the run began to stop.
+/// When the run began to stop.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Stopping {
     pub(crate) time: Time,
-    /// Frames sent before.
+    /// Number of frames sent until then.
     pub(crate) sent: usize,
 }
 
-/// A session, the virtual stage, and the ways between them.
+/// A session, the virtual stage, and the connections between them.
 pub(crate) struct Bench {
     pub(crate) now: Time,
     pub(crate) stage: VirtualStage,
@@ -48,11 +48,11 @@ pub(crate) struct Bench {
     pub(crate) records: Vec<Record>,
     /// Every frame that the session sent.
     pub(crate) sent: Vec<Frame>,
-    /// Every frame and sample that reached the session while its run went on.
+    /// The frames, and the number of samples, that reached the session before its run ended.
     pub(crate) received: (Vec<Frame>, usize),
     pub(crate) detection: Option<Detection>,
     pub(crate) stopping: Option<Stopping>,
-    /// What goes wrong ends as soon as it is detected.
+    /// The fault ends as soon as it is detected.
     pub(crate) heals: bool,
     tool: String,
     target: Option<String>,
@@ -61,7 +61,7 @@ pub(crate) struct Bench {
     late: Vec<(Time, Input)>,
 }
 
-/// The paper's observer and law: what is measured here does not change with the default ones.
+/// The paper's observer and law, so that the measured numbers do not change with the defaults.
 pub(crate) const PAPER: [&str; 5] = [
     "observer.kind=\"coupled\"",
     "observer.coupled.gains=\"placed\"",
@@ -70,19 +70,18 @@ pub(crate) const PAPER: [&str; 5] = [
     "control.feedback_linearization.roll_demand_max_deg=60",
 ];
 
-/// The configuration with `sets` laid over the defaults and over the paper's steering.
+/// The configuration of the paper's steering with `sets`.
 pub(crate) fn configured(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
     configured_with(&[&PAPER, sets].concat())
 }
 
-/// The configuration with `sets` laid over the defaults. Most insertions here are too short to reach
-/// the plane.
+/// The default configuration with `sets`. Most insertions here are too short to reach the plane.
 pub(crate) fn configured_with(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
     let short = "insertion.plane_out_of_reach=\"insert\"";
     let sets: Vec<String> = [&[short], sets].concat().iter().map(|set| set.to_string()).collect();
     let config = Config::from_sources(&[], &sets).expect("valid");
     let mut session = config.session().expect("valid");
-    // The silence before the bring-up changes nothing of what is measured here.
+    // Skips the wait for another master; no test here measures it.
     session.stage.listen_first = Duration::ZERO;
     (session, config.virtual_stage().expect("valid"))
 }
@@ -119,17 +118,17 @@ impl Bench {
         }
     }
 
-    /// Everything on its way to the bench goes through `fate`.
+    /// Decides by `fate` what happens to every input on its way to the bench.
     pub(crate) fn spoil(&mut self, fate: impl FnMut(Input) -> Fate + 'static) {
         self.to_bench = Box::new(fate);
     }
 
-    /// What `lost` picks out on its way to the bench is lost.
+    /// Loses the inputs for which `lost` is true on their way to the bench.
     pub(crate) fn lose(&mut self, mut lost: impl FnMut(&Input) -> bool + 'static) {
         self.spoil(move |input| if lost(&input) { Fate::Lost } else { Fate::Arrives(input) });
     }
 
-    /// Every sample is changed on its way to the bench.
+    /// Changes every sample on its way to the bench.
     pub(crate) fn change_samples(&mut self, mut change: impl FnMut(&mut Sample) + 'static) {
         self.spoil(move |mut input| {
             if let Input::Tracker(Event::Sample(sample)) = &mut input {
@@ -139,22 +138,22 @@ impl Bench {
         });
     }
 
-    /// The insertion drive's position is changed in its TPDO, counts.
+    /// Changes the insertion drive's position in its TPDO1, counts.
     pub(crate) fn change_depth(&mut self, mut change: impl FnMut(i32) -> i32 + 'static) {
         self.change_tpdo(move |word, counts| (word, change(counts)));
     }
 
-    /// Nothing that the bench sends reaches the drives.
+    /// Loses everything that the bench sends to the drives.
     pub(crate) fn deafen_drives(&mut self) {
         self.to_drives = Box::new(|_| false);
     }
 
-    /// What `lost` picks out on its way to the drives is lost.
+    /// Loses the frames for which `lost` is true on their way to the drives.
     pub(crate) fn lose_to_drives(&mut self, mut lost: impl FnMut(&Frame) -> bool + 'static) {
         self.to_drives = Box::new(move |frame| !lost(frame));
     }
 
-    /// TPDO1 of the insertion drive is changed on its way to the bench: statusword and position.
+    /// Changes statusword and position in TPDO1 of the insertion drive on its way to the bench.
     pub(crate) fn change_tpdo(&mut self, mut change: impl FnMut(u16, i32) -> (u16, i32) + 'static) {
         self.spoil(move |input| match input {
             Input::Frame(frame) if frame.cob_id() == Some(0x181) => {
@@ -173,7 +172,7 @@ impl Bench {
         self.to_drives = Box::new(|_| true);
     }
 
-    /// Gives the session one input, past whatever goes wrong.
+    /// Gives the session one input directly, whatever fault is set.
     pub(crate) fn hand(&mut self, input: Input) {
         if self.session.outcome().is_none() {
             match &input {
@@ -204,7 +203,7 @@ impl Bench {
         }
     }
 
-    /// Carries everything that is under way until both sides are silent.
+    /// Delivers all outputs until neither side has any.
     fn settle(&mut self) {
         loop {
             let mut quiet = true;
@@ -262,7 +261,7 @@ impl Bench {
         self.records.push(record);
     }
 
-    /// Leaps to the next thing that is due, `until` at the latest.
+    /// Advances to the next deadline, at most to `until`.
     fn step(&mut self, until: Time) {
         self.settle();
         let late = self.late.iter().map(|(due, _)| *due).min().unwrap_or(Time::NEVER);
@@ -289,7 +288,7 @@ impl Bench {
         }
     }
 
-    /// Runs until the needle has truly come so deep.
+    /// Runs to this true depth.
     pub(crate) fn run_to_mm(&mut self, depth_mm: f64) {
         while self.stage.position_true(self.now).0 < depth_mm {
             assert!(self.session.outcome().is_none() && self.now < END_BY, "{}", self.reason());
@@ -297,7 +296,7 @@ impl Bench {
         }
     }
 
-    /// Runs to the end, then on for a second in which all is well: nothing may come of it.
+    /// Runs to the end and one second further without a fault, in which nothing may be sent, recorded or moved.
     pub(crate) fn run_to_end(&mut self) {
         while self.session.outcome().is_none() {
             assert!(self.now < END_BY, "the run does not end");
@@ -310,11 +309,11 @@ impl Bench {
         let (records, sent) = (self.records.len(), self.sent.len());
         let position = self.stage.position_true(self.now);
         self.run_for(Duration::from_secs(1));
-        assert_eq!((records, sent), (self.records.len(), self.sent.len()), "it is over");
+        assert_eq!((records, sent), (self.records.len(), self.sent.len()), "after the end");
         assert_eq!(self.stage.position_true(self.now), position, "both axes stand");
     }
 
-    /// The bench does nothing for `duration`; what is sent to it waits.
+    /// Stalls the bench for `duration`; what is sent to it waits.
     pub(crate) fn hold_up_for(&mut self, duration: Duration) {
         let end = self.now + duration;
         while self.now < end {
@@ -327,7 +326,7 @@ impl Bench {
         self.session.outcome() == Some(&Outcome::Completed)
     }
 
-    /// Why the run was stopped.
+    /// The stop reason.
     pub(crate) fn reason(&self) -> String {
         let reason = self.session.outcome().and_then(Outcome::stop_reason);
         reason.unwrap_or("not stopped").to_owned()
@@ -348,7 +347,7 @@ impl Bench {
         })
     }
 
-    /// The frames that the session recorded: those it received.
+    /// The received frames that the session recorded.
     pub(crate) fn recorded_frames(&self) -> Vec<Frame> {
         let frame = |record: &Record| match record {
             Record::Can { frame, .. } => Some(*frame),

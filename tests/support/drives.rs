@@ -1,9 +1,9 @@
-//! The drives as the public program reads them.
+//! The state of the drives, as `needle-bench check` reads it.
 
 use super::programs::Program;
 use std::process::Command;
 
-/// What a drive says of itself: statusword and position.
+/// Statusword and position of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Drive {
     pub(crate) statusword: u64,
@@ -23,7 +23,6 @@ pub(crate) fn drives(settings: &[&str]) -> [Drive; 2] {
     let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
     command.current_dir(env!("CARGO_MANIFEST_DIR"));
     command.args(["check", "bench-config/vcan.toml", "--connect", "--listen", "0.1", "--json"]);
-    // The tracker is not looked at, whether it is there or not.
     for setting in ["can.sdo_attempts=10"].iter().chain(settings) {
         command.args(["--set", setting]);
     }
@@ -35,7 +34,7 @@ pub(crate) fn drives(settings: &[&str]) -> [Drive; 2] {
     })
 }
 
-/// Both drives, read twice: they stand, and take no targets.
+/// Asserts that both drives stand and take no targets: reads them twice.
 #[track_caller]
 pub(crate) fn assert_the_drives_stand(settings: &[&str]) -> [Drive; 2] {
     let (first, second) = (drives(settings), drives(settings));

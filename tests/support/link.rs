@@ -1,8 +1,8 @@
-//! Interfaces, brought down and up.
+//! Configures network interfaces.
 
 use std::process::Command;
 
-/// `ip` as root, or with a sudo that asks nothing, which is how the interfaces came to be.
+/// Runs `ip` as root, or with a sudo that needs no password, as `vcan/run.sh` does.
 pub(crate) fn ip(arguments: &str) {
     let script = format!("[ $(id -u) = 0 ] && exec ip {arguments}; exec sudo -n ip {arguments}");
     let status = Command::new("sh").args(["-c", &script]).status().unwrap();

@@ -1,5 +1,5 @@
-//! What the tests share. Every test binary has all of it and uses a part.
-#![allow(dead_code, reason = "no test binary needs all of it")]
+//! Helpers that the test binaries share.
+#![allow(dead_code, reason = "each test binary uses a part")]
 
 pub(crate) mod bench;
 pub(crate) mod drives;
@@ -18,3 +18,4 @@ pub(crate) mod stop;
 pub(crate) mod terminal;
 pub(crate) mod udp_stage;
 pub(crate) mod vcan;
+pub(crate) mod witness;

@@ -1,11 +1,11 @@
-//! What a machine may lack: peers, data sets, CAN interfaces, privileges.
+//! Skips tests on a machine that lacks peers, data sets, CAN interfaces or privileges.
 
 use std::ffi::OsString;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// Fails the test in CI (`CI=true`), where nothing may be missing. Elsewhere says, past the
-/// harness's capture, that the test is skipped and what would let it run.
+/// Fails the test in CI (`CI=true`), where nothing may be missing. Elsewhere this prints that the test is skipped
+/// and the remedy; the test harness does not capture it.
 #[track_caller]
 pub(crate) fn skip(missing: &str, remedy: &str) {
     let test = std::thread::current().name().unwrap_or("a test").to_owned();
@@ -13,7 +13,7 @@ pub(crate) fn skip(missing: &str, remedy: &str) {
     let _ = writeln!(std::io::stderr(), "SKIPPED {test}: no {missing}; {remedy}");
 }
 
-/// The Python that has tests/peers/requirements.txt.
+/// The Python interpreter with tests/peers/requirements.txt.
 pub(crate) fn python() -> Option<OsString> {
     let python = std::env::var_os("NEEDLE_PEERS_PYTHON");
     if python.is_none() {
@@ -23,9 +23,8 @@ pub(crate) fn python() -> Option<OsString> {
     python
 }
 
-/// A file or folder of the recordings made by others, which have no licence that lets this project
-/// ship them: in `$NEEDLE_DATA`, or in `../shared/data` where that is not set. `NEEDLE_DATA=none`
-/// goes without them, in CI too.
+/// A file or folder of the recordings by other labs, which this project has no licence to ship: in
+/// `$NEEDLE_DATA`, by default `../shared/data`. `NEEDLE_DATA=none` skips the tests that need them, in CI too.
 pub(crate) fn data(path: &str) -> Option<PathBuf> {
     let folder = std::env::var_os("NEEDLE_DATA").map_or_else(
         || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"),

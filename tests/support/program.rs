@@ -1,10 +1,10 @@
-//! Runs the programs as their user does, in a folder of the test's own.
+//! Runs `needle-bench` as a user does, in a folder of the test's own.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::atomic::{AtomicU32, Ordering};
 
-/// A folder that goes with the test.
+/// A folder that is removed with the test.
 pub(crate) struct Scratch(PathBuf);
 
 impl Scratch {
@@ -34,7 +34,7 @@ impl Drop for Scratch {
     }
 }
 
-/// What a program said and how it ended.
+/// Output and exit status of a program.
 pub(crate) struct Said {
     command: String,
     pub(crate) status: i32,
@@ -43,8 +43,8 @@ pub(crate) struct Said {
 }
 
 impl Said {
-    /// As on a screen, for a snapshot: the command, what it said and how it ended. Lines for an
-    /// operator are short.
+    /// Command, output and exit status, for a snapshot. Asserts that no line on stderr is longer than 200
+    /// characters.
     pub(crate) fn screen(&self) -> String {
         let Said { command, status, stdout, stderr } = self;
         for line in stderr.lines() {
@@ -78,7 +78,7 @@ pub(crate) fn needle_bench(scratch: &Scratch, arguments: &[&str]) -> Said {
     }
 }
 
-/// The screens of commands that are bad usage (exit 2), for a snapshot.
+/// The screens of commands that are refused as bad usage (exit 2), for a snapshot.
 pub(crate) fn refusals(scratch: &Scratch, commands: &[&[&str]]) -> String {
     let refused = |arguments: &&[&str]| {
         let said = needle_bench(scratch, arguments);
@@ -88,7 +88,7 @@ pub(crate) fn refusals(scratch: &Scratch, commands: &[&[&str]]) -> String {
     commands.iter().map(refused).collect()
 }
 
-/// A file of the repository.
+/// The absolute path of a file in the repository.
 pub(crate) fn repository(path: &str) -> String {
     format!("{}/{path}", env!("CARGO_MANIFEST_DIR"))
 }

@@ -1,9 +1,10 @@
-//! The public programs as child processes, and what they leave behind.
+//! The public programs as child processes, and the files that they write.
 //!
-//! A child is ended by its own handle or process number, and with the test at the latest.
+//! A test ends its child processes by handle or process number; at the latest they end with the test.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Read};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, Once, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
@@ -12,30 +13,29 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-/// Long enough for an emulated machine on a busy one; nothing waits this long unless it fails.
+/// Timeout of a wait, for an emulated machine on a busy host. Only a test that fails waits this long.
 pub(crate) const LONG: Duration = Duration::from_secs(60);
 const POLL: Duration = Duration::from_millis(10);
 
-/// Who runs: one test that has the machine to itself, or some that share it.
+/// Held by one test alone, or by those that share the machine.
 static MACHINE: RwLock<()> = RwLock::new(());
 
-/// One at a time: the tests share vcan0, the tracker's port and two cores.
+/// For a test that needs vcan0, the tracker's port or both cores to itself.
 pub(crate) fn alone() -> RwLockWriteGuard<'static, ()> {
     let guard = MACHINE.write().unwrap_or_else(PoisonError::into_inner);
     read_programs();
     guard
 }
 
-/// Beside others that share the machine: for tests on a bus of their own that mostly wait.
-#[allow(dead_code, reason = "not every binary needs it")]
+/// For a test on a bus of its own that mostly waits: it runs beside others.
 pub(crate) fn beside_others() -> RwLockReadGuard<'static, ()> {
     let guard = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
     read_programs();
     guard
 }
 
-/// In an emulated machine the programs come over a file system at a few MB/s: they are read once, so
-/// that no page of them is awaited in the middle of a run.
+/// Reads the programs into the page cache. An emulated machine loads them at a few MB/s, and a page fault during a
+/// run would stall it.
 fn read_programs() {
     static READ: Once = Once::new();
     READ.call_once(|| {
@@ -52,7 +52,7 @@ pub(crate) struct Program {
     stderr: Output,
 }
 
-/// How a program ended and what it said.
+/// Exit status and output of a program.
 pub(crate) struct Ended {
     pub(crate) status: ExitStatus,
     pub(crate) stdout: String,
@@ -95,7 +95,7 @@ impl Program {
         Program::start_on(command, Stdio::null())
     }
 
-    /// The same with this standard input.
+    /// Starts it with this standard input.
     pub(crate) fn start_on(command: &mut Command, stdin: impl Into<Stdio>) -> Self {
         let mut child = command
             .stdin(stdin)
@@ -108,62 +108,69 @@ impl Program {
         Program { child, stdout, stderr }
     }
 
-    /// Waits until the program has said `text`, on whichever output.
+    /// Waits until the program has printed `text` on stdout or stderr.
     pub(crate) fn wait_for(&mut self, text: &str) {
         let end = Instant::now() + LONG;
         while !self.said().contains(text) {
             let ended = self.child.try_wait().unwrap();
             assert!(
                 Instant::now() < end && ended.is_none_or(|_| self.said().contains(text)),
-                "not said: {text:?} ({ended:?}), but:\n{}",
+                "not printed: {text:?} ({ended:?}), but:\n{}",
                 self.said()
             );
             thread::sleep(POLL);
         }
     }
 
-    /// True once it has ended.
-    #[allow(dead_code, reason = "not every test needs it")]
+    /// True once the program has ended.
     pub(crate) fn has_ended(&mut self) -> bool {
         self.child.try_wait().unwrap().is_some()
     }
 
-    /// Its process number.
-    #[allow(dead_code, reason = "not every test needs it")]
+    /// The process number.
     pub(crate) fn id(&self) -> u32 {
         self.child.id()
     }
 
-    /// Both outputs so far.
+    /// Stdout and stderr so far.
     pub(crate) fn said(&self) -> String {
         self.stdout.so_far() + &self.stderr.so_far()
     }
 
-    /// Sends it `signal`, such as INT, which is Ctrl-C.
+    /// Sends `signal`, such as INT, which is Ctrl-C.
     pub(crate) fn signal(&self, signal: &str) {
-        // The shell's own: the program of this name is in a package that may not be there.
-        let script = format!("kill -s {signal} {}", self.child.id());
-        let status = Command::new("sh").args(["-c", &script]).status();
-        assert!(status.unwrap().success(), "{script}");
+        send_signal(self.child.id(), signal);
     }
 
-    /// Waits until it ends.
+    /// Waits until the program ends.
     pub(crate) fn end(mut self) -> Ended {
         let end = Instant::now() + 3 * LONG;
         let status = loop {
             if let Some(status) = self.child.try_wait().unwrap() {
                 break status;
             }
-            assert!(Instant::now() < end, "it does not end, and said:\n{}", self.said());
+            assert!(
+                Instant::now() < end,
+                "the program does not end, and printed:\n{}",
+                self.said()
+            );
             thread::sleep(POLL);
         };
         Ended { status, stdout: self.stdout.whole(), stderr: self.stderr.whole() }
     }
 }
 
+/// Sends `signal` to a process.
+pub(crate) fn send_signal(process: u32, signal: &str) {
+    // The shell's builtin: not every machine has the program `kill`.
+    let script = format!("kill -s {signal} {process}");
+    let status = Command::new("sh").args(["-c", &script]).status();
+    assert!(status.unwrap().success(), "{script}");
+}
+
 impl Drop for Program {
     fn drop(&mut self) {
-        // It may have ended by itself.
+        // The program may have ended already.
         let _ = self.child.kill();
         let _ = self.child.wait();
         if thread::panicking() {
@@ -178,7 +185,7 @@ impl Ended {
         self.stdout.lines().last().unwrap_or("")
     }
 
-    /// The one JSON object that `--json` promises on stdout.
+    /// The JSON object that `--json` prints on stdout.
     pub(crate) fn json(&self) -> Value {
         serde_json::from_str(&self.stdout)
             .unwrap_or_else(|error| panic!("{error}: {}\n{}", self.stdout, self.stderr))
@@ -190,7 +197,7 @@ impl Ended {
     }
 }
 
-/// A folder for what the tests write, empty at first, gone with it.
+/// A folder for the files of a test, removed with it.
 pub(crate) struct Scratch(PathBuf);
 
 impl Scratch {
@@ -204,12 +211,12 @@ impl Scratch {
         self.0.join(name)
     }
 
-    /// The bench's settings for runs recorded here, in an emulated machine.
+    /// Settings of the runs recorded here, which an emulated machine can keep.
     ///
-    /// Its threads are not scheduled for 20 to 40 ms now and then, and for 100 ms on a busy
-    /// machine, so that with the default limits a run ends there for want of a drive's answer or of
-    /// a heartbeat. A position that comes as late is as far behind its target. The default observer
-    /// takes most of a SYNC period there, which a run about something else does without.
+    /// Such a machine deschedules a thread for 20 to 40 ms now and then, for 100 ms on a busy host. With the
+    /// default limits a run would stop there, because an answer of a drive or a heartbeat is late, or the
+    /// following error grows meanwhile. The default observer takes most of a SYNC period there; most tests do not
+    /// need it.
     fn settings(&self) -> Vec<String> {
         let settings = [
             "can.missed_feedback_max=30",
@@ -225,18 +232,18 @@ impl Scratch {
         settings.map(str::to_owned).into_iter().chain([record]).collect()
     }
 
-    /// `needle-bench run bench-config/vcan.toml` at 5 mm/s, with more settings. At that speed the
-    /// default blind depth is 0.1 s, less than an emulated machine may be held up for.
+    /// Starts `needle-bench run bench-config/vcan.toml` at 5 mm/s with these flags and settings.
     pub(crate) fn bench(&self, flags: &[&str], settings: &[&str]) -> Program {
         Program::start(&mut self.command(flags, settings))
     }
 
-    /// The same, not yet started.
+    /// The command that [`bench`](Self::bench) starts.
     pub(crate) fn command(&self, flags: &[&str], settings: &[&str]) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
         command.current_dir(env!("CARGO_MANIFEST_DIR"));
         command.args(["run", "bench-config/vcan.toml"]).args(flags);
         let given = self.settings();
+        // At this speed the default `hold_after_mm` is reached in 0.1 s, and an emulated machine may stall longer.
         let fast = ["insertion.speed_mm_per_s=5", "tracker.hold_after_mm=3"];
         let given = given.iter().map(String::as_str).chain(fast);
         for setting in given.chain(settings.iter().copied()) {
@@ -253,6 +260,21 @@ impl Scratch {
         assert!(dirs.next().is_none(), "more than one run folder");
         dir
     }
+
+    /// Waits until an `events.log` of the runs contains `text`.
+    #[track_caller]
+    pub(crate) fn wait_for_event(&self, text: &str) {
+        let end = Instant::now() + 3 * LONG;
+        let events = || {
+            let runs = fs::read_dir(self.path("runs")).into_iter().flatten().flatten();
+            let logs = runs.map(|run| fs::read_to_string(run.path().join("events.log")));
+            logs.filter_map(Result::ok).collect::<String>()
+        };
+        while !events().contains(text) {
+            assert!(Instant::now() < end, "not recorded: {text:?}, but:\n{}", events());
+            thread::sleep(POLL);
+        }
+    }
 }
 
 impl Drop for Scratch {
@@ -261,7 +283,13 @@ impl Drop for Scratch {
     }
 }
 
-/// `vcan-stage`, once it serves.
+/// An address on the loopback where nothing listens.
+pub(crate) fn free_address() -> SocketAddr {
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
+    listener.local_addr().expect("an address")
+}
+
+/// Starts `vcan-stage` and waits until it serves.
 pub(crate) fn stage(arguments: &[&str]) -> Program {
     let mut command = Command::new(env!("CARGO_BIN_EXE_vcan-stage"));
     let mut stage = Program::start(command.args(arguments));
@@ -269,7 +297,7 @@ pub(crate) fn stage(arguments: &[&str]) -> Program {
     stage
 }
 
-/// The rows of a CSV file by column name; an unfinished last line is left out.
+/// The rows of a CSV file by column name, without an unfinished last line.
 pub(crate) fn csv(path: &Path) -> Vec<std::collections::HashMap<String, String>> {
     let text = read(path);
     let mut lines = text[..text.rfind('\n').map_or(0, |end| end + 1)].lines();

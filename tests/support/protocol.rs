@@ -1,22 +1,21 @@
 //! The worked protocol of docs/rig.md: its commands, and an operator who follows it from power-on to the
-//! calibrated needle, on two drives with the habits of EPOS4 and a tracker that pyigtl serves.
+//! calibrated needle, on two emulated EPOS4 drives and a tracker that pyigtl serves.
 
-use super::peers::peer;
+use super::peers::serving_peer;
 use super::program::repository;
-use super::programs::{Ended, LONG, Program, Scratch, manifest, read, stage};
+use super::programs::{Ended, LONG, Program, Scratch, free_address, manifest, read, stage};
 use super::replays::assert_it_replays;
 use super::terminal::OnTerminal;
 use nalgebra::Vector3;
 use needle_bench::geometry::{FixedAngles, Pose};
 use std::fs;
 use std::io::{BufRead as _, BufReader, Write as _};
-use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// The commands of the page in its order: each as it is printed, and its words after `needle-bench`.
+/// The commands of the page in order: each as printed there, and as words after `needle-bench`.
 pub(crate) fn commands() -> Vec<(String, Vec<String>)> {
     let page = read(Path::new(&repository("docs/rig.md")));
     let lines = page.lines().filter_map(|line| line.strip_prefix("needle-bench "));
@@ -27,12 +26,12 @@ pub(crate) fn commands() -> Vec<(String, Vec<String>)> {
     commands.collect()
 }
 
-/// Whether the page tries this command without bus and tracker.
+/// Whether this command needs neither bus nor tracker.
 pub(crate) fn is_without_rig(line: &str) -> bool {
     ["--rehearse", "--virtual", "emulator."].iter().any(|word| line.contains(word))
 }
 
-/// The words of a command line whose quoted argument has no space at its ends.
+/// Splits a command line into words. A quoted argument must not begin or end with a space.
 fn words(line: &str) -> Vec<String> {
     let parts = line.split('\'').enumerate();
     let words = parts.flat_map(|(n, part)| match n % 2 {
@@ -42,7 +41,7 @@ fn words(line: &str) -> Vec<String> {
     words.collect()
 }
 
-/// Where the tracker truly is on the bench.
+/// True pose of the tracker on the bench.
 const X_WT: &str = "tracker.registration={ x_mm = 120.0, y_mm = -40.0, z_mm = 310.0, yaw_deg = 30.0, \
                     pitch_deg = -20.0, roll_deg = 100.0 }";
 const X_WT_MM: [f64; 3] = [120.0, -40.0, 310.0];
@@ -64,17 +63,16 @@ const RIG: [&str; 8] = [
     X_WT,
 ];
 
-/// What differs from bench-config/rig-epos4.toml on every bus, and why; docs/rig.md says so too.
+/// The changes of bench-config/rig-epos4.toml on every bus, with their reasons, as in docs/rig.md.
 const CHANGES: [Change; 11] = [
-    // Less to wait for: a shorter needle, the highest speed that the limits allow, and a faster withdrawal.
+    // Shorter runs: a shorter insertion, the highest speed that the limits allow, and a faster withdrawal.
     ("depth_mm = 50.0", "depth_mm = 25.0"),
     ("speed_mm_per_s = 1.0\nacceleration", "speed_mm_per_s = 2.0\nacceleration"),
     ("jog_speed_mm_per_s = 1.0", "jog_speed_mm_per_s = 2.0"),
     ("speed_max_mm_per_s = 2.0", "speed_max_mm_per_s = 5.0"),
     ("withdraw_speed_mm_per_s = 1.0", "withdraw_speed_mm_per_s = 5.0"),
-    // A busy machine, or an emulated one, does not run a thread for 200 ms now and then: the answers and the
-    // heartbeat that are due meanwhile come late, positions that come late are as far behind their target, and
-    // the needle goes on meanwhile.
+    // A busy or emulated machine deschedules a thread for 200 ms now and then: answers and heartbeats come late,
+    // the following error grows, and the needle moves on without tip positions.
     (
         "sync_ms = 10 ",
         "sync_ms = 10\nsdo_timeout_ms = 1000\nmissed_feedback_max = 100\nheartbeat_timeout_ms = 1500 ",
@@ -83,8 +81,8 @@ const CHANGES: [Change; 11] = [
     ("following_error_deg = 2.0", "following_error_deg = 90.0\njog_speed_deg_per_s = 60.0"),
     ("hold_after_s = 0.5", "hold_after_s = 3.0"),
     ("hold_after_mm = 1.0", "hold_after_mm = 6.0"),
-    // In an emulated machine the default observer holds the bench up for longer than a heartbeat when it starts;
-    // and with it the base hardly rests, so that the paths are too straight to calibrate the needle.
+    // In an emulated machine the default observer stalls the bench for longer than a heartbeat when it starts.
+    // It also turns the base nearly all the time, and such paths are too straight to calibrate the needle.
     (
         "[needle]\nradius_mm",
         "[observer]\nkind = \"coupled\"\nshadows = []\n[observer.coupled]\ngains = \"placed\"\n\n\
@@ -92,10 +90,10 @@ const CHANGES: [Change; 11] = [
     ),
 ];
 
-/// A text that stands once in the operator's file, and what takes its place.
+/// A text that occurs once in the operator's file, and its replacement.
 pub(crate) type Change = (&'static str, &'static str);
 
-/// The operator's file and folder.
+/// The operator's configuration file and its folder.
 struct Rig {
     scratch: Scratch,
     interface: String,
@@ -120,7 +118,7 @@ impl Rig {
         self.scratch.path(name)
     }
 
-    /// Edits the file, as the page says.
+    /// Edits the file as the page says.
     #[track_caller]
     fn change(&mut self, changes: &[(&str, &str)]) {
         for (from, to) in changes {
@@ -140,7 +138,7 @@ impl Rig {
         Program::start(&mut self.command(words)).end()
     }
 
-    /// The fiducials as the tracker sees them, mm.
+    /// The fiducials in the tracker's frame, mm.
     fn seen_mm() -> [[f64; 3]; 5] {
         let [yaw, pitch, roll] = X_WT_DEG.map(f64::to_radians);
         let x_wt = Pose {
@@ -150,7 +148,7 @@ impl Rig {
         FIDUCIALS_MM.map(|bench| x_wt.inverse().transform(&Vector3::from(bench)).into())
     }
 
-    /// The registration as the operator writes it down who measured each point by hand.
+    /// Writes the file of points that an operator measured by hand.
     fn write_points(&self) {
         let mut csv =
             "x_tracker_mm,y_tracker_mm,z_tracker_mm,x_bench_mm,y_bench_mm,z_bench_mm\n".to_owned();
@@ -160,13 +158,13 @@ impl Rig {
         fs::write(self.path("points.csv"), csv).expect("a file");
     }
 
-    /// The tool rests at this place of the tracker's frame until it is let go.
+    /// Holds the tool at this position of the tracker's frame until the file `carried` is removed.
     fn carry(&self, [x, y, z]: [f64; 3]) {
         fs::write(self.path("new"), format!("{x} {y} {z}")).expect("a file");
         fs::rename(self.path("new"), self.path("carried")).expect("a file");
     }
 
-    /// Touches one fiducial after the other and types its place.
+    /// Touches one fiducial after the other and types its position.
     fn collect(&self, words: &[&str]) -> Ended {
         let mut command = self.command(words);
         let piped = || Stdio::piped();
@@ -186,7 +184,7 @@ impl Rig {
         for (seen, [x, y, z]) in Self::seen_mm().into_iter().zip(FIDUCIALS_MM) {
             until(": touch it");
             self.carry(seen);
-            // The tool is there before its place is typed.
+            // The tool arrives before its position is typed.
             thread::sleep(Duration::from_millis(500));
             writeln!(keyboard, "{x} {y} {z}").expect("typed");
             until("taken: ");
@@ -206,11 +204,11 @@ impl Rig {
         OnTerminal::start(&self.command(words), &keyboard, [24, 80]).expect("a terminal")
     }
 
-    /// A run on hardware, which asks first: the operator answers Ctrl-C, and then yes. A yes before the
-    /// question does not count.
+    /// A run on hardware, which asks for confirmation: the operator first answers Ctrl-C, then yes. A yes that was
+    /// typed before the question does not count.
     fn confirmed(&self, words: &[&str]) -> Ended {
         let asked = |run: &mut OnTerminal| {
-            // The last row of the list; the question after it is no whole line.
+            // The last row of the list. The question after it has no end of line.
             run.program.wait_for("  configuration ");
             thread::sleep(Duration::from_millis(500));
         };
@@ -221,14 +219,14 @@ impl Rig {
         let refused = unsure.program.end();
         refused.assert_status(1);
         assert!(refused.stdout.contains("nothing has moved"), "{}", refused.stdout);
-        assert!(self.insertions().is_empty(), "no record of a run that did not begin");
+        assert!(self.insertions().is_empty(), "a record of a run that did not begin");
         let mut sure = self.on_terminal(words);
         asked(&mut sure);
         sure.press("y\n");
         sure.program.end()
     }
 
-    /// A run on the console, which the operator holds, resumes, and leaves after its end.
+    /// A run on the console: the operator holds and resumes it, and leaves the console after its end.
     fn on_console(&self, words: &[&str]) -> Ended {
         let earlier = self.insertions().len();
         let mut bench = self.on_terminal(words);
@@ -255,7 +253,7 @@ impl Rig {
         bench.program.end()
     }
 
-    /// Makes two runs more, each from another angle of the base.
+    /// Makes two more runs, each from another angle of the base, and calibrates the needle from all of them.
     fn calibrate_needle(&self, words: &[&str]) -> Ended {
         for angle in ["-90deg", "0deg"] {
             let turn = ["stage", "jog", "my-rig.toml", "--axis", "rotation", "--to", angle];
@@ -273,7 +271,7 @@ impl Rig {
         self.run(&with_runs.collect::<Vec<_>>())
     }
 
-    /// The folders of the runs so far, without those of operations, the oldest first.
+    /// The folders of the insertions so far, the oldest first.
     fn insertions(&self) -> Vec<PathBuf> {
         let runs = fs::read_dir(self.path("runs")).into_iter().flatten().flatten();
         let runs = runs.map(|run| run.path()).filter(|run| run.join("manifest.json").exists());
@@ -282,7 +280,7 @@ impl Rig {
         runs
     }
 
-    /// Writes what the page lets the operator type in place of a calibration.
+    /// Writes into the file the values that the page allows in place of a calibration.
     fn type_in(&mut self, line: &str) {
         if line.starts_with("calibrate registration points.csv my-rig.toml --out") {
             let typed = X_WT.strip_prefix("tracker.").expect("a key of the tracker");
@@ -293,7 +291,7 @@ impl Rig {
         }
     }
 
-    /// Does what a command of the page says, and what the page says to do before and after it.
+    /// Runs a command of the page, with what the page says to do before and after it.
     fn follow(&mut self, line: &str, words: Vec<String>) {
         let is = |begin: &str| line.starts_with(begin);
         let bus = format!("={}", self.interface);
@@ -306,7 +304,7 @@ impl Rig {
         } else if is("run") && !line.contains("--console") && !self.is_hardware() {
             add(&["--yes"]);
         } else if is("calibrate registration points.csv my-rig.toml --out") {
-            // The other way to the same two files.
+            // The page offers another way to the same two files.
             fs::remove_file(self.path("registration.toml")).expect("collected");
             self.write_points();
         }
@@ -319,9 +317,9 @@ impl Rig {
             _ if is("calibrate needle") => self.calibrate_needle(&words),
             _ => self.run(&words),
         };
-        // What it says is printed where it fails: all of it would bury the reason.
+        // Output is printed only on failure: all of it would hide the reason.
         println!("$ needle-bench {line}  # {:.1} s", begun.elapsed().as_secs_f64());
-        // Until the registration is measured the page has `check` fail.
+        // `check` fails until the registration is measured, as the page says.
         let is_registered = self.text.contains("\nregistration");
         ended.assert_status(if is("check") && !is_registered { 2 } else { 0 });
         if is("check my-rig.toml --connect") {
@@ -341,7 +339,6 @@ impl Rig {
             assert!(ended.stdout.contains(stands), "{}", ended.stdout);
             assert_it_replays(&self.insertions()[0]);
         } else if line.contains("--console") {
-            // With its hold and its resume.
             assert_it_replays(self.insertions().last().expect("a run"));
         } else if is("stage withdraw") {
             let status = self.run(&["stage", "status", "my-rig.toml", "--json"]).json();
@@ -350,7 +347,7 @@ impl Rig {
         } else if is("calibrate needle") {
             let found: toml::Table = read(&self.path("needle.toml")).parse().expect("TOML");
             let radius_mm = 1.0 / found["needle"]["curvature_per_mm"].as_float().expect("a number");
-            // In 30 emulated rigs it was 114 to 130.
+            // In 30 emulated rigs it was 114 to 130 mm.
             assert!((radius_mm - 122.0).abs() < 30.0, "{found}");
             self.change(&[("radius_mm = 122.0 ", "# "), ("# needle_file", "needle_file")]);
             self.run(&["check", "my-rig.toml"]).assert_status(0);
@@ -358,27 +355,24 @@ impl Rig {
     }
 }
 
-/// Follows the page on this bus, with `changes` of the operator's file, and gives the commands that were run:
-/// those that need a rig and that `is_followed` chooses.
+/// Follows the page on this bus, with `changes` of the operator's file. Runs those commands that need a rig and
+/// that `is_followed` accepts, and returns them.
 pub(crate) fn follow(
     interface: &str,
     changes: &[Change],
     mut is_followed: impl FnMut(&str) -> bool,
 ) -> Vec<String> {
-    let free = TcpListener::bind("127.0.0.1:0").expect("a free port").local_addr().expect("a port");
-    let of_drives = format!("tracker.address=\"{free}\"");
+    let source = free_address();
+    let address = format!("tracker.address=\"{source}\"");
     let mut rig = Rig::new(Scratch::new("protocol"), interface, changes);
     let file = rig.path("my-rig.toml");
-    let sets = RIG.into_iter().chain([&*of_drives]).flat_map(|set| ["--set", set]);
+    let sets = RIG.into_iter().chain([&*address]).flat_map(|set| ["--set", set]);
     let drives =
         stage(&[file.to_str().expect("UTF-8")].into_iter().chain(sets).collect::<Vec<_>>());
-    let (port, carried) = (free.port().to_string(), rig.path("carried"));
+    let (port, carried) = (source.port().to_string(), rig.path("carried"));
     let relay = ["--from-port", &port, "--port", "0", "--stay", "--duration", "3600", "--carried"];
     let relay = [&relay[..], &[carried.to_str().expect("UTF-8")]].concat();
-    let mut tracker = peer("pyigtl_relay.py", &relay).expect("NEEDLE_PEERS_PYTHON");
-    tracker.wait_for("listening ");
-    let said = tracker.said();
-    let port = said.lines().find_map(|line| line.strip_prefix("listening ")).expect("a port");
+    let (_tracker, port) = serving_peer("pyigtl_relay.py", &relay).expect("NEEDLE_PEERS_PYTHON");
     rig.change(&[("127.0.0.1:18944", &format!("127.0.0.1:{port}"))]);
 
     let mut done = Vec::new();

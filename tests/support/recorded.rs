@@ -1,14 +1,14 @@
-//! The recorded runs under `tests/recorded`, and how they are made anew.
+//! Records the runs under `tests/recorded` again.
 
 use needle_bench::archive::file;
 use needle_bench::telemetry::{RunFolder, write_manifest};
 use std::path::Path;
 
-/// Set in the environment, it has the tests record their runs anew.
+/// The environment variable that has the tests record their runs again.
 pub(crate) const ANEW: &str = "NEEDLE_RECORD_ANEW";
 
-/// Makes the run in `run_dir` the recorded run `name` where that is asked for. Its `run.rrd`, which
-/// no replay reads and which is larger than the rest together, stays behind.
+/// Copies the run in `run_dir` to the recorded run `name` if [`ANEW`] is set. It leaves out `run.rrd`, which no
+/// replay reads and which is larger than all other files.
 pub(crate) fn keep(run_dir: &Path, name: &str) {
     if std::env::var_os(ANEW).is_none() {
         return;

@@ -1,12 +1,12 @@
-//! Recordings of a needle that is known.
+//! Recordings of an insertion with known parameters.
 
 use nalgebra::UnitQuaternion;
 use needle_bench::geometry::Pose;
 use needle_bench::needle::{Increment, Needle, Play, Torsion};
 use std::fmt::Write as _;
 
-/// CSV of an insertion of 60 mm, the sensor in line with the tip. `turns` is the turn of the base,
-/// rad, at each of its 600 rows.
+/// CSV of an insertion of 60 mm in 600 rows, the sensor in line with the tip. `turns` gives the turn of the base
+/// at each row, rad.
 pub(crate) fn recording(needle: Needle, torsion: &Torsion, turns: impl Fn(u32) -> f64) -> String {
     let mut csv = "insertion_mm,rotation_rad,x_mm,y_mm,z_mm,qw,qx,qy,qz\n".to_owned();
     let (mut tip, mut rotation, mut play) = (Pose::identity(), 0.0, Play::default());
@@ -24,7 +24,7 @@ pub(crate) fn recording(needle: Needle, torsion: &Torsion, turns: impl Fn(u32) -
     csv
 }
 
-/// The base turning to and fro at 0.6 rad/mm, each way for `way_mm`.
+/// Turns the base to and fro, by 0.6 and −0.5 rad/mm, each way for `way_mm`.
 pub(crate) fn to_and_fro(way_mm: u32) -> impl Fn(u32) -> f64 {
     move |n| if (n / (10 * way_mm)).is_multiple_of(2) { 0.06 } else { -0.05 }
 }

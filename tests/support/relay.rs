@@ -1,5 +1,5 @@
-//! Runs at 1 mm/s and 10 ms SYNC through a relay between bench and drives, which changes what the
-//! drives say and what they are told: tests/peers/can_relay.py.
+//! Runs at 1 mm/s and 10 ms SYNC through tests/peers/can_relay.py, a relay between bench and drives that changes
+//! frames on their way.
 
 use super::peers::peer;
 use super::programs::{Ended, Scratch};
@@ -15,9 +15,8 @@ pub(crate) enum Buses {
 }
 
 impl Buses {
-    /// How far a needle at 1 mm/s goes while the machine holds the programs up, mm: an emulated one for up to
-    /// half a second.
-    fn held_up_mm(self) -> f64 {
+    /// Travel of a needle at 1 mm/s during a stall of the machine, mm: an emulated one stalls for half a second.
+    fn stall_travel_mm(self) -> f64 {
         match self {
             Buses::Udp => 0.0,
             Buses::Vcan => 0.5,
@@ -25,16 +24,17 @@ impl Buses {
     }
 }
 
-/// A run through the relay, and what the relay saw.
+/// A run through the relay.
 struct Relayed {
     buses: Buses,
     bench: Ended,
+    /// What the relay printed.
     relay: Vec<Seen>,
-    /// Where the insertion drive stands in the end, mm.
+    /// Position of the insertion drive at the end, mm.
     stands_at_mm: f64,
 }
 
-/// A line of the relay's.
+/// A line that the relay printed.
 #[derive(Debug, Clone)]
 struct Seen {
     time_s: f64,
@@ -42,12 +42,12 @@ struct Seen {
     what: String,
 }
 
-/// Runs 3 mm with `rules` and with `settings`; none without the peer.
+/// Runs 3 mm with these rules of the relay and settings of the bench; `None` without the peer.
 fn run(buses: Buses, test: &str, rules: &[&str], settings: &[&str]) -> Option<Relayed> {
     run_on(buses, &[], test, rules, settings)
 }
 
-/// The same on a virtual stage with these arguments.
+/// As [`run`], on a virtual stage with these arguments.
 fn run_on(
     buses: Buses,
     stage: &[&str],
@@ -58,7 +58,7 @@ fn run_on(
     let (stage, bench_side, drives_side) = match buses {
         Buses::Udp => {
             let stage = Stage::start(stage);
-            // The group is this process's own, and so is the next port of it.
+            // No other test uses the group, so the next port is free too.
             let bench_side = SocketAddrV4::new(*stage.group.ip(), stage.group.port() + 1);
             let drives_side = format!("udp:{}", stage.group);
             (stage, format!("udp:{bench_side}"), drives_side)
@@ -101,53 +101,56 @@ impl Relayed {
         found.unwrap_or_else(|| panic!("{what}: not among {:?}", self.relay))
     }
 
-    /// It was stopped for `reason`, and the insertion was told to by SDO soon after the relay did
-    /// `what`, and to stand.
+    /// Asserts that the run was stopped for `reason`: soon after the relay did `what`, the bench sent a quick stop
+    /// to the insertion drive by SDO, and the drive stood soon after that.
     #[track_caller]
-    fn was_stopped(&self, what: &str, reason: &str) {
+    fn assert_stopped(&self, what: &str, reason: &str) {
         self.bench.assert_status(1);
         assert_eq!(self.bench.json()["stop_reason"], reason);
-        let (struck, stop) = (self.first(what), self.first("controlword 0x0002 by SDO"));
-        let after_ms = (stop.time_s - struck.time_s) * 1e3;
-        let until_mm = stop.depth_mm - struck.depth_mm;
+        let (fault, stop) = (self.first(what), self.first("controlword 0x0002 by SDO"));
+        let after_ms = (stop.time_s - fault.time_s) * 1e3;
+        let until_mm = stop.depth_mm - fault.depth_mm;
         let then_mm = self.stands_at_mm - stop.depth_mm;
         println!("{after_ms:.1} ms, {until_mm:.3} mm until, {then_mm:.3} mm then");
-        // A busy machine may hold the bench up, and its SYNCs with it: the axes do not go on then.
+        // A busy machine stalls the bench and its SYNCs; without SYNC the axes do not move on.
         let late_max_ms = match self.buses {
             Buses::Udp => 500.0,
             Buses::Vcan => 3000.0,
         };
-        let until_max_mm = 0.05 + self.buses.held_up_mm();
+        let until_max_mm = 0.05 + self.buses.stall_travel_mm();
         assert!(
             (0.0..late_max_ms).contains(&after_ms) && until_mm < until_max_mm,
-            "{after_ms} {until_mm}"
+            "stopped after {after_ms} ms and {until_mm} mm"
         );
-        self.stood_after(stop);
+        self.assert_stood_after(stop);
     }
 
-    /// The insertion stands soon after this was seen.
+    /// Asserts that the insertion drive stood soon after this was seen.
     #[track_caller]
-    fn stood_after(&self, seen: &Seen) {
+    fn assert_stood_after(&self, seen: &Seen) {
         let then_mm = self.stands_at_mm - seen.depth_mm;
-        assert!((-0.001..0.1 + self.buses.held_up_mm()).contains(&then_mm), "{then_mm}");
+        assert!((-0.001..0.1 + self.buses.stall_travel_mm()).contains(&then_mm), "{then_mm} mm");
     }
 }
 
-/// Found in Fault, which is gone before it is enabled: what it says later is of now.
-pub(crate) fn an_emergency_of_a_drive_that_was_found_in_fault(buses: Buses) {
+/// The drive is in Fault when the bench finds it, and is reset before it is enabled. A later emergency is a new
+/// fault.
+pub(crate) fn a_new_emergency_of_a_drive_that_was_found_in_fault_stops_the_run(buses: Buses) {
     let rules = ["node=1 until=1sync set=0x0008 clear=0x0067", "node=1 from=2mm emcy=0x8611"];
     let settings = ["stage.fault_reset_on_start=true"];
     let Some(run) = run(buses, "relay-emcy", &rules, &settings) else { return };
-    run.was_stopped(
+    run.assert_stopped(
         "emergency 0x8611",
         "stage: insertion: emergency 0x8611 following error (register 0x21)",
     );
 }
 
-/// A drive faults by itself. Its emergency message says why; where that is lost, its statusword says that it did.
-pub(crate) fn an_emergency_message_that_is_changed_or_lost_on_the_way(buses: Buses) {
+/// The stop reason has the code of the emergency message as it arrives; if the message is lost, the statusword.
+pub(crate) fn a_drive_fault_stops_the_run_if_its_emergency_message_is_changed_or_lost(
+    buses: Buses,
+) {
     let fault = r#"emulator.fault=[{ at_mm = 2, kind = "drive-fault", axis = "insertion", code = 0x4210 }]"#;
-    for (rule, struck, reason) in [
+    for (rule, seen, reason) in [
         ("node=1 edit=0x8611", "becomes", "stage: insertion: emergency 0x8611 following error"),
         ("node=1 drop=emcy", "lost", "stage: insertion: drive in fault (statusword 0x021"),
     ] {
@@ -157,12 +160,11 @@ pub(crate) fn an_emergency_message_that_is_changed_or_lost_on_the_way(buses: Bus
         run.bench.assert_status(1);
         let stop_reason = run.bench.json()["stop_reason"].as_str().unwrap().to_owned();
         assert!(stop_reason.starts_with(reason), "{stop_reason}");
-        run.stood_after(run.first(struck));
+        run.assert_stood_after(run.first(seen));
     }
 }
 
-/// It still has power: said, with what was tried.
-pub(crate) fn a_drive_that_takes_no_command_at_the_end(buses: Buses) {
+pub(crate) fn a_drive_that_ignores_every_command_to_power_off_is_reported(buses: Buses) {
     let rules = ["node=1 from=2mm hold=0x000f"];
     let Some(run) = run(buses, "relay-hold", &rules, &[]) else { return };
     run.bench.assert_status(1);
@@ -171,33 +173,37 @@ pub(crate) fn a_drive_that_takes_no_command_at_the_end(buses: Buses) {
         "stage: insertion: the drive still has power 2000 ms after shutdown (statusword 0x1237 \
          operation enabled); if it does not stop now, press the emergency stop"
     );
-    let told = "off: press the emergency stop, then look at the stage";
-    assert!(run.bench.stderr.contains(told), "{}", run.bench.stderr);
+    let advice = "off: press the emergency stop, then look at the stage";
+    assert!(run.bench.stderr.contains(advice), "{}", run.bench.stderr);
     assert!((run.stands_at_mm - 3.0).abs() < 0.01, "{}", run.stands_at_mm);
     let first = |what| run.first(what).time_s;
     let shutdown_s = first("controlword 0x0006 by RPDO lost");
     for (word, after_s) in [("0x0002", 2.0), ("0x0000", 4.0)] {
         let what = format!("controlword {word} by SDO lost");
-        let told: Vec<f64> = run
+        let times_s: Vec<f64> = run
             .relay
             .iter()
             .filter(|seen| seen.what.ends_with(&what))
             .map(|seen| seen.time_s)
             .collect();
-        println!("{what}: {} times from {:.2} s after shutdown", told.len(), told[0] - shutdown_s);
+        println!(
+            "{what}: {} times from {:.2} s after shutdown",
+            times_s.len(),
+            times_s[0] - shutdown_s
+        );
         let (late_max_s, least) = match buses {
             Buses::Udp => (0.2, 15),
             Buses::Vcan => (3.0, 10),
         };
-        assert!((least..=20).contains(&told.len()), "{told:?}");
-        let late_s = told[0] - shutdown_s - after_s;
-        assert!((-0.2..late_max_s).contains(&late_s), "{told:?}");
+        assert!((least..=20).contains(&times_s.len()), "{times_s:?}");
+        let late_s = times_s[0] - shutdown_s - after_s;
+        assert!((-0.2..late_max_s).contains(&late_s), "{times_s:?}");
     }
 }
 
-/// Remote, voltage enabled, and drive follows command. On vcan, where a run takes long, the second alone: there a
-/// scripted fault clears the first.
-pub(crate) fn statuswords_of_a_drive_that_no_longer_obeys_or_follows(buses: Buses) {
+/// The bits are remote, voltage enabled, and drive follows command. On vcan, where a run takes long, only the
+/// second is tested; there a scripted fault clears the first.
+pub(crate) fn statusword_bit_9_4_or_12_cleared_stops_the_run(buses: Buses) {
     let bits = [
         (
             "0x0200",
@@ -215,19 +221,19 @@ pub(crate) fn statuswords_of_a_drive_that_no_longer_obeys_or_follows(buses: Buse
              bit 12 clear), does an input or another tool hold it?",
         ),
     ];
-    let tried = match buses {
+    let tested = match buses {
         Buses::Udp => 0..3,
         Buses::Vcan => 1..2,
     };
-    for (bit, reason) in &bits[tried] {
+    for (bit, reason) in &bits[tested] {
         let rule = format!("node=1 from=2mm until=2.5mm clear={bit}");
         let Some(run) = run(buses, "relay-bit", &[&rule], &[]) else { return };
-        run.was_stopped("becomes", reason);
+        run.assert_stopped("becomes", reason);
     }
 }
 
-/// Bit 7.
-pub(crate) fn a_drive_that_warns_goes_on(buses: Buses) {
+/// The warning is bit 7 of the statusword.
+pub(crate) fn a_run_completes_although_a_drive_warns(buses: Buses) {
     let rules = ["node=2 from=2mm until=2.5mm set=0x0080"];
     let Some(run) = run(buses, "relay-warning", &rules, &[]) else { return };
     run.bench.assert_status(0);

@@ -1,10 +1,10 @@
-//! A run folder made by a test, replayed.
+//! Replays run folders that a test made.
 
 use super::programs::Program;
 use std::path::Path;
 use std::process::Command;
 
-/// `needle-bench replay` of a run folder comes out as it was recorded.
+/// Asserts that `needle-bench replay` gives the same run again.
 #[track_caller]
 pub(crate) fn assert_it_replays(run_dir: &Path) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));

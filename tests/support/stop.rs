@@ -1,4 +1,4 @@
-//! A run that a fault stopped: what must hold of every one, and what `docs/hazards.md` says of it.
+//! Runs that a fault stops: checks what must hold for every stop, and compares it with `docs/hazards.md`.
 
 use super::bench::{Bench, Detection, Position, Stopping, configured};
 use needle_bench::canopen::Frame;
@@ -14,7 +14,7 @@ const RPDOS: [u16; 2] = [0x201, 0x202];
 /// Bit 3 of the controlword: enable operation.
 const ENABLE: u8 = 1 << 3;
 
-/// A fault and how its run ended, checked.
+/// A run that a fault stopped, checked.
 pub(crate) struct Stop {
     pub(crate) bench: Bench,
     pub(crate) struck: Time,
@@ -23,8 +23,8 @@ pub(crate) struct Stop {
     stopping: Stopping,
 }
 
-/// Runs to 10 mm of 30, where the needle turns by 3.5° a mm, and strikes: once with a fault that
-/// lasts, once with one that goes away as soon as it is detected.
+/// Runs to 10 mm of 30, where the needle turns by 3.5° per mm, and causes a fault with `strike`: once a fault that
+/// lasts, once one that ends as soon as it is detected.
 pub(crate) fn stopped(sets: &[&str], strike: impl Fn(&mut Bench)) -> [Stop; 2] {
     [false, true].map(|heals| {
         let mut bench = Bench::new(configured(&[sets, &["insertion.depth_mm=30"]].concat()));
@@ -35,7 +35,7 @@ pub(crate) fn stopped(sets: &[&str], strike: impl Fn(&mut Bench)) -> [Stop; 2] {
 }
 
 impl Stop {
-    /// Strikes now, runs to the end, and checks what must hold after any fault.
+    /// Causes the fault now, runs to the end, and checks what must hold after any fault.
     pub(crate) fn of(mut bench: Bench, strike: impl Fn(&mut Bench)) -> Stop {
         let (struck, struck_at) = (bench.now, bench.stage.position_true(bench.now));
         strike(&mut bench);
@@ -53,26 +53,26 @@ impl Stop {
         self.detection.time.since(self.struck)
     }
 
-    /// From the fault to its detection, and from there to standstill.
+    /// Travel from the fault to its detection, and from there to standstill.
     pub(crate) fn travel(&self) -> [Position; 2] {
         let end = self.bench.stage.position_true(self.bench.now);
         let way = |from: Position, to: Position| ((to.0 - from.0).abs(), (to.1 - from.1).abs());
         [way(self.struck_at, self.detection.position), way(self.detection.position, end)]
     }
 
-    /// No drive takes set-points; that they stand was seen when the run ended.
+    /// No drive takes set-points. `run_to_end` has checked that both stand.
     fn is_safe(&self) {
         for drive in self.bench.stage.drives() {
             assert_ne!(drive.state(), DriveState::OperationEnabled);
         }
     }
 
-    /// No drive was ever told to switch on.
+    /// Asserts that no drive was ever told to switch on.
     pub(crate) fn never_had_power(&self) {
         assert!(self.bench.sent.iter().all(|frame| !enables(frame)));
     }
 
-    /// Once the run stops targets stay what the last SYNC made them, and nothing is enabled or started.
+    /// After the stop the targets stay those of the last SYNC, and no drive is enabled or started.
     fn commands_nothing(&self) {
         let (before, after) = self.bench.sent.split_at(self.stopping.sent);
         let is_sync = |frame: &Frame| frame.cob_id() == Some(0x080);
@@ -80,7 +80,7 @@ impl Stop {
         for id in RPDOS {
             let of_axis = |frame: &&Frame| frame.cob_id() == Some(id);
             let target = |frame: &Frame| frame.data().get(2..6).map(<[u8]>::to_vec);
-            // Of a run that had sent none, the first: where the axis stands, which `travel` shows.
+            // A run that had sent no target sends one with its stop: the position of the axis, as `travel` shows.
             let taken_up = in_effect.iter().rev().find(of_axis);
             let sent = taken_up.or_else(|| after.iter().find(of_axis));
             let last = sent.and_then(target);
@@ -93,8 +93,8 @@ impl Stop {
         assert!(!started, "a node was started after the stop");
     }
 
-    /// Everything that reached the session is in the record, its steps have no gap, the
-    /// fault is told once and the last word is the end.
+    /// The record has everything that reached the session, steps without a gap, the fault once, and the end as its
+    /// last state.
     fn is_recorded(&self) {
         let bench = &self.bench;
         assert_eq!(bench.recorded_frames(), bench.received.0);
@@ -126,8 +126,8 @@ pub(crate) fn enables(frame: &Frame) -> bool {
         && frame.data().first().is_some_and(|controlword| controlword & 1 != 0)
 }
 
-/// Asserts the reason, the time within which the fault was detected, and that the row of
-/// `docs/hazards.md` which names `test` says the same.
+/// Asserts the stop reason, that the fault was detected within `within_ms`, and that the row of `docs/hazards.md`
+/// for `test` has these values.
 pub(crate) fn documented(stops: &[Stop], test: &str, within_ms: f64, reason: &str) {
     assert!(reason.chars().count() <= 200, "{reason}");
     for stop in stops {
@@ -142,7 +142,7 @@ pub(crate) fn documented(stops: &[Stop], test: &str, within_ms: f64, reason: &st
     measured.is_documented(test, within_ms, reason);
 }
 
-/// What was measured of a fault; travel in mm and rad.
+/// The measured figures of a fault; travel in mm and rad.
 #[derive(Debug)]
 pub(crate) struct Measured {
     pub(crate) detected_ms: f64,
@@ -167,15 +167,15 @@ impl Measured {
     }
 }
 
-/// Asserts that the row of `docs/hazards.md` which names `test` ends in `row`.
+/// Asserts that the row of `docs/hazards.md` for `test` ends in `row`.
 pub(crate) fn is_row(test: &str, row: &str) {
     let found = HAZARDS.lines().find(|line| line.contains(&format!("`{test}`")));
     let found = found.unwrap_or_else(|| panic!("docs/hazards.md has no row: {row}"));
-    assert!(agree(found, row), "docs/hazards.md says\n{found}\nmeasured was\n{row}");
+    assert!(agree(found, row), "docs/hazards.md has\n{found}\nmeasured:\n{row}");
 }
 
-/// True if `line` ends in `row`, its numbers to a unit of their last digit: another platform may
-/// round the other way.
+/// True if `line` ends in `row`. Numbers may differ by a unit of their last digit, because another platform may
+/// round otherwise.
 fn agree(line: &str, row: &str) -> bool {
     let words = |text: &str| text.split_whitespace().rev().map(str::to_owned).collect::<Vec<_>>();
     let (line, row) = (words(line), words(row));

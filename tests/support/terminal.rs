@@ -1,4 +1,4 @@
-//! A program on a pseudoterminal, which `script` (util-linux) makes, and its keyboard.
+//! A program on a pseudoterminal, which `script` (util-linux) makes, with a keyboard.
 
 use super::needed;
 use super::programs::{LONG, Program};
@@ -15,8 +15,8 @@ pub(crate) struct OnTerminal {
 }
 
 impl OnTerminal {
-    /// Starts `command` on a terminal of so many rows and columns, with a new pipe at `keyboard` as its keys;
-    /// `None` without `script`.
+    /// Starts `command` on a terminal of `size` (rows, columns), with a new pipe at `keyboard` as its keys; `None`
+    /// without `script`.
     pub(crate) fn start(command: &Command, keyboard: &Path, size: [u16; 2]) -> Option<Self> {
         if Command::new("script").arg("--version").output().is_err() {
             needed::skip("script", "install util-linux");
@@ -37,12 +37,13 @@ impl OnTerminal {
             .arg(keyboard)
             .current_dir(command.get_current_dir().expect("a folder"))
             .env("TERM", "xterm");
-        // Open to read and write, so that neither side waits for the other.
+        // Opened for reading and writing, because opening a pipe for one of them blocks until the other side
+        // opens.
         let keyboard = File::options().read(true).write(true).open(keyboard).expect("a keyboard");
         Some(OnTerminal { program: Program::start(&mut script), keyboard })
     }
 
-    /// The program's own process: the child of `script`.
+    /// The process number of the program, a child of `script`.
     pub(crate) fn process(&self) -> u32 {
         let parent = self.program.id().to_string();
         let is_child = |entry: &fs::DirEntry| {
@@ -56,7 +57,7 @@ impl OnTerminal {
         child.file_name().to_string_lossy().parse().expect("a process")
     }
 
-    /// Presses `keys` in turn until the program has ended: after a run they count once its record is whole.
+    /// Presses `keys` in turn until the program ends: the console ignores keys until the record is closed.
     pub(crate) fn press_to_the_end(&mut self, keys: &[&str]) {
         let end = Instant::now() + 3 * LONG;
         for key in keys.iter().cycle() {
@@ -69,7 +70,7 @@ impl OnTerminal {
         }
     }
 
-    /// The terminal that the program is on.
+    /// The device of the terminal.
     pub(crate) fn terminal(&self) -> PathBuf {
         fs::read_link(format!("/proc/{}/fd/2", self.process())).expect("a terminal")
     }

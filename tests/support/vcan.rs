@@ -1,11 +1,11 @@
-//! Tests on vcan0 and vcan1.
+//! Access to vcan0 and vcan1.
 
 use super::needed;
 use super::programs::alone;
 use std::sync::RwLockWriteGuard;
 
-/// The bus for one test where `NEEDLE_VCAN=1` says that there is one, as `vcan/run.sh` does: a missing
-/// interface is then a failure.
+/// Reserves vcan0 and vcan1 for one test; `None` without `NEEDLE_VCAN=1`, which `vcan/run.sh` sets. With it a
+/// missing interface fails the test.
 pub(crate) fn alone_on_it() -> Option<RwLockWriteGuard<'static, ()>> {
     if std::env::var("NEEDLE_VCAN").as_deref() == Ok("1") {
         return Some(alone());

@@ -1,5 +1,5 @@
-//! Tests on vcan0 and vcan1, which `vcan/run.sh` provides. Each test asks
-//! `support::vcan::alone_on_it()`: one at a time has the bus.
+//! Tests on vcan0 and vcan1, which `vcan/run.sh` provides. Each test holds `support::vcan::alone_on_it()`, because
+//! only one at a time can use the bus.
 #![cfg(target_os = "linux")]
 
 mod peers;

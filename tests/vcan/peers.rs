@@ -1,6 +1,5 @@
-//! Programs nobody here wrote, on real SocketCAN: python-canopen against the virtual stage's
-//! drives, pyigtl between tracker and bench, can-utils over the record.
-//! candump, cangen and canplayer are Debian's can-utils.
+//! Third-party programs on real SocketCAN: python-canopen against the virtual stage's drives, pyigtl between
+//! tracker and bench, and candump, cangen and canplayer of can-utils.
 
 use std::fs;
 use std::process::Command;
@@ -13,17 +12,12 @@ use needle_bench::canopen::{CanId, Frame};
 use needle_bench::transport::can::{BusEvent, CanBus};
 use needle_bench::transport::socketcan::SocketCan;
 
-/// Where the tests on vcan are asked for, the peers have to be there.
-fn peer(script: &str, arguments: &[&str]) -> Program {
-    peers::peer(script, arguments).expect("NEEDLE_PEERS_PYTHON")
-}
-
 #[test]
 fn python_canopen_drives_resets_and_homes_a_drive() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let _stage = stage(&[]);
     let arguments = ["--interface", "socketcan", "--channel", "vcan0", "--node", "1"];
-    let master = peer("canopen_enable.py", &arguments).end();
+    let master = peers::peer("canopen_enable.py", &arguments).expect("NEEDLE_PEERS_PYTHON").end();
     println!("{}", master.stdout);
     master.assert_status(0);
     assert!(master.stdout.contains("\nOPERATION ENABLED: statusword 0x"), "{}", master.stdout);
@@ -40,9 +34,9 @@ fn the_bench_moves_drives_of_python_canopen() {
     python_drives::are_moved_by_the_bench("socketcan", "vcan0", "vcan0");
 }
 
-/// Frames of a node that is none of ours, some 600 a second, as long as the run lasts.
+/// cangen sends some 600 frames a second of a foreign node.
 #[test]
-fn a_run_under_a_flood_of_cangen_is_a_run() {
+fn a_run_completes_under_a_flood_of_cangen() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let _stage = stage(&[]);
     let flood = ["vcan0", "-g", "1.5", "-I", "5A5", "-L", "8", "-D", "i"];
@@ -70,14 +64,14 @@ fn a_run_under_a_flood_of_cangen_is_a_run() {
     assert_the_drives_stand(&[]);
 }
 
-/// What is on the wire of vcan0, by candump's account.
+/// candump on vcan0.
 struct Candump(Program);
 
 impl Candump {
-    /// Returns once it listens.
+    /// Starts candump and waits until it listens.
     fn start() -> Self {
         let mut command = Command::new("candump");
-        // Room for what comes while it is not scheduled, and word of what did not find any.
+        // A large receive buffer, and a report of what it dropped.
         let candump = Program::start(command.args(["-L", "-d", "-r", "4000000", "vcan0"]));
         let mut bus = SocketCan::open("vcan0").unwrap();
         let call = Frame::from_parts(CanId::Extended(0x1FFF_FFFF), false, &[]).unwrap();
@@ -90,7 +84,7 @@ impl Candump {
         Candump(candump)
     }
 
-    /// All frames since then, as `id#data`.
+    /// Ends candump; returns all frames since its start, as `id#data`.
     fn end(self) -> Vec<String> {
         self.0.signal("INT");
         let ended = self.0.end();
@@ -101,21 +95,19 @@ impl Candump {
 }
 
 #[test]
-fn a_run_steers_by_what_pyigtl_hands_on_and_candump_agrees_with_its_record() {
+fn a_run_steers_by_positions_that_pyigtl_relays_and_candump_agrees_with_its_record() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("relayed");
     let candump = Candump::start();
     let _stage = stage(&[]);
-    let mut relay = peer("pyigtl_relay.py", &[]);
-    relay.wait_for("listening ");
-    let said = relay.said();
-    let port = said.lines().find_map(|line| line.strip_prefix("listening ")).unwrap();
+    let relay = peers::serving_peer("pyigtl_relay.py", &[]);
+    let (relay, port) = relay.expect("NEEDLE_PEERS_PYTHON");
     let tracker = format!("tracker.address=\"127.0.0.1:{port}\"");
     let settings = [
         &tracker,
         "tracker.stamp=\"source\"",
         "insertion={ depth_mm = 20, plane_out_of_reach = \"insert\" }",
-        // A relay in Python, in a machine that is emulated by a busy one.
+        // The relay is slow: Python in an emulated machine on a busy host.
         "tracker.hold_after_s=2",
         "tracker.hold_after_mm=11",
     ];
@@ -153,11 +145,11 @@ fn a_run_steers_by_what_pyigtl_hands_on_and_candump_agrees_with_its_record() {
     println!("{} frames sent, {} received", sent.len(), received.len());
     assert!(sent.len() > 1000 && received.len() > 1000);
     assert!(wire_sent == sent, "{}", difference(&wire_sent, &sent));
-    // The drives spoke before the bench listened, and go on when it is gone.
+    // The drives sent before the bench listened, and send on after its end.
     let all_heard = wire_received.windows(received.len()).any(|window| window == received);
-    assert!(all_heard, "the record does not hold what candump heard of the drives");
+    assert!(all_heard, "the record lacks frames of the drives that candump received");
 
-    // canplayer plays the record.
+    // canplayer replays the record.
     let beginning: Vec<&str> = log.lines().take(200).collect();
     let part = scratch.path("beginning.log");
     fs::write(&part, beginning.join("\n") + "\n").unwrap();
@@ -166,13 +158,13 @@ fn a_run_steers_by_what_pyigtl_hands_on_and_candump_agrees_with_its_record() {
     Program::start(Command::new("canplayer").args(arguments)).end().assert_status(0);
     for line in beginning {
         let Some(BusEvent::Frame(frame)) = vcan1.receive(LONG).unwrap() else {
-            panic!("not played: {line}");
+            panic!("not replayed: {line}");
         };
         assert_eq!(line.split(' ').nth(2), Some(frame.to_string().as_str()));
     }
 }
 
-/// Where two accounts part.
+/// The first frame in which wire and record differ.
 fn difference(wire: &[&str], record: &[&str]) -> String {
     let n = wire.iter().zip(record).take_while(|(a, b)| a == b).count();
     format!("frame {n}: candump has {:?}, can.log {:?}", wire.get(n), record.get(n))

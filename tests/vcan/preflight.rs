@@ -1,12 +1,24 @@
-//! What the preflight says of a real CAN controller: the one that vcan/guest/run.sh puts into its machine.
+//! The preflight of a real CAN controller, which vcan/guest/run.sh puts into its machine.
 
 use crate::support::link::ip;
 use crate::support::programs::{Program, Scratch};
 use crate::support::vcan;
 use serde_json::Value;
 use std::process::Command;
+use std::sync::RwLockWriteGuard;
 
-/// The rows about the bus, each as its verdict and what was found.
+/// Reserves the bus and the controller of the emulated machine; `None` elsewhere, because another controller may
+/// have a rig behind it.
+fn controller() -> Option<(RwLockWriteGuard<'static, ()>, String)> {
+    let alone = vcan::alone_on_it()?;
+    let can = std::env::var("NEEDLE_CAN").ok();
+    if can.is_none() {
+        println!("no controller of the emulated machine: VCAN_GUEST=1 vcan/run.sh has one");
+    }
+    Some((alone, can?))
+}
+
+/// The preflight's rows about the bus, as verdict and finding.
 fn bus(interface: &str) -> Vec<(String, String)> {
     let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
     command.current_dir(env!("CARGO_MANIFEST_DIR"));
@@ -31,13 +43,8 @@ fn bus(interface: &str) -> Vec<(String, String)> {
 
 /// Bit rate, restart-ms, error counters and state come from the kernel, by netlink.
 #[test]
-fn a_controller_is_judged_by_what_the_kernel_says() {
-    let Some(_alone) = vcan::alone_on_it() else { return };
-    // Never a controller that may have a rig behind it.
-    let Ok(can) = std::env::var("NEEDLE_CAN") else {
-        println!("no controller of the emulated machine: VCAN_GUEST=1 vcan/run.sh has one");
-        return;
-    };
+fn a_controller_is_judged_by_what_the_kernel_reports() {
+    let Some((_alone, can)) = controller() else { return };
     let set = |what: &str| {
         ip(&format!("link set {can} down"));
         ip(&format!("link set {can} type can {what}"));
@@ -65,14 +72,9 @@ fn a_controller_is_judged_by_what_the_kernel_says() {
     assert_eq!(bus(&can)[0], row("FAIL", &format!("{can} down, stopped")));
 }
 
-/// A name does not make an interface virtual.
 #[test]
-fn a_controller_that_is_named_as_a_virtual_one_is_no_virtual_stage() {
-    let Some(_alone) = vcan::alone_on_it() else { return };
-    let Ok(can) = std::env::var("NEEDLE_CAN") else {
-        println!("no controller of the emulated machine: VCAN_GUEST=1 vcan/run.sh has one");
-        return;
-    };
+fn hardware_false_is_refused_on_a_controller_named_vcan9() {
+    let Some((_alone, can)) = controller() else { return };
     ip(&format!("link set {can} down"));
     ip(&format!("link set {can} type can bitrate 1000000"));
     ip(&format!("link set {can} name vcan9"));

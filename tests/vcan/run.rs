@@ -1,91 +1,37 @@
-//! Whole runs over real SocketCAN, between the public programs alone: `needle-bench run` on one
-//! side of vcan0, `vcan-stage` on the other. `vcan/run.sh` provides the interface.
+//! Whole runs of `needle-bench run` and `vcan-stage` over real SocketCAN, on vcan0 of `vcan/run.sh`.
 
 use std::fs;
 use std::path::Path;
 use std::process::Command;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use crate::support::drives::{assert_the_drives_stand, drives};
 use crate::support::link::ip;
-use crate::support::programs::{self, LONG, Program, Scratch, stage};
+use crate::support::programs::{self, Program, Scratch, stage};
 use crate::support::replays::assert_it_replays;
+use crate::support::udp_stage::COUNTS_PER_MM;
 use crate::support::vcan;
-use needle_bench::canopen::Frame;
-use needle_bench::transport::can::{BusEvent, CanBus};
+use crate::support::witness::Witness;
 use needle_bench::transport::socketcan::SocketCan;
 use serde_json::Value;
 
-/// Counts per mm of the insertion drive in bench-config/vcan.toml.
-const COUNTS_PER_MM: f64 = 4646.0;
 const SYNC: u16 = 0x080;
-const TPDO1_INSERTION: u16 = 0x181;
-const RPDO1_INSERTION: u16 = 0x201;
-const HEARTBEAT_BENCH: u16 = 0x77F;
 const HEARTBEAT_INSERTION: u16 = 0x701;
-const EMCY_INSERTION: u16 = 0x081;
 /// The speed of the rows of docs/hazards.md.
 const SLOWLY: &str = "insertion.speed_mm_per_s=1";
 
-/// A witness on vcan0: no part of the bench, and no part of the stage.
-struct Witness {
-    bus: SocketCan,
-    /// By the insertion drive's own word, in its last TPDO1.
-    inserted_mm: f64,
-    /// The bench's last set-point for it, in its last RPDO1.
-    commanded_mm: f64,
-    /// When the bench was last heard.
-    bench_heard: Instant,
+fn witness_on_vcan0() -> Witness {
+    Witness::new(SocketCan::open("vcan0").unwrap())
 }
 
-impl Witness {
-    fn new() -> Self {
-        let bus = SocketCan::open("vcan0").unwrap();
-        Witness { bus, inserted_mm: 0.0, commanded_mm: 0.0, bench_heard: Instant::now() }
-    }
-
-    /// The next frame.
-    fn next(&mut self) -> Frame {
-        let frame = loop {
-            match self.bus.receive(LONG).unwrap() {
-                Some(BusEvent::Frame(frame)) => break frame,
-                Some(BusEvent::Error(_)) => {}
-                None => panic!("vcan0 is silent"),
-            }
-        };
-        match (frame.cob_id(), frame.data()) {
-            // Statusword, then position.
-            (Some(TPDO1_INSERTION), &[_, _, a, b, c, d]) => {
-                self.inserted_mm = f64::from(i32::from_le_bytes([a, b, c, d])) / COUNTS_PER_MM;
-            }
-            // Controlword, then target.
-            (Some(RPDO1_INSERTION), &[_, _, a, b, c, d]) => {
-                self.commanded_mm = f64::from(i32::from_le_bytes([a, b, c, d])) / COUNTS_PER_MM;
-            }
-            (Some(HEARTBEAT_BENCH), _) => self.bench_heard = Instant::now(),
-            _ => {}
-        }
-        frame
-    }
-
-    /// Waits until the needle is `depth_mm` in.
-    fn wait_until_inserted(&mut self, depth_mm: f64) {
-        let end = Instant::now() + LONG;
-        while self.inserted_mm < depth_mm {
-            self.next();
-            assert!(Instant::now() < end, "the needle was not seen {depth_mm} mm in");
-        }
-    }
-}
-
-/// The lines of an ndjson file; an unfinished last one is left out.
+/// The lines of an NDJSON file without an unfinished last line.
 fn ndjson(path: &Path) -> Vec<Value> {
     let text = programs::read(path);
     let whole = text.rfind('\n').map_or("", |end| &text[..end]);
     whole.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
 }
 
-/// The frames in `can.log`, as `T` or `R` and `id#data`; an unfinished last line is left out.
+/// The frames in `can.log` as direction, `T` or `R`, and `id#data`, without an unfinished last line.
 fn can_log(run_dir: &Path) -> Vec<(String, String)> {
     let text = programs::read(&run_dir.join("can.log"));
     let whole = text.rfind('\n').map_or("", |end| &text[..end]);
@@ -103,12 +49,12 @@ fn number(row: &std::collections::HashMap<String, String>, column: &str) -> f64 
 }
 
 #[test]
-fn a_whole_insertion() {
+fn an_insertion_of_150_mm_completes_with_a_complete_record() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("whole");
     let truth_csv = scratch.path("truth.csv");
     let stage = stage(&["--truth", truth_csv.to_str().unwrap()]);
-    // The default observer takes long there.
+    // The default observer takes long in an emulated machine.
     let steered = [
         "observer.kind=\"invariant\"",
         "control.kind=\"nested-saturation\"",
@@ -127,13 +73,13 @@ fn a_whole_insertion() {
     assert_eq!(json["stop_reason"], Value::Null);
     assert!((json["insertion_mm"].as_f64().unwrap() - 150.0).abs() < 0.1, "{json}");
     assert!(json["off_plane_rms_mm"].as_f64().unwrap() < 4.0, "{json}");
-    // Truth is on the other side of the bus.
+    // The bench cannot know the truth, which is on the other side of the bus.
     assert_eq!((&json["estimate_rms"], &json["final_error"]), (&Value::Null, &Value::Null));
     assert_eq!(Path::new(json["run_dir"].as_str().unwrap()), run_dir);
 
     assert_it_replays(&run_dir);
 
-    // The record is whole.
+    // The record is complete.
     let manifest = programs::manifest(&run_dir);
     println!("{}", manifest["timing"]);
     assert_eq!(manifest["outcome"], "completed");
@@ -143,17 +89,16 @@ fn a_whole_insertion() {
     let frames = can_log(&run_dir);
     assert_eq!(manifest["counts"]["can_frames"], frames.len());
     let sync_count = frames.iter().filter(|frame| **frame == ("T".into(), "080#".into())).count();
-    assert!(sync_count > 2500, "30 s at 10 ms, less what a slow machine skips: {sync_count}");
+    assert!(sync_count > 2500, "{sync_count} SYNCs in 30 s at 10 ms; a slow machine skips some");
     let samples = ndjson(&run_dir.join("tracker.ndjson"));
     assert_eq!(manifest["counts"]["tracker_samples"], samples.len());
-    assert!(samples.len() > 1000, "30 s at 40 Hz: {}", samples.len());
+    assert!(samples.len() > 1000, "{} samples in 30 s at 40 Hz", samples.len());
     assert!(fs::read(run_dir.join("run.rrd")).unwrap().starts_with(b"RRF2"));
     let used = run_dir.join("config.toml");
     assert!(programs::read(&used).contains("speed_mm_per_s = 5"), "{}", used.display());
 
-    // The estimate at the end, against where the stage's needle truly came to rest. Of 24 seeds in
-    // virtual time the worst was 0.4 mm, 1.6 degrees of pitch and 4.3 of roll, and 0.9 mm from the
-    // plane.
+    // The last estimate is compared with the true pose at standstill. The largest errors of 24 seeds in virtual
+    // time were 0.4 mm, 1.6° of pitch and 4.3° of roll, and 0.9 mm from the plane.
     let steps = programs::csv(&run_dir.join("steps.csv"));
     assert_eq!(steps.len(), 151);
     for (n, step) in steps.iter().enumerate() {
@@ -179,9 +124,9 @@ fn a_whole_insertion() {
     assert!(number(&truth, "x_true_mm").abs() < 2.0, "{truth:?}");
 }
 
-/// Root has the rights; whoever has not is told which they are, and nothing moves.
+/// Root may use `--realtime`. Without the permission no run begins.
 #[test]
-fn in_real_time() {
+fn a_realtime_run_has_priority_80_or_names_the_missing_permission() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("realtime");
     let _stage = stage(&[]);
@@ -206,10 +151,10 @@ fn in_real_time() {
 }
 
 #[test]
-fn interrupted_by_the_operator() {
+fn ctrl_c_stops_the_run_and_closes_its_record() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("interrupted");
-    let (mut witness, _stage) = (Witness::new(), stage(&[]));
+    let (mut witness, _stage) = (witness_on_vcan0(), stage(&[]));
     let bench = scratch.bench(&[], &[SLOWLY]);
     witness.wait_until_inserted(2.0);
     bench.signal("INT");
@@ -227,30 +172,29 @@ fn interrupted_by_the_operator() {
 }
 
 #[test]
-fn a_killed_bench_leaves_drives_that_stop_by_themselves() {
+fn drives_stop_by_themselves_when_the_bench_is_killed() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("killed");
-    let (mut witness, _stage) = (Witness::new(), stage(&[]));
+    let (mut witness, _stage) = (witness_on_vcan0(), stage(&[]));
     let bench = scratch.bench(&[], &[SLOWLY]);
     witness.wait_until_inserted(2.0);
     bench.signal("KILL");
     let ended = bench.end();
     assert_eq!(ended.status.code(), None, "killed by a signal");
 
-    // The drives say when they miss the bench: their time-out after its last heartbeat.
-    while witness.next().cob_id() != Some(EMCY_INSERTION) {}
-    let missed = witness.bench_heard.elapsed();
-    println!("the drives missed the bench after {missed:?}");
+    // The drives send an emergency message at their timeout after the last heartbeat.
+    witness.wait_for_emergency();
+    let missed = witness.heartbeat_at.elapsed();
+    println!("the drives reported the missing heartbeat after {missed:?}");
     let bounds = Duration::from_millis(500)..Duration::from_millis(3000);
-    assert!(bounds.contains(&missed), "the time-out is 1 s, and it was {missed:?}");
+    assert!(bounds.contains(&missed), "{missed:?} with a timeout of 1 s");
     let [insertion, _] = assert_the_drives_stand(&[]);
     let stands_at_mm = insertion.position_counts as f64 / COUNTS_PER_MM;
-    // How far the drive lags behind its set-points is the machine's load; past the last of them no
-    // drive goes.
+    // The following error depends on the machine's load, but no drive passes its last set-point.
     let reach_mm = witness.inserted_mm - 0.01..witness.commanded_mm + 0.01;
     assert!(reach_mm.contains(&stands_at_mm), "{stands_at_mm} mm, outside {reach_mm:?}");
 
-    // Nobody closed the record, and it can be read.
+    // The record is open, and can be read.
     let run_dir = scratch.run_dir();
     assert_eq!(programs::manifest(&run_dir)["outcome"], Value::Null);
     let (steps, frames) = (programs::csv(&run_dir.join("steps.csv")), can_log(&run_dir));
@@ -263,13 +207,13 @@ fn a_killed_bench_leaves_drives_that_stop_by_themselves() {
 fn a_stage_that_vanishes_ends_the_run() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("vanished");
-    let (mut witness, stage) = (Witness::new(), stage(&[]));
+    let (mut witness, stage) = (witness_on_vcan0(), stage(&[]));
     let bench = scratch.bench(&[], &[SLOWLY]);
     witness.wait_until_inserted(2.0);
     stage.signal("KILL");
     let bench = bench.end();
     bench.assert_status(1);
-    // Drives and tracker fall silent together; whichever is missed first.
+    // Drives and tracker fall silent together, and the bench may notice either first.
     let reason = bench.last_line();
     let silent = ["no TPDO1", "no heartbeat", "tracker: last tip"];
     assert!(silent.iter().any(|what| reason.contains(what)), "{reason}");
@@ -281,7 +225,7 @@ fn a_stage_that_vanishes_ends_the_run() {
 fn an_interface_that_goes_down_ends_the_run_for_good() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("down");
-    let (mut witness, _stage) = (Witness::new(), stage(&[]));
+    let (mut witness, _stage) = (witness_on_vcan0(), stage(&[]));
     let bench = scratch.bench(&[], &[SLOWLY]);
     witness.wait_until_inserted(2.0);
     ip("link set vcan0 down");
@@ -292,8 +236,8 @@ fn an_interface_that_goes_down_ends_the_run_for_good() {
     assert!(reason.starts_with("stopped: can: interface vcan0 is down"), "{reason}");
     assert_eq!(programs::manifest(&scratch.run_dir())["outcome"], "stopped");
 
-    // The cable is back and the drives are heard again; nobody commands them.
-    let mut witness = Witness::new();
+    // The bus is back and the drives send again, but no master commands them.
+    let mut witness = witness_on_vcan0();
     let mut heartbeats = 0;
     while heartbeats < 20 {
         let frame = witness.next();
@@ -303,16 +247,16 @@ fn an_interface_that_goes_down_ends_the_run_for_good() {
     assert_the_drives_stand(&[]);
 }
 
-/// The kernel stamps frames by a clock that may be set in a run, either way.
+/// The kernel stamps frames with the system clock.
 #[test]
-fn a_clock_that_is_set_in_a_run_changes_nothing() {
+fn setting_the_system_clock_during_a_run_changes_nothing() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     if std::env::var("NEEDLE_CAN").is_err() {
-        println!("not the emulated machine: the clock of this one is not set");
+        println!("skipped: only the clock of the emulated machine is set");
         return;
     }
     let scratch = Scratch::new("clock");
-    let (mut witness, _stage) = (Witness::new(), stage(&[]));
+    let (mut witness, _stage) = (witness_on_vcan0(), stage(&[]));
     let bench = scratch.bench(&["--json"], &["insertion.depth_mm=25"]);
     for (depth_mm, by_s) in [(5.0, 3600), (10.0, -7200), (15.0, 3600)] {
         witness.wait_until_inserted(depth_mm);
@@ -327,12 +271,11 @@ fn a_clock_that_is_set_in_a_run_changes_nothing() {
     assert_it_replays(&scratch.run_dir());
 }
 
-/// From another process, as an operator in a hurry does.
 #[test]
-fn a_stop_ends_a_run_on_the_bus() {
+fn a_stop_from_another_process_ends_a_run_on_the_bus() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("stopped");
-    let (mut witness, _stage) = (Witness::new(), stage(&[]));
+    let (mut witness, _stage) = (witness_on_vcan0(), stage(&[]));
     let bench = scratch.bench(&[], &[SLOWLY]);
     witness.wait_until_inserted(2.0);
     let mut stop = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
@@ -346,9 +289,9 @@ fn a_stop_ends_a_run_on_the_bus() {
     assert_the_drives_stand(&[]);
 }
 
-/// The same script as in virtual time, struck by the stage's own process on a real bus.
+/// The stage's process causes the same faults as in virtual time.
 #[test]
-fn scripted_faults_end_the_run_by_name() {
+fn scripted_faults_end_the_run_with_their_reason() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     // Bit 9 of the statusword.
     let remote = r#"kind = "corrupt", frames = "pdo", axis = "insertion", byte = 1, mask = 0x02"#;
@@ -384,12 +327,12 @@ fn another_drive_than_configured_is_refused_before_anything_moves() {
     assert_eq!(bench.last_line(), reason);
     let run_dir = scratch.run_dir();
     assert_eq!(programs::manifest(&run_dir)["outcome"], "stopped");
-    assert!(programs::csv(&run_dir.join("steps.csv")).is_empty(), "it has begun");
+    assert!(programs::csv(&run_dir.join("steps.csv")).is_empty(), "the insertion has begun");
     assert_eq!(assert_the_drives_stand(&[]).map(|drive| drive.position_counts), before);
 }
 
 #[test]
-fn without_drives_or_interface_there_is_no_run() {
+fn a_run_without_drives_or_interface_fails_with_the_reason() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("absent");
     let bench = scratch.bench(&[], &[]).end();

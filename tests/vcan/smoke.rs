@@ -1,39 +1,35 @@
-//! The SocketCAN transport on a real kernel's vcan0 and vcan1: `vcan/run.sh` provides them.
-//!
-//! What would harm other tests happens on vcan1.
+//! The SocketCAN transport on vcan0 and vcan1 of `vcan/run.sh`. Tests that would disturb others use vcan1.
 
 use std::time::{Duration, SystemTime};
 
 use crate::support::link::ip;
+use crate::support::programs::LONG;
 use crate::support::vcan;
 use needle_bench::canopen::{CanId, Frame, NodeId};
 use needle_bench::transport::can::{BusError, BusEvent, CanBus, CanError};
 use needle_bench::transport::socketcan::SocketCan;
 use socketcan::{CanErrorFrame, CanFrame, CanSocket, Socket};
 
-/// A kernel that is busy hands a frame over some time after it was sent.
+/// A busy kernel may deliver a frame this long after it was sent.
 const ARRIVES: Duration = Duration::from_secs(1);
-
-/// Long enough for an emulated machine on a busy one; nothing waits this long unless it fails.
-const LONG: Duration = Duration::from_secs(20);
 
 fn open(interface: &str) -> SocketCan {
     SocketCan::open(interface).unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// The first event that `wanted` accepts: other tests' traffic is passed over.
+/// The first event that `wanted` accepts; skips the traffic of other tests.
 fn next(bus: &mut SocketCan, wanted: impl Fn(&BusEvent) -> bool) -> BusEvent {
     loop {
         match bus.receive(LONG).unwrap() {
             Some(event) if wanted(&event) => return event,
             Some(_) => {}
-            None => panic!("nothing came within {LONG:?}"),
+            None => panic!("no event within {LONG:?}"),
         }
     }
 }
 
 #[test]
-fn a_frame_makes_the_round_trip() {
+fn request_and_reply_pass_and_the_request_is_not_echoed() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let (mut master, mut drive) = (open("vcan0"), open("vcan0"));
     let request = Frame::new(0x601, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]);
@@ -42,7 +38,7 @@ fn a_frame_makes_the_round_trip() {
     master.send(&request).unwrap();
     next(&mut drive, |event| *event == BusEvent::Frame(request));
     drive.send(&reply).unwrap();
-    // One's own frames do not come back, so the reply is the first of the two to arrive.
+    // A socket does not receive its own frames, so the reply comes first.
     let ours = |event: &BusEvent| [request, reply].map(BusEvent::Frame).contains(event);
     assert_eq!(next(&mut master, ours), BusEvent::Frame(reply));
 }
@@ -60,7 +56,7 @@ fn extended_and_remote_frames_pass() {
 }
 
 #[test]
-fn error_frames_are_received_by_name() {
+fn an_error_frame_is_received_and_described() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let injector = CanSocket::open("vcan0").unwrap();
     let mut bus = open("vcan0");
@@ -74,7 +70,7 @@ fn error_frames_are_received_by_name() {
 }
 
 #[test]
-fn the_kernel_says_when_a_frame_came() {
+fn the_kernel_stamps_a_frame_when_it_arrives() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let (mut a, mut b) = (open("vcan0"), open("vcan0"));
     let frame = Frame::new(0x604, &[1]);
@@ -85,7 +81,7 @@ fn the_kernel_says_when_a_frame_came() {
             let before = SystemTime::now();
             a.send(&frame).unwrap();
             let after = SystemTime::now();
-            // However long it waits until it is taken.
+            // The stamp does not depend on how long the frame waits here.
             next(&mut b, |event| *event == BusEvent::Frame(frame));
             Some((before, after, b.received_at()?))
         })
@@ -94,10 +90,10 @@ fn the_kernel_says_when_a_frame_came() {
 }
 
 #[test]
-fn a_filter_passes_what_is_of_or_for_our_nodes_whoever_sends_it() {
+fn a_filter_passes_frames_from_and_for_our_nodes_whoever_sends_them() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let (mut sender, mut bus) = (open("vcan1"), open("vcan1"));
-    // Passed while there was no filter yet.
+    // This frame waits already when the filter is set.
     sender.send(&Frame::new(0x185, &[0])).unwrap();
     bus.listen_to(&[1, 127].map(|node| NodeId::new(node).unwrap())).unwrap();
     let extended = CanId::Extended(0x181);
@@ -120,12 +116,12 @@ fn a_filter_passes_what_is_of_or_for_our_nodes_whoever_sends_it() {
 }
 
 #[test]
-fn frames_that_nobody_received_are_counted() {
+fn frames_that_overflow_the_receive_buffer_are_counted() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let (mut sender, mut sleeper) = (open("vcan1"), open("vcan1"));
     let mut sent = 0;
     while sleeper.dropped().unwrap() < 3 {
-        assert!(sent < 100_000, "a socket that holds everything");
+        assert!(sent < 100_000, "the socket drops no frame");
         sender.send(&Frame::new(0x80, &[])).unwrap();
         sent += 1;
     }
@@ -133,10 +129,10 @@ fn frames_that_nobody_received_are_counted() {
     assert_eq!(received, sent - 3);
 }
 
-/// The kernel's echo says that a frame left; until it is taken, two cycles wait and no third joins
-/// them. A stranger's frame that is the same to the bit is heard all the same.
+/// The kernel's echo confirms that a frame was sent. An identical frame of another sender is received all the
+/// same.
 #[test]
-fn sending_is_confirmed_by_the_kernel() {
+fn a_third_cycle_is_refused_until_the_kernel_confirms_the_first_two() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let (mut bench, mut stranger) = (open("vcan1"), open("vcan1"));
     bench.confirm_sending(2).unwrap();
@@ -149,13 +145,13 @@ fn sending_is_confirmed_by_the_kernel() {
     assert!(matches!(refused, CanError::NotConfirmed { frames: 4, .. }), "{refused}");
     stranger.send(&sync).unwrap();
     let heard = next(&mut bench, |event| matches!(event, BusEvent::Frame(_)));
-    assert_eq!(heard, BusEvent::Frame(sync), "none of its own");
+    assert_eq!(heard, BusEvent::Frame(sync), "only the other sender's");
     assert_eq!(bench.receive(Duration::ZERO).unwrap(), None);
     bench.send(&set_point).unwrap();
 }
 
 #[test]
-fn an_interface_that_is_down_says_so() {
+fn an_interface_that_is_down_is_reported_at_open_send_and_receive() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     let mut bus = open("vcan1");
     ip("link set vcan1 down");
@@ -169,7 +165,7 @@ fn an_interface_that_is_down_says_so() {
 }
 
 #[test]
-fn what_is_no_can_interface_says_so() {
+fn an_interface_that_is_absent_or_not_can_is_refused() {
     let Some(_alone) = vcan::alone_on_it() else { return };
     assert!(matches!(SocketCan::open("lo"), Err(CanError::NotCan { .. })));
     assert!(matches!(SocketCan::open("can99"), Err(CanError::NoInterface { .. })));

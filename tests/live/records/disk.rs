@@ -1,30 +1,30 @@
-//! Small file systems of a test's own.
+//! Small file systems for one test each.
 
 use crate::support::needed::skip;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-/// A small file system, mounted as long as it is held.
+/// A small file system, mounted until this is dropped.
 pub(crate) struct Disk(pub(crate) PathBuf);
 
 impl Disk {
-    /// What a disk in memory holds.
+    /// Capacity of a disk in memory.
     pub(crate) const BYTES: usize = 1 << 20;
 
-    /// One in memory; none where this process may not mount.
+    /// Mounts a disk in memory; `None` without the permission to mount.
     pub(crate) fn in_memory(path: PathBuf) -> Option<Self> {
         let options = format!("size={},mode=777", Self::BYTES);
         Self::mount(path, &["-t", "tmpfs", "-o", &options, "none"])
     }
 
-    /// One that can be frozen, with its blocks in the file `image`; none where this
-    /// process may not mount.
+    /// Mounts a disk that can be frozen, with its blocks in the file `image`; `None` without the permission to
+    /// mount.
     pub(crate) fn in_file(path: PathBuf, image: &Path) -> Option<Self> {
         File::create(image).unwrap().set_len(64 << 20).unwrap();
         run("mkfs.ext4", &["-q"], image);
         let disk = Self::mount(path, &["-o", "loop", image.to_str().unwrap()])?;
-        // Of ext4's own, and no run folder.
+        // ext4 makes this folder, which is not a run folder.
         fs::remove_dir(disk.0.join("lost+found")).unwrap();
         Some(disk)
     }
@@ -40,7 +40,7 @@ impl Disk {
         None
     }
 
-    /// From now on whoever writes to it waits.
+    /// Blocks every write to the disk until the result is dropped.
     pub(crate) fn freeze(&self) -> Frozen<'_> {
         run("fsfreeze", &["-f"], &self.0);
         Frozen(self)
@@ -53,8 +53,8 @@ impl Drop for Disk {
     }
 }
 
-/// A disk that takes nothing, as long as this is held: shorter than whoever writes to it, since one
-/// who waits for a disk cannot be ended.
+/// A disk that blocks every write until this is dropped. It must be dropped before the writing process, because a
+/// process that waits for a disk cannot be killed.
 pub(crate) struct Frozen<'a>(&'a Disk);
 
 impl Drop for Frozen<'_> {

@@ -1,10 +1,10 @@
-//! A disk that is full, and a folder that is gone.
+//! Runs on a full disk, and runs whose folder is moved or changed.
 
 use super::disk::Disk;
-use super::witness::Witness;
 use super::{SLOW, closed, repair};
 use crate::support::programs::{self, Program, Scratch, beside_others};
 use crate::support::udp_stage::Stage;
+use crate::support::witness::Witness;
 use needle_bench::archive::{Dropped, EventLine, RunOutcome, file};
 use needle_bench::telemetry::RunFolder;
 use std::fs;
@@ -12,7 +12,7 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// The bench where no file may grow past `kb` kB.
+/// Starts the bench with a limit of `kb` kB for the size of a file.
 fn on_a_full_disk(scratch: &Scratch, kb: u32, settings: &[&str]) -> Program {
     let bench = scratch.command(&["--json"], settings);
     // POSIX counts blocks of 512 bytes.
@@ -48,8 +48,8 @@ fn a_run_may_go_on_without_its_record() {
     let bench = on_a_full_disk(&scratch, FULL_KB, &stage.settings(&settings)).end();
     bench.assert_status(0);
     assert!((stage.assert_it_stands() - 20.0).abs() < 0.1);
-    let told = "the run goes on (record.on_failure)";
-    assert!(bench.stderr.contains(told), "{}", bench.stderr);
+    let warning = "the run goes on (record.on_failure)";
+    assert!(bench.stderr.contains(warning), "{}", bench.stderr);
     let manifest = closed(&scratch.run_dir());
     assert_eq!(manifest.outcome, Some(RunOutcome::Completed));
     assert!(!manifest.faults.is_empty());
@@ -58,11 +58,11 @@ fn a_run_may_go_on_without_its_record() {
     assert_eq!(bench.json()["record_error"], manifest.faults[0].as_str());
 }
 
-/// No file may be larger: a few seconds of `can.log`.
+/// Largest size of a file: a few seconds of `can.log`.
 const FULL_KB: u32 = 100;
 
-/// Filled by the run itself, the disk is full before anything of the record is lost; filled by
-/// another, at once, it takes all files at a time, and the room for the manifest with them.
+/// If the run itself fills the disk, the run stops before any record is lost. If another program fills it at once,
+/// all files fail at the same time, and no room is left for the manifest.
 #[test]
 fn a_full_file_system_is_refused_before_a_run_and_stops_one_safely() {
     let _machine = beside_others();
@@ -81,7 +81,7 @@ fn a_full_file_system_is_refused_before_a_run_and_stops_one_safely() {
         refused.assert_status(3);
         assert!(refused.stderr.contains("No space left"), "{}", refused.stderr);
         let left = fs::read_dir(&disk.0).unwrap().count();
-        assert_eq!(left, 1, "no folder of a run that never began");
+        assert_eq!(left, 1, "a folder of a run that never began");
         fs::remove_file(disk.0.join(FILLER)).unwrap();
 
         let mut witness = Witness::of(&stage);
@@ -108,7 +108,7 @@ fn a_full_file_system_is_refused_before_a_run_and_stops_one_safely() {
     }
 }
 
-/// Takes all the room of the small disk `dir`.
+/// Fills the small disk `dir`.
 fn fill(dir: &Path) {
     let filled = fs::write(dir.join(FILLER), vec![0; 2 * Disk::BYTES]).unwrap_err();
     assert_eq!(filled.kind(), ErrorKind::StorageFull);
@@ -116,12 +116,12 @@ fn fill(dir: &Path) {
 
 const FILLER: &str = "filler";
 
-/// A full disk, by the keeper's account and by the system's.
+/// The messages about a full disk, of the run folder's keeper and of the system.
 const FULL: [&str; 2] = ["the disk is full", "No space left"];
 
 /// Each file of the folder is part of the record.
 #[test]
-fn a_file_taken_away_stops_the_run_safely() {
+fn a_deleted_file_of_the_record_stops_the_run_safely() {
     let _machine = beside_others();
     for name in [file::EVENTS, file::CONFIG] {
         let scratch = Scratch::new(&format!("records-without-{name}"));
@@ -139,10 +139,9 @@ fn a_file_taken_away_stops_the_run_safely() {
     }
 }
 
-/// What steered is what the bench had read; what somebody writes into its copy later is no part of
-/// the record, and shows.
+/// The bench steers by what it read before the run.
 #[test]
-fn a_configuration_edited_while_the_run_goes_on_is_told_as_edited() {
+fn a_configuration_edited_during_the_run_is_reported_as_edited() {
     let _machine = beside_others();
     let scratch = Scratch::new("records-edited");
     let stage = Stage::start(&[]);
@@ -159,9 +158,9 @@ fn a_configuration_edited_while_the_run_goes_on_is_told_as_edited() {
     assert!(said.contains("config.toml was edited"), "{said}");
 }
 
-/// The bench's own record is left open; what stands in its place is another's.
+/// The bench leaves its own record open.
 #[test]
-fn what_takes_the_folders_place_is_not_touched() {
+fn another_folder_in_the_place_of_the_run_folder_is_not_written_to() {
     let _machine = beside_others();
     let scratch = Scratch::new("records-swapped");
     let stage = Stage::start(&[]);
@@ -187,7 +186,7 @@ fn what_takes_the_folders_place_is_not_touched() {
 }
 
 #[test]
-fn a_folder_taken_away_stops_the_run_safely_and_can_be_repaired() {
+fn a_moved_run_folder_stops_the_run_safely_and_can_be_repaired() {
     let _machine = beside_others();
     let scratch = Scratch::new("records-moved");
     let stage = Stage::start(&[]);
@@ -197,7 +196,7 @@ fn a_folder_taken_away_stops_the_run_safely_and_can_be_repaired() {
     let moved: PathBuf = scratch.path("moved");
     fs::rename(scratch.run_dir(), &moved).unwrap();
     let bench = bench.end();
-    // The record was left open, which is a failure of its own.
+    // Exit 3, because the record was left open.
     bench.assert_status(3);
     let reason = bench.last_line();
     assert!(reason.starts_with("stopped: record: run folder: "), "{reason}");

@@ -1,22 +1,22 @@
-//! A writer waits for its disk, a viewer reads nothing.
+//! Runs whose writer or disk stalls, or whose viewer reads nothing.
 
 use super::disk::Disk;
-use super::viewer::{free_address, frozen_viewer};
-use super::witness::Witness;
-use super::{SLOW, assert_they_agree, closed, repair};
-use crate::support::peers::hold;
-use crate::support::programs::{self, Ended, Program, Scratch, beside_others};
+use super::viewer::frozen_viewer;
+use super::{SLOW, closed, repair};
+use crate::support::peers::{assert_recording_agrees, hold};
+use crate::support::programs::{self, Ended, Program, Scratch, beside_others, free_address};
 use crate::support::udp_stage::Stage;
+use crate::support::witness::Witness;
 use needle_bench::archive::{Manifest, file};
 use needle_bench::telemetry::RunFolder;
 
-/// A run of some seconds that is hindered in the middle of it.
+/// A run of some seconds with a hindrance in the middle.
 struct Hindered {
     scratch: Scratch,
     stage: Stage,
 }
 
-/// Depth at which the hindrance begins, mm, at which it ends, and of the run.
+/// Depths at which the hindrance begins and ends, mm, and depth of the run.
 const BEGINS_MM: f64 = 1.0;
 const ENDS_MM: f64 = 5.0;
 const DEPTH: &str = "insertion={ depth_mm = 8, plane_out_of_reach = \"insert\" }";
@@ -27,14 +27,14 @@ impl Hindered {
         Hindered { scratch, stage: Stage::start(&[]) }
     }
 
-    /// One whose record goes to a disk of its own; none where that cannot be had.
+    /// A run whose record goes to a disk of its own; `None` without the permission to mount.
     fn on_disk(by: &str) -> Option<(Self, Disk)> {
         let run = Self::new(by);
         let disk = Disk::in_file(run.scratch.path("runs"), &run.scratch.path("disk"))?;
         Some((run, disk))
     }
 
-    /// A bench that is at the depth where the hindrance begins.
+    /// Starts the bench and waits for the depth at which the hindrance begins.
     fn begin(&self, flags: &[&str], settings: &[&str]) -> (Program, Witness) {
         let mut witness = Witness::of(&self.stage);
         let settings = [&SLOW[..], settings].concat();
@@ -44,8 +44,8 @@ impl Hindered {
         (bench, witness)
     }
 
-    /// The run completed and nothing of its record is lost. How well time was kept is printed, to be
-    /// set against that of a run in which nothing was in the way.
+    /// Asserts that the run completed and its record is complete. Prints the timing, to compare with that of a run
+    /// without a hindrance.
     fn assert_whole(&self, by: &str, bench: &Ended) -> Manifest {
         bench.assert_status(0);
         let manifest = closed(&self.scratch.run_dir());
@@ -54,7 +54,7 @@ impl Hindered {
         let [sync, record] = ["sync_late_us", "record_ns"].map(|figure| {
             ["p50", "p99", "max"].map(|of| timing[format!("{figure}_{of}")].to_string()).join(" ")
         });
-        println!("{by}: SYNC late {sync} us, a record handed over in {record} ns; {dropped:?}");
+        println!("{by}: SYNC late {sync} us, a record queued in {record} ns; {dropped:?}");
         assert_eq!((manifest.faults.len(), dropped.text_files, dropped.recording), (0, 0, 0));
         let can_log = programs::read(&self.scratch.run_dir().join(file::CAN));
         let syncs = can_log.lines().filter(|line| line.ends_with(" 080# T")).count();
@@ -64,18 +64,18 @@ impl Hindered {
 }
 
 #[test]
-fn nothing_in_the_way() {
+fn a_run_without_a_hindrance_has_a_complete_record() {
     let _machine = beside_others();
     let run = Hindered::new("nothing");
     let (bench, mut witness) = run.begin(&[], &[DEPTH]);
     witness.wait_until_inserted(ENDS_MM);
-    run.assert_whole("nothing in the way", &bench.end());
-    assert_they_agree(&run.scratch.run_dir(), 0);
+    run.assert_whole("no hindrance", &bench.end());
+    assert_recording_agrees(&run.scratch.run_dir(), 0);
 }
 
-/// A thread that is held is to the others what one is that waits for a disk.
+/// For the other threads a writer that is stopped by ptrace is like one that waits for its disk.
 #[test]
-fn a_writer_that_is_held_is_told_of_and_loses_nothing() {
+fn a_writer_that_stalls_is_reported_and_loses_nothing() {
     let _machine = beside_others();
     for thread in ["text-files", "run-folder"] {
         let run = Hindered::new(thread);
@@ -92,7 +92,7 @@ fn a_writer_that_is_held_is_told_of_and_loses_nothing() {
 }
 
 #[test]
-fn a_frozen_disk_is_told_of_and_loses_nothing() {
+fn a_frozen_disk_is_reported_and_loses_nothing() {
     let _machine = beside_others();
     let Some((run, disk)) = Hindered::on_disk("frozen") else { return };
     let (mut bench, mut witness) = run.begin(&[], &[DEPTH, "record.free_mb_min=0"]);
@@ -104,10 +104,10 @@ fn a_frozen_disk_is_told_of_and_loses_nothing() {
     run.assert_whole("disk frozen", &bench.end());
 }
 
-/// Two that read nothing: one is given more and more to read, and to the other the thread that
-/// serves viewers is as one that waits for them for ever.
+/// One viewer reads nothing of what the bench sends. In addition the bench's thread that serves viewers is
+/// stopped, as if it waited for one for ever.
 #[test]
-fn frozen_viewers_are_nothing_to_the_run_and_its_record() {
+fn frozen_viewers_disturb_neither_the_run_nor_its_record() {
     let _machine = beside_others();
     let run = Hindered::new("viewer");
     let address = free_address();
@@ -116,7 +116,7 @@ fn frozen_viewers_are_nothing_to_the_run_and_its_record() {
     let (bench, mut witness) = run.begin(&[&live], &[DEPTH]);
     let holder = hold(&bench, "live-view");
     witness.wait_until_inserted(ENDS_MM);
-    // A disk that others write to may stall, and is alive again while the viewers are not.
+    // The disk may stall for other reasons, but must recover while the viewers are frozen.
     let said = bench.said();
     let times = |words: &str| said.matches(words).count();
     assert_eq!(times("no sign of life"), times("alive again"), "{said}");
@@ -130,26 +130,26 @@ fn frozen_viewers_are_nothing_to_the_run_and_its_record() {
 }
 
 #[test]
-fn a_writer_that_never_comes_back_stops_the_run_safely() {
+fn a_writer_that_stalls_for_5_s_stops_the_run_safely() {
     let _machine = beside_others();
-    let run = Hindered::new("wedged");
+    let run = Hindered::new("stalled");
     let (mut bench, _) = run.begin(&[], &[]);
     let Some(holder) = hold(&bench, "text-files") else { return };
     bench.wait_for("fault: record: text files: no sign of life for 5.0 s (given up after 5.0)");
     bench.wait_for("stage: taking power off both axes");
-    // It comes back after all, and writes down what waited.
+    // The writer resumes after all, and writes what waited.
     holder.signal("INT");
     run.assert_stopped(&bench.end());
 }
 
-/// Nobody knows what is in the files of such a writer: the record is not closed over them.
+/// The bench cannot know what such a writer has written, so it does not close the record.
 #[test]
-fn a_writer_that_is_gone_for_good_leaves_the_record_open() {
+fn a_writer_that_stalls_beyond_the_end_leaves_the_record_open() {
     let _machine = beside_others();
     let run = Hindered::new("lost");
     let (mut bench, _) = run.begin(&[], &[]);
     let Some(holder) = hold(&bench, "text-files") else { return };
-    // It cannot end while one of its threads is held, but has said all there is to say.
+    // The process cannot end while one of its threads is stopped, but it prints its result.
     bench.wait_for("\"record_error\"");
     drop(holder);
     let bench = bench.end();
@@ -167,7 +167,7 @@ fn a_writer_that_is_gone_for_good_leaves_the_record_open() {
 }
 
 #[test]
-fn a_disk_that_takes_nothing_stops_the_run_safely() {
+fn a_disk_that_stalls_for_5_s_stops_the_run_safely() {
     let _machine = beside_others();
     let Some((run, disk)) = Hindered::on_disk("dead") else { return };
     let (mut bench, _) = run.begin(&[], &["record.free_mb_min=0"]);
@@ -178,14 +178,14 @@ fn a_disk_that_takes_nothing_stops_the_run_safely() {
     run.assert_stopped(&bench.end());
 }
 
-/// The operator hears how the run ended all the same, and the record can be closed afterwards.
+/// The bench prints its result all the same, and the record can be closed afterwards.
 #[test]
-fn a_disk_that_never_comes_back_leaves_the_record_open() {
+fn a_disk_that_stalls_beyond_the_end_leaves_the_record_open() {
     let _machine = beside_others();
     let Some((run, disk)) = Hindered::on_disk("gone") else { return };
     let (mut bench, _) = run.begin(&[], &["record.free_mb_min=0"]);
     let frozen = disk.freeze();
-    // One who waits for a disk can say what there is to say, and not end.
+    // A process that waits for a disk cannot end, but it prints its result.
     bench.wait_for("\"record_error\"");
     run.stage.assert_it_stands();
     drop(frozen);
@@ -199,7 +199,7 @@ fn a_disk_that_never_comes_back_leaves_the_record_open() {
 }
 
 impl Hindered {
-    /// The run was stopped for its record, of which nothing is lost all the same.
+    /// Asserts that the run was stopped because of its record, and that the record is complete all the same.
     fn assert_stopped(&self, bench: &Ended) {
         bench.assert_status(1);
         self.stage.assert_it_stands();

@@ -1,9 +1,10 @@
-//! The bench is killed.
+//! Records of a bench that is killed.
 
-use super::witness::{EMCY_INSERTION, Witness};
-use super::{SLOW, assert_they_agree, repair};
+use super::{SLOW, repair};
+use crate::support::peers::assert_recording_agrees;
 use crate::support::programs::{self, LONG, Scratch, beside_others};
 use crate::support::udp_stage::Stage;
+use crate::support::witness::Witness;
 use needle_bench::archive::{EventLine, file};
 use needle_bench::telemetry::RunFolder;
 use needle_bench::units::Time;
@@ -18,21 +19,21 @@ use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 const KILLS: usize = 5;
-/// What a kill may cost, in SYNC periods of 10 ms, and in s.
+/// Largest loss by a kill, in SYNC periods of 10 ms and in s.
 const LOST_SYNCS_MAX: usize = 20;
 const LOST_MAX_S: f64 = 0.2;
 const SYNC_S: f64 = 0.01;
-/// Between two steps, by [`SLOW`].
+/// Time between two steps with [`SLOW`].
 const STEP_S: f64 = 0.2;
-/// Steps that `steps.csv` may have and the recording not.
+/// Steps of `steps.csv` that the recording may lack.
 const STEPS_LOST_MAX: usize = 1;
 
-/// The last line of `text` that has its end.
+/// The last whole line of `text`.
 fn last_line(text: &str) -> &str {
     text.rsplit_once('\n').and_then(|(whole, _)| whole.lines().last()).expect("a line")
 }
 
-/// The last moment on the time line of the recording, s.
+/// The last time in the recording, s.
 fn last_of_recording(path: &Path) -> f64 {
     let recording = BufReader::new(File::open(path).unwrap());
     let chunks = DecoderApp::decode_lazy(recording).filter_map(|message| match message.unwrap() {
@@ -48,7 +49,7 @@ fn last_of_recording(path: &Path) -> f64 {
     Time::from_nanos(times.max().expect("a row")).as_secs_f64()
 }
 
-/// What of each file is missing at its end, s, when the run went on to `end_s`.
+/// For each file of a run that went on to `end_s`: the time missing at its end, and the time between two lines, s.
 fn missing_s(run_dir: &Path, end_s: f64) -> [(&'static str, f64, f64); 4] {
     let text = |name: &str| programs::read(&run_dir.join(name));
     let ns = |ns: &str| ns.parse::<i64>().unwrap() as f64 * 1e-9;
@@ -64,10 +65,10 @@ fn missing_s(run_dir: &Path, end_s: f64) -> [(&'static str, f64, f64); 4] {
     lasts.map(|(name, last_s, every_s)| (name, end_s - last_s, every_s))
 }
 
-/// Kills come at random moments of the insertion. `NEEDLE_KILL_SEED` repeats those of a run that
-/// failed, as far as time can be repeated.
+/// The moments of the kills are random. `NEEDLE_KILL_SEED` repeats those of a failed test, as far as time can be
+/// repeated.
 #[test]
-fn a_record_killed_at_any_moment_can_be_read_up_to_it() {
+fn a_record_can_be_read_up_to_the_moment_of_a_kill() {
     let _machine = beside_others();
     let seed = std::env::var("NEEDLE_KILL_SEED").map_or_else(|_| now_ns(), |s| s.parse().unwrap());
     println!("NEEDLE_KILL_SEED={seed}");
@@ -81,25 +82,23 @@ fn a_record_killed_at_any_moment_can_be_read_up_to_it() {
         let bench = scratch.bench(&[], &stage.settings(&settings));
         witness.wait_until_inserted(1.5);
         let kill_at = witness.syncs + syncs_more;
-        while witness.syncs < kill_at {
-            witness.hear();
-        }
-        // A SYNC was the last thing heard; within its period it may come at any moment.
+        witness.wait_until(|seen| seen.syncs >= kill_at);
+        // The last frame was a SYNC; this is a random moment in its period.
         thread::sleep(Duration::from_micros(us_more));
         bench.signal("KILL");
         assert_eq!(bench.end().status.code(), None, "killed by a signal");
-        while witness.hear() != Some(EMCY_INSERTION) {}
+        witness.wait_for_emergency();
 
         let run_dir = scratch.run_dir();
         let can_log = programs::read(&run_dir.join(file::CAN));
         let syncs: Vec<&str> = can_log.lines().filter(|line| line.ends_with(" 080# T")).collect();
-        let lost = witness.syncs.checked_sub(syncs.len()).expect("all of them were on the bus");
+        let lost = witness.syncs.checked_sub(syncs.len()).expect("each was on the bus");
         assert!(lost <= LOST_SYNCS_MAX, "{lost} SYNCs are not in can.log");
 
         repair(&run_dir);
         let run = RunFolder::open(&run_dir).unwrap();
         run.verify().unwrap();
-        assert_they_agree(&run_dir, STEPS_LOST_MAX);
+        assert_recording_agrees(&run_dir, STEPS_LOST_MAX);
         let reason = run.manifest().stop_reason.clone().unwrap();
         assert!(
             reason.starts_with("the bench ended without closing its record; the last step is ")
@@ -121,20 +120,19 @@ fn a_record_killed_at_any_moment_can_be_read_up_to_it() {
     }
 }
 
-/// The origin of the run's time line, s since 1970: the first frame that was received has its time
-/// on both.
+/// Start of the run's time line, s since 1970. The first received frame has its time in both files.
 fn started_unix_s(can_log: &str, inputs: &str) -> f64 {
     let received = can_log.lines().find(|line| line.ends_with(" R")).unwrap();
     let stamp: f64 = received.split([' ', '(', ')']).nth(1).unwrap().parse().unwrap();
-    let given = inputs.lines().find_map(|line| line.strip_suffix(" frame")).unwrap();
-    stamp - given.parse::<i64>().unwrap() as f64 * 1e-9
+    let input = inputs.lines().find_map(|line| line.strip_suffix(" frame")).unwrap();
+    stamp - input.parse::<i64>().unwrap() as f64 * 1e-9
 }
 
-/// Before the first step, and after the last.
+/// Kills come before the first step and after the last.
 #[test]
 fn a_bench_killed_at_its_start_or_its_end_leaves_a_record_that_can_be_closed() {
     let _machine = beside_others();
-    for (n, said) in
+    for (n, message) in
         ["", "listening for another master", "enabling both axes", "stopping both axes"]
             .into_iter()
             .enumerate()
@@ -153,12 +151,12 @@ fn a_bench_killed_at_its_start_or_its_end_leaves_a_record_that_can_be_closed() {
             assert!(Instant::now() < deadline, "no run folder: {}", bench.said());
             thread::sleep(Duration::from_millis(1));
         }
-        bench.wait_for(said);
+        bench.wait_for(message);
         bench.signal("KILL");
         let run_dir = scratch.run_dir();
         match bench.end().status.code() {
-            None => println!("killed at {said:?}: {}", repair(&run_dir)),
-            Some(status) => println!("at {said:?} it had ended already: {status}"),
+            None => println!("killed at {message:?}: {}", repair(&run_dir)),
+            Some(status) => println!("at {message:?} the bench had ended already: {status}"),
         }
         let run = RunFolder::open(&run_dir).unwrap();
         run.verify().unwrap();

@@ -1,18 +1,13 @@
-//! A viewer that comes and then does nothing.
+//! A viewer that connects and then reads nothing.
 
 use crate::support::programs::LONG;
 use std::io::{Read as _, Write as _};
-use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
+use std::net::{SocketAddr, TcpStream};
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// An address nobody listens at.
-pub(crate) fn free_address() -> SocketAddr {
-    TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap().local_addr().unwrap()
-}
-
-/// A viewer by its first words: HTTP/2, settings, and a request for the messages of the run.
-/// From then on it reads nothing and answers nothing.
+/// Connects as a viewer: HTTP/2 preface, settings, and a request for the messages of the run. After that it reads
+/// and answers nothing.
 pub(crate) fn frozen_viewer(address: SocketAddr) -> TcpStream {
     let deadline = Instant::now() + LONG;
     let mut viewer = loop {
@@ -26,13 +21,13 @@ pub(crate) fn frozen_viewer(address: SocketAddr) -> TcpStream {
     viewer.write_all(&[0, 0, 0, 4, 0, 0, 0, 0, 0]).unwrap();
     let mut settings = [0; 9];
     viewer.read_exact(&mut settings).unwrap();
-    // The server's SETTINGS: it listens, and knows us for a viewer.
+    // The server's SETTINGS: it has accepted a viewer.
     assert_eq!(settings[3], 4);
     viewer.write_all(&request()).unwrap();
     viewer
 }
 
-/// HEADERS of a gRPC call without Huffman coding (RFC 7541, 6.2.2), and an empty message.
+/// HEADERS of a gRPC call without Huffman coding (RFC 7541, 6.2.2), and DATA with an empty message.
 fn request() -> Vec<u8> {
     let mut block = Vec::new();
     for (name, value) in [
