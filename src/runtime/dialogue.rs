@@ -142,15 +142,15 @@ mod tests {
     use crate::stage::{Axis, QuickStop, StageConfig};
     use std::io;
 
-    /// The virtual stage in real time, on a bus that refuses some frames.
+    /// The virtual stage in real time, on a bus that refuses frames and fails to receive.
     struct RefusingBus<F> {
         stage: VirtualStage,
         clock: Clock,
         refuses: F,
-        /// What it took.
+        /// Frames that it accepted.
         sent: Vec<Frame>,
-        /// Errors that `receive` still has to report.
-        deaf: u32,
+        /// Number of calls of `receive` that still fail.
+        receive_errors: u32,
     }
 
     impl<F: FnMut(&Frame) -> bool + Send> CanBus for RefusingBus<F> {
@@ -165,10 +165,10 @@ mod tests {
         }
 
         fn receive(&mut self, timeout: Duration) -> Result<Option<BusEvent>, CanError> {
-            if self.deaf > 0 {
-                self.deaf -= 1;
+            if self.receive_errors > 0 {
+                self.receive_errors -= 1;
                 let (interface, action) = ("can0".to_owned(), "receive");
-                return Err(CanError::Io { interface, action, reason: io::Error::other("deaf") });
+                return Err(CanError::Io { interface, action, reason: io::Error::other("broken") });
             }
             let end = self.clock.now() + timeout;
             loop {
@@ -204,14 +204,14 @@ mod tests {
         (stage, VirtualStage::new(emulated, Time::ZERO))
     }
 
-    /// Stops a stage in spite of a bus that refuses frames and does not receive `deaf` times.
+    /// Stops a stage on a bus that refuses frames and fails to receive `receive_errors` times.
     fn stop<F: FnMut(&Frame) -> bool + Send>(
         refuses: F,
-        deaf: u32,
+        receive_errors: u32,
     ) -> (RefusingBus<F>, QuickStop, BusTrouble, Duration) {
         let (config, stage) = stage();
         let clock = Clock::start();
-        let mut bus = RefusingBus { stage, clock, refuses, sent: Vec::new(), deaf };
+        let mut bus = RefusingBus { stage, clock, refuses, sent: Vec::new(), receive_errors };
         let begun = clock.now();
         let mut quick_stop = QuickStop::new(&config, begun);
         let trouble = talk_despite_errors(
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn the_other_drive_is_told_at_once_when_the_frames_of_one_are_refused() {
+    fn one_drive_is_stopped_at_once_although_the_frames_to_the_other_are_refused() {
         let of_insertion = |frame: &Frame| {
             frame.cob_id() == Some(0x601) || (frame.cob_id(), frame.data()) == (Some(0), &[0x80, 1])
         };
@@ -267,17 +267,19 @@ mod tests {
         for frame in ["000#8001", "601#2B40600002000000", "601#2B40600000000000"] {
             assert!(unsent.contains(&frame.to_owned()), "no {frame} in {unsent:?}");
         }
-        // The stop timeout, then power off is tried three times; a few times a second.
+        // After the stop timeout the bench tries three times to take power off, a few times per second.
         assert!(took < Duration::from_secs(2), "{took:?}");
         assert!((10..100).contains(&trouble.refused), "{}", trouble.refused);
     }
 
-    /// The deadline of a bus that is gone altogether.
     #[test]
-    fn a_stop_on_a_dead_bus_comes_to_an_end() {
+    fn a_stop_on_a_dead_bus_ends_at_its_deadline() {
         let (bus, quick_stop, trouble, took) = stop(|_| true, u32::MAX);
         assert!(bus.sent.is_empty());
-        assert!(Axis::BOTH.iter().all(|axis| quick_stop.result(*axis).is_some_and(|r| r.is_err())));
+        for axis in Axis::BOTH {
+            let error = quick_stop.result(axis).expect("over").expect_err("not confirmed");
+            assert!(error.ends_with("power off was not confirmed"), "{axis}: {error}");
+        }
         assert!(trouble.unsent.len() >= 4, "{:?}", trouble.unsent);
         assert!((Duration::from_millis(600)..Duration::from_secs(2)).contains(&took), "{took:?}");
     }

@@ -82,28 +82,31 @@ mod tests {
     use std::time::{Duration, Instant};
 
     #[test]
-    fn the_operators_own_stop_is_no_signal() {
+    fn a_stop_by_the_operator_counts_as_no_signal() {
         let interrupt = Interrupt::default();
         interrupt.raise();
         assert_eq!((interrupt.is_raised(), interrupt.is_signalled()), (true, false));
     }
 
-    /// A terminal that is closed, a service that is stopped: none of them leaves a moving stage, nor lets
-    /// what comes after begin.
+    /// Ctrl-C, a stopped service, a closed terminal and Ctrl-\ each stop a moving stage, and no later run may
+    /// begin.
     #[test]
-    fn every_way_to_end_a_program_raises_the_flag_for_good() {
+    fn every_signal_that_ends_a_program_raises_the_flag_for_good() {
         for kind in [Signal::SIGINT, Signal::SIGTERM, Signal::SIGHUP, Signal::SIGQUIT] {
             SIGNALLED.store(false, Ordering::Relaxed);
             let interrupt = Interrupt::listen().unwrap();
             raise(kind).unwrap();
             let end = Instant::now() + Duration::from_secs(10);
             while !interrupt.is_raised() {
-                assert!(Instant::now() < end, "{kind} is not heard");
+                assert!(Instant::now() < end, "{kind} is not received");
                 std::thread::yield_now();
             }
             assert!(interrupt.is_signalled(), "{kind}");
-            assert!(Interrupt::listen().unwrap().is_raised(), "{kind}: the next one knows");
-            assert!(!Interrupt::default().is_raised(), "one that does not listen does not");
+            assert!(
+                Interrupt::listen().unwrap().is_raised(),
+                "{kind}: a later listener does not know"
+            );
+            assert!(!Interrupt::default().is_raised(), "{kind}: raised without listening");
         }
     }
 }

@@ -119,7 +119,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_processor_that_is_not_there_is_refused_with_those_that_are() {
+    fn an_absent_processor_is_refused_with_those_that_exist() {
         let error = std::thread::spawn(|| enter_real_time(Some(CpuSet::count() - 1)));
         let error = error.join().unwrap().unwrap_err();
         let expected = "--realtime: cannot bind the SYNC thread to processor 1023: EINVAL";
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn refusals_say_what_to_do() {
+    fn a_refused_memory_lock_names_the_permission_and_the_limit() {
         assert_eq!(
             memory_refused(Errno::EPERM, 8192),
             "--realtime: memory cannot be locked: EPERM: Operation not permitted; run as root, or \

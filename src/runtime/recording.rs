@@ -274,23 +274,22 @@ mod tests {
     use super::*;
     use crate::config::Config;
     use crate::session::Outcome;
-    use crate::telemetry::tests::{CONFIG_TOML, manifest, scene};
+    use crate::telemetry::tests::{CONFIG_TOML, Scratch, manifest, scene};
     use crate::telemetry::{Backpressure, Recorder};
     use std::path::PathBuf;
 
-    /// A closed record with one event and no inputs, as of a run that was killed at once. Returns the parent of
-    /// its folder, the folder, and the time of the event.
-    fn record_of_one_event(name: &str) -> (PathBuf, PathBuf, Time) {
-        let parent =
-            std::env::temp_dir().join(format!("needle-bench-{name}-{}", std::process::id()));
+    /// A closed record with one event and no inputs, like that of a run that was killed at once; its run folder
+    /// and the time of the event.
+    fn record_of_one_event(name: &str) -> (Scratch, PathBuf, Time) {
+        let scratch = Scratch::new(name);
         let mut recorder =
-            Recorder::create(&parent, manifest(), CONFIG_TOML.to_owned(), Backpressure::Block)
+            Recorder::create(&scratch.0, manifest(), CONFIG_TOML.to_owned(), Backpressure::Block)
                 .unwrap();
         let (time, text) = (Time::from_secs_f64(7.0), "late".to_owned());
         let (lane, severity) = (Lane::Session, Severity::Warning);
         recorder.record(Entry::from(Record::Event { time, lane, severity, text }));
         let finished = recorder.finish(|manifest| manifest.set_outcome(&Outcome::Completed));
-        (parent, finished.unwrap().run_dir, time)
+        (scratch, finished.unwrap().run_dir, time)
     }
 
     fn describe() -> Describe {
@@ -300,27 +299,24 @@ mod tests {
         })
     }
 
-    /// A run that was killed at once, or that does not replay: its frames and events take long as well, and
-    /// must not be taken for a stalled disk.
+    /// The frames and events of a run that does not replay take long too, which must not look like a stalled disk.
     #[test]
-    fn what_the_text_files_alone_hold_is_progress() {
-        let (parent, run_dir, time) = record_of_one_event("made");
+    fn events_of_a_run_without_inputs_count_as_progress() {
+        let (_scratch, run_dir, time) = record_of_one_event("progress");
         let reached_ns = AtomicI64::new(0);
         let fault = make_from_text_files(&run_dir, describe(), &reached_ns).unwrap();
         assert_eq!((fault, reached_ns.load(Ordering::Relaxed)), (None, time.as_nanos()));
-        std::fs::remove_dir_all(parent).unwrap();
     }
 
     #[test]
-    fn lines_that_cannot_be_read_are_a_fault_of_the_recording() {
-        let (parent, run_dir, _) = record_of_one_event("unread");
+    fn unreadable_lines_are_a_fault_of_the_recording() {
+        let (_scratch, run_dir, _) = record_of_one_event("unreadable");
         let events = run_dir.join(file::EVENTS);
         std::fs::remove_file(&events).unwrap();
-        // Opens like a file, and every read at its beginning fails, as at a bad sector.
+        // This file opens, and reading its first bytes fails, as from a bad sector.
         std::os::unix::fs::symlink("/proc/self/mem", &events).unwrap();
         let fault = make_from_text_files(&run_dir, describe(), &AtomicI64::new(0)).unwrap();
         let expected = "run.rrd lacks the rest of events.log: Input/output error (os error 5)";
         assert_eq!(fault.as_deref(), Some(expected));
-        std::fs::remove_dir_all(parent).unwrap();
     }
 }

@@ -159,10 +159,12 @@ pub fn serve_stage(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::telemetry::tests::Scratch;
 
     #[test]
-    fn a_truth_file_that_exists_is_named() {
-        let path = std::env::temp_dir().join(format!("needle-bench-truth-{}", std::process::id()));
+    fn an_existing_truth_file_is_refused_and_kept() {
+        let scratch = Scratch::new("truth");
+        let path = scratch.0.join("truth.csv");
         std::fs::write(&path, "kept").unwrap();
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         let clock = Clock::start();
@@ -170,6 +172,5 @@ mod tests {
         let said = server.err().unwrap();
         assert_eq!(said, format!("truth file {}: File exists (os error 17)", path.display()));
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "kept");
-        std::fs::remove_file(path).unwrap();
     }
 }

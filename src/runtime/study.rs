@@ -164,7 +164,7 @@ mod tests {
     use crate::config::Config;
     use crate::session::{PlaneOutOfReach, StepRecord};
 
-    /// The steps of the trial with this seed, through a whole session and without.
+    /// The steps of the trial with this seed, with a whole session and without one.
     fn both_ways(config: &Config, seed: u64) -> [Vec<(StepRecord, Truth)>; 2] {
         let stage = |seed| {
             config
@@ -200,7 +200,7 @@ mod tests {
         [whole, short]
     }
 
-    /// The largest distance of true and of estimated tips, mm, over all steps.
+    /// The largest distance over all steps between the true tips, and between the estimated tips, mm.
     fn distances(config: &Config, seed: u64) -> [f64; 2] {
         let [whole, short] = both_ways(config, seed);
         assert_eq!(whole.len(), short.len());
@@ -226,10 +226,10 @@ mod tests {
         Config::from_sources(&[], &sets).unwrap()
     }
 
-    /// Without drives and bytes the same insertion, but for what the encoders round, 0.0002 mm and
-    /// 0.005 deg: late positions, believed or not, and a shaft that twists included.
+    /// The encoders round to 0.0002 mm and 0.005°. The cases include late positions, with and without their
+    /// latency configured, and a shaft with torsion.
     #[test]
-    fn a_trial_is_a_session_without_its_bytes() {
+    fn a_trial_agrees_with_a_whole_session_within_the_encoders_resolution() {
         let smooth = [
             "observer.kind=coupled",
             "observer.coupled.gains=placed",
@@ -242,7 +242,7 @@ mod tests {
         let misled = ["emulator.tracker_latency_ms=175", "insertion.speed_mm_per_s=1"];
         for (case, sets) in [&[][..], &stepwise, &late, &misled, &twisting].into_iter().enumerate()
         {
-            // Without any, a needle that starts would say the same twice, which is not believed.
+            // Without noise the first positions would be identical, and the gate would refuse them.
             for noise in ["emulator.noise={ sd_mm = 1e-6 }", "emulator.noise={ uniform_mm = 1.0 }"]
             {
                 let config = config(&[&smooth[..], &[noise], sets].concat());
@@ -253,9 +253,9 @@ mod tests {
         }
     }
 
-    /// A bank of hypotheses and a law with a nearer side may take the rounding for more.
+    /// A bank of hypotheses and a law that chooses the nearer side can amplify the rounding.
     #[test]
-    fn the_default_steering_takes_rounding_for_little() {
+    fn a_trial_with_the_default_steering_agrees_with_a_session_within_0_02_mm() {
         let [true_mm, estimated_mm] = distances(&config(&[]), 3);
         assert!(true_mm < 0.02 && estimated_mm < 0.02, "{true_mm} {estimated_mm}");
     }

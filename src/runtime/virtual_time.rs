@@ -324,16 +324,16 @@ mod tests {
         let begun = Instant::now();
         let mut pace = Pace::begin();
         let mut now = Time::ZERO;
-        // A deadline may have passed already.
+        // The third deadline has passed already.
         for due in [at(0), at(7), at(3), at(40), Time::NEVER, Time::NEVER] {
             now = now.max(pace.wait(now, due));
             assert!(begun.elapsed() >= now.since(Time::ZERO), "{now:?}");
         }
-        assert_eq!(now, at(67), "in strides of 20 ms");
+        assert_eq!(now, at(67), "without a deadline it waits 20 ms");
     }
 
     #[test]
-    fn a_suspended_program_does_not_hurry_afterwards() {
+    fn a_suspended_program_does_not_catch_up() {
         let mut pace = Pace::begin();
         thread::sleep(CATCH_UP_MAX * 2);
         pace.wait(at(0), at(1));

@@ -198,7 +198,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_error_frame_names_all_that_it_reports() {
+    fn an_error_frame_is_described_with_everything_it_reports() {
         let passive = BusError::new(0x204, [0, 0x30, 0, 0, 0, 0, 136, 128]);
         assert!(!passive.is_bus_off() && BusError::bus_off().is_bus_off());
         assert!(BusError::new(0x100, [0; 8]).is_restarted());

@@ -304,32 +304,34 @@ mod tests {
     }
 
     #[test]
-    fn a_control_thread_that_was_late_is_given_the_newest_samples() {
+    fn a_late_control_thread_gets_the_newest_samples() {
         let (mut link, mut outlet) = Link::new(&LinkSettings::default());
         (0..50).for_each(|n| outlet.deliver(Time::ZERO, sample(n)));
         assert_eq!(positions(&mut link), (0..50).collect::<Vec<_>>());
         outlet.deliver(Time::ZERO, Event::Connected { peer: "lab".to_owned() });
         (50..500).for_each(|n| outlet.deliver(Time::ZERO, sample(n)));
-        assert!(matches!(link.try_next(), Some(Event::Connected { .. })), "no sample, not dropped");
+        assert!(
+            matches!(link.try_next(), Some(Event::Connected { .. })),
+            "only samples are dropped"
+        );
         assert_eq!(positions(&mut link), (500 - Link::BATCH_MAX..500).collect::<Vec<_>>());
         let dropped = (450 - Link::BATCH_MAX) as u64;
         assert_eq!(link.passed_over(), Some(Event::PassedOver { messages: 0, dropped }));
         assert_eq!((link.passed_over(), link.messages()), (None, 500));
     }
 
-    /// However much comes, what changes the connection's state has room.
     #[test]
     fn a_flood_leaves_room_for_the_state_of_the_connection() {
         let settings = LinkSettings { queue: 8, ..LinkSettings::default() };
         let (mut link, mut outlet) = Link::new(&settings);
-        let state = |outlet: &mut Outlet, n: usize| {
+        let deliver_tool = |outlet: &mut Outlet, n: usize| {
             let (tool, message_type) = (format!("tool {n}"), "IMAGE".to_owned());
             outlet.deliver(Time::ZERO, Event::SawTool { tool, message_type });
         };
         outlet.deliver(Time::ZERO, Event::Connected { peer: "lab".to_owned() });
         for n in 0..Reader::NAMES_MAX {
             (0..100).for_each(|n| outlet.deliver(Time::ZERO, sample(n)));
-            state(&mut outlet, n);
+            deliver_tool(&mut outlet, n);
         }
         outlet.deliver(Time::ZERO, Event::Disconnected { reason: "gone".to_owned() });
         drop(outlet);
@@ -376,7 +378,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_recording_is_given_to_its_end() {
+    async fn a_recording_is_replayed_to_its_end() {
         let line = |ns: u32| {
             format!(r#"{{"tool":"N","position_tracker_mm":[{ns},0,0],"receive_time_ns":{ns}}}"#)
         };
@@ -388,7 +390,7 @@ mod tests {
         let mut samples = Vec::new();
         while let Some(event) = link.next().await {
             if let Event::Sample(sample) = event {
-                assert!(sample.receive_time <= clock(), "none comes before its time");
+                assert!(sample.receive_time <= clock(), "a sample before its time");
                 samples.push(sample.receive_time.as_nanos());
             }
         }

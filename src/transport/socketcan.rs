@@ -315,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn error_frames_are_kept_whole() {
+    fn an_error_frame_keeps_its_class_and_data() {
         let data = [0, 0x20, 0, 0, 0, 0, 128, 3];
         let frame = CanErrorFrame::new_error(0x244, &data).unwrap();
         let expected = BusEvent::Error(BusError::new(0x244, data));
@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn an_interface_that_vanished_is_gone_at_every_frame() {
+    fn a_vanished_interface_is_reported_as_gone() {
         for errno in [Errno::ENODEV, Errno::ENXIO] {
             let error = failed("can0", "send", errno.into());
             assert_eq!(error.to_string(), "interface can0 is gone, was the adapter unplugged?");
@@ -333,8 +333,8 @@ mod tests {
     }
 
     #[test]
-    fn an_interface_that_is_not_there_is_named() {
-        // Two right answers: a kernel with CAN, and one without.
+    fn an_absent_interface_is_refused_with_its_name() {
+        // The error depends on whether the kernel has CAN.
         match SocketCan::open("needle-none0") {
             Err(CanError::NoInterface(interface) | CanError::NoCan(interface)) => {
                 assert_eq!(interface, "needle-none0");

@@ -165,7 +165,7 @@ mod tests {
 
     const LONG: Duration = Duration::from_secs(10);
 
-    /// A group of the test's own, told by the process number: other tests may run at once.
+    /// A multicast group of this process, with a port for each test, because other tests may run at the same time.
     fn group(number: u8) -> SocketAddrV4 {
         let [a, b, ..] = std::process::id().to_le_bytes();
         SocketAddrV4::new(Ipv4Addr::new(239, 74, a, b), 43_200 + u16::from(number))
@@ -184,9 +184,9 @@ mod tests {
         assert_eq!(a.receive(Duration::ZERO).unwrap(), None);
     }
 
-    /// Else one bench's SYNC would be another master's for the next.
+    /// Otherwise a bench would take another bench's SYNC for that of a second master.
     #[test]
-    fn a_bus_hears_its_own_group_alone() {
+    fn a_bus_receives_only_its_own_group() {
         let here = group(8);
         let there = SocketAddrV4::new(Ipv4Addr::new(239, 73, 1, 1), here.port());
         let (mut ours, mut theirs) = (UdpBus::join(here).unwrap(), UdpBus::join(there).unwrap());
@@ -215,7 +215,7 @@ mod tests {
         let (mut sender, mut sleeper) =
             (UdpBus::join(group(3)).unwrap(), UdpBus::join(group(3)).unwrap());
         let frame = Frame::new(0x80, &[]);
-        // More than any socket's buffer holds of these; the count comes with the next datagram.
+        // More than a socket's buffer can hold. The kernel reports the drops with the next datagram.
         let count = 20_000;
         (0..count).for_each(|_| sender.send(&frame).unwrap());
         let held = std::iter::from_fn(|| sleeper.receive(Duration::ZERO).unwrap()).count();
@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn a_group_that_is_none_is_an_error() {
+    fn a_unicast_address_is_refused_as_a_group() {
         let unicast = SocketAddrV4::new(Ipv4Addr::LOCALHOST, 43_299);
         let error = UdpBus::join(unicast).unwrap_err().to_string();
         assert!(

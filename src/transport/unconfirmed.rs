@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn two_cycles_may_wait_and_no_third() {
+    fn two_cycles_may_be_unconfirmed_and_no_third() {
         let mut unconfirmed = Unconfirmed::new(2);
         for cycle in 0..2 {
             assert_eq!(unconfirmed.too_many(), None);
@@ -124,10 +124,10 @@ mod tests {
         assert!(unconfirmed.take_echo(&set_point(0)));
         assert_eq!(unconfirmed.too_many(), Some((3, 2)));
         assert!(unconfirmed.take_echo(&sync()));
-        assert_eq!(unconfirmed.too_many(), None, "it goes on as soon as one cycle is out");
+        assert_eq!(unconfirmed.too_many(), None, "one cycle is confirmed");
     }
 
-    /// Frames that were dropped before the cable came out must not hide that it is out.
+    /// Frames that were dropped before the cable was unplugged must not hide the missing echoes after it.
     #[test]
     fn only_frames_dropped_since_the_oldest_sync_that_waits_excuse_missing_echoes() {
         let mut unconfirmed = Unconfirmed::new(2);
@@ -136,22 +136,22 @@ mod tests {
         unconfirmed.sent(sync(), 5);
         unconfirmed.sent(sync(), 5);
         assert!(unconfirmed.too_many().is_some());
-        assert!(!unconfirmed.may_be_dropped(5), "dropped before");
+        assert!(!unconfirmed.may_be_dropped(5), "dropped before both SYNCs");
         assert!(!unconfirmed.may_be_dropped(0), "the count could not be read");
         assert!(unconfirmed.may_be_dropped(6));
         unconfirmed.give_up();
         unconfirmed.sent(sync(), 6);
         unconfirmed.sent(sync(), 7);
-        assert!(unconfirmed.may_be_dropped(7), "between the two");
+        assert!(unconfirmed.may_be_dropped(7), "dropped between the two");
         // The first is confirmed late, while the second waits.
         assert!(unconfirmed.take_echo(&sync()));
         unconfirmed.sent(sync(), 7);
         assert!(unconfirmed.too_many().is_some());
-        assert!(!unconfirmed.may_be_dropped(7), "before both that wait");
+        assert!(!unconfirmed.may_be_dropped(7), "dropped before both that wait");
     }
 
     #[test]
-    fn a_frame_is_an_echo_once() {
+    fn a_sent_frame_has_one_echo() {
         let mut unconfirmed = Unconfirmed::new(2);
         unconfirmed.sent(sync(), 0);
         assert!(!unconfirmed.take_echo(&set_point(1)), "never sent");
@@ -159,7 +159,7 @@ mod tests {
         assert!(!unconfirmed.take_echo(&sync()), "another master's");
     }
 
-    /// Their echoes are not taken for another master's frames.
+    /// Otherwise the bench would take its own frames for those of another master.
     #[test]
     fn the_echo_of_a_frame_that_was_given_up_is_recognized() {
         let mut unconfirmed = Unconfirmed::new(2);
@@ -170,13 +170,13 @@ mod tests {
         assert_eq!(unconfirmed.too_many(), None);
         unconfirmed.sent(set_point(200), 0);
         assert!(unconfirmed.take_echo(&set_point(99)));
-        assert!(!unconfirmed.take_echo(&set_point(1)), "long ago");
+        assert!(!unconfirmed.take_echo(&set_point(1)), "given up long ago");
         assert!(unconfirmed.take_echo(&set_point(200)));
     }
 
-    /// A thread that changes the processor between two frames: the kernel echoes them in two queues.
+    /// If a thread moves to another processor between two frames, the kernel echoes them from two queues.
     #[test]
-    fn echoes_may_pass_one_another() {
+    fn echoes_may_arrive_in_another_order() {
         let mut unconfirmed = Unconfirmed::new(2);
         (0..3).for_each(|number| unconfirmed.sent(set_point(number), 0));
         unconfirmed.sent(sync(), 0);
@@ -195,7 +195,7 @@ mod tests {
             let mut unconfirmed = Unconfirmed::new(2);
             unconfirmed.sent(set_point(7), 0);
             unconfirmed.sent(set_point(8), 0);
-            assert!(unconfirmed.take_echo(&set_point(8)), "that of 7 is lost");
+            assert!(unconfirmed.take_echo(&set_point(8)), "the echo of 7 is lost");
             for _ in 0..cycles {
                 unconfirmed.sent(sync(), 0);
                 assert!(unconfirmed.take_echo(&sync()));

@@ -1,5 +1,5 @@
-//! Links and servers against each other and against bare sockets, on the loopback. The limits of
-//! time here only end a test that hangs.
+//! Links and servers against each other and against bare sockets, on the loopback. The timeouts here only end a
+//! test that hangs.
 
 use super::*;
 use crate::tracker::openigtlink::{
@@ -36,7 +36,7 @@ async fn next(link: &mut Link) -> Event {
     timeout(HANGING, link.next()).await.expect("an event").expect("the link runs")
 }
 
-/// Events up to the first that `wanted` takes.
+/// Takes events until `wanted` returns a value.
 async fn until<T>(link: &mut Link, wanted: impl Fn(&Event) -> Option<T>) -> T {
     loop {
         if let Some(found) = wanted(&next(link).await) {
@@ -52,7 +52,7 @@ fn disconnected(event: &Event) -> Option<String> {
     }
 }
 
-/// A peer on a bare socket, and the link connected to it.
+/// A link connected to a peer on a bare socket.
 async fn bare_peer(settings: LinkSettings) -> (Link, TcpStream, SocketAddr) {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("loopback");
     let address = listener.local_addr().expect("bound");
@@ -71,7 +71,7 @@ async fn clients(server: &TransformServer, wanted: usize) {
 }
 
 #[tokio::test]
-async fn a_served_position_arrives_with_its_name_and_time() {
+async fn a_served_position_arrives_with_its_tool_and_time() {
     let server = TransformServer::bind("127.0.0.1:0").await.expect("loopback");
     let mut link = Link::connect(&server.local_addr().to_string(), quick(), clock);
     clients(&server, 1).await;
@@ -100,7 +100,7 @@ async fn every_client_is_served_and_one_that_falls_behind_is_dropped() {
     for link in &mut links {
         until(link, |event| matches!(event, Event::Sample(_)).then_some(())).await;
     }
-    // One runtime thread: nothing is sent while this loop runs, so all fall behind.
+    // The only runtime thread runs this loop, so nothing is sent meanwhile and every client falls behind.
     for _ in 0..=TransformServer::BACKLOG {
         server.send(&position("Needle", 2.0));
     }
@@ -114,7 +114,7 @@ async fn every_client_is_served_and_one_that_falls_behind_is_dropped() {
 }
 
 #[tokio::test]
-async fn a_lost_server_is_found_again() {
+async fn the_link_reconnects_to_a_server_that_comes_back() {
     let server = TransformServer::bind("127.0.0.1:0").await.expect("loopback");
     let address = server.local_addr().to_string();
     let mut link = Link::connect(&address, quick(), clock);
@@ -136,7 +136,7 @@ async fn a_lost_server_is_found_again() {
 }
 
 #[tokio::test]
-async fn what_is_not_openigtlink_is_dropped_by_name() {
+async fn a_connection_of_another_protocol_is_dropped_with_the_reason() {
     let (mut link, mut peer, address) = bare_peer(quick()).await;
     let page = [b'x'; 100];
     peer.write_all(&page).await.expect("sent");
@@ -150,7 +150,7 @@ async fn what_is_not_openigtlink_is_dropped_by_name() {
 }
 
 #[tokio::test]
-async fn a_message_wrong_inside_is_reported_and_the_next_is_read() {
+async fn a_malformed_message_is_reported_and_the_next_is_read() {
     let (mut link, mut peer, _) = bare_peer(quick()).await;
     let mut wrong = encode(&position("Needle", 1.0));
     wrong[2..14].copy_from_slice(b"TRANSFORM\0\0\0"); // 12 bytes where 48 are due
@@ -172,7 +172,7 @@ async fn a_message_wrong_inside_is_reported_and_the_next_is_read() {
 }
 
 #[tokio::test]
-async fn a_status_is_passed_on_and_a_cut_message_named() {
+async fn a_status_is_passed_on_and_a_message_cut_off_is_reported() {
     let (mut link, mut peer, address) = bare_peer(quick()).await;
     let status = Status {
         code: Status::OK,
@@ -200,13 +200,13 @@ async fn a_status_is_passed_on_and_a_cut_message_named() {
 }
 
 #[tokio::test]
-async fn samples_nobody_takes_are_dropped_and_counted() {
+async fn samples_that_overflow_the_queue_are_dropped_and_counted() {
     let settings = LinkSettings { queue: 8, ..quick() };
     let (mut link, mut peer, _) = bare_peer(settings).await;
     for x_mm in 0..100u8 {
         peer.write_all(&encode(&position("Needle", f32::from(x_mm)))).await.expect("sent");
     }
-    // Two of the eight places hold the connection and the tool's name.
+    // Of the eight places, two hold the connection and the tool's name.
     let wait = async {
         while link.dropped() < 94 {
             tokio::task::yield_now().await;
@@ -222,7 +222,7 @@ async fn samples_nobody_takes_are_dropped_and_counted() {
 }
 
 #[tokio::test]
-async fn a_silent_server_is_connected_to_anew() {
+async fn the_link_reconnects_to_a_silent_server() {
     let settings = LinkSettings { silence_limit: Duration::from_millis(20), ..quick() };
     let (mut link, _silent, address) = bare_peer(settings).await;
     assert_eq!(
@@ -231,28 +231,28 @@ async fn a_silent_server_is_connected_to_anew() {
     );
 }
 
-/// What a peer reads up to and with the `len`-th byte.
-async fn heard(peer: &mut TcpStream, len: usize) -> Vec<u8> {
+/// The next `len` bytes that a peer receives.
+async fn received(peer: &mut TcpStream, len: usize) -> Vec<u8> {
     let mut bytes = vec![0; len];
     timeout(HANGING, peer.read_exact(&mut bytes)).await.expect("in time").expect("as many bytes");
     bytes
 }
 
 #[tokio::test]
-async fn a_server_is_asked_for_its_stream_and_told_to_end_it() {
+async fn a_stream_is_requested_at_the_start_and_stopped_at_the_end() {
     for name in ["TDATA", "QTDATA"] {
         let request = ToolStream { name, period_ms: 25 };
         let settings = LinkSettings { request: Some(request), ..quick() };
         let (mut link, mut peer, _) = bare_peer(settings).await;
         let start = request.start();
-        assert_eq!(heard(&mut peer, start.len()).await, start);
+        assert_eq!(received(&mut peer, start.len()).await, start);
         let tool = Tool { name: "Needle".to_owned(), kind: tool_kind::SIX_D, pose: [0.5; 12] };
         let tools = Message::new("Tracker", None, Body::TrackingData(vec![tool]));
         peer.write_all(&encode(&tools)).await.expect("sent");
         assert_eq!(until(&mut link, tool_of_sample).await, "Needle");
         drop(link);
         let stop = request.stop();
-        assert_eq!(heard(&mut peer, stop.len()).await, stop);
+        assert_eq!(received(&mut peer, stop.len()).await, stop);
     }
 }
 
@@ -299,14 +299,14 @@ fn tool_of_sample(event: &Event) -> Option<String> {
 }
 
 #[tokio::test]
-async fn a_client_that_pushes_is_read_and_a_second_turned_away() {
+async fn a_client_that_pushes_is_read_and_a_second_is_refused() {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("loopback");
     let address = listener.local_addr().expect("bound").to_string();
     let mut link = Link::listen(listener, quick(), clock);
     let first = push(&address, &position("First", 1.0)).await;
     assert_eq!(until(&mut link, tool_of_sample).await, "First");
     let mut second = TcpStream::connect(&address).await.expect("listening");
-    let closed = timeout(HANGING, second.read(&mut [0; 1])).await.expect("turned away");
+    let closed = timeout(HANGING, second.read(&mut [0; 1])).await.expect("refused");
     assert!(matches!(closed, Ok(0) | Err(_)));
     drop(first);
     until(&mut link, disconnected).await;
@@ -328,8 +328,8 @@ async fn a_silent_client_gives_way_to_the_next() {
     assert_eq!(until(&mut link, tool_of_sample).await, "Second");
 }
 
-/// No file descriptors are left while the client is silent. Their limit is that of a process, so this test runs
-/// once more in one of its own.
+/// No file descriptor is free when the second client connects. The limit applies to the process, so this test runs
+/// again in a process of its own.
 #[test]
 fn a_silent_client_gives_way_although_a_connection_was_not_accepted() {
     const OF_ITS_OWN: &str = "NEEDLE_TEST_PROCESS";
@@ -358,7 +358,7 @@ async fn a_client_without_a_file_descriptor() {
     let (soft, hard) = getrlimit(Resource::RLIMIT_NOFILE).expect("a limit");
     setrlimit(Resource::RLIMIT_NOFILE, 0, hard).expect("lowered");
     let mut second = second.connect(address).await.expect("listening");
-    // The link's task runs meanwhile, and cannot accept.
+    // Meanwhile the link's task tries to accept the connection, and fails.
     tokio::time::sleep(Duration::from_millis(20)).await;
     setrlimit(Resource::RLIMIT_NOFILE, soft, hard).expect("as before");
     second.write_all(&encode(&position("Second", 1.0))).await.expect("sent");
@@ -368,7 +368,7 @@ async fn a_client_without_a_file_descriptor() {
 }
 
 #[tokio::test]
-async fn dropping_an_end_closes_its_connections() {
+async fn dropping_a_link_or_server_closes_its_connections() {
     let (link, mut peer, _) = bare_peer(quick()).await;
     drop(link);
     let closed = timeout(HANGING, peer.read(&mut [0; 1])).await.expect("closed");

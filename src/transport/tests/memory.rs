@@ -8,11 +8,11 @@ use std::time::Duration;
 use crate::canopen::Frame;
 use crate::transport::can::{BusError, BusEvent, CanBus, CanError};
 
-/// Events an endpoint holds that nobody has received yet. What comes on top of them is dropped and
-/// counted, as by a kernel's socket (which holds some 280 frames by default).
+/// Capacity of an endpoint's receive queue. Further events are dropped and counted, as by a kernel's socket, which
+/// holds some 280 frames by default.
 const RECEIVE_QUEUE: usize = 512;
 
-/// The wire: hand an [endpoint](MemoryBus::endpoint) to each node.
+/// The bus. Each node gets an [endpoint](MemoryBus::endpoint).
 #[derive(Debug, Clone, Default)]
 pub(crate) struct MemoryBus {
     wire: Arc<Mutex<Wire>>,
@@ -33,7 +33,7 @@ struct Tap {
 }
 
 impl MemoryBus {
-    /// A bus with nobody on it.
+    /// A bus without nodes.
     pub(crate) fn new() -> Self {
         MemoryBus::default()
     }
@@ -56,7 +56,7 @@ impl MemoryBus {
         self.carry(BusEvent::Error(error), None);
     }
 
-    /// Brings `event` to all endpoints but `sender`. One lock for all: everyone sees one order.
+    /// Delivers `event` to all endpoints but `sender`. One lock covers all endpoints, so all see the same order.
     fn carry(&self, event: BusEvent, sender: Option<usize>) {
         self.with_wire(|wire| {
             wire.taps.retain(|tap| {
@@ -75,7 +75,7 @@ impl MemoryBus {
         });
     }
 
-    /// No one leaves the wire half changed, so a thread that panicked does no harm here.
+    /// No action leaves the wire half changed, so a lock that a panic poisoned can be used.
     fn with_wire<T>(&self, action: impl FnOnce(&mut Wire) -> T) -> T {
         action(&mut self.wire.lock().unwrap_or_else(PoisonError::into_inner))
     }
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn two_threads_talk() {
+    fn frames_pass_between_two_threads() {
         let bus = MemoryBus::new();
         let (mut master, mut drive) = (bus.endpoint(), bus.endpoint());
         let echo = thread::spawn(move || {
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn senders_at_once_are_seen_in_one_order() {
+    fn frames_of_concurrent_senders_have_one_order_for_all() {
         let bus = MemoryBus::new();
         let mut listeners = [bus.endpoint(), bus.endpoint()];
         let senders: Vec<_> = (1..=4)
@@ -192,11 +192,14 @@ mod tests {
     }
 
     #[test]
-    fn error_reports_reach_everyone() {
+    fn an_error_report_reaches_every_endpoint() {
         let bus = MemoryBus::new();
-        let (mut a, b) = (bus.endpoint(), bus.endpoint());
-        drop(b);
+        let (mut a, mut b, dropped) = (bus.endpoint(), bus.endpoint(), bus.endpoint());
+        drop(dropped);
         bus.report(BusError::bus_off());
-        assert_eq!(a.receive(AT_ONCE).unwrap(), Some(BusEvent::Error(BusError::bus_off())));
+        for endpoint in [&mut a, &mut b] {
+            let event = endpoint.receive(AT_ONCE).unwrap();
+            assert_eq!(event, Some(BusEvent::Error(BusError::bus_off())));
+        }
     }
 }

@@ -1,4 +1,4 @@
-//! What tests of several files share.
+//! Helpers that tests of several files share.
 
 pub(crate) mod memory;
 

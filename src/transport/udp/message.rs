@@ -126,13 +126,13 @@ mod tests {
         5f737769746368c2b56572726f725f73746174655f696e64696361746f72c2";
 
     #[test]
-    fn agrees_with_python_can_to_the_byte() {
+    fn messages_agree_with_python_can_to_the_byte() {
         let request = Frame::new(0x601, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]);
         let sdo = BusEvent::Frame(request);
         assert_eq!(decode(&hex(SDO)), Some(sdo));
         assert_eq!(encode(1_700_000_000.25, &sdo).unwrap(), hex(SDO));
 
-        // The channel is the sender's own name for the bus; ours is none.
+        // The channel is the sender's name for the bus; this bench sends none.
         let remote = Frame::from_parts(CanId::Extended(0x0123_4567), true, &[0; 4]).unwrap();
         assert_eq!(decode(&hex(REMOTE)), Some(BusEvent::Frame(remote)));
 
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn only_classic_frames_are_taken() {
+    fn only_classic_frames_are_accepted() {
         let message = |arbitration_id, dlc, data, is_fd| {
             let datagram = rmp_serde::to_vec_named(&Fields {
                 arbitration_id,
@@ -155,15 +155,15 @@ mod tests {
         };
         assert!(message(0x7FF, 2, &[1, 2], false).is_some());
         assert_eq!(message(0x80, 2, &[1, 2], true), None, "CAN FD");
-        assert_eq!(message(0x800, 1, &[1], false), None);
-        assert_eq!(message(0x80, 9, &[0; 9], false), None);
-        assert_eq!(message(0x80, 8, &[0; 7], false), None);
-        assert_eq!(decode(b"hello"), None);
+        assert_eq!(message(0x800, 1, &[1], false), None, "identifier over 11 bits");
+        assert_eq!(message(0x80, 9, &[0; 9], false), None, "9 bytes");
+        assert_eq!(message(0x80, 8, &[0; 7], false), None, "length without data");
+        assert_eq!(decode(b"hello"), None, "not a message");
     }
 
-    /// Heads of strings, maps and arrays that announce 4 GiB, and arrays in arrays to the end.
+    /// Strings, binary data, arrays and maps that announce 4 GiB, and 2000 nested arrays.
     #[test]
-    fn announced_lengths_cost_no_memory() {
+    fn hostile_lengths_and_nesting_are_refused() {
         for head in [0xDB, 0xC6, 0xDD, 0xDF] {
             let key = [&[0x81, 0xA4][..], b"data", &[head, 0xFF, 0xFF, 0xFF, 0xFF]].concat();
             for hostile in [&key[6..], &key] {
@@ -182,7 +182,7 @@ mod tests {
         }
 
         #[test]
-        fn any_bytes_are_a_message_or_none(mut bytes: Vec<u8>, at: usize, byte: u8) {
+        fn damaged_bytes_never_panic_and_cut_messages_are_refused(mut bytes: Vec<u8>, at: usize, byte: u8) {
             let _ = decode(&bytes);
             bytes = hex(SDO);
             let at = at % bytes.len();
