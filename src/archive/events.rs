@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_written_is_read() {
+    fn lines_are_read_back_and_cut_lines_are_refused() {
         for record in lines() {
             let line = EventLine::of(&record).unwrap();
             assert_eq!(EventLine::parse(&line.to_string()), Some(line));

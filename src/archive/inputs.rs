@@ -216,7 +216,7 @@ mod tests {
         Input::Tracker(event)
     }
 
-    /// One of each, and its line. Do not edit: replay reads these lines.
+    /// One input of each kind, and its line. Do not edit: replay reads these lines.
     fn frozen() -> Vec<(Input, &'static str)> {
         let sample = Sample {
             tool: "N".to_owned(),
@@ -288,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_none_is_named() {
+    fn malformed_inputs_are_refused_with_the_line() {
         let header = "needle-bench inputs 1, begun 0";
         let cases = [
             (String::new(), "inputs.log holds no input"),
@@ -296,7 +296,7 @@ mod tests {
             (header.replace('1', "2") + "\n", "inputs.log has format 2, this bench reads format 1"),
             (format!("{header}\n0 tock\n"), "inputs.log line 2: \"0 tock\" is no input"),
             (format!("{header}\n0 stop\n"), "inputs.log line 2: \"0 stop\" is no input"),
-            (format!("{header}\n0 stop \"x\n"), "inputs.log line 2: "),
+            (format!("{header}\n0 stop \"x\n"), "inputs.log line 2: \"0 stop \\\"x\" is no input"),
             (
                 format!("{header}\n5 tick\n3 tick\n"),
                 "inputs.log line 3: its time goes back by 2 ns",

@@ -63,7 +63,7 @@ mod tests {
         assert_eq!(without_partial_line("a"), "");
     }
 
-    /// A disk that keeps failing must not occupy a reader indefinitely.
+    /// Otherwise a disk that keeps failing would block the reader for ever.
     #[test]
     fn a_read_error_is_the_last_item() {
         struct BrokenDisk;

@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_written_is_read() {
+    fn a_manifest_is_read_back() {
         let mut manifest = manifest();
         let reason = "wrong gain".to_owned();
         let given_utc = "2023-11-15T08:00:00.000000Z".to_owned();
@@ -340,7 +340,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_none_is_named() {
+    fn a_foreign_edited_or_newer_manifest_is_refused_with_the_reason() {
         let text = manifest().to_text().unwrap();
         let cases = [
             ("{}".to_owned(), "not a run's manifest: missing field `format`"),

@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_unknown_is_empty() {
+    fn unknown_values_are_empty() {
         let row = StepRow::new(&step(), None).to_string();
         assert_eq!(row, format!("7,7.3,7.001,-0.1{},0{}", ",".repeat(22), ",".repeat(9)));
     }
@@ -222,7 +222,7 @@ mod tests {
         let rows = [Some(&truth), None].map(|truth| StepRow::new(&step(), truth).to_string());
         let columns = RecordedColumns::of(&steps_csv_header());
         assert_eq!(columns.time(&rows[0]), Some(step().time));
-        let read = columns.truth(&rows[0]).expect("is there");
+        let read = columns.truth(&rows[0]).expect("a truth");
         assert!((read.x_pb().rotation.matrix() - pose.rotation.matrix()).norm() < 1e-14);
         assert_eq!(read.x_pb().translation, pose.translation);
         assert_eq!(read.target_mm(), truth.target_mm());

@@ -51,7 +51,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_number_is_named() {
+    fn a_value_that_is_not_a_number_is_refused_with_its_line() {
         let error = StepsTable::parse("step,x_mm\n0,1\n1,gone\n").unwrap_err();
         assert_eq!(error.to_string(), "line 3: x_mm is \"gone\", expected a number");
     }

@@ -28,7 +28,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn known_moments() {
+    fn known_moments_are_formatted() {
         assert_eq!(rfc3339(0), "1970-01-01T00:00:00.000000Z");
         assert_eq!(rfc3339(1_700_000_000_123_456), "2023-11-14T22:13:20.123456Z");
         assert_eq!(rfc3339(951_782_400_000_000), "2000-02-29T00:00:00.000000Z");

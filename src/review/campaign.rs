@@ -314,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_left_out_is_said_by_reason() {
+    fn excluded_runs_are_listed_by_reason() {
         let campaign = Campaign::of(entries(), None).unwrap();
         assert_eq!((campaign.lines.len(), campaign.counted()), (12, 8));
         assert_eq!(campaign.lines[0].dir, "runs/1");
@@ -327,12 +327,11 @@ mod tests {
         insta::assert_snapshot!(campaign.to_text().unwrap());
     }
 
-    /// Six runs with one seed count as one.
     #[test]
     fn a_seeded_run_counts_once_however_often_it_was_run() {
         let seeded = |n, steps: &'static [u8], bus: &'static str| {
             folder(n, |folder| {
-                // Neither its name nor where it is recorded makes it another run.
+                // A run with another name or folder is not another run.
                 folder.manifest.name = format!("trial-{}", n % 2);
                 folder.manifest.config_sha256 = format!("other {n}");
                 let toml = folder.config_toml.as_mut().unwrap();
@@ -347,7 +346,7 @@ mod tests {
         // The steps of a real stage never repeat exactly, so the rule does not apply to them.
         entries.extend((7..9).map(|n| seeded(n, b"seed 1", "can0")));
         let by_folder = Campaign::of(entries.clone(), Some("record.dir")).unwrap();
-        assert_eq!(by_folder.counted(), 9, "once for each value that is asked for");
+        assert_eq!(by_folder.counted(), 9, "each value of the grouping key counts");
         let campaign = Campaign::of(entries, None).unwrap();
         assert_eq!(campaign.counted(), 4);
         let (exclusion, why) = campaign.lines[5].excluded.clone().unwrap();
@@ -362,7 +361,7 @@ mod tests {
         );
     }
 
-    /// Of three runs to a target one ended beside it and one was stopped; the fourth run has no target.
+    /// Of three runs to a target, one missed it and one was stopped; the fourth run has no target.
     #[test]
     fn runs_to_a_target_are_judged_by_their_target() {
         let to_target = |n, error_mm: f64| {
@@ -390,8 +389,7 @@ mod tests {
         assert!(text.contains("reached     1 of 3, 33 % "), "{text}");
     }
 
-    /// Two runs without a step are two where their tip positions are; without a position nothing says that
-    /// they are one.
+    /// Without tip positions, nothing shows that two runs without a step are the same.
     #[test]
     fn runs_without_a_step_are_told_apart_by_their_tip_positions() {
         let waiting = |n, positions: &'static [u8]| {
@@ -408,7 +406,7 @@ mod tests {
     }
 
     #[test]
-    fn groups_may_be_of_a_keys_values() {
+    fn runs_can_be_grouped_by_the_values_of_a_key() {
         let campaign = Campaign::of(entries(), Some("needle.radius_mm")).unwrap();
         let labels: Vec<&str> = campaign.groups.iter().map(|group| group.label.as_str()).collect();
         assert_eq!(labels, ["needle.radius_mm = 121.0", "needle.radius_mm = 122.0"]);
@@ -417,7 +415,7 @@ mod tests {
     }
 
     #[test]
-    fn json_has_what_the_text_has() {
+    fn json_has_runs_exclusions_and_groups() {
         let json = Campaign::of(entries(), None).unwrap().to_json();
         assert_eq!(
             (json["counted"].as_u64(), json["runs"].as_array().unwrap().len()),

@@ -223,13 +223,13 @@ mod tests {
     }
 
     #[test]
-    fn a_run_is_as_itself() {
+    fn a_run_has_no_difference_from_itself() {
         let text = Comparison::of(&run(), &run()).to_text().unwrap();
         assert!(text.contains("configuration: the same\n\nsetting: the same\n"), "{text}");
     }
 
     #[test]
-    fn json_has_both_and_the_difference() {
+    fn json_has_both_values_and_their_difference() {
         let mut open = other();
         open.folder.condition = Condition::Open;
         let json = Comparison::of(&run(), &open).to_json();
@@ -242,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn differences_are_told_key_by_key() {
+    fn differences_are_listed_key_by_key() {
         let a = "name = \"a\"\n[needle]\nradius_mm = 122.0\n[needle.torsion]\noffset_deg = 0.0\n";
         let b = "name = \"a\"\n[needle]\nradius_mm = 121.5\n[needle.torsion]\noffset_deg = 0.0\n\
                  [[emulator.fault]]\nkind = \"silent\"\nat_mm = 10.0\n";
@@ -260,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn a_configuration_agrees_with_itself() {
+    fn a_configuration_has_no_difference_from_itself() {
         let keys = keys(crate::config::DEFAULT_TOML).unwrap();
         assert!(keys.len() > 100);
         assert!(differences(&keys, &keys).is_empty());

@@ -233,7 +233,7 @@ mod tests {
     use crate::session::Outcome;
 
     #[test]
-    fn a_figure_is_held_against_the_limit_that_the_run_was_under() {
+    fn figures_beyond_the_limits_of_the_run_are_outside() {
         let mut run = run();
         run.folder.manifest.figures.insert("off_plane_rms_mm".to_owned(), 1.25.into());
         let figures = run.limited_figures();
@@ -243,19 +243,19 @@ mod tests {
     }
 
     #[test]
-    fn steps_alone_tell_the_figures_of_a_run_that_was_not_closed() {
+    fn a_run_that_was_not_closed_has_its_figures_from_its_steps() {
         let mut run = run();
         let kept = run.figures();
         run.folder.manifest.figures.clear();
         run.folder.figures_of_steps = figures_of_steps(&steps_csv());
-        let told = run.figures();
-        assert_eq!((told.insertion_mm, told.steps), (kept.insertion_mm, kept.steps));
-        assert_eq!((told.off_plane_rms_mm, told.steps_saturated), (Some(0.5), None));
-        assert_eq!(told.estimate_rms.unwrap().x_mm, 0.25);
+        let found = run.figures();
+        assert_eq!((found.insertion_mm, found.steps), (kept.insertion_mm, kept.steps));
+        assert_eq!((found.off_plane_rms_mm, found.steps_saturated), (Some(0.5), None));
+        assert_eq!(found.estimate_rms.unwrap().x_mm, 0.25);
     }
 
     #[test]
-    fn figures_of_a_stopped_run_say_so() {
+    fn figures_of_a_stopped_run_are_labelled_as_stopped() {
         let mut run = run();
         run.folder.manifest.set_outcome(&Outcome::Stopped("tracker: no tip".to_owned()));
         let labels: Vec<String> = run.limited_figures().into_iter().map(|f| f.label).collect();
@@ -264,16 +264,17 @@ mod tests {
     }
 
     #[test]
-    fn the_stage_without_a_needle_has_no_plane() {
+    fn an_operation_has_no_figures_of_a_plane_or_of_steps() {
         let mut run = run();
         run.folder.manifest.operation = Some("jog".to_owned());
         let keys: Vec<String> = run.limited_figures().into_iter().map(|f| f.key).collect();
+        assert!(keys.iter().any(|key| key == "following_error_mm_max"), "{keys:?}");
         assert!(keys.iter().all(|key| !key.contains("plane") && key != "steps"), "{keys:?}");
     }
 
-    /// 10 mm/s and 360 deg/s, 30 ms of servo lag and two SYNC of 10 ms.
+    /// The following errors are the travel of 30 ms of servo lag and two SYNCs of 10 ms, at 10 mm/s and 360°/s.
     #[test]
-    fn limits_are_those_that_the_run_was_under() {
+    fn limits_come_from_the_configuration_of_the_run() {
         let sets = ["insertion.depth_mm=120.0", "tracker.hold_after_s=0.25"].map(str::to_owned);
         let limits = limits(&Config::from_sources(&[], &sets).unwrap()).unwrap();
         assert_eq!(limits["depth_mm"], 120.0);
@@ -284,7 +285,6 @@ mod tests {
         assert!((limits["following_error_deg_max"] - 18.0).abs() < 1e-12);
     }
 
-    /// The truth of an emulated run is known, also where its last step has no estimate.
     #[test]
     fn a_distance_from_the_plane_is_named_true_where_the_truth_is_recorded() {
         let mut run = run();

@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn a_median_may_be_never() {
+    fn medians_may_include_infinite_values() {
         let values: Vec<f64> = (0..9).map(f64::from).chain([f64::INFINITY]).collect();
         let median = MedianInterval::of(&values).unwrap();
         assert_eq!((median.value, median.interval), (4.5, Some([1.0, 8.0])));

@@ -78,10 +78,10 @@ mod tests {
     use super::*;
     use crate::review::run::tests::run;
 
-    /// The first axis of the default stage, 100 ms from the start on: 0, 1 and 2 mm; a heartbeat and a
-    /// frame of another length are no positions.
+    /// From 110 ms on the first axis reports 0, 1 and 2 mm. A heartbeat and a frame of another length have no
+    /// position.
     #[test]
-    fn positions_are_those_of_the_pdos() {
+    fn positions_are_read_from_the_pdos() {
         let mut folder = run().folder;
         folder.config_toml = Some(
             "[stage.insertion]\nnode = 5\ncounts_per_mm = { counts = 1000, mm = 1 }\nsign = 1\n\
@@ -97,7 +97,7 @@ mod tests {
             line(130, "185#3702DC050000"),
             line(145, "185#3702DD050000"),
             line(160, "185#3702C4090000"),
-            // As no bench stamps it: the file was edited.
+            // No bench writes this stamp: the file was edited.
             "(-9223372036854.000000) vcan0 185#3702C4090000 R".to_owned(),
         ];
         let frames: Vec<TimedFrame> = lines.iter().filter_map(|line| parse_frame(line)).collect();

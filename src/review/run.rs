@@ -322,12 +322,12 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn states_are_told_with_their_depths() {
+    fn states_are_listed_with_their_depths() {
         let states = run().states();
-        let told: Vec<(f64, Option<f64>, &str)> =
+        let listed: Vec<(f64, Option<f64>, &str)> =
             states.iter().map(|s| (s.time_s, s.insertion_mm, s.state.as_str())).collect();
         assert_eq!(
-            told,
+            listed,
             [
                 (0.0, None, "preparing"),
                 (2.0, Some(0.0), "inserting"),

@@ -189,7 +189,7 @@ mod tests {
     use std::thread;
 
     #[test]
-    fn a_folder_is_never_given_twice() {
+    fn runs_of_one_second_get_different_folders() {
         let scratch = Scratch::new("folder");
         let parent = scratch.0.join("runs");
         let made: Vec<String> = (0..3)
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn a_manifest_takes_the_place_of_the_one_before() {
+    fn a_manifest_replaces_the_one_before() {
         let scratch = Scratch::new("manifest");
         let path = scratch.0.join("manifest.json");
         fs::write(&path, "the manifest of the start").unwrap();
@@ -224,9 +224,9 @@ mod tests {
         assert!(lock(&scratch.0).unwrap().is_some());
     }
 
-    /// A run gets its lock however often others look whether there is one.
+    /// A run gets its lock however often others check for one.
     #[test]
-    fn looking_for_a_lock_takes_none() {
+    fn a_check_for_a_lock_takes_no_lock() {
         let scratch = Scratch::new("look");
         fs::write(scratch.0.join(file::CONFIG), "").unwrap();
         let is_over = AtomicBool::new(false);
@@ -256,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn too_little_room_is_refused_with_what_there_is() {
+    fn too_little_room_is_refused_with_the_free_megabytes() {
         let scratch = Scratch::new("room");
         let dir = scratch.0.join("runs");
         check_room(&dir, 0).unwrap();

@@ -150,25 +150,25 @@ mod tests {
         Folder::open(dir.to_path_buf(), vec![(path, file)], RingBuffer::new(1).0).unwrap()
     }
 
-    fn said(folder: &mut Folder) -> Vec<String> {
+    fn faults(folder: &mut Folder) -> Vec<String> {
         folder.sync_and_check().iter().map(ToString::to_string).collect()
     }
 
     #[test]
-    fn a_file_that_is_gone_is_noticed() {
+    fn a_file_that_is_gone_or_replaced_is_a_fault() {
         let scratch = Scratch::new("keeper");
         let mut folder = folder(&scratch.0);
-        assert_eq!(said(&mut folder), Vec::<String>::new());
+        assert_eq!(faults(&mut folder), Vec::<String>::new());
         let path = scratch.0.join(file::STEPS);
         fs::remove_file(&path).unwrap();
         assert!(
-            said(&mut folder)[0].contains("steps.csv: No such file"),
+            faults(&mut folder)[0].contains("steps.csv: No such file"),
             "{:?}",
-            said(&mut folder)
+            faults(&mut folder)
         );
         fs::write(&path, "").unwrap();
         let replaced = "steps.csv: another file has taken its place";
-        assert!(said(&mut folder)[0].ends_with(replaced), "{:?}", said(&mut folder));
+        assert!(faults(&mut folder)[0].ends_with(replaced), "{:?}", faults(&mut folder));
         let manifest = Manifest::new("x", String::new());
         folder.write_last(manifest).unwrap();
         let manifest = fs::read_to_string(scratch.0.join(file::MANIFEST)).unwrap();
@@ -177,19 +177,18 @@ mod tests {
         assert!(problems.iter().eq(&folder.known), "{problems:?}");
     }
 
-    /// For example another run's folder.
     #[test]
-    fn what_stands_in_the_folders_place_is_not_written_to() {
+    fn another_folder_in_the_place_of_the_run_folder_is_not_written_to() {
         let scratch = Scratch::new("keeper-moved");
         let dir = scratch.0.join("run");
         fs::create_dir(&dir).unwrap();
         let mut folder = folder(&dir);
         fs::rename(&dir, scratch.0.join("moved")).unwrap();
-        assert!(said(&mut folder)[0].contains("run: No such file"), "{:?}", said(&mut folder));
+        assert!(faults(&mut folder)[0].contains("run: No such file"), "{:?}", faults(&mut folder));
         fs::create_dir(&dir).unwrap();
         fs::write(dir.join(file::MANIFEST), "another's").unwrap();
         let replaced = "run: another file has taken its place";
-        assert!(said(&mut folder)[0].ends_with(replaced), "{:?}", said(&mut folder));
+        assert!(faults(&mut folder)[0].ends_with(replaced), "{:?}", faults(&mut folder));
         let manifest = Manifest::new("x", String::new());
         for refused in [
             folder.write_manifest(&manifest).unwrap_err(),
@@ -201,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn a_manifest_that_is_dropped_is_called_one() {
+    fn dropped_manifests_are_reported_as_manifests() {
         let scratch = Scratch::new("keeper-dropped");
         let (mut keeper, _) = keep(scratch.0.clone(), Vec::new()).unwrap();
         while keeper.dropped == 0 {
@@ -216,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn each_trouble_is_told_once() {
+    fn each_problem_is_reported_once() {
         let scratch = Scratch::new("keeper-problems");
         let dir = scratch.0.join("run");
         fs::create_dir(&dir).unwrap();

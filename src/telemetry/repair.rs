@@ -218,7 +218,7 @@ mod tests {
 
     /// A bench may be killed after it made the folder and before it made the files.
     #[test]
-    fn a_missing_file_does_not_keep_a_record_open() {
+    fn a_record_with_a_missing_file_is_closed_with_a_fault() {
         let scratch = open_record("repair-early");
         fs::remove_file(scratch.0.join(file::STEPS)).unwrap();
         let repaired = repair(&scratch.0).unwrap();
@@ -270,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn an_edited_record_and_a_folder_without_record_are_left_alone() {
+    fn an_edited_record_and_a_folder_without_a_record_are_left_alone() {
         let scratch = open_record("repair-edited");
         let dir = &scratch.0;
         fs::write(dir.join(file::CONFIG), "name = \"y\"\n").unwrap();

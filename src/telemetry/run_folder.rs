@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn a_whole_run_is_itself() {
+    fn an_unchanged_run_is_verified() {
         let scratch = Scratch::new("run-folder-whole");
         run(&scratch.0);
         let folder = RunFolder::open(&scratch.0).unwrap();
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn every_change_is_named() {
+    fn every_change_of_a_closed_run_is_named() {
         let scratch = Scratch::new("run-folder-changed");
         let dir = &scratch.0;
         let said = || RunFolder::open(dir).unwrap().verify().unwrap_err().to_string();
@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn a_text_file_without_a_seal_is_not_vouched_for() {
+    fn a_text_file_without_a_seal_is_refused() {
         let scratch = Scratch::new("run-folder-unsealed");
         let dir = &scratch.0;
         run(dir);
@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_run_folder_is_told_why() {
+    fn a_path_that_is_not_a_run_folder_is_refused_with_the_reason() {
         let scratch = Scratch::new("run-folder-none");
         let said = |path: &Path| RunFolder::open(path).unwrap_err().to_string();
         assert!(said(&scratch.0).contains("not a run folder: manifest.json: No such file"));

@@ -14,7 +14,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// A folder of its own for a test, gone with it.
+/// A folder for one test, removed with it.
 pub(crate) struct Scratch(pub(crate) PathBuf);
 
 impl Scratch {
@@ -33,7 +33,7 @@ impl Drop for Scratch {
 
 pub(crate) const CONFIG_TOML: &str = "[insertion]\ndepth_mm = 150.0\n";
 
-/// What is known of a run before it starts.
+/// The manifest of a run before it starts.
 pub(crate) fn manifest() -> Manifest {
     Manifest {
         version: "0.1.0".to_owned(),
@@ -64,7 +64,7 @@ fn recorder(parent: &Path, backpressure: Backpressure) -> Recorder {
     Recorder::create(parent, manifest(), CONFIG_TOML.to_owned(), backpressure).unwrap()
 }
 
-/// An axis that may go from −1 to `max`.
+/// An axis with limits −1 and `max`.
 fn axis(node: u8, counts: u32, max: f64) -> AxisConfig {
     let limits = AxisLimits { min: -1.0, max, speed_max: 10.0, acceleration_max: None };
     AxisConfig::new(NodeId::new(node).unwrap(), CountsRatio::new(counts, 1).unwrap(), limits)
@@ -84,7 +84,7 @@ fn completed(manifest: &mut Manifest) {
     manifest.duration_s = Some(12.5);
 }
 
-/// Makes `run.rrd` of `entries` in `dir`, and gives its path.
+/// Makes `run.rrd` of `entries` in `dir`, and returns its path.
 fn recording_of(dir: &Path, entries: impl IntoIterator<Item = Entry>) -> PathBuf {
     let mut recording = Recording::create(dir, &manifest(), CONFIG_TOML, &scene()).unwrap();
     entries.into_iter().for_each(|entry| recording.take(entry).unwrap());
@@ -148,23 +148,22 @@ fn a_run_leaves_every_file() {
     assert!(!expected.is_empty());
     assert_eq!(log.lines().filter_map(EventLine::parse).collect::<Vec<_>>(), expected);
 
-    // Every file is sealed as it is.
+    // The seals cover every file and agree with it.
     let run = RunFolder::open(dir).unwrap();
     run.verify().unwrap();
     let sealed: BTreeSet<String> = run.manifest().files.keys().cloned().collect();
     assert_eq!(sealed.len() + 1, names.len(), "all but the manifest: {sealed:?}");
 }
 
-/// While a run is recorded nobody repairs its folder.
 #[test]
-fn a_folder_is_locked_while_it_is_filled() {
+fn a_run_folder_cannot_be_repaired_while_it_is_written() {
     let scratch = Scratch::new("locked");
     let recorder = recorder(&scratch.0, Backpressure::Block);
     let dir = recorder.run_dir().to_path_buf();
     let said = repair(&dir).unwrap_err().to_string();
     assert!(said.contains("a bench is still writing this record"), "{said}");
 
-    // What a kill leaves: all of it but the lock.
+    // A kill leaves all files and releases the lock.
     let left = scratch.0.join("left");
     fs::create_dir(&left).unwrap();
     for file in fs::read_dir(&dir).unwrap().flatten() {
@@ -185,9 +184,8 @@ fn a_run_that_cannot_begin_leaves_no_folder() {
     assert_eq!(fs::read_dir(&scratch.0).unwrap().count(), 0);
 }
 
-/// What goes wrong with the folder is news within a second; the manifest has it where it can.
 #[test]
-fn a_folder_that_is_removed_is_news() {
+fn a_removed_run_folder_is_reported_and_cannot_be_closed() {
     let scratch = Scratch::new("removed");
     let mut recorder = recorder(&scratch.0, Backpressure::DropAndCount);
     fs::remove_dir_all(recorder.run_dir()).unwrap();
@@ -204,20 +202,21 @@ fn a_folder_that_is_removed_is_news() {
     assert!(error.to_string().contains("virtual: No such file"), "{error}");
 }
 
-/// A writer that was given up may still write, and nobody may cut its files meanwhile.
+/// A writer that was given up may still write, so a repair must not cut its files.
 #[test]
 fn a_record_left_open_stays_locked_while_its_bench_lives() {
     let scratch = Scratch::new("left-locked");
     let recorder = recorder(&scratch.0, Backpressure::DropAndCount);
     let moved = scratch.0.join("moved");
     fs::rename(recorder.run_dir(), &moved).unwrap();
-    recorder.finish(completed).unwrap_err();
+    let error = recorder.finish(completed).unwrap_err();
+    assert!(error.to_string().contains("No such file"), "{error}");
     let said = repair(&moved).unwrap_err().to_string();
     assert!(said.contains("a bench is still writing this record"), "{said}");
 }
 
 #[test]
-fn a_run_that_never_ends_says_so() {
+fn the_manifest_of_a_run_that_was_not_closed_has_no_outcome() {
     let scratch = Scratch::new("abandoned");
     let recorder = recorder(&scratch.0, Backpressure::Block);
     let manifest = fs::read(recorder.run_dir().join("manifest.json")).unwrap();
@@ -236,9 +235,8 @@ fn two_runs_never_share_a_folder() {
     assert_eq!(fs::read(first.run_dir.join("steps.csv")).unwrap(), steps);
 }
 
-/// Numbers that are none break no file.
 #[test]
-fn hostile_numbers_break_no_file() {
+fn nan_and_infinity_break_no_file() {
     let scratch = Scratch::new("hostile");
     let mut entries = synthetic::run(3, 2);
     for entry in &mut entries {
@@ -252,6 +250,8 @@ fn hostile_numbers_break_no_file() {
     let columns = steps_csv_header().matches(',').count();
     assert!(steps.lines().all(|row| row.matches(',').count() == columns));
     let tracker = fs::read_to_string(finished.run_dir.join("tracker.ndjson")).unwrap();
+    assert_eq!(tracker.lines().count() as u64, finished.counts.tracker_samples);
+    assert!(!tracker.is_empty());
     for line in tracker.lines() {
         let sample: serde_json::Value = serde_json::from_str(line).unwrap();
         assert_eq!(sample["position_tracker_mm"][0], "inf");

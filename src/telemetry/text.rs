@@ -208,7 +208,7 @@ mod tests {
     use crate::archive::sha256_hex;
     use std::sync::{Arc, Mutex};
 
-    /// A disk of so many bytes, and what is on it.
+    /// A disk with room for `room` bytes.
     #[derive(Clone)]
     struct SmallDisk {
         content: Arc<Mutex<Vec<u8>>>,
@@ -245,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn a_disk_that_fills_keeps_whole_lines_and_the_seal_is_theirs() {
+    fn a_full_disk_keeps_whole_lines_and_the_seal_covers_what_is_left() {
         for (can_cut, left) in [(true, "first\nsecond\n"), (false, "first\nsecond\nthi")] {
             let disk = SmallDisk { can_cut, ..SmallDisk::new(16) };
             let mut file = TextFile::new(file::STEPS, "run/steps.csv".into(), disk.clone());

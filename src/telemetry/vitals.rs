@@ -169,7 +169,7 @@ impl Watch {
 mod tests {
     use super::*;
 
-    /// A thread that is watched every `every_ms`.
+    /// A thread, and a watcher that looks at it every `every_ms`.
     struct Watched {
         vitals: Vitals,
         watch: Watch,
@@ -188,9 +188,9 @@ mod tests {
             }
         }
 
-        /// What is reported in the next `ms`, and after how many of them.
-        fn hear(&mut self, ms: u64, dropped: u64) -> Vec<(u64, String)> {
-            let mut heard = Vec::new();
+        /// The reports of the next `ms`, each with its time in ms.
+        fn reports_of_next(&mut self, ms: u64, dropped: u64) -> Vec<(u64, String)> {
+            let mut reports = Vec::new();
             for n in 1..=ms / self.every_ms {
                 self.now += Duration::from_millis(self.every_ms);
                 while let Some(news) = self.watch.look(&self.vitals, dropped, self.now) {
@@ -198,78 +198,78 @@ mod tests {
                         RecordNews::Warning(text) => text,
                         RecordNews::Failed(error) => format!("failed: {error}"),
                     };
-                    heard.push((n * self.every_ms, text));
+                    reports.push((n * self.every_ms, text));
                 }
             }
-            heard
+            reports
         }
     }
 
     #[test]
-    fn silence_is_told_within_a_second_and_given_up_after_five() {
+    fn a_stall_is_reported_within_a_second_and_given_up_after_five() {
         let mut watched = Watched::new(5);
         watched.vitals.beat();
-        let heard = watched.hear(10_000, 0);
-        let silent = "text files: no sign of life for 0.7 s (given up after 5.0); is the disk \
+        let reports = watched.reports_of_next(10_000, 0);
+        let stalled = "text files: no sign of life for 0.7 s (given up after 5.0); is the disk \
                       stalled?";
-        assert_eq!(heard[0], (710, silent.to_owned()));
-        assert!(heard[1].1.starts_with("failed: text files: no sign of life for 5.0 s"));
-        assert_eq!((heard.len(), heard[1].0), (2, 5010));
+        assert_eq!(reports[0], (710, stalled.to_owned()));
+        assert!(reports[1].1.starts_with("failed: text files: no sign of life for 5.0 s"));
+        assert_eq!((reports.len(), reports[1].0), (2, 5010));
         watched.vitals.beat();
-        let heard = watched.hear(100, 0);
-        assert_eq!(heard, [(5, "text files: alive again after 10.0 s".to_owned())]);
+        let reports = watched.reports_of_next(100, 0);
+        assert_eq!(reports, [(5, "text files: alive again after 10.0 s".to_owned())]);
     }
 
     #[test]
     fn a_watcher_that_was_descheduled_raises_no_alarm() {
         let mut watched = Watched::new(3000);
         watched.vitals.beat();
-        assert_eq!(watched.hear(30_000, 0), []);
+        assert_eq!(watched.reports_of_next(30_000, 0), []);
     }
 
     #[test]
-    fn a_thread_that_beats_is_well() {
+    fn a_thread_that_beats_raises_no_alarm() {
         let mut watched = Watched::new(50);
         for _ in 0..100 {
             watched.vitals.beat();
-            assert_eq!(watched.hear(600, 0), []);
+            assert_eq!(watched.reports_of_next(600, 0), []);
         }
     }
 
     #[test]
-    fn a_fault_is_said_once() {
+    fn a_fault_is_reported_once() {
         let mut watched = Watched::new(5);
         watched.vitals.fail("no space left".to_owned());
         watched.vitals.fail("and again".to_owned());
         let said = "failed: text files: no space left; what follows is not recorded";
-        assert_eq!(watched.hear(1000, 0), [(5, said.to_owned())]);
+        assert_eq!(watched.reports_of_next(1000, 0), [(5, said.to_owned())]);
     }
 
     #[test]
-    fn what_the_record_lacks_is_a_failure_once() {
+    fn lost_records_are_a_failure_once_and_then_a_warning() {
         let mut watched = Watched::new(50);
         watched.vitals.beat();
-        let heard = watched.hear(100, 3);
+        let reports = watched.reports_of_next(100, 3);
         let said = "failed: text files: records lost: 3, its queue is full; is the disk too slow for \
                     this run?";
-        assert_eq!(heard, [(50, said.to_owned())]);
-        let mut heard = Vec::new();
+        assert_eq!(reports, [(50, said.to_owned())]);
+        let mut reports = Vec::new();
         for _ in 0..12 {
             watched.vitals.beat();
-            heard.extend(watched.hear(100, 4).into_iter().map(|(_, text)| text));
+            reports.extend(watched.reports_of_next(100, 4).into_iter().map(|(_, text)| text));
         }
-        assert_eq!(heard, ["text files: records lost: 1 more, 4 in all"]);
+        assert_eq!(reports, ["text files: records lost: 1 more, 4 in all"]);
     }
 
     #[test]
-    fn drops_are_told_once_a_second() {
+    fn lost_records_are_reported_once_a_second() {
         let mut watched = Watched::new(50);
-        let mut heard = Vec::new();
+        let mut reports = Vec::new();
         for dropped in 1..=20 {
             watched.vitals.beat();
-            heard.extend(watched.hear(100, dropped));
+            reports.extend(watched.reports_of_next(100, dropped));
         }
-        let said: Vec<&str> = heard.iter().map(|(_, text)| text.as_str()).collect();
+        let said: Vec<&str> = reports.iter().map(|(_, text)| text.as_str()).collect();
         assert_eq!(
             said,
             [
@@ -282,20 +282,20 @@ mod tests {
 
     /// The disk of a stalled writer may turn out to be broken.
     #[test]
-    fn a_fault_after_a_silence_is_said_too() {
+    fn a_fault_after_a_stall_is_reported_too() {
         let mut watched = Watched::new(5);
-        let given_up = watched.hear(6000, 0).pop().expect("given up").1;
+        let given_up = watched.reports_of_next(6000, 0).pop().expect("given up").1;
         assert!(
             given_up.starts_with("failed: text files: no sign of life for 5.0 s"),
             "{given_up}"
         );
         watched.vitals.fail("Input/output error".to_owned());
         let said = "failed: text files: Input/output error; what follows is not recorded";
-        assert_eq!(watched.hear(1000, 0), [(5, said.to_owned())]);
+        assert_eq!(watched.reports_of_next(1000, 0), [(5, said.to_owned())]);
     }
 
     #[test]
-    fn it_lasts_while_it_is_looked_at() {
+    fn a_silence_counts_only_the_time_that_the_watcher_ran() {
         let ms = Duration::from_millis;
         let begin = Instant::now();
         let mut silence = Silence::new(7, begin);

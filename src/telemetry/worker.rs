@@ -250,10 +250,10 @@ mod tests {
     use crate::units::Time;
     use std::sync::mpsc::{SyncSender, sync_channel};
 
-    /// A sink that takes an entry only when the test allows it, and signals that it has begun to.
+    /// A sink that signals when it begins to take an entry, and waits for the test's permission.
     struct Gated {
         begun: SyncSender<()>,
-        let_go: Receiver<()>,
+        permission: Receiver<()>,
         taken: u64,
         fail_at: u64,
     }
@@ -263,7 +263,7 @@ mod tests {
         const TICK: Duration = Duration::from_millis(50);
         fn take(&mut self, _: Entry) -> Result<(), String> {
             let _ = self.begun.send(());
-            let _ = self.let_go.recv();
+            let _ = self.permission.recv();
             self.taken += 1;
             if self.taken == self.fail_at { Err("no space left".to_owned()) } else { Ok(()) }
         }
@@ -280,9 +280,9 @@ mod tests {
         backpressure: Backpressure,
     ) -> (Worker<Entry>, Receiver<()>, SyncSender<()>) {
         let (begun_tx, begun) = sync_channel(100);
-        let (let_go, let_go_rx) = sync_channel(100);
-        let sink = Gated { begun: begun_tx, let_go: let_go_rx, taken: 0, fail_at };
-        (Worker::start("gated", 4, backpressure, || Ok(sink)).unwrap(), begun, let_go)
+        let (permit, permission) = sync_channel(100);
+        let sink = Gated { begun: begun_tx, permission, taken: 0, fail_at };
+        (Worker::start("gated", 4, backpressure, || Ok(sink)).unwrap(), begun, permit)
     }
 
     fn entry() -> Entry {
@@ -301,39 +301,39 @@ mod tests {
     }
 
     #[test]
-    fn a_wedged_writer_costs_entries_and_never_the_callers_time() {
-        let (mut worker, begun, let_go) = gated(u64::MAX, Backpressure::DropAndCount);
+    fn a_stalled_writer_drops_entries_and_never_blocks_the_caller() {
+        let (mut worker, begun, permit) = gated(u64::MAX, Backpressure::DropAndCount);
         worker.give(entry());
         begun.recv().unwrap();
-        // The writer holds one and its queue four: of ten more, six are lost. Were `give` to
-        // block, this test would not end.
+        // The writer holds one entry and its queue four, so six of ten more are lost. If `give` blocked, this test
+        // would not end.
         (0..10).for_each(|_| worker.give(entry()));
         assert_eq!(worker.dropped, 6);
-        drop(let_go);
+        drop(permit);
         assert_eq!(entries_left(worker), 5);
     }
 
     #[test]
-    fn a_waiting_caller_loses_nothing() {
-        let (mut worker, _begun, let_go) = gated(u64::MAX, Backpressure::Block);
-        let lets_go = thread::spawn(move || (0..50).for_each(|_| let_go.send(()).unwrap()));
+    fn a_writer_with_back_pressure_loses_nothing() {
+        let (mut worker, _begun, permit) = gated(u64::MAX, Backpressure::Block);
+        let permits = thread::spawn(move || (0..50).for_each(|_| permit.send(()).unwrap()));
         (0..50).for_each(|_| worker.give(entry()));
-        lets_go.join().unwrap();
+        permits.join().unwrap();
         assert_eq!(worker.dropped, 0);
         assert_eq!(entries_left(worker), 50);
     }
 
     #[test]
-    fn a_failed_writer_is_seen_and_stops_no_caller() {
+    fn a_failed_writer_is_reported_and_never_blocks_the_caller() {
         for backpressure in [Backpressure::Block, Backpressure::DropAndCount] {
-            let (mut worker, _begun, let_go) = gated(2, backpressure);
+            let (mut worker, _begun, permit) = gated(2, backpressure);
             assert_eq!(worker.vitals.fault(), None);
             (0..2).for_each(|_| worker.give(entry()));
-            drop(let_go);
+            drop(permit);
             let (left, fault) = worker.close(&Manifest::default(), HOUR).unwrap();
             let said = "gated: no space left; what follows is not recorded";
             assert_eq!(fault.unwrap().to_string(), said);
-            assert_eq!(left.entries, 2, "what it left is told all the same");
+            assert_eq!(left.entries, 2, "the result of a failed writer");
             assert_eq!(worker.vitals.fault(), Some("no space left"));
             (0..10).for_each(|_| worker.give(entry()));
             assert_eq!(worker.dropped, 10);
@@ -341,8 +341,8 @@ mod tests {
     }
 
     #[test]
-    fn a_wedged_writer_does_not_hold_up_the_end() {
-        let (mut worker, begun, _let_go) = gated(u64::MAX, Backpressure::DropAndCount);
+    fn closing_gives_up_a_stalled_writer_at_the_limit() {
+        let (mut worker, begun, _permit) = gated(u64::MAX, Backpressure::DropAndCount);
         worker.give(entry());
         begun.recv().unwrap();
         (0..4).for_each(|_| worker.give(entry()));
@@ -350,10 +350,10 @@ mod tests {
         assert!(given_up.to_string().starts_with("gated: no sign of life for 0."), "{given_up}");
     }
 
-    /// A sink whose tick is not due before the test is over.
-    struct Unhurried(SyncSender<&'static str>);
+    /// A sink whose tick is not due during the test.
+    struct SlowTick(SyncSender<&'static str>);
 
-    impl Sink for Unhurried {
+    impl Sink for SlowTick {
         type Item = Entry;
         const TICK: Duration = HOUR;
         fn take(&mut self, _: Entry) -> Result<(), String> {
@@ -367,15 +367,14 @@ mod tests {
         }
     }
 
-    /// An entry wakes the writer, and so does the end of a run that nobody closed.
     #[test]
-    fn a_sleeping_writer_is_woken() {
+    fn an_entry_and_the_drop_of_the_worker_wake_a_sleeping_writer() {
         let (said, heard) = sync_channel(10);
         let backpressure = Backpressure::DropAndCount;
         let mut worker =
-            Worker::start("unhurried", 4, backpressure, || Ok(Unhurried(said))).unwrap();
+            Worker::start("slow-tick", 4, backpressure, || Ok(SlowTick(said))).unwrap();
         for _ in 0..3 {
-            // The writer sleeps by then.
+            // Meanwhile the writer falls asleep.
             thread::sleep(Duration::from_millis(20));
             worker.give(entry());
             assert_eq!(heard.recv_timeout(Duration::from_secs(60)), Ok("taken"));
@@ -385,24 +384,24 @@ mod tests {
         assert_eq!(heard.recv_timeout(Duration::from_secs(60)), Ok("last tick"));
     }
 
-    /// A slow machine is not a stalled disk: the limit counts from the last sign of life.
+    /// The limit counts from the last beat, because a slow machine is not a stalled disk.
     #[test]
-    fn a_writer_that_shows_itself_is_waited_for() {
-        let (mut worker, begun, let_go) = gated(u64::MAX, Backpressure::DropAndCount);
+    fn closing_waits_for_a_writer_that_beats() {
+        let (mut worker, begun, permit) = gated(u64::MAX, Backpressure::DropAndCount);
         worker.give(entry());
         begun.recv().unwrap();
         let vitals = Arc::clone(&worker.vitals);
         let limit = Duration::from_secs(1);
-        let shows_itself = thread::spawn(move || {
+        let beats = thread::spawn(move || {
             let end = Instant::now() + 2 * limit;
             while Instant::now() < end {
                 vitals.beat();
                 thread::sleep(RETRY);
             }
-            drop(let_go);
+            drop(permit);
         });
         let (left, fault) = worker.close(&Manifest::default(), limit).unwrap();
-        shows_itself.join().unwrap();
+        beats.join().unwrap();
         assert!(fault.is_none(), "{fault:?}");
         assert_eq!(left.entries, 1);
     }

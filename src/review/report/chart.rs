@@ -257,7 +257,7 @@ mod tests {
         assert!(!chart(vec![Layer::level("limit", 1.0)]).has_curve());
     }
 
-    /// A pixel a unit.
+    /// An axis with one pixel per unit.
     const UNIT: Axis = Axis { range: (0.0, 1.0), ends: (0.0, 1.0) };
 
     #[test]

@@ -295,14 +295,14 @@ mod tests {
     use crate::session::Outcome;
 
     #[test]
-    fn an_angle_that_goes_round_is_no_line_across() {
+    fn a_curve_breaks_where_its_angle_wraps() {
         let xs = (0..4).map(|x| Some(f64::from(x))).collect();
         let pieces = pieces(&xs, &vec![Some(170.0), Some(-175.0), None, Some(-160.0)], 180.0);
         assert_eq!(pieces, [vec![(0.0, 170.0)], vec![(1.0, -175.0), (3.0, -160.0)]]);
     }
 
     #[test]
-    fn what_a_run_does_not_have_is_not_drawn() {
+    fn curves_without_data_are_not_drawn() {
         let limits = run().folder.limits().unwrap();
         let titles = |run: &Run| curves(run, &limits).iter().map(|c| c.title).collect::<Vec<_>>();
         let mut run = run();
@@ -326,7 +326,7 @@ mod tests {
     /// Samples are acquired at 0, 1 and 2 s and received 0.1 s later; the one in between is
     /// refused.
     #[test]
-    fn age_is_what_the_one_before_has_become() {
+    fn the_age_is_that_of_the_previous_accepted_position() {
         let mut run = run();
         let at = |ms: i64, refused: bool| TrackerTimes {
             receive_time_ns: (ms + 100) * 1_000_000,
@@ -351,7 +351,7 @@ mod tests {
         assert_eq!(chart.layers[2].pieces, [[(8.9, 1.4)]]);
     }
 
-    /// The run is stopped at 9 s at 3.5 mm depth; the last accepted position came at 2 s.
+    /// The run stops at 9 s in 3.5 mm; the last accepted position came at 2 s.
     #[test]
     fn the_hold_that_stopped_a_run_is_in_its_curves() {
         let mut run = run();
@@ -368,7 +368,7 @@ mod tests {
         assert_eq!(chart.layers[0].pieces, [[(2.0, 1.0), (9.0, 7.0), (10.0, 8.0)]]);
         let chart = blind_depth(&run, &Limits::new());
         let blind = &chart.layers[0].pieces;
-        assert_eq!(blind, &[[(9.0, 3.5), (10.0, 3.5)]], "seen at 0 mm, stopped at 3.5");
+        assert_eq!(blind, &[[(9.0, 3.5), (10.0, 3.5)]], "last position at 0 mm, stop at 3.5 mm");
         let chart = insertion(&run, &Limits::new());
         assert_eq!(chart.layers[1].pieces[0].last(), Some(&(9.0, 3.5)));
     }

@@ -108,7 +108,7 @@ mod tests {
     use std::borrow::Cow;
 
     #[test]
-    fn hostile_text_stays_text() {
+    fn hostile_text_is_escaped() {
         let mut run = run();
         let evil = "</style><script src=\"http://x\">alert('1')</script>\u{1b}";
         let manifest = &mut run.folder.manifest;

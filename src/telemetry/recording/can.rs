@@ -145,13 +145,13 @@ mod tests {
     }
 
     #[test]
-    fn a_drive_that_enters_another_state_is_noticed_once() {
+    fn a_change_of_a_drives_state_is_reported_once() {
         let mut selection = Selection::new(&scene().stage);
         let mut entered = |cob_id, data: &[u8]| selection.entered(&Frame::new(cob_id, data));
         let enabled = Some((Axis::Insertion, DriveState::OperationEnabled));
         assert_eq!(entered(0x181, &[0x37, 0x16, 0, 0, 0, 0]), enabled);
         assert_eq!(entered(0x181, &[0x37, 0x16, 9, 0, 0, 0]), None);
-        assert_eq!(entered(0x183, &[0x37, 0x16, 0, 0, 0, 0]), None, "no drive of the stage");
+        assert_eq!(entered(0x183, &[0x37, 0x16, 0, 0, 0, 0]), None, "not a drive of the stage");
         assert_eq!(entered(0x181, &[0x37]), None, "too short");
     }
 }

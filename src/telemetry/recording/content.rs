@@ -236,7 +236,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_depth_never_runs_back() {
+    fn the_depth_never_decreases() {
         let mut depth_um = 0;
         let depths_um = [1.0, 2.5, 2.499, f64::NAN, -3.0, 3.0].map(|insertion_mm| {
             depth_um = deepest_um(depth_um, insertion_mm);

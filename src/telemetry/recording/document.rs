@@ -53,7 +53,7 @@ mod tests {
     use serde_json::json;
 
     #[test]
-    fn figures_stand_in_rows() {
+    fn each_figure_of_a_manifest_has_a_row() {
         let mut manifest = Manifest::new("virtual", "2026-01-01T00:00:00Z".to_owned());
         manifest.note = Some("a | b".to_owned());
         let figures = json!({ "steps": 3, "final_error": { "x_mm": 0.123456, "y_mm": null } });

@@ -129,12 +129,12 @@ mod tests {
         drive(&mut now, 0.0, DriveState::OperationEnabled);
         let info = |now: &mut Now, text| now.explain(at(1.0), Lane::Session, Severity::Info, text);
         assert!(!info(&mut now, "at 10 mm"));
-        // The tracker says why, after the state of the run.
+        // The tracker gives the reason after the run has changed its state.
         enter(&mut now, 2.0, State::Holding);
         let warning =
             |now: &mut Now, s, text| now.explain(at(s), Lane::Tracker, Severity::Warning, text);
         assert!(warning(&mut now, 2.0, "no tip | held"));
-        assert!(!warning(&mut now, 2.1, "no tip | held"), "said already");
+        assert!(!warning(&mut now, 2.1, "no tip | held"), "shown already");
         assert_eq!(now.page().matches("| no tip \\| held |").count(), 2, "{}", now.page());
         enter(&mut now, 2.0, State::Coasting);
         assert!(now.page().contains("| tracker | **coasting** | 2.00 s | no tip \\| held |"));
@@ -143,7 +143,7 @@ mod tests {
         assert!(now.page().contains("| tracker | **tracking** | 3.00 s |  |"), "{}", now.page());
         enter(&mut now, 3.0, State::Inserting);
         assert!(now.page().contains("| session | **inserting** | 3.00 s |  |"), "{}", now.page());
-        // A fault is said before the state that it leads to.
+        // A fault comes before the state that it causes.
         let emcy = Emcy { code: EmcyCode::FOLLOWING_ERROR, register: 0x21, manufacturer: [0; 5] };
         assert!(now.emergency(at(4.0), Axis::Insertion, &emcy));
         assert!(now.explain(at(4.0), Lane::Session, Severity::Fault, "stage: insertion: fault"));

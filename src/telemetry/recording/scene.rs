@@ -201,19 +201,18 @@ mod tests {
     use crate::telemetry::tests;
 
     #[test]
-    fn the_plane_goes_where_the_needle_starts() {
+    fn the_plane_moves_to_a_needle_that_starts_outside_it() {
         let reach = Reach::of(&Scene { insertion_mm: 150.0, ..tests::scene() });
         let moved = |x: f64, y: f64, z: f64| reach.moved_to(&Vector3::new(x, y, z));
-        assert_eq!(moved(30.0, 5.0, -9.0), None, "it is seen as it is");
+        assert_eq!(moved(30.0, 5.0, -9.0), None, "the start is inside");
         let far = moved(0.0, -80.0, 400.0).expect("moved");
         assert_eq!(far.z_mm, [390.0, reach.z_mm[1] + 400.0]);
         assert_eq!(far.middle_mm()[0], -80.0);
         assert_eq!([moved(0.0, f64::NAN, 0.0), moved(0.0, 0.0, 1e300)], [None, None]);
     }
 
-    /// A short insertion has labelled depths too.
     #[test]
-    fn every_length_has_a_few_labels() {
+    fn every_insertion_depth_has_a_few_labels() {
         let tick_mm =
             |insertion_mm: f64| Reach::of(&Scene { insertion_mm, ..tests::scene() }).tick_mm();
         assert_eq!(

@@ -103,9 +103,9 @@ impl Meaning {
 mod tests {
     use super::*;
 
-    /// A run that completed ends in no colour of a fault, in any lane.
+    /// A run that completes ends without a fault's colour in any lane.
     #[test]
-    fn only_what_is_wrong_has_the_colour_of_a_fault() {
+    fn only_faults_have_the_colour_of_a_fault() {
         let colour = |state: State| Meaning::of(state).colour(0);
         assert_eq!(colour(State::Completed), GOOD);
         assert_eq!(colour(State::PowerOff), NEUTRAL);

@@ -8,7 +8,7 @@ use rerun::external::re_log_encoding::DecoderApp;
 use rerun::log::{Chunk, LogMsg};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// A series of the recording: moments on one of its time lines, and values.
+/// A series of the recording: places on one of its time lines, and values.
 type Series = Vec<(i64, f64)>;
 
 struct ReadBack {
@@ -18,7 +18,7 @@ struct ReadBack {
     layouts: usize,
 }
 
-/// Reads the recording `path`, tables by their place on `timeline`.
+/// Reads the recording `path` with its series over `timeline`.
 fn read_back(path: &Path, timeline: &'static str) -> ReadBack {
     let file = std::io::BufReader::new(fs::File::open(path).unwrap());
     let mut layouts = BTreeSet::new();
@@ -124,13 +124,13 @@ fn the_recording_holds_what_was_recorded() {
         .collect();
     assert_same(read.column("/steps", "x_high_mm"), &upper);
     assert_eq!(read.column("/shadows/finite-difference", "x_error_mm").len(), 30);
-    // Ten a second, and the limits once a second and at the end.
+    // Ten rows a second, and the limits once a second and at the end.
     assert_eq!(read.column("/motion", "insertion_lag_mm").len(), 149);
     let limits = read.column("/limits", "insertion_max_mm");
     assert!(limits.len() == 31 && limits.iter().all(|(_, limit)| *limit == 150.0), "{limits:?}");
 }
 
-/// A view of states with an axis of its own shows no more than what there was when it was opened.
+/// A view of states with its own axis does not grow after it was opened.
 #[test]
 fn plots_and_states_share_one_time_axis() {
     let scratch = Scratch::new("axis");
@@ -166,7 +166,7 @@ fn plots_and_states_share_one_time_axis() {
 }
 
 #[test]
-fn a_recording_that_is_not_finished_leaves_what_stood_in_its_place() {
+fn an_unfinished_recording_leaves_the_earlier_one() {
     let scratch = Scratch::new("unfinished");
     let path = recording_of(&scratch.0, synthetic::run(1, 1));
     let whole = fs::read(&path).unwrap();
@@ -174,14 +174,13 @@ fn a_recording_that_is_not_finished_leaves_what_stood_in_its_place() {
     synthetic::run(3, 5).into_iter().for_each(|entry| unfinished.take(entry).unwrap());
     drop(unfinished);
     assert_eq!(fs::read(&path).unwrap(), whole);
-    assert_eq!(fs::read_dir(&scratch.0).unwrap().count(), 1, "something was left over");
+    assert_eq!(fs::read_dir(&scratch.0).unwrap().count(), 1, "a temporary file was left");
     let error = Recording::create(&path, &manifest(), CONFIG_TOML, &scene()).err().unwrap();
     assert!(error.to_string().contains("run.rrd: Not a directory"), "{error}");
 }
 
-/// A file that cannot grow any more.
 #[test]
-fn a_full_disk_is_an_error_at_the_end() {
+fn a_full_disk_fails_the_recording_and_leaves_no_file() {
     let scratch = Scratch::new("rrd-full");
     std::os::unix::fs::symlink("/dev/full", scratch.0.join("run.rrd.new")).unwrap();
     let recording = Recording::create(&scratch.0, &manifest(), CONFIG_TOML, &scene());
@@ -191,7 +190,7 @@ fn a_full_disk_is_an_error_at_the_end() {
 }
 
 #[test]
-fn every_row_stands_on_all_three_time_lines() {
+fn every_row_is_on_all_three_time_lines() {
     let scratch = Scratch::new("time-lines");
     let path = recording_of(&scratch.0, synthetic::run(10, 5));
     let by = |timeline| read_back(&path, timeline);
@@ -213,7 +212,7 @@ fn every_row_stands_on_all_three_time_lines() {
 fn cyclic_frames_are_thinned_out_and_others_are_not() {
     let scratch = Scratch::new("cyclic");
     let path = recording_of(&scratch.0, synthetic::run(10, 50));
-    // The bring-up's 24 frames, and one of each of the five identifiers a step.
+    // The 24 frames of the bring-up, and one frame of each of the five identifiers per step.
     assert_eq!(read_back(&path, "step").rows["/can"], 24 + 10 * 5);
 }
 

@@ -1,4 +1,4 @@
-//! A run made up from the needle's kinematics, with everything a real one records.
+//! A synthetic run by the needle's kinematics, with every kind of record of a real one.
 
 use crate::canopen::Frame;
 use crate::emulator::Truth;
@@ -16,7 +16,7 @@ use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
 const CURVATURE_PER_MM: f64 = 1.0 / 122.0;
 
-/// `steps` mm at 1 mm/s, each of `syncs` SYNC cycles; 20 tracker samples a step at most.
+/// A run of `steps` mm at 1 mm/s, each step with `syncs` SYNC cycles and at most 20 tracker samples.
 pub(in crate::telemetry) fn run(steps: u32, syncs: u32) -> Vec<Entry> {
     let needle = Needle::new(CURVATURE_PER_MM).unwrap();
     let mut run = Run {
@@ -46,7 +46,7 @@ pub(in crate::telemetry) fn run(steps: u32, syncs: u32) -> Vec<Entry> {
     run.entries
 }
 
-/// Puts `value` in place of numbers of `entry`.
+/// Replaces numbers in `entry` by `value`.
 pub(super) fn spoil(entry: &mut Entry, value: f64) {
     match &mut entry.record {
         Record::Stage(stage) => {
@@ -88,7 +88,7 @@ struct Run {
 }
 
 impl Run {
-    /// Uniform in −1 to 1 (MMIX's linear congruence).
+    /// Uniform noise from −1 to 1 (MMIX's linear congruential generator).
     fn noise(&mut self) -> f64 {
         self.noise = self
             .noise
@@ -97,7 +97,7 @@ impl Run {
         (self.noise >> 11) as f64 / (1u64 << 52) as f64 - 1.0
     }
 
-    /// Into the plane: pitch by the distance, roll by the pitch, rotation by the roll.
+    /// Steers into the plane: the distance gives the pitch, the pitch the roll, and the roll the rotation rate.
     fn rotation_rate(&self) -> f64 {
         let FixedAngles { pitch, roll, .. } = FixedAngles::from_rotation(&self.tip.rotation);
         let pitch_wanted = -(0.02 * self.tip.translation.x).clamp(-0.15, 0.15);
@@ -192,7 +192,7 @@ impl Run {
         self.tip.translation + Vector3::new(self.noise(), self.noise(), self.noise())
     }
 
-    /// The estimate is wrong by a screw that fades with depth.
+    /// The error of the estimate is a screw that decays with depth.
     fn step(&mut self, step: u32, time: Time, rate: f64) {
         let fade = (-f64::from(step) / 25.0).exp();
         let screw = Twist {
