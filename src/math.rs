@@ -16,7 +16,7 @@ mod tests {
     /// Do not edit: recorded runs replay to these bits. At these arguments other libraries differ in
     /// the last bit.
     #[test]
-    fn the_bits_are_frozen() {
+    fn functions_return_the_recorded_bits() {
         let x = [1e-3, 0.1, 0.7, 0.9999, 2.0, 3.7, 41.3, 1e5];
         let one = |f: fn(f64) -> f64| x.map(|x| f(x).to_bits());
         let digest =
@@ -43,7 +43,7 @@ mod tests {
 
     /// nalgebra uses the same functions for its rotations.
     #[test]
-    fn nalgebra_uses_the_same() {
+    fn nalgebra_returns_the_same_bits() {
         for x in (1..1000).map(|n| 0.01 * f64::from(n)) {
             assert_eq!(ComplexField::sin(x).to_bits(), sin(x).to_bits());
             assert_eq!(ComplexField::cos(x).to_bits(), cos(x).to_bits());

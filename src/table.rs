@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn refuses_by_line_and_column() {
+    fn errors_name_the_line_and_the_column() {
         let message = |csv: &str| Table::parse(csv).numbers(["a", "b"]).unwrap_err().to_string();
         assert_eq!(message(""), "line 1: no column \"a\"; there are ");
         assert_eq!(message("x,a\n"), "line 1: no column \"b\"; there are x, a");
@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn a_message_stays_short() {
+    fn messages_about_long_cells_stay_short() {
         let long = "x".repeat(10_000);
         for csv in [format!("{long}\n"), format!("a\n{long}\n"), format!("a\n\"{long}\n1\n")] {
             let message = Table::parse(&csv).numbers(["a"]).unwrap_err().to_string();
@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn orientations_are_all_there_or_none() {
+    fn an_orientation_needs_four_columns_and_a_norm() {
         let rotations = |csv: &str| Table::parse(csv).rotations().map_err(|e| e.to_string());
         assert_eq!(rotations("a\n1\n"), Ok(vec![None]));
         assert_eq!(rotations("qw,qx,qy,qz\n2,0,0,0\n"), Ok(vec![Some(Rotation3::identity())]));

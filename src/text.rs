@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_terminal_acts_upon_is_shown_as_an_escape() {
+    fn control_characters_are_escaped() {
         assert_eq!(
             escaped("a\nb\r\t\u{1b}[2J\u{7f}\u{9b}1m\u{202e}x\u{2066}y\u{2028}é\u{1F600}\\"),
             "a\\nb\\r\\t\\u{1b}[2J\\u{7f}\\u{9b}1m\\u{202e}x\\u{2066}y\\u{2028}é\u{1F600}\\"
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn long_lines_are_broken_where_they_pause() {
+    fn long_lines_are_wrapped_at_a_semicolon_or_a_space() {
         let short = "a short line\nanother";
         assert!(matches!(wrapped(short), Cow::Borrowed(_)));
         let (half, rest) = ("é".repeat(110), "word ".repeat(50));
@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_have_their_decimals() {
+    fn numbers_are_rounded_and_a_missing_one_is_a_dash() {
         assert_eq!(fixed(Some(0.15), 1), "0.1");
         assert_eq!(
             (fixed(Some(f64::INFINITY), 1), fixed(None, 1)),
@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn a_statement_leaves_no_line() {
+    fn a_template_statement_leaves_no_empty_line() {
         let template = "a\n{% for n in [1, none] %}\n{{ n|fixed(2) }} {{ unit }}\n{% endfor %}\n";
         let object = std::collections::BTreeMap::from([("unit", "mm")]);
         assert_eq!(screen(template, &object, context! {}).unwrap(), "a\n1.00 mm\n- mm");

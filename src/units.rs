@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn time_saturates_and_never_goes_below_zero_elapsed() {
+    fn time_saturates_at_never_and_elapsed_time_at_zero() {
         assert_eq!(Time::NEVER + Duration::from_secs(1), Time::NEVER);
         assert_eq!(Time::ZERO.since(Time::from_secs_f64(1.0)), Duration::ZERO);
         assert_eq!(Time::from_secs_f64(1.5).since(Time::ZERO), Duration::from_millis(1500));

@@ -194,7 +194,7 @@ HighLimit=10
     }
 
     #[test]
-    fn a_sheet_is_written_as_it_was_read() {
+    fn an_eds_is_written_as_it_was_read() {
         assert_eq!(Eds::parse(SHEET).to_string(), SHEET);
     }
 
@@ -210,7 +210,7 @@ HighLimit=10
     }
 
     #[test]
-    fn values_change_and_objects_go() {
+    fn a_value_can_be_set_and_an_object_removed() {
         let mut eds = Eds::parse(SHEET);
         eds.set("607Dsub1", "DefaultValue", 7);
         eds.set("607Dsub1", "NoSuchKey", 7);

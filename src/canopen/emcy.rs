@@ -121,7 +121,7 @@ mod tests {
     const NODE: NodeId = NodeId::new(5).unwrap();
 
     #[test]
-    fn a_following_error_has_these_bytes() {
+    fn the_emergency_of_a_following_error_has_the_bytes_of_cia_301() {
         let emcy =
             Emcy { code: EmcyCode::FOLLOWING_ERROR, register: 0x21, manufacturer: [1, 2, 3, 4, 5] };
         let frame = emcy.to_frame(NODE);
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn codes_are_named_or_else_their_class_is() {
+    fn an_emergency_code_prints_its_name_or_that_of_its_class() {
         assert_eq!(EmcyCode(0x8611).to_string(), "0x8611 following error");
         assert_eq!(EmcyCode(0x8130).to_string(), "0x8130 heartbeat or life guard lost");
         assert_eq!(EmcyCode(0x4215).to_string(), "0x4215 device temperature");
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn sync_and_short_frames_are_no_emergencies() {
+    fn sync_short_and_other_frames_are_no_emergencies() {
         assert_eq!(parse_emcy(&Frame::new(0x080, &[0; 8])), None);
         assert_eq!(parse_emcy(&Frame::new(0x085, &[0; 7])), None);
         assert_eq!(parse_emcy(&Frame::new(0x185, &[0; 8])), None);

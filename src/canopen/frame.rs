@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn refuses_what_does_not_fit() {
+    fn an_identifier_payload_or_node_out_of_range_is_refused() {
         assert!(Frame::from_parts(CanId::Base(0x800), false, &[]).is_none());
         assert!(Frame::from_parts(CanId::Base(1), false, &[0; 9]).is_none());
         assert!(

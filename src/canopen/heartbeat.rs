@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_that_never_speaks_is_missed_when_expected() {
+    fn a_node_that_sends_no_heartbeat_by_the_expected_time_is_lost() {
         let mut consumer = HeartbeatConsumer::new(NODE, TIMEOUT);
         consumer.expect_by(at(500));
         assert_eq!(consumer.handle_timeout(at(499)), None);
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn other_nodes_do_not_keep_it_alive() {
+    fn a_heartbeat_of_another_node_does_not_prolong_the_timeout() {
         let mut consumer = HeartbeatConsumer::new(NODE, TIMEOUT);
         consumer.handle_frame(at(0), &beat(NmtState::Operational));
         consumer.handle_frame(at(90), &Frame::new(0x706, &[5]));
@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn the_producer_keeps_its_beat_and_skips_what_it_missed() {
+    fn the_producer_keeps_its_period_and_skips_missed_heartbeats() {
         let mut producer = HeartbeatProducer::new(NODE, TIMEOUT, at(0));
         assert_eq!(
             producer.handle_timeout(at(3), NmtState::Operational),

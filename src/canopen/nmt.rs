@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn heartbeats_tell_the_state() {
+    fn a_heartbeat_carries_the_nmt_state() {
         assert_eq!(heartbeat_frame(NODE, NmtState::BootUp).to_string(), "705#00");
         assert_eq!(heartbeat_frame(NODE, NmtState::PreOperational).to_string(), "705#7F");
         let operational = Frame::new(0x705, &[0x05]);

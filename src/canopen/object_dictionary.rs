@@ -285,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reset_restores_the_range_it_names() {
+    fn a_reset_restores_the_defaults_of_its_index_range() {
         let mut dictionary = dictionary();
         dictionary.set(RW, 7);
         dictionary.set(LIMITED, 300);

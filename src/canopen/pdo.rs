@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn mappings_over_a_frame_are_refused() {
+    fn mappings_longer_than_a_frame_and_empty_objects_are_refused() {
         let object = MappedObject::new(0x607a, 0, 32);
         assert_eq!(PdoMapping::new([object; 3]), None);
         let empty = MappedObject::new(0x607a, 0, 0);
@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn identifier_entries_have_their_three_flags() {
+    fn a_pdo_cob_id_entry_has_its_three_flags() {
         let entry = PdoCobId::enabled(0x185);
         assert_eq!(entry.0, 0x4000_0185);
         assert!(entry.is_valid() && entry.0 & 1 << 30 != 0);

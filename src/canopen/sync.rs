@@ -52,7 +52,7 @@ mod tests {
     }
 
     #[test]
-    fn sync_is_empty_or_one_counter() {
+    fn a_sync_frame_is_empty_or_holds_a_counter() {
         assert_eq!(sync_frame().to_string(), "080#");
         assert!(is_sync(&sync_frame(), 0x80));
         assert!(is_sync(&Frame::new(0x80, &[7]), 0x80), "with a counter");
@@ -61,7 +61,7 @@ mod tests {
     }
 
     #[test]
-    fn beats_are_absolute_and_missed_ones_are_skipped() {
+    fn sync_times_are_absolute_and_missed_ones_are_skipped() {
         let mut sync = SyncProducer::new(Duration::from_millis(10), at(0));
         assert_eq!((sync.handle_timeout(at(4)), sync.deadline), (Some(0), at(10)));
         assert_eq!(sync.handle_timeout(at(9)), None);

@@ -119,7 +119,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_no_bus_can_have_is_no_name() {
+    fn a_name_that_no_bus_can_have_is_refused() {
         for name in ["vcan0:1", "memory:1", ".", "..", "udp:127.0.0.1:43113", "udp:239.1.2.3:0"] {
             assert_eq!(CanInterface::named(name), None, "{name}");
         }

@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_calibrated_and_nothing_else_changes_it() {
+    fn only_calibrated_values_change_the_calibration_text() {
         let usual = calibration("name=\"usual\"");
         assert_eq!(usual, calibration("emulator.seed=9"));
         for set in [

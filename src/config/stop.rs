@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn a_configuration_that_a_run_takes_is_taken() {
+    fn a_stop_reads_a_valid_configuration() {
         let rig = read(RIG, &["can.sdo_timeout_ms=300", "stage.stop_timeout_s=4"]).unwrap();
         assert_eq!(rig.interface, CanInterface::Socket("can0".to_owned()));
         assert_eq!(nodes(&rig), [1, 2]);
@@ -158,7 +158,7 @@ mod tests {
 
     /// Each of these a run refuses.
     #[test]
-    fn an_error_elsewhere_does_not_keep_a_stop_from_being_sent() {
+    fn an_error_elsewhere_does_not_prevent_a_stop() {
         let elsewhere = [
             "insertion.dpeth_mm=3",
             "insertion.depth_mm=-3",
@@ -193,7 +193,7 @@ mod tests {
 
     /// A stage that cannot work so is stopped; it is given the time that its counts need to stand.
     #[test]
-    fn a_scale_or_a_time_that_a_run_refuses_does_not_keep_a_stop_from_being_sent() {
+    fn a_scale_or_a_time_that_a_run_refuses_does_not_prevent_a_stop() {
         let stop_timeout = |set| read(RIG, &[set]).unwrap().stage.power.stop_timeout;
         assert_eq!(stop_timeout("stage.stop_timeout_s=0.5"), Duration::from_millis(500));
         let coarse = "stage.insertion.counts_per_mm={ counts = 20, mm = 1 }";
@@ -209,7 +209,7 @@ mod tests {
 
     /// As it may be saved half-way through an edit, while a needle moves.
     #[test]
-    fn a_file_that_is_not_toml_elsewhere_has_its_bus_and_nodes() {
+    fn bus_and_nodes_are_read_from_a_file_with_broken_toml_elsewhere() {
         let appended =
             ["\n[tracker.gates]\nnoise_sd_mm = 0.6,\n", "\n[insertion]\n", "\nx = = 1\n"]
                 .map(|broken| format!("{RIG}{broken}"));
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn no_file_is_needed() {
+    fn a_stop_needs_no_file_if_bus_and_nodes_are_set() {
         let sets = ["can.interface=can1", "stage.insertion.node=5", "stage.rotation.node=6"];
         let stop = read("", &sets).unwrap();
         assert_eq!((stop.interface.to_string().as_str(), nodes(&stop)), ("can1", [5, 6]));
@@ -261,7 +261,7 @@ mod tests {
 
     /// Only an emulated stage has the nodes of the virtual one.
     #[test]
-    fn interface_and_nodes_must_be_known() {
+    fn a_stop_without_interface_or_nodes_is_refused() {
         assert_eq!(
             read("", &[]).unwrap_err(),
             "can.interface is not given, and a stop needs it\n\

@@ -124,7 +124,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn noise_has_the_spread_it_is_told() {
+    fn white_noise_has_its_configured_spread() {
         for (noise, variance) in
             [(WhiteNoise::Uniform(1.0), 1.0 / 3.0), (WhiteNoise::Gaussian(0.5), 0.25)]
         {
@@ -141,7 +141,7 @@ mod tests {
 
     /// Neighbours in number and in seed have nothing to do with one another.
     #[test]
-    fn noise_is_white() {
+    fn white_noise_is_uncorrelated_between_numbers_and_between_seeds() {
         let noise = WhiteNoise::Gaussian(1.0);
         let correlation = |next: fn(u64) -> (u64, u64)| {
             let products = (0..20_000).map(|k| {
@@ -165,7 +165,7 @@ mod tests {
     /// The spread and its decay are as told, and neighbours in seed have nothing to do with one
     /// another.
     #[test]
-    fn correlated_noise_decays_as_told() {
+    fn correlated_noise_decays_as_configured() {
         let noise = CorrelatedNoise { sd_mm: 0.5, time_s: 0.2 };
         for lag in [0, 1, 3, 8, 20, 60] {
             let expected = 0.25 * (-INTERVAL_S * lag as f64 / 0.2).exp();
@@ -197,7 +197,7 @@ mod tests {
 
     /// A mean of many positions has the variance that is stated.
     #[test]
-    fn a_long_mean_has_the_variance_stated() {
+    fn a_long_mean_has_the_stated_variance() {
         let noise = CorrelatedNoise { sd_mm: 0.5, time_s: 0.2 };
         let (means, of) = (400u64, 400u64);
         let mean = |block: u64| {

@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn a_needle_pulled_back_and_pushed_again_cuts_on_from_its_deepest() {
+    fn a_needle_pulled_back_and_pushed_again_cuts_on_from_its_deepest_point() {
         let mut tissue = tissue();
         tissue.advance(10.0, 0.0);
         let deepest = *tissue.tip_true();
@@ -173,7 +173,7 @@ mod tests {
     /// One move across the old depth slides to it and cuts from there; of a turn on the way, the
     /// part in the channel comes first.
     #[test]
-    fn one_move_from_the_channel_into_new_tissue_cuts_from_the_deepest() {
+    fn one_move_from_the_channel_into_new_tissue_cuts_from_the_deepest_point() {
         let needle = Needle::new(1.0 / 122.0).unwrap();
         for turn_rad in [0.0, 0.7] {
             let mut tissue = tissue();
@@ -266,7 +266,7 @@ mod tests {
 
     /// Cutting or in the channel, the base turns through the band before the tip follows.
     #[test]
-    fn the_tip_turns_by_what_the_shaft_passes_on() {
+    fn the_tip_turns_once_the_base_has_crossed_the_torsion_band() {
         let needle = Needle::new(1.0 / 122.0).unwrap();
         let step = |from: &Pose, l, turned| needle.step(from, Increment::new(l, turned).unwrap());
         let mut tissue = twisting(0.5);

@@ -195,7 +195,7 @@ mod tests {
 
     /// The tracker's k-th position carries the k-th noise, whoever asked for others before.
     #[test]
-    fn a_position_has_the_noise_of_its_number() {
+    fn the_kth_position_has_the_kth_noise() {
         for noise in [WhiteNoise::Uniform(1.0), WhiteNoise::Gaussian(0.5)] {
             let mut tracker = tracker(noise, 0, 0);
             for k in 0..50 {
@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn the_target_moves_with_the_needle() {
+    fn the_target_drifts_with_the_depth() {
         let target = TargetModel {
             start_mm: Vector3::new(0.0, 5.0, 100.0),
             drift_mm_per_mm: Vector3::new(0.0, 0.03, 0.0),

@@ -357,7 +357,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fault_lasts_its_own_time_whatever_other_begins_and_ends() {
+    fn overlapping_faults_each_last_their_own_time() {
         let mut stage = stage(&[
             r#"{ kind = "no-voltage", at_s = 0.1, duration_s = 0.3, axis = "insertion" }"#,
             r#"{ kind = "no-voltage", at_s = 0.2, duration_s = 0.1 }"#,
@@ -383,7 +383,7 @@ mod tests {
     }
 
     #[test]
-    fn held_frames_leave_at_the_end_or_are_lost_with_the_interface() {
+    fn held_frames_are_sent_at_the_end_or_lost_with_the_interface() {
         for (down, answers) in [("", 1), (r#"{ kind = "bus-down", at_s = 0.15 }"#, 0)] {
             let stuck = r#"{ kind = "bus-stuck", at_s = 0.1, duration_s = 0.1 }"#;
             let mut stage = stage(&[stuck, down]);

@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn values_are_taken_in_mm_rad_and_s() {
+    fn values_are_converted_to_mm_rad_and_s() {
         let text = "angles_deg = [180.0, 90.0]\npause_ms = 20\ncounts_per_mm_or_turn = 3\n";
         let take = |text: &str| Sample::take(Some(&Value::Table(text.parse().unwrap())));
         let expected = Sample {

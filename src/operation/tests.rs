@@ -226,7 +226,7 @@ fn withdrawing_never_pushes() {
 
 /// At 2 mm/s and 21.5 mm/s²: under 0.15 mm from the stop to standstill, a SYNC included.
 #[test]
-fn what_stops_a_run_stops_an_operation() {
+fn an_operator_a_bus_fault_and_a_drive_fault_stop_an_operation() {
     let inputs = [
         (Input::Stop("operator: interrupted".to_owned()), "operator: interrupted"),
         (Input::BusFault("can0: bus off".to_owned()), "can: can0: bus off"),
@@ -247,7 +247,7 @@ fn what_stops_a_run_stops_an_operation() {
 }
 
 #[test]
-fn an_axis_that_does_not_come_to_its_goal_is_named() {
+fn an_axis_that_does_not_reach_its_goal_is_an_error() {
     let feedback = |time_s: f64| crate::stage::Feedback {
         time: Time::from_secs_f64(time_s),
         sync: 1,
@@ -306,7 +306,7 @@ fn homing_finds_the_switch_and_ends_without_power() {
 }
 
 #[test]
-fn an_axis_that_needs_homing_is_not_moved_without() {
+fn an_axis_that_needs_homing_is_not_moved_before_it() {
     let config = config(&["stage.insertion.reference=homing"]);
     let mut bench = Bench::new(&config, Operation::Move(by(Axis::Insertion, 2.0)));
     let reason = bench.reason();
@@ -316,7 +316,7 @@ fn an_axis_that_needs_homing_is_not_moved_without() {
 }
 
 #[test]
-fn a_bench_that_falls_silent_is_missed_by_both_drives() {
+fn prove_completes_when_both_drives_miss_the_silent_bench() {
     let mut bench = Bench::new(&config(&[]), Operation::Prove);
     assert_eq!(bench.run(), Outcome::Completed);
     assert_eq!(bench.travel(), (0.0, 0.0));
@@ -324,7 +324,7 @@ fn a_bench_that_falls_silent_is_missed_by_both_drives() {
 
 /// A drive may have missed an earlier bench, and have said so twice before it was brought up.
 #[test]
-fn a_drive_that_repeats_an_earlier_message_is_heard_to_miss_the_bench() {
+fn prove_completes_after_a_drive_has_repeated_an_earlier_emergency() {
     let mut bench = Bench::new(&config(&[]), Operation::Prove);
     let missed = Frame::new(0x82, &[0x30, 0x81, 0x11, 127, 0, 0, 0, 0]);
     for _ in 0..2 {
@@ -335,7 +335,7 @@ fn a_drive_that_repeats_an_earlier_message_is_heard_to_miss_the_bench() {
 
 /// By 6007 = 0 its emergency message is all that it does.
 #[test]
-fn a_drive_that_misses_the_bench_and_goes_on_is_named() {
+fn prove_fails_on_a_drive_that_misses_the_bench_and_goes_on() {
     let config = config(&["stage.rotation.abort_connection_option=0"]);
     let mut bench = Bench::new(&config, Operation::Prove);
     let reason = bench.reason();
@@ -347,7 +347,7 @@ fn a_drive_that_misses_the_bench_and_goes_on_is_named() {
 
 /// Home is inside the limits by what the bench was told, and outside by what the drive makes of it.
 #[test]
-fn an_axis_that_is_home_out_of_its_limits_is_said_so() {
+fn a_home_outside_the_axis_limits_is_an_error() {
     let mut drives = config(&["stage.insertion.homing.method=37"]);
     let mut bench = Bench::new(&drives, Operation::Prove);
     // 607C as the drive may have been left by the maker's own tool.
@@ -371,7 +371,7 @@ fn an_axis_that_is_home_out_of_its_limits_is_said_so() {
 
 /// Its heartbeat consumer is switched off behind the bench's back.
 #[test]
-fn a_drive_that_does_not_miss_the_bench_is_named() {
+fn prove_fails_on_a_drive_that_does_not_miss_the_bench() {
     let mut bench = Bench::new(&config(&[]), Operation::Prove);
     while bench.stage.drives()[1].state() != DriveState::OperationEnabled {
         bench.step();
@@ -401,7 +401,7 @@ fn off_axis(turned_rad: f64) -> Vector3<f64> {
 }
 
 #[test]
-fn a_sensor_off_the_axis_proves_the_hand() {
+fn a_sensor_off_the_axis_proves_the_handedness() {
     let mut bench = answer(Some(off_axis));
     assert_eq!(bench.run(), Outcome::Completed);
     let (insertion_mm, rotation_rad) = bench.travel();
@@ -409,7 +409,7 @@ fn a_sensor_off_the_axis_proves_the_hand() {
 }
 
 #[test]
-fn a_sensor_that_answers_wrongly_is_named() {
+fn a_sensor_that_moves_wrongly_fails_the_check_with_a_cause() {
     let mirrored = |turned_rad| off_axis(turned_rad).component_mul(&Vector3::new(-1.0, 1.0, 1.0));
     let turned = |turned_rad| {
         let p = off_axis(turned_rad);
@@ -431,7 +431,7 @@ fn a_sensor_that_answers_wrongly_is_named() {
 }
 
 #[test]
-fn a_refusal_at_one_rest_does_not_explain_the_silence_at_the_next() {
+fn a_refusal_at_one_standstill_does_not_explain_silence_at_the_next() {
     let mut bench = answer(Some(|_| Vector3::repeat(f64::NAN)));
     while bench.operation.progress().state != State::TurningInAir {
         bench.step();
@@ -450,7 +450,7 @@ fn a_refusal_at_one_rest_does_not_explain_the_silence_at_the_next() {
 }
 
 #[test]
-fn a_sensor_that_is_not_seen_proves_nothing() {
+fn a_sensor_that_is_not_seen_fails_the_check_before_any_motion() {
     let mut bench = answer(None);
     assert_eq!(
         bench.reason(),
@@ -461,7 +461,7 @@ fn a_sensor_that_is_not_seen_proves_nothing() {
 
 /// A drive that noticed, stands, and keeps its power is no success; nor is one that nobody has seen.
 #[test]
-fn a_proof_whose_drive_keeps_its_power_is_not_completed() {
+fn prove_fails_on_a_drive_that_keeps_its_power() {
     let mut bench = Bench::new(&config(&[]), Operation::Prove);
     assert_eq!(bench.run(), Outcome::Completed, "power off is seen, though no TPDO comes");
     let mut bench = Bench::new(&config(&[]), Operation::Prove);

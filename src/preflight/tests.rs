@@ -53,7 +53,7 @@ fn verdicts(checks: &[Check]) -> String {
 }
 
 #[test]
-fn a_bus_that_would_restart_by_itself_is_refused() {
+fn a_bus_that_restarts_by_itself_or_is_down_fails() {
     let config = rig(&[]);
     assert_eq!(verdicts(&bus(&config, Ok(Some(facts())))), "PPPP");
     let restarting = BusFacts { restart_ms: Some(100), ..facts() };
@@ -81,7 +81,7 @@ fn a_bus_that_would_restart_by_itself_is_refused() {
 }
 
 #[test]
-fn a_drive_is_refused_for_what_a_run_would_stumble_over() {
+fn a_drive_that_a_run_would_refuse_fails() {
     let config = rig(&["stage.insertion.product_code=7"]);
     let of = |status: AxisStatus| verdicts(&drive(&config, Axis::Insertion, Ok(status)));
     assert_eq!(of(status()), "PPPP");
@@ -136,7 +136,7 @@ fn listened(config: &Config, late_s: f64, at: impl Fn(u32) -> Vector3<f64>) -> T
 }
 
 #[test]
-fn a_tracker_is_judged_by_what_comes() {
+fn a_tracker_is_judged_by_its_positions_noise_and_stamps() {
     let config = rig(&[REGISTRATION]);
     let jitter = |sd: f64| {
         move |k: u32| {
@@ -170,7 +170,7 @@ fn a_tracker_is_judged_by_what_comes() {
 
 /// A run would refuse every position outside, and not say where it was.
 #[test]
-fn the_measured_tip_is_compared_with_the_workspace() {
+fn a_tip_outside_the_workspace_fails() {
     const BOX: &str =
         "tracker.workspace={ min_mm = [-30.0, -30.0, -10.0], max_mm = [30.0, 30.0, 80.0] }";
     let config = rig(&[REGISTRATION, BOX]);
@@ -201,7 +201,7 @@ fn the_measured_tip_is_compared_with_the_workspace() {
 }
 
 #[test]
-fn the_way_into_the_plane_is_told_from_the_last_position() {
+fn the_plane_is_checked_from_the_last_position() {
     let config = rig(&[REGISTRATION]);
     let at =
         |x_mm: f64| listened(&config, 0.0, move |k| Vector3::new(x_mm, 0.1 * f64::from(k), 0.5));
@@ -223,7 +223,7 @@ const FIT: &str = "tracker.registration={ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, ya
     date_utc = \"2026-08-01T12:00:00.000000Z\", points = 9, rms_mm = 0.4, spread_mm = [9.0, 9.0, 9.0] } }";
 
 #[test]
-fn calibrations_get_old() {
+fn missing_poor_or_old_calibrations_do_not_pass() {
     let of = |sets: &[&str]| verdicts(&calibrations(&rig(sets), NOW_UNIX_US));
     const OFFSET: &str = "tracker.tip_offset_mm=[0.0, 0.0, 7.0]";
     assert_eq!(of(&[OFFSET]), "FWW", "missing");
@@ -254,7 +254,7 @@ fn calibrations_get_old() {
 
 /// A run notices a registration that is turned about the needle only where the roll at the start is told.
 #[test]
-fn a_roll_that_is_not_told_is_said() {
+fn an_unknown_roll_at_the_start_is_a_warning() {
     let of = |sd_deg: f64| {
         let sd = format!("yaw_deg = 12.0, pitch_deg = 8.0, roll_deg = {sd_deg:.1}");
         let check = start_roll(&rig(&[&format!("observer.invariant.start_sd={{ {sd} }}")]));
@@ -268,7 +268,7 @@ fn a_roll_that_is_not_told_is_said() {
 }
 
 #[test]
-fn a_proof_counts_for_the_configuration_it_was_made_with() {
+fn a_proof_counts_while_it_is_young_and_its_keys_unchanged() {
     let config = rig(&[]);
     let earlier = |date: &str, changed: &[&str]| Earlier {
         started_utc: date.to_owned(),
@@ -298,7 +298,7 @@ fn a_proof_counts_for_the_configuration_it_was_made_with() {
 }
 
 #[test]
-fn a_full_disk_is_refused() {
+fn a_full_disk_fails() {
     let config = rig(&[]);
     for (free_mb, verdict) in [
         (Ok(Some(100)), Verdict::Pass),

@@ -261,7 +261,7 @@ mod tests {
 
     /// The start is on the wall at z = 0. The room beyond it is there alone.
     #[test]
-    fn a_tip_outside_the_workspace_is_refused_but_at_the_start() {
+    fn a_tip_outside_the_workspace_is_refused_except_at_the_start() {
         let goal = goal(&[]);
         assert_eq!(goal.check_start(&Vector3::new(0.5, -0.4, -1.9)), Ok(()));
         let why = goal.check_start(&Vector3::new(0.0, 5.0, -1.9)).unwrap_err();
@@ -270,7 +270,7 @@ mod tests {
 
     /// The insertion is long enough for the path, or there is none.
     #[test]
-    fn the_depth_limits_the_path() {
+    fn the_depth_limits_the_length_of_the_path() {
         let goal = goal(&["insertion.depth_mm=130"]);
         assert!((goal.path.length_mm() - 120.0).abs() < 1e-6);
         assert_eq!(goal.problem.length_max_mm, 130.0);

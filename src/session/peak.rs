@@ -118,7 +118,7 @@ mod tests {
 
     /// The bound is no higher than it has to be.
     #[test]
-    fn a_profile_comes_to_its_peak() {
+    fn a_profile_reaches_its_peak_acceleration() {
         let mut highest = 0.0f64;
         let period = Duration::from_millis(10);
         for n in 0..2000 {
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn the_rotation_comes_to_its_peak() {
+    fn the_rotation_peaks_when_it_reverses_from_one_sync_to_the_next() {
         let period = Duration::from_millis(10);
         // 60° a mm at 2 mm/s.
         assert!((rotation_peak(60.0, 2.0, period) - 24_000.0).abs() < 1e-9);

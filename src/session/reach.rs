@@ -87,7 +87,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_depth_can_correct_is_accepted() {
+    fn an_offset_that_the_depth_can_correct_is_accepted() {
         assert_eq!(reach(&[], 8.0), Ok(()));
         assert_eq!(reach(&["insertion.depth_mm=1"], 1.0), Ok(()), "within the noise");
         assert_eq!(reach(&["insertion.depth_mm=30"], -5.0), Ok(()));
@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn a_target_in_the_plane_that_the_tip_passes_beside_is_refused() {
+    fn a_target_too_near_to_correct_the_offset_is_refused() {
         let at = |z_mm: f64, x_mm: f64, more: &[&str]| {
             let target = format!("goal.position_mm=[0.0, 0.0, {z_mm:?}]");
             reach(&[&["goal.kind=\"target\"", &target], more].concat(), x_mm)
@@ -132,7 +132,7 @@ mod tests {
 
     /// A heading that is known to lead away leaves less of the depth.
     #[test]
-    fn the_heading_counts() {
+    fn a_heading_away_from_the_plane_is_refused_and_toward_it_accepted() {
         let known = "observer.invariant.start_sd.pitch_deg=1";
         let away = ["insertion.depth_mm=60", "observer.start.pitch_deg=20", known];
         assert!(reach(&away, 5.0).is_err());

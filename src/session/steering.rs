@@ -275,14 +275,14 @@ mod tests {
     /// A position that is sent five times does not count for five, whose standard deviation would
     /// be √5 times less.
     #[test]
-    fn repeated_positions_make_no_surer() {
+    fn repeated_positions_do_not_lower_the_standard_deviation() {
         let [repeated, five] = [(4, 5), (20, 1)].map(|(per_mm, times)| x_sd_mm(per_mm, times));
         assert!(repeated > 1.8 * five, "{repeated} {five}");
     }
 
     /// Positions of correlated noise, told to be so, count for less from the first on.
     #[test]
-    fn noise_that_is_told_takes_confidence_away() {
+    fn configured_correlated_noise_raises_the_standard_deviation() {
         let sd_mm = |noise| {
             let mut config = Config::from_sources(&[], &[]).unwrap().session().unwrap();
             config.tracker.noise = noise;

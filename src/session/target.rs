@@ -209,7 +209,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_mean_is_of_the_newest_positions() {
+    fn the_moving_mean_covers_the_newest_positions() {
         let mut mean = MovingMean::new(Duration::from_millis(100));
         assert_eq!(mean.mean_mm(), None);
         for k in 0..10u32 {

@@ -441,7 +441,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tip_that_is_lost_before_the_insertion_is_not_found_by_a_model() {
+    fn a_tip_lost_before_the_insertion_is_not_recovered_by_the_model() {
         let records = records(9, 3..8, false);
         let says = |part: &str| {
             let said = |record: &Record| matches!(record, Record::Event { text, .. } if text.contains(part));
@@ -451,7 +451,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_of_too_many_waiting_positions_is_refused_as_that() {
+    fn the_oldest_of_too_many_waiting_positions_is_refused() {
         let records = records(257, 0..0, true);
         let [Record::Sample(sample), ..] = &records[..] else { panic!("{records:?}") };
         assert_eq!(sample.refused.as_ref().map(|refusal| &*refusal.why), Some(TOO_MANY_WAIT));

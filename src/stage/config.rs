@@ -446,7 +446,7 @@ mod tests {
     }
 
     #[test]
-    fn mistakes_are_named() {
+    fn an_invalid_stage_configuration_is_refused_with_the_reason() {
         assert_eq!(config().validate(), Ok(()));
         let text = |change: fn(&mut StageConfig)| {
             let mut config = config();

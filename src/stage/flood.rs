@@ -44,7 +44,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_flood_is_told_once_each_time_it_begins() {
+    fn a_flood_is_reported_once_each_time_it_begins() {
         let at = |ms: i64| Time::from_nanos(ms * 1_000_000);
         let mut watch = FloodWatch::new(at(0));
         let mut check = |ms, frames| {

@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn refuses_by_name_number_and_limit() {
+    fn a_refusal_names_the_axis_the_value_and_the_limit() {
         let check = check(Sign::Positive, 0);
         assert_eq!(
             text(check.check(151.2, at(150.0))),
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reversed_axis_keeps_its_ends_apart() {
+    fn a_reversed_axis_is_refused_at_the_right_end() {
         let check = check(Sign::Negative, 5);
         assert_eq!(
             check.check(150.0, Commanded { counts: 5 - 149_950, step_counts: 0 }),

@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn a_real_lead_screw() {
+    fn a_ratio_that_is_no_whole_number_is_rounded_to_the_nearest_count() {
         let screw = ratio(590_000, 127);
         assert_eq!(screw.nearest_count(127.0), Some(590_000));
         assert_eq!(screw.nearest_count(-1.0), Some(-4646)); // 4645.669
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn halves_go_away_from_zero_and_nothing_overflows() {
+    fn halves_round_away_from_zero_and_an_overflow_is_none() {
         let unit = ratio(1, 1);
         assert_eq!(unit.nearest_count(0.5), Some(1));
         assert_eq!(unit.nearest_count(-2.5), Some(-3));
@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turn_is_a_turn_both_ways() {
+    fn whole_turns_convert_exactly_in_both_directions() {
         let scale = Scale::new(Axis::Rotation, ratio(75_760, 1), Sign::Negative, 100);
         assert_eq!(scale.counts(TAU), Some(100 - 75_760));
         assert_eq!(scale.counts(-10.0 * TAU), Some(100 + 757_600));
@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn a_million_increments_do_not_drift() {
+    fn a_million_set_points_do_not_drift() {
         let scale = Scale::new(Axis::Insertion, ratio(590_000, 127), Sign::Positive, 0);
         let mut sent = 0;
         for step in 1..=1_000_000_i64 {
@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn a_position_goes_on_past_the_wrap_and_back() {
+    fn a_position_is_unwrapped_past_32_bits_and_back() {
         let mut position = Unwrapper::new(i32::MAX - 1);
         assert_eq!(position.unwrap(i32::MIN), i64::from(i32::MAX) + 1);
         assert_eq!(position.unwrap(-1_000_000_000), (1_i64 << 32) - 1_000_000_000);

@@ -273,7 +273,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_moves_or_configures_a_drive_is_a_masters_command() {
+    fn frames_that_move_or_configure_a_drive_are_commands_of_a_master() {
         let node = |n| NodeId::new(n).unwrap();
         let command = |id, data: &[u8]| {
             command_of_another_master(&Frame::new(id, data), node(127), [node(1), node(2)])

@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn the_way_up_is_shutdown_switch_on_enable() {
+    fn enabling_commands_shutdown_then_switch_on_then_enable() {
         let mut sequence = EnableSequence::default();
         let mut step = |state| sequence.step(Statusword(Statusword::state_bits(state)));
         assert_eq!(step(S::NotReadyToSwitchOn).0, 0x00);
@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fault_is_reset_on_a_rising_edge_the_sequence_made_itself() {
+    fn fault_reset_follows_a_controlword_with_bit_7_low() {
         let fault = Statusword(Statusword::state_bits(S::Fault));
         let mut sequence = EnableSequence::default();
         let sent: Vec<u16> = (0..4).map(|_| sequence.step(fault).0).collect();
@@ -283,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn modes_are_bits_of_6502() {
+    fn a_mode_is_supported_by_its_bit_in_6502() {
         assert!(Mode::CSP.is_in(0x3a5));
         assert!(Mode::HOMING.is_in(0x3a5));
         assert!(!Mode(7).is_in(0x3a5), "interpolated position");

@@ -201,7 +201,7 @@ mod tests {
 
     /// Frames as CiA 301 lays them out. Do not edit: they are the standard's, not ours.
     #[test]
-    fn frozen_bytes() {
+    fn sdo_frames_have_the_bytes_of_cia_301() {
         let write = |object, value| ClientFrame::Request(SdoRequest::Download(object, value));
         let client = [
             (

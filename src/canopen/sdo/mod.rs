@@ -198,7 +198,7 @@ mod tests {
 
     /// The table in CiA 301. Do not edit: it is the standard's, not ours.
     #[test]
-    fn the_table_of_abort_codes_is_the_standards() {
+    fn the_abort_codes_are_those_of_cia_301() {
         let table = [
             0x0503_0000_u32,
             0x0504_0000,
@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn codes_are_named() {
+    fn abort_codes_print_their_meaning() {
         assert_eq!(AbortCode::NO_SUCH_OBJECT.to_string(), "0x06020000 object does not exist");
         assert_eq!(AbortCode(0x0f00_ffc0).to_string(), "0x0F00FFC0 unknown abort code");
     }

@@ -9,7 +9,7 @@ fn refusal(text: &str) -> String {
 }
 
 #[test]
-fn homing_needs_a_zero_of_its_own() {
+fn a_homing_reference_without_a_zero_in_counts_is_refused() {
     assert_eq!(
         refusal("stage.rotation.reference = \"homing\""),
         "bench.toml:1: stage.rotation.zero is \"start\", but stage.rotation.reference is \
@@ -19,7 +19,7 @@ fn homing_needs_a_zero_of_its_own() {
 
 /// Three jogs of 15° by limits of 20° that count from each jog's start would end at 45°.
 #[test]
-fn limits_of_a_real_axis_need_a_zero_that_stays() {
+fn limits_of_a_real_axis_without_a_fixed_zero_are_refused() {
     let rig = include_str!("../../../bench-config/rig-epos4.toml");
     let load = |sets: &[&str]| {
         let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
@@ -39,7 +39,7 @@ fn limits_of_a_real_axis_need_a_zero_that_stays() {
 }
 
 #[test]
-fn home_is_inside_the_limits_where_that_can_be_known() {
+fn a_home_outside_the_limits_is_refused() {
     assert_eq!(
         refusal("stage.insertion.homing.offset_mm = 5"),
         "bench.toml:1: stage.insertion.homing.offset_mm is 5, which puts home at -5.000 mm with \
@@ -79,7 +79,7 @@ fn a_homing_that_seeks_the_wrong_end_is_refused() {
 }
 
 #[test]
-fn operations_keep_to_the_axis_limits() {
+fn a_withdrawal_speed_over_the_axis_limit_is_refused() {
     assert_eq!(
         refusal("stage.insertion.withdraw_speed_mm_per_s = 12"),
         "bench.toml:1: stage.insertion.withdraw_speed_mm_per_s is 12, allowed: up to \
@@ -89,7 +89,7 @@ fn operations_keep_to_the_axis_limits() {
 
 /// Each with both keys and both numbers; at the bound itself nothing is refused.
 #[test]
-fn accelerations_keep_to_the_axis_limits() {
+fn accelerations_over_the_axis_limits_are_refused() {
     let braking = "tracker.hold_braking_mm_per_s2 = 10\ntracker.hold_after_mm = 2\n";
     let along =
         |max: f64| format!("{braking}stage.insertion.acceleration_max_mm_per_s2 = {max:?}\n");
@@ -133,7 +133,7 @@ fn accelerations_keep_to_the_axis_limits() {
 }
 
 #[test]
-fn the_stage_is_told_how_its_axes_are_homed() {
+fn the_stage_gets_the_homing_of_its_axes() {
     let text = "[stage.insertion]\nreference = \"homing\"\nzero = -500\n\
                 [stage.rotation.homing]\nspeed_zero_deg_per_s = 180.0\n";
     let source = Source { name: "bench.toml", text };
@@ -176,7 +176,7 @@ fn said(text: &str, sets: &[&str]) -> Result<Config, String> {
 }
 
 #[test]
-fn a_real_drive_must_stop_by_itself() {
+fn options_by_which_a_real_drive_would_not_stop_are_refused() {
     for (key, allowed, refused) in [
         ("abort_connection_option", &[1, 2, 3][..], &[-1, 0, 4][..]),
         ("communication_error_behaviour", &[0, 2], &[1, 3]),
@@ -201,7 +201,7 @@ fn a_real_drive_must_stop_by_itself() {
 }
 
 #[test]
-fn what_moves_or_watches_an_axis_is_not_optional() {
+fn objects_that_move_or_supervise_an_axis_are_not_optional() {
     for index in [
         0x1000, 0x1016, 0x1017, 0x1018, 0x1400, 0x1600, 0x1800, 0x1A00, 0x6007, 0x6040, 0x6041,
         0x6060, 0x6061, 0x6064, 0x607A, 0x607C, 0x607D, 0x6085, 0x6098,
@@ -222,7 +222,7 @@ fn what_moves_or_watches_an_axis_is_not_optional() {
 }
 
 #[test]
-fn a_drive_notices_no_later_than_the_bench() {
+fn a_following_error_timeout_longer_than_the_benchs_is_refused() {
     let timeout = |ms| format!("stage.insertion.following_error_timeout_ms={ms}");
     assert!(said("", &[&timeout(20)]).is_ok());
     assert_eq!(
@@ -233,7 +233,7 @@ fn a_drive_notices_no_later_than_the_bench() {
 }
 
 #[test]
-fn what_the_bench_writes_itself_is_not_for_raw_sdos() {
+fn raw_sdos_to_objects_that_the_bench_writes_are_refused() {
     let raw = |index: u16| {
         format!("stage.insertion.sdo=[{{ index = {index}, subindex = 0, value = 0, bits = 8 }}]")
     };

@@ -3,7 +3,7 @@
 use super::*;
 
 #[test]
-fn both_alternatives() {
+fn two_alternatives_in_one_source_are_refused() {
     assert_eq!(
         refusal("[needle]\nradius_mm = 100\ncurvature_per_mm = 0.01"),
         "bench.toml:3: needle.curvature_per_mm is given along with needle.radius_mm: give one of \
@@ -32,7 +32,7 @@ fn both_alternatives() {
 }
 
 #[test]
-fn keys_that_do_not_go_together() {
+fn contradictory_keys_are_refused_with_both_values() {
     assert_eq!(
         refusal("\ninsertion.depth_mm = 400"),
         "bench.toml:2: insertion.depth_mm is 400, allowed: up to stage.insertion.max_mm, which is \
@@ -132,7 +132,7 @@ fn keys_that_do_not_go_together() {
 }
 
 #[test]
-fn sources_of_tip_positions_that_do_not_go_together() {
+fn tracker_keys_that_contradict_the_source_are_refused() {
     assert_eq!(
         refusal("tracker.source = \"csv\""),
         "bench.toml:1: tracker.source is \"csv\", and there is no tracker.file to read"
@@ -176,7 +176,7 @@ fn sources_of_tip_positions_that_do_not_go_together() {
 }
 
 #[test]
-fn correlated_noise_without_a_time_or_a_size() {
+fn correlated_noise_without_a_time_or_a_size_is_refused() {
     assert_eq!(
         set_refusal(&["emulator.noise={sd_mm=0.1,correlated_sd_mm=0.4}"]),
         "--set emulator.noise.correlated_sd_mm is given without \
@@ -194,7 +194,7 @@ fn correlated_noise_without_a_time_or_a_size() {
 }
 
 #[test]
-fn noise_that_lasts_longer_than_the_run() {
+fn noise_that_lasts_longer_than_the_insertion_is_refused() {
     let noise = |time: &str| {
         format!("tracker.noise={{white_sd_mm=0.1,correlated_sd_mm=0.1,correlation_time_s={time}}}")
     };
@@ -219,7 +219,7 @@ fn noise_that_lasts_longer_than_the_run() {
 }
 
 #[test]
-fn a_target_that_does_not_move_or_moves_faster_than_the_needle() {
+fn a_target_move_without_a_tool_or_faster_than_the_needle_is_refused() {
     let moves = "study.target_move_mm=[1, 30]";
     assert_eq!(
         set_refusal(&[moves]),
@@ -237,7 +237,7 @@ fn a_target_that_does_not_move_or_moves_faster_than_the_needle() {
 
 /// Only a path to a target goes around them.
 #[test]
-fn obstacles_on_the_way_into_the_plane() {
+fn obstacles_on_the_way_into_the_plane_are_refused() {
     assert_eq!(
         refusal(
             "[[goal.obstacle]]\nshape = \"sphere\"\ncentre_mm = [0.0, 0.0, 60.0]\nradius_mm = 10.0"

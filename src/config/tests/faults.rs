@@ -6,7 +6,7 @@ use super::*;
 use crate::emulator::drive::{Model, Switches};
 
 #[test]
-fn faults_are_told_in_the_order_they_are_written() {
+fn faults_are_read_in_the_order_of_the_file() {
     let config = loaded(
         "[[emulator.fault]]\nat_mm = 10\nkind = \"delay\"\naxis = \"rotation\"\nframes = \"pdo\"\n\
          toward = \"drives\"\ndelay_ms = 2.5\ncount = 3\nduration_s = 0.1\n\
@@ -30,7 +30,7 @@ fn faults_are_told_in_the_order_they_are_written() {
 
 /// The bench's heartbeat is the one that drives watch.
 #[test]
-fn heartbeats_to_the_drives_are_the_benchs() {
+fn a_heartbeat_fault_toward_the_drives_hits_the_bench_node() {
     let set = "emulator.fault=[{ at_s = 1, kind = \"drop\", frames = \"heartbeat\", \
                toward = \"drives\" }]";
     let stage = loaded("", &[set, "can.bench_node=100"]).virtual_stage().expect("valid");
@@ -39,7 +39,7 @@ fn heartbeats_to_the_drives_are_the_benchs() {
 }
 
 #[test]
-fn every_kind_is_taken_with_what_it_needs() {
+fn every_kind_of_fault_loads_with_the_keys_it_needs() {
     for kind in [
         "kind = \"drop\"",
         "kind = \"delay\", delay_ms = 1",
@@ -68,7 +68,7 @@ fn every_kind_is_taken_with_what_it_needs() {
 }
 
 #[test]
-fn a_fault_without_what_it_needs_is_refused() {
+fn a_fault_without_a_key_it_needs_is_refused() {
     for (fault, message) in [
         ("kind = \"stall\"", "a fault of kind \"stall\" needs at_mm or at_s"),
         ("at_mm = 1, kind = \"delay\"", "a fault of kind \"delay\" needs delay_ms"),
@@ -105,7 +105,7 @@ fn a_fault_without_what_it_needs_is_refused() {
 }
 
 #[test]
-fn a_key_that_the_kind_of_fault_does_not_have() {
+fn a_key_that_the_kind_of_fault_does_not_have_is_refused() {
     assert_eq!(
         refusal("[[emulator.fault]]\nkind = \"drop\"\nat_mm = 10\ncode = 0x8611\n"),
         "bench.toml:4: emulator.fault[0].code: a fault of kind \"drop\" has no such key, only at_mm, \
@@ -132,13 +132,13 @@ fn a_key_that_the_kind_of_fault_does_not_have() {
 
 /// A recorded configuration has these keys in every fault.
 #[test]
-fn the_defaults_of_keys_that_the_kind_of_fault_does_not_have_are_taken() {
+fn default_values_of_keys_that_the_kind_does_not_have_are_accepted() {
     let defaults = "axis = \"both\", frames = \"any\", toward = \"bench\"";
     loaded("", &[&format!("emulator.fault=[{{ at_s = 1, kind = \"bus-off\", {defaults} }}]")]);
 }
 
 #[test]
-fn switches_are_told_in_counts_of_the_drive() {
+fn switches_are_converted_to_counts_of_the_drive() {
     let switches = "emulator.insertion_switches_mm={ negative = -2, positive = 10, home = 1 }";
     let stage =
         loaded("", &[switches, "emulator.drives=\"epos4\""]).virtual_stage().expect("valid");

@@ -22,7 +22,7 @@ fn every_shipped_configuration_loads_and_reads_back_the_same() {
 }
 
 #[test]
-fn the_defaults_are_the_file() {
+fn the_defaults_are_those_of_virtual_toml() {
     assert_eq!(loaded("", &[]), loaded(DEFAULT_TOML, &[]));
 }
 
@@ -57,7 +57,7 @@ fn strings_need_no_quotes_on_the_command_line() {
 }
 
 #[test]
-fn buses_have_names() {
+fn a_bus_is_read_and_printed_by_its_name() {
     let bus = |name: &str| {
         let interface = format!("can.interface={name}");
         let config = loaded("tracker.source = \"openigtlink\"", &[&interface]);
@@ -83,7 +83,7 @@ fn buses_have_names() {
 }
 
 #[test]
-fn an_alternative_replaces_the_other_of_the_layers_below() {
+fn an_alternative_replaces_the_other_one_of_an_earlier_source() {
     let config = loaded("needle.curvature_per_mm = 0.01", &[]);
     assert_eq!(config.needle.arc, Arc { radius_mm: None, curvature_per_mm: Some(0.01) });
     let config = loaded("needle.curvature_per_mm = 0.01", &["needle.radius_mm=50"]);
@@ -102,7 +102,7 @@ fn an_alternative_replaces_the_other_of_the_layers_below() {
 
 /// Noise that is correlated in time is added to the white part.
 #[test]
-fn correlated_noise_is_taken_beside_the_white() {
+fn correlated_noise_is_read_besides_white_noise() {
     let tracker = |set: &str| loaded("", &[set]).emulator.to_tracker();
     assert_eq!(tracker("emulator.noise.sd_mm=0.1").correlated, None);
     let noise =
@@ -126,7 +126,7 @@ fn each_observer_and_each_law_has_its_section() {
 
 /// A limit in the section of a law that is not chosen limits nothing.
 #[test]
-fn what_is_set_in_a_shipped_file_has_an_effect() {
+fn shipped_files_give_no_warning_and_keys_without_effect_do() {
     let warnings = |name: &str, text: &str| {
         let no_files = |_: &Path| Err(String::new());
         Config::with_warnings(&[Source { name, text }], &[], &no_files).expect("valid").1
@@ -188,7 +188,7 @@ fn a_real_tracker_has_no_registration_unless_one_is_given() {
 }
 
 #[test]
-fn the_columns_of_a_recording_are_told_in_their_units() {
+fn the_columns_of_a_recording_are_read_with_their_units() {
     let config = loaded(
         "[tracker]\nsource = \"csv\"\nfile = \"tip.csv\"\n\
          [tracker.csv]\ntime = { s = \"sec\", ns = \"nanosec\" }\nposition_unit_mm = 1000\n\
@@ -208,7 +208,7 @@ fn the_columns_of_a_recording_are_told_in_their_units() {
 }
 
 #[test]
-fn the_rig_is_refused_for_its_registration_alone() {
+fn the_rig_file_lacks_only_a_registration() {
     let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
     let config = loaded(&rig, &[]);
     assert!(config.stage.hardware);
@@ -222,7 +222,7 @@ fn the_rig_is_refused_for_its_registration_alone() {
 }
 
 #[test]
-fn the_stage_is_told_in_counts_and_radians() {
+fn the_stage_gets_counts_mm_and_radians() {
     let config = loaded(
         "[stage.rotation]\nfollowing_error_deg = 3.6\ncounts_per_turn = { counts = 1000, turns = 1 }\n\
          optional_objects = [0x60C2]\nsign = -1\n\
@@ -294,7 +294,7 @@ fn the_reference_lists_the_words_of_nested_keys() {
 /// What is drawn lies in its range, is drawn again by the same seed, and does not depend on what
 /// else is drawn.
 #[test]
-fn trials_are_drawn_by_their_seed() {
+fn a_trial_is_drawn_within_its_ranges_by_its_seed() {
     let ranges = ["study.curvature_error=[-0.3, 0.3]", "study.torsion_half_width_deg=[30, 50]"];
     let plain = loaded("", &[]);
     let wide = loaded("", &ranges);
@@ -319,7 +319,7 @@ fn trials_are_drawn_by_their_seed() {
 
 /// The record of a trial can be read, whatever is drawn; ranges whose ends a key does not allow are refused.
 #[test]
-fn what_a_trial_draws_is_allowed_by_its_key() {
+fn a_range_that_exceeds_that_of_its_key_is_refused() {
     let curved = ["emulator.radius_mm=20", "study.curvature_error=[-0.5, 1.0]"];
     let creep = ["emulator.torsion.creep_mm=50", "study.creep_error=[0.0, 1.0]"];
     for sets in [curved, creep] {
@@ -346,7 +346,7 @@ fn what_a_trial_draws_is_allowed_by_its_key() {
 
 /// Each constant of a creeping shaft is drawn by itself.
 #[test]
-fn the_two_constants_of_creep_are_drawn_apart() {
+fn the_two_constants_of_creep_are_drawn_independently() {
     let torsion = "emulator.torsion.creep_mm=0.75";
     let growth = "emulator.torsion.creep_mm_per_mm=0.006";
     let config = loaded("", &[torsion, growth, "study.creep_error=[-0.3, 0.3]"]);
@@ -403,7 +403,7 @@ fn a_calibration_file_that_cannot_be_used_hides_no_other_error() {
 
 /// It would be replaced without a word.
 #[test]
-fn a_value_beside_the_calibration_file_that_holds_it_is_refused() {
+fn a_value_that_the_calibration_file_holds_too_is_refused() {
     let read = |_: &Path| Err("cannot be read".to_owned());
     let said = |text: &str, sets: &[&str]| {
         let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
@@ -435,7 +435,7 @@ fn a_value_beside_the_calibration_file_that_holds_it_is_refused() {
 
 /// A registration or a tip that is changed by hand is no longer the measured one.
 #[test]
-fn a_calibration_does_not_vouch_for_a_value_that_is_given_over_it() {
+fn a_value_set_over_a_calibration_drops_its_fit() {
     let origin =
         "file = \"p.csv\"\nsha256 = \"0\"\nversion = \"0\"\ndate_utc = \"2026-08-01T12:00:00Z\"";
     let text = format!(

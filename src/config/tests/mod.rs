@@ -113,7 +113,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(400))]
 
     #[test]
-    fn any_overlay_is_taken_or_refused_and_what_is_taken_reads_back(
+    fn any_overlay_is_refused_or_loads_and_reads_back(
         file in prop::collection::btree_map(key(), value(), 0..4),
         sets in prop::collection::vec((key(), value()), 0..3),
     ) {
@@ -130,7 +130,7 @@ proptest! {
     }
 
     #[test]
-    fn any_text_is_taken_or_refused(text in "\\PC{0,60}", set in "\\PC{0,30}") {
+    fn any_text_loads_or_is_refused(text in "\\PC{0,60}", set in "\\PC{0,30}") {
         let source = Source { name: "bench.toml", text: &text };
         let _ = Config::from_sources(&[source], &[set]).map_err(|error| error.to_string());
     }

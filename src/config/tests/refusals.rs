@@ -3,7 +3,7 @@
 use super::*;
 
 #[test]
-fn an_unknown_key_with_the_nearest_known_one() {
+fn an_unknown_key_is_refused_with_the_nearest_known_one() {
     assert_eq!(
         refusal("\n[insertion]\ndepth_mm = 100\nspeed_mm_s = 3\n"),
         "bench.toml:4: unknown key \"insertion.speed_mm_s\"; did you mean \
@@ -33,7 +33,7 @@ fn an_unknown_key_with_the_nearest_known_one() {
 }
 
 #[test]
-fn the_wrong_kind() {
+fn a_value_of_the_wrong_type_is_refused() {
     assert_eq!(
         refusal("[insertion]\ndepth_mm = \"150 mm\""),
         "bench.toml:2: insertion.depth_mm is \"150 mm\", expected a number in mm"
@@ -78,7 +78,7 @@ fn the_wrong_kind() {
 }
 
 #[test]
-fn what_is_out_of_range() {
+fn a_value_out_of_range_is_refused_with_the_range() {
     assert_eq!(
         refusal("\n\n\n\n\n[insertion]\ndepth_mm = -5"),
         "bench.toml:7: insertion.depth_mm is -5, allowed: over 0 to 1000 mm"
@@ -139,7 +139,7 @@ fn what_is_out_of_range() {
 }
 
 #[test]
-fn a_raw_sdo_with_its_own_line() {
+fn an_invalid_raw_sdo_is_refused_with_its_line() {
     assert_eq!(
         refusal("[[stage.insertion.sdo]]\nindex = 0x2310\nsubindex = 0\nvalue = 40000\nbits = 8"),
         "bench.toml:4: stage.insertion.sdo[0].value is 40000, allowed: -128 to 255"
@@ -159,7 +159,7 @@ fn a_raw_sdo_with_its_own_line() {
 }
 
 #[test]
-fn half_a_ratio() {
+fn a_ratio_with_one_number_is_refused() {
     assert_eq!(
         refusal("stage.rotation.counts_per_turn = { counts = 8000 }"),
         "bench.toml:1: stage.rotation.counts_per_turn.turns is missing and has no default here, \
@@ -168,7 +168,7 @@ fn half_a_ratio() {
 }
 
 #[test]
-fn a_real_stage_without_its_facts() {
+fn a_real_stage_without_nodes_scales_and_signs_is_refused() {
     let said = refusal(
         "stage.hardware = true\ncan.interface = \"can0\"\ntracker.source = \"openigtlink\"",
     );
@@ -183,7 +183,7 @@ fn a_real_stage_without_its_facts() {
 }
 
 #[test]
-fn what_is_no_toml() {
+fn text_that_is_not_toml_is_refused_with_its_place() {
     assert_eq!(
         refusal("[insertion]\ndepth_mm = = 3\n"),
         "bench.toml:2:12: extra `=`, expected nothing"
@@ -230,7 +230,7 @@ fn what_is_no_toml() {
 }
 
 #[test]
-fn everything_at_once_in_the_order_of_the_file() {
+fn all_problems_are_reported_at_once_in_the_order_of_the_file() {
     let text = "[insertion]\nstep_mm = 99\ndpth_mm = 1\nmode = \"fast\"\n[can]\nsync_ms = true\n";
     let said = load(text, &["record.dir=3"]).expect_err("refused").to_string();
     assert_eq!(
@@ -245,7 +245,7 @@ fn everything_at_once_in_the_order_of_the_file() {
 
 /// As in a file, where it is a table in the place of a value.
 #[test]
-fn a_key_below_a_value() {
+fn a_key_below_a_value_is_refused() {
     assert_eq!(
         set_refusal(&["insertion.depth_mm.x=5"]),
         "--set insertion.depth_mm.x: unknown key; insertion.depth_mm has no keys below it; allowed as its \

@@ -187,7 +187,7 @@ mod tests {
 
     /// (method, from, home): where zero is found with an index pulse every 300 counts.
     #[test]
-    fn every_method_finds_its_place() {
+    fn every_homing_method_finds_its_home() {
         for (method, from, home) in [
             (1, 0, -900),
             (17, 0, -999),

@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn a_place_on_the_way_is_reached_in_time() {
+    fn a_position_on_the_way_has_the_time_at_which_it_is_reached() {
         let motion = Motion::linear(at(0), 0.0, -100.0, PERIOD);
         assert_eq!(motion.reaches(at(0), -40.0), Some(at(4)));
         assert_eq!(motion.reaches(at(6), -40.0), None, "past it");
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn an_early_beat_ends_a_piece_and_a_stray_one_does_not() {
+    fn an_early_sync_ends_the_period_and_a_stray_one_does_not() {
         let mut motion = Motion::linear(at(0), 0.0, 100.0, PERIOD);
         motion.align_to_sync(at(2));
         assert_eq!(motion.position_at(at(2)), 20.0);

@@ -60,7 +60,7 @@ mod tests {
 
     /// A value of a type that is not known, or a number that cannot be read, would be left out.
     #[test]
-    fn every_value_of_the_sheet_is_an_object() {
+    fn every_default_value_of_the_data_sheet_is_an_object() {
         let objects = Eds::parse(GENERIC).objects(const { NodeId::new(5).unwrap() });
         let sections = GENERIC.split("\n[").filter(|section| section.contains("DefaultValue="));
         let mut values = 0;

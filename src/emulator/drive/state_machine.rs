@@ -61,7 +61,7 @@ mod tests {
 
     /// Every state against every command: rows as in the standard's table. `-` is no transition.
     #[test]
-    fn the_whole_table() {
+    fn every_state_answers_every_command_as_in_cia_402() {
         let columns = [0x00, 0x02, 0x06, 0x07, 0x0f];
         let states = [
             ('N', S::NotReadyToSwitchOn),
@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn commands_look_at_their_own_bits_only() {
+    fn a_command_is_decoded_by_its_own_bits_only() {
         for (controlword, command) in [
             (0x008d, Command::DisableVoltage),
             (0x000b, Command::QuickStop),

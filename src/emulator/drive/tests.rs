@@ -182,7 +182,7 @@ fn moving() -> Bench {
 }
 
 #[test]
-fn it_introduces_itself() {
+fn a_drive_identifies_itself_and_refuses_invalid_writes() {
     let mut bench = Bench::new(config());
     assert_eq!(bench.read(ObjectAddress::new(0x1000, 0)), [0x92, 0x01, 0x02, 0x00]);
     let name = bench.sdo(SdoRequest::Upload(ObjectAddress::new(0x1008, 0)));
@@ -199,7 +199,7 @@ fn it_introduces_itself() {
 }
 
 #[test]
-fn unconfigured_it_reports_each_change_of_state_by_its_own_pdo() {
+fn the_default_tpdo1_reports_each_change_of_state() {
     let mut bench = Bench::new(config());
     let word = |bench: &mut Bench, frame| {
         bench.pass(PERIOD);
@@ -244,7 +244,7 @@ fn targets_are_reached_exactly_one_period_later() {
 }
 
 #[test]
-fn a_sync_a_little_early_is_the_beat_all_the_same() {
+fn a_sync_that_is_1_ms_early_ends_the_period() {
     let mut bench = Bench::enabled_at(0);
     for target in [100, 200, 300] {
         bench.command(0x0f, target);
@@ -257,7 +257,7 @@ fn a_sync_a_little_early_is_the_beat_all_the_same() {
 }
 
 #[test]
-fn counts_wrap_on_the_bus_and_not_in_truth() {
+fn counts_wrap_on_the_bus_and_not_in_the_true_position() {
     let start = i64::from(i32::MAX) - 150;
     let mut bench = Bench::enabled_at(start);
     for step in 1..=4 {
@@ -309,7 +309,7 @@ fn a_target_somewhat_too_fast_is_followed_with_a_lag() {
 }
 
 #[test]
-fn software_limits_cut_the_target() {
+fn software_limits_clip_the_target() {
     let mut bench = Bench::enabled_at(0);
     bench.write(object::SOFTWARE_LIMIT_MIN, &(-50i32).to_le_bytes());
     bench.write(object::SOFTWARE_LIMIT_MAX, &100i32.to_le_bytes());
@@ -330,7 +330,7 @@ fn software_limits_cut_the_target() {
 }
 
 #[test]
-fn without_voltage_there_is_no_power() {
+fn a_drive_without_voltage_is_in_fault_until_it_returns() {
     let mut bench = moving();
     bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::NoVoltage), true);
     bench.take();
@@ -395,7 +395,7 @@ proptest! {
     /// It never moves without power, never starts to move outside Operational, and never faster
     /// than it can.
     #[test]
-    fn it_moves_only_when_it_may(inputs in inputs()) {
+    fn an_axis_moves_only_with_power_and_within_its_speed(inputs in inputs()) {
         let mut bench = Bench::enabled_at(0);
         for input in inputs {
             let state = bench.state();

@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn each_action_does_what_it_says() {
+    fn each_line_fault_changes_the_frames_as_configured() {
         let once = |fault: Fault| arrivals(&Fault { count: Some(1), ..fault });
         let order = |arrivals: Vec<(i64, Vec<u8>)>| {
             arrivals.into_iter().map(|(ms, data)| (ms, data[0])).collect::<Vec<_>>()

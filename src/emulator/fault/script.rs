@@ -137,7 +137,7 @@ mod tests {
 
     /// Withdrawing passes depths too.
     #[test]
-    fn a_depth_is_passed_either_way() {
+    fn a_depth_triggers_in_either_direction() {
         let mut script = Script::new(&[at_mm(-3.0), at_mm(0.0)], at(0));
         assert_eq!(script.poll(at(0), 0.0), Some(ScriptEvent::Begins(at_mm(0.0), Time::NEVER)));
         assert_eq!(script.poll(at(1), 5.0), None);
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn a_foreign_node_sends_again_and_again() {
+    fn a_foreign_node_sends_every_period_until_its_fault_ends() {
         let [after, period, duration] = [0, 2, 5].map(|ms| Some(Duration::from_millis(ms)));
         let frame = Some("181#01".to_owned());
         let foreign = Fault::of(FaultKind::Foreign);

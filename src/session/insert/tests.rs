@@ -127,7 +127,7 @@ const CONFIGURED: &str = "both drives are configured";
 
 /// The mean that decides takes 0.5 s, and the run waits 0.3 s for a tip.
 #[test]
-fn a_start_in_doubt_is_decided_before_the_tip_times_out() {
+fn a_start_out_of_reach_is_refused_for_that_and_not_for_the_tip_timeout() {
     let mut bench = Bench::new(&["tracker.timeout_s=0.3", "insertion.depth_mm=150"]);
     bench.tip_mm = Vector3::new(-100.0, 3.0, -2.0);
     bench.run_until(CONFIGURED);
@@ -138,7 +138,7 @@ fn a_start_in_doubt_is_decided_before_the_tip_times_out() {
 
 /// The same, where the mean is within reach, although the first position is not.
 #[test]
-fn a_start_in_doubt_that_is_good_begins_although_the_tip_times_out() {
+fn a_start_whose_mean_is_within_reach_begins_although_the_tip_times_out() {
     let seen_at = |x_mm: f64, then_mm: f64, phase_ms: u64| {
         // 0.5 s are no whole number of SYNCs.
         let sets = ["tracker.timeout_s=0.3", "insertion.depth_mm=150", "can.sync_ms=12"];
@@ -169,7 +169,7 @@ fn a_start_in_doubt_that_is_good_begins_although_the_tip_times_out() {
 
 /// The stamp of receipt is right for the last of them, and too late for the others.
 #[test]
-fn of_positions_that_are_received_at_once_the_last_corrects() {
+fn of_positions_received_at_once_only_the_last_corrects() {
     let mut bench = Bench::new(&["insertion.depth_mm=10", "insertion.plane_out_of_reach=insert"]);
     bench.next_sample = Time::ZERO;
     bench.behind_mm = Some(0.5);
@@ -184,7 +184,7 @@ fn of_positions_that_are_received_at_once_the_last_corrects() {
 
 /// The bench has given it no power, but must not claim that it has none.
 #[test]
-fn a_drive_that_keeps_power_from_elsewhere_is_told_at_the_end() {
+fn power_from_another_master_that_stays_on_is_reported_at_the_end() {
     let mut bench = Bench::new(&[]);
     bench.run_until(CONFIGURED);
     bench.is_deaf = true;
@@ -205,7 +205,7 @@ fn a_drive_that_keeps_power_from_elsewhere_is_told_at_the_end() {
 }
 
 #[test]
-fn power_from_elsewhere_that_the_stop_took_off_is_told_at_the_end() {
+fn power_from_another_master_that_the_stop_took_off_is_reported_at_the_end() {
     let mut bench = Bench::new(&[]);
     bench.run_until(CONFIGURED);
     for controlword in [0x06, 0x07, 0x0F] {

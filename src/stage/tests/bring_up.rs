@@ -19,7 +19,7 @@ pub(super) fn fault_of(config: StageConfig, spoil: impl FnOnce(&mut Bench)) -> S
 
 /// What the insertion drive is sent, as candump prints it: the order is the contract.
 #[test]
-fn the_frames_of_bring_up() {
+fn bring_up_sends_these_frames_in_this_order() {
     let mut bench = Bench::new(config());
     bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
     let sent: Vec<String> = bench
@@ -32,7 +32,7 @@ fn the_frames_of_bring_up() {
 }
 
 #[test]
-fn both_drives_end_up_as_the_bench_needs_them() {
+fn bring_up_writes_the_configuration_to_both_drives() {
     let mut bench = Bench::new(config());
     bench.run_until(|event| *event == StageEvent::Ready);
     for drive in [&bench.insertion, &bench.rotation] {
@@ -54,7 +54,7 @@ fn both_drives_end_up_as_the_bench_needs_them() {
 }
 
 #[test]
-fn the_operator_is_told_who_the_drives_are_and_what_they_lack() {
+fn the_identity_and_the_missing_objects_of_a_drive_are_reported() {
     let mut bench = Bench::new(config());
     let event = bench.run_until(|event| matches!(event, StageEvent::Identity(..)));
     let identity = Identity {
@@ -88,7 +88,7 @@ fn both_axes_are_enabled_at_one_sync_and_nothing_moves() {
 }
 
 #[test]
-fn a_homed_axis_keeps_its_zero() {
+fn positions_count_from_the_configured_zero() {
     let mut config = config();
     config.insertion.zero = Some(1000 - COUNTS_PER_MM);
     config.rotation.sign = Sign::Negative;
@@ -116,7 +116,7 @@ fn an_axis_that_stands_outside_its_limits_is_not_enabled() {
 }
 
 #[test]
-fn an_absent_drive_says_what_to_check() {
+fn an_absent_drive_is_a_fault_that_says_what_to_check() {
     let text = fault_of(config(), |bench| bench.insertion.off = true);
     assert_eq!(
         text,
@@ -136,7 +136,7 @@ fn a_drive_switched_on_late_is_waited_for() {
 }
 
 #[test]
-fn a_drive_of_another_make_is_refused() {
+fn a_drive_of_another_vendor_profile_or_mode_is_refused() {
     let mut other = config();
     other.rotation.vendor_id = Some(0x22);
     assert_eq!(
@@ -154,14 +154,14 @@ fn a_drive_of_another_make_is_refused() {
 }
 
 #[test]
-fn a_value_that_does_not_stay_is_named() {
+fn a_written_value_that_reads_back_different_is_a_fault() {
     let mode = ObjectAddress::new(0x6060, 0);
     let text = fault_of(config(), |bench| bench.insertion.forgets = Some(mode));
     assert_eq!(text, "node 1 (insertion): 0x6060:00: expected 0x08, received 0x01");
 }
 
 #[test]
-fn a_lost_sdo_is_tried_again_and_then_named_with_the_attempts() {
+fn an_unanswered_sdo_is_retried_and_then_a_fault() {
     let object = ObjectAddress::new(0x1017, 0);
     let mut bench = Bench::new(config());
     bench.insertion.mute = Some((object, 2));
@@ -176,7 +176,7 @@ fn a_lost_sdo_is_tried_again_and_then_named_with_the_attempts() {
 }
 
 #[test]
-fn configured_objects_are_written_and_a_refusal_is_named() {
+fn a_refused_raw_sdo_is_a_fault_with_the_abort_code() {
     let raw = |index| RawSdo { bits: 16, index, subindex: 0, value: 7, read_back: true };
     let mut config = config();
     config.insertion.sdo = vec![raw(0x2001), raw(0x2000)];
@@ -244,7 +244,7 @@ fn sent_when_interrupted_at(object: ObjectAddress) -> (Bench, Vec<String>) {
 }
 
 #[test]
-fn an_interrupted_bring_up_takes_power_off_a_drive_that_is_known_and_leaves_its_supervision() {
+fn an_interrupted_bring_up_takes_power_off_an_identified_drive() {
     let (off, pre_operational) = ("601#2B40600000000000", "000#8001");
     for object in [ObjectAddress::new(0x6502, 0), ObjectAddress::new(0x1018, 3)] {
         let (bench, sent) = sent_when_interrupted_at(object);
@@ -259,7 +259,7 @@ fn an_interrupted_bring_up_takes_power_off_a_drive_that_is_known_and_leaves_its_
 }
 
 #[test]
-fn a_node_whose_identity_is_not_known_or_wrong_is_not_written_to() {
+fn a_node_of_unknown_or_wrong_identity_is_not_written_to() {
     for (index, subindex) in [(0x1000, 0), (0x1018, 1), (0x1018, 2)] {
         let (bench, sent) = sent_when_interrupted_at(ObjectAddress::new(index, subindex));
         assert_eq!(sent, [""; 0], "{index:x}");
@@ -282,7 +282,7 @@ fn a_node_whose_identity_is_not_known_or_wrong_is_not_written_to() {
 
 /// The soft limits in counts, wider by what the axis may be from its target: 30 ms at its speed.
 #[test]
-fn the_drives_keep_the_limits_too() {
+fn the_soft_limits_and_windows_are_written_to_the_drives() {
     let mut config = config();
     config.rotation.sign = Sign::Negative;
     config.insertion.zero = Some(500);
@@ -303,7 +303,7 @@ fn the_drives_keep_the_limits_too() {
 
 /// A drive that has no 0x6066 is brought up all the same.
 #[test]
-fn a_drive_is_told_how_long_it_may_wait_beyond_its_window() {
+fn the_following_error_timeout_is_written_where_the_drive_has_it() {
     let mut config = config();
     config.insertion.following_error_timeout_ms = Some(20);
     config.rotation.following_error_timeout_ms = Some(20);
@@ -314,7 +314,7 @@ fn a_drive_is_told_how_long_it_may_wait_beyond_its_window() {
 }
 
 #[test]
-fn an_axis_that_goes_round_has_no_limits_in_its_drive() {
+fn a_wrapping_axis_gets_no_position_limits_in_its_drive() {
     let mut config = config();
     config.rotation.wraps = true;
     let mut bench = Bench::new(config);
@@ -358,7 +358,7 @@ fn reboot(bench: &mut Bench, times: u32) {
 }
 
 #[test]
-fn a_drive_that_restarts_in_bring_up_is_brought_up_anew() {
+fn a_drive_that_restarts_in_bring_up_is_brought_up_again() {
     let mut bench = Bench::new(config());
     bench.insertion.mute = Some((ObjectAddress::new(0x6040, 0), u32::MAX));
     bench.rotation.mute = Some((ObjectAddress::new(0x1018, 4), 2));
@@ -371,7 +371,7 @@ fn a_drive_that_restarts_in_bring_up_is_brought_up_anew() {
 }
 
 #[test]
-fn a_drive_that_restarts_again_and_again_is_a_fault() {
+fn a_drive_that_restarts_three_times_is_a_fault() {
     let mut bench = Bench::new(config());
     bench.insertion.mute = Some((ObjectAddress::new(0x6040, 0), u32::MAX));
     reboot(&mut bench, 3);

@@ -36,7 +36,7 @@ fn a_drive_that_keeps_its_power_at_the_end_is_a_fault() {
 /// It gets quick stop and then Disable Voltage every 100 ms until the time is over, and keeps
 /// the bench's heartbeat to miss.
 #[test]
-fn a_drive_that_takes_no_command_is_told_again_and_left_its_watchdog() {
+fn a_drive_that_ignores_commands_gets_them_again_and_keeps_its_watchdog() {
     let mut bench = Bench::ready();
     bench.drive_on(20);
     (bench.insertion.ignores_rpdo, bench.insertion.ignores_sdo) = (true, true);
@@ -57,7 +57,7 @@ fn a_drive_that_takes_no_command_is_told_again_and_left_its_watchdog() {
 }
 
 #[test]
-fn an_axis_that_does_not_come_to_stand_at_the_end_is_a_fault() {
+fn an_axis_that_is_not_seen_to_stand_at_the_end_is_a_fault() {
     let mut bench = Bench::ready();
     bench.drive_on(20);
     bench.stage.disable(bench.now);
@@ -123,7 +123,7 @@ fn a_drive_that_no_longer_obeys_or_follows_stops_the_run() {
 
 /// It gets no power, or loses it at once: no stop would be obeyed.
 #[test]
-fn a_drive_that_stops_obeying_on_its_way_to_power_is_enabled_no_further() {
+fn a_drive_that_stops_obeying_during_enabling_is_a_fault() {
     use DriveState as S;
     for state in [S::ReadyToSwitchOn, S::SwitchedOn, S::OperationEnabled] {
         let mut bench = Bench::new(config());
@@ -140,7 +140,7 @@ fn a_drive_that_stops_obeying_on_its_way_to_power_is_enabled_no_further() {
 }
 
 #[test]
-fn an_internal_limit_may_hold_a_drive_for_a_while() {
+fn an_internal_limit_that_holds_a_drive_for_a_while_is_no_fault() {
     let mut bench = Bench::new(config());
     bench.rotation.extra_bits = Statusword::FOLLOWS_COMMAND;
     bench.until_feedback();
@@ -154,7 +154,7 @@ fn an_internal_limit_may_hold_a_drive_for_a_while() {
 
 /// What a drive never shows is not lost; that it could not be noticed is said once.
 #[test]
-fn what_a_drive_never_shows_is_told_and_not_missed() {
+fn a_status_bit_that_a_drive_never_sets_is_reported_and_no_fault() {
     let mut bench = Bench::new(config());
     bench.insertion.clear_bits = Statusword::REMOTE | Statusword::VOLTAGE_ENABLED;
     bench.rotation.extra_bits = Statusword::FOLLOWS_COMMAND;
@@ -170,7 +170,7 @@ fn what_a_drive_never_shows_is_told_and_not_missed() {
 }
 
 #[test]
-fn a_warning_is_told_ever_more_rarely_and_the_run_goes_on() {
+fn repeated_warnings_are_reported_ever_more_rarely_and_no_fault() {
     let mut bench = Bench::ready();
     for _ in 0..9 {
         bench.rotation.extra_bits = Statusword::WARNING;
@@ -188,7 +188,7 @@ fn a_warning_is_told_ever_more_rarely_and_the_run_goes_on() {
 }
 
 #[test]
-fn an_undefined_statusword_is_no_operation_enabled() {
+fn an_undefined_statusword_is_a_fault() {
     let mut bench = Bench::ready();
     bench.drive_on(10);
     // Bits 6, 5, 3, 2, 1, 0 of no state.
@@ -202,7 +202,7 @@ fn an_undefined_statusword_is_no_operation_enabled() {
 
 /// As of an encoder that is read anew when its drive is enabled.
 #[test]
-fn a_position_that_jumps_at_enabling_moves_nothing() {
+fn a_position_jump_at_enabling_is_a_fault_and_moves_nothing() {
     let mut bench = Bench::new(config());
     bench.insertion.brake_cycles = 5;
     while bench.insertion.state != DriveState::OperationEnabled {

@@ -25,7 +25,7 @@ fn power_waits_until_it_is_permitted() {
 
 /// A fault that comes while power is awaited ends it, and is not reset.
 #[test]
-fn what_happens_while_power_is_awaited_ends_it() {
+fn a_fault_while_power_is_awaited_stops_the_stage_and_is_not_reset() {
     let awaiting = || {
         let mut bench = Bench::new(resetting_config());
         bench.stage.permit_power(false);
@@ -46,7 +46,7 @@ fn what_happens_while_power_is_awaited_ends_it() {
 
 /// A drive that never answers a SYNC gets no power to wait for.
 #[test]
-fn a_drive_that_never_answers_is_not_waited_for() {
+fn a_drive_that_never_answers_a_sync_is_a_fault() {
     let mut bench = Bench::new(config());
     bench.stage.permit_power(false);
     bench.rotation.tpdos_lost = u32::MAX;
@@ -60,7 +60,7 @@ fn a_drive_that_never_answers_is_not_waited_for() {
 /// An emergency stop that is pressed, or a safety input that is open: letting it go must not be
 /// what begins the motion.
 #[test]
-fn a_drive_that_is_not_let_on_ends_it_at_once() {
+fn a_drive_that_refuses_to_switch_on_is_a_fault_at_once() {
     let said = "insertion: the drive refused to switch on (statusword 0x0250 switch on disabled); \
                 check safety input";
     let mut bench = Bench::new(config());
@@ -150,7 +150,7 @@ fn a_node_that_ignores_the_start_command_is_named_by_its_state() {
 
 /// Both drives are enabled then, and neither is named for that.
 #[test]
-fn a_node_that_does_not_say_that_it_is_operational_is_named() {
+fn a_node_whose_heartbeat_does_not_say_operational_is_a_fault() {
     for (heard, said) in [
         (None, "rotation: enabled, but no heartbeat within 3000 ms, is can.heartbeat_ms longer?"),
         (
@@ -174,7 +174,7 @@ fn a_node_that_does_not_say_that_it_is_operational_is_named() {
 
 /// The last heartbeat comes after the answers to the last SYNC in time.
 #[test]
-fn drives_that_are_enabled_too_late_are_told_from_those_that_are_not() {
+fn drives_enabled_just_as_the_timeout_ends_are_a_fault_that_says_so() {
     let mut config = config();
     config.bus.heartbeat_timeout_ms = 60_000;
     let mut bench = Bench::new(config);

@@ -37,7 +37,7 @@ fn fault_of_a_depth_off(sync_ms: u16, window_mm: Option<f64>, off_mm: f64) -> Op
 }
 
 #[test]
-fn how_far_an_axis_may_lag_is_a_matter_of_the_drive_and_not_of_the_sync_period() {
+fn the_following_error_limit_is_the_window_plus_two_sync_periods() {
     for (sync_ms, window_mm, limit_mm) in [
         (1, None, 0.32),
         (10, None, 0.5),

@@ -63,7 +63,7 @@ fn enabling_after_a_fault() -> Bench {
 
 /// Whose fault is gone by itself before it is reset: what comes then is of now.
 #[test]
-fn what_a_fault_that_was_found_excuses_ends_with_it() {
+fn once_a_found_fault_has_ended_a_new_one_is_not_reset() {
     let mut bench = enabling_after_a_fault();
     bench.rotation.state = DriveState::SwitchOnDisabled;
     bench.run_until(|event| *event == StageEvent::Ready);
@@ -87,7 +87,7 @@ fn what_a_fault_that_was_found_excuses_ends_with_it() {
 
 /// 0x603F says which fault it was found in: another one is new, and is not reset.
 #[test]
-fn only_the_fault_that_was_found_is_excused() {
+fn only_the_emergency_of_the_found_fault_is_ignored() {
     let mut bench = enabling_after_a_fault();
     bench.receive(bench.rotation.emergency(0x7320));
     bench.run_until(|event| *event == StageEvent::Ready);

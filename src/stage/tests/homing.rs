@@ -45,7 +45,7 @@ fn until_homed(bench: &mut Bench) -> (f64, usize) {
 }
 
 #[test]
-fn the_drive_is_told_how_and_finds_its_home() {
+fn homing_writes_its_parameters_and_finds_home() {
     let mut bench = ready_to_home(|_| ());
     let drive = &bench.insertion;
     assert_eq!(drive.value(0x6098, 0), 17);
@@ -75,7 +75,7 @@ fn the_drive_is_told_how_and_finds_its_home() {
 
 /// The bits are not those of the homing before, however late the drive clears them.
 #[test]
-fn an_old_success_or_failure_is_not_taken_for_the_new_one() {
+fn the_result_of_an_earlier_homing_is_not_taken_for_the_new_one() {
     for before in [Homing::Attained, Homing::Failed] {
         let mut bench = ready_to_home(|bench| {
             bench.insertion.homing = before;
@@ -89,7 +89,7 @@ fn an_old_success_or_failure_is_not_taken_for_the_new_one() {
 
 /// Bits of the homing before are not believed while the axis is on its way, however long.
 #[test]
-fn an_axis_that_is_on_its_way_is_not_home() {
+fn a_moving_axis_is_not_home_whatever_its_bits_say() {
     let mut bench = ready_to_home(|bench| {
         bench.insertion.homing = Homing::Attained;
         bench.insertion.homing_cycles = 300;
@@ -102,7 +102,7 @@ fn an_axis_that_is_on_its_way_is_not_home() {
 
 /// As by methods 35 and 37: its bits are never seen clear. They count after a second, standing.
 #[test]
-fn a_homing_that_takes_no_time_is_seen() {
+fn a_homing_that_takes_no_time_is_accepted_after_a_second() {
     let mut bench = ready_to_home(|bench| {
         bench.insertion.homing = Homing::Attained;
         bench.insertion.homing_cycles = 0;
@@ -173,7 +173,7 @@ fn an_axis_that_needs_homing_is_not_enabled_without_it() {
 }
 
 #[test]
-fn a_drive_may_have_a_bit_of_its_own_for_it() {
+fn a_configured_homed_bit_is_read_in_any_mode() {
     let mut config = homing_config();
     config.insertion.homing = Some(HomingConfig { homed_bit: 15, ..homing_by(17) });
     let mut bench = Bench::new(config.clone());

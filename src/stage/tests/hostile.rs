@@ -135,7 +135,7 @@ proptest! {
     }
 
     #[test]
-    fn no_run_of_commands_leaves_its_limits(
+    fn no_series_of_commands_leaves_its_limits(
         steps in prop::collection::vec((-0.05..0.13_f64, -0.25..0.15_f64), 1..60),
     ) {
         let mut bench = Bench::new(narrow());

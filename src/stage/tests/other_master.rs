@@ -6,7 +6,7 @@ use crate::canopen::nmt::{NmtState, heartbeat_frame};
 
 /// While nothing was sent yet, nothing is, but for reading nobody minds.
 #[test]
-fn another_master_is_heard_before_anything_is_sent() {
+fn another_master_heard_before_the_start_is_a_fault_and_nothing_is_sent() {
     for word in [
         Frame::new(0x080, &[]),
         Frame::new(0x202, &[0x0F, 0, 1, 0, 0, 0]),
@@ -26,7 +26,7 @@ fn another_master_is_heard_before_anything_is_sent() {
 }
 
 #[test]
-fn nothing_is_sent_while_another_master_may_be_heard() {
+fn nothing_is_sent_while_the_stage_listens_for_another_master() {
     let mut bench = Bench::new(config());
     let begun = bench.now;
     bench.run_until(|event| *event == StageEvent::Ready);
@@ -35,7 +35,7 @@ fn nothing_is_sent_while_another_master_may_be_heard() {
 }
 
 #[test]
-fn another_master_stops_a_stage_at_its_first_word() {
+fn another_master_stops_a_stage_at_its_first_frame() {
     let words = [
         (Frame::new(0x201, &[0x0F, 0, 0, 0x25, 0, 0]), "RPDO1 of a drive (201#0F0000250000)"),
         (Frame::new(0x080, &[]), "SYNC (080#)"),
@@ -81,7 +81,7 @@ fn drives_that_another_master_sends_to_nmt_stopped_are_stopped() {
 
 /// Another sender's answer may come first and be believed once; that there are two shows at once.
 #[test]
-fn two_senders_of_one_position_are_told_apart_in_two_syncs() {
+fn two_senders_of_one_tpdo1_are_a_fault_after_two_syncs() {
     let mut bench = Bench::ready();
     for _ in 0..2 {
         bench.until_feedback();
@@ -93,7 +93,7 @@ fn two_senders_of_one_position_are_told_apart_in_two_syncs() {
 
 /// The same frame twice is what a bus does that lost an acknowledgement.
 #[test]
-fn the_same_position_twice_is_counted_and_no_more() {
+fn a_repeated_tpdo1_is_counted_and_no_fault() {
     let mut bench = Bench::ready();
     for _ in 0..20 {
         bench.until_feedback();
@@ -106,7 +106,7 @@ fn the_same_position_twice_is_counted_and_no_more() {
 }
 
 #[test]
-fn a_flood_under_the_drives_own_identifiers_is_told() {
+fn a_flood_on_the_drives_own_identifiers_is_reported() {
     for flood in [
         Frame::new(0x581, &[0x4B, 0x41, 0x60, 0, 0x37, 2, 0, 0]),
         heartbeat_frame(node(1), NmtState::Operational),

@@ -164,7 +164,7 @@ fn a_drive_that_stops_by_itself_in_nmt_stopped_is_seen_to_stand() {
 }
 
 #[test]
-fn a_drive_that_does_not_obey_is_told_again_and_then_named() {
+fn a_drive_that_ignores_quick_stop_gets_it_again_and_is_an_error() {
     let (result, drive) = halt_of_a_drive_that_obeys_late(Duration::from_millis(300));
     assert_eq!((result, drive.state), (Ok(7), DriveState::SwitchOnDisabled));
     let (result, _) = halt_of_a_drive_that_obeys_late(Duration::from_secs(3));

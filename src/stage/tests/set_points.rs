@@ -41,7 +41,7 @@ fn until_sync(bench: &mut Bench) -> Vec<(Time, String)> {
 }
 
 #[test]
-fn set_points_leave_at_once_and_the_sync_leaves_alone() {
+fn set_points_are_sent_at_once_and_held_ones_with_the_sync() {
     let mut bench = Bench::ready();
     bench.sent.clear();
     let commanded = bench.now;
@@ -114,7 +114,7 @@ fn a_late_bench_skips_whole_periods_and_never_bursts() {
 /// Holding for one SYNC is no acceleration that was asked for: 10 mm/s² are 4.6 counts a SYNC, per
 /// SYNC, and the axis is on its way at 46 counts a SYNC.
 #[test]
-fn one_lost_position_is_no_acceleration() {
+fn lost_positions_do_not_count_as_acceleration() {
     let mut config = config();
     config.insertion.limits.acceleration_max = Some(10.0);
     let mut bench = Bench::new(config);
@@ -187,7 +187,7 @@ fn a_refused_command_moves_neither_axis() {
 }
 
 #[test]
-fn a_rotation_past_32_bits_goes_on() {
+fn a_wrapping_rotation_continues_past_32_bits() {
     let mut config = config();
     config.rotation.wraps = true;
     let mut bench = Bench::new(config);
@@ -205,7 +205,7 @@ fn a_rotation_past_32_bits_goes_on() {
 
 /// An insertion whose counts fall as it goes on, across the end of 32 bits where its drive wraps.
 #[test]
-fn a_reversed_axis_ends_at_its_own_limits() {
+fn a_reversed_axis_across_32_bits_is_refused_at_its_limits() {
     let mut config = config();
     config.insertion.sign = Sign::Negative;
     config.insertion.wraps = true;

@@ -46,7 +46,7 @@ fn a_fault_during_the_orderly_end_makes_it_a_quick_stop() {
 }
 
 #[test]
-fn quick_stop_in_bring_up_ends_it() {
+fn a_quick_stop_ends_the_bring_up() {
     let mut bench = Bench::new(config());
     bench.rotation.off = true;
     bench.run_for(Duration::from_millis(500));
@@ -57,7 +57,7 @@ fn quick_stop_in_bring_up_ends_it() {
 
 /// Five SYNCs of a quick cycle are no time: an axis at 0.4 mm/s moves 2 µm in them.
 #[test]
-fn a_slow_axis_of_a_quick_cycle_does_not_stand() {
+fn standstill_takes_50_ms_even_with_a_short_sync_period() {
     let mut config = config();
     config.bus.sync_ms = 1;
     let mut bench = Bench::new(config);
@@ -70,7 +70,7 @@ fn a_slow_axis_of_a_quick_cycle_does_not_stand() {
 
 /// It hears no PDO any more, but SDOs.
 #[test]
-fn a_drive_that_left_operational_loses_its_power_too() {
+fn a_drive_that_left_nmt_operational_loses_power_by_sdo() {
     let mut bench = Bench::ready();
     bench.drive_on(5);
     bench.rotation.nmt = NmtState::PreOperational;
@@ -80,7 +80,7 @@ fn a_drive_that_left_operational_loses_its_power_too() {
 }
 
 #[test]
-fn a_drive_that_lost_power_does_not_keep_the_stage_from_ending() {
+fn a_drive_without_supply_does_not_delay_the_end_beyond_its_timeouts() {
     let mut bench = Bench::ready();
     bench.rotation.off = true;
     bench.until_fault();
@@ -93,7 +93,7 @@ fn a_drive_that_lost_power_does_not_keep_the_stage_from_ending() {
 /// Positions by SDO count for the time that they took, also between TPDOs: an axis of 100 counts/mm stands
 /// after half a second.
 #[test]
-fn an_axis_whose_positions_come_by_pdo_and_by_sdo_does_not_stand_early() {
+fn standstill_is_not_early_when_positions_come_by_pdo_and_by_sdo() {
     let mut config = config();
     config.insertion.ratio = CountsRatio::new(100, 1).expect("not zero");
     let mut bench = Bench::new(config);

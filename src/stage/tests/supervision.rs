@@ -5,7 +5,7 @@ use crate::canopen::cia402::DriveState;
 use crate::canopen::nmt::{NmtState, heartbeat_frame};
 
 #[test]
-fn a_limit_inside_a_drive_is_told_once() {
+fn an_internal_limit_is_reported_once() {
     let mut bench = Bench::ready();
     bench.rotation.extra_bits = 1 << 11;
     bench.run_for(Duration::from_millis(100));
@@ -14,7 +14,7 @@ fn a_limit_inside_a_drive_is_told_once() {
 }
 
 #[test]
-fn one_lost_position_is_tolerated_and_the_second_stops_both_axes() {
+fn one_lost_tpdo1_is_tolerated_and_two_in_a_row_stop_both_axes() {
     let mut bench = Bench::ready();
     for missed in 1..=3 {
         bench.rotation.tpdos_lost = 1;
@@ -34,7 +34,7 @@ fn one_lost_position_is_tolerated_and_the_second_stops_both_axes() {
 }
 
 #[test]
-fn the_drive_that_is_silent_for_longer_is_named() {
+fn the_fault_names_the_drive_that_is_silent_for_longer() {
     let mut bench = Bench::ready();
     bench.rotation.tpdos_lost = 2;
     bench.step();
@@ -82,7 +82,7 @@ fn fault_in_mid_run(spoil: impl FnOnce(&mut Bench)) -> String {
 }
 
 #[test]
-fn whatever_a_drive_reports_stops_the_run_by_name() {
+fn what_a_drive_reports_stops_the_run_with_its_reason() {
     assert_eq!(
         fault_in_mid_run(|bench| bench.receive(bench.rotation.emergency(0x8611))),
         "rotation: emergency 0x8611 following error (register 0x21)"
@@ -130,7 +130,7 @@ fn the_end_of_an_emergency_is_no_fault() {
 }
 
 #[test]
-fn foreign_and_malformed_frames_are_counted_and_told_ever_more_rarely() {
+fn foreign_and_malformed_frames_are_counted_and_reported_ever_more_rarely() {
     let mut bench = Bench::ready();
     (bench.events, bench.seen) = (Vec::new(), 0);
     for _ in 0..9 {

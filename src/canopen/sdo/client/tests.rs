@@ -40,7 +40,7 @@ fn expedited_upload() {
 
 /// Some servers leave the object out of their aborts.
 #[test]
-fn an_abort_that_names_no_object_is_of_the_transfer_under_way() {
+fn an_abort_without_an_object_ends_the_transfer_under_way() {
     let mut client = started(SdoRequest::Upload(VENDOR));
     answer(&mut client, [0x80, 0, 0, 0, 0, 0, 0x02, 0x06]);
     let error = client.poll_result().unwrap().unwrap_err();
@@ -50,7 +50,7 @@ fn an_abort_that_names_no_object_is_of_the_transfer_under_way() {
 
 /// One that comes after its transfer has timed out is not of the next.
 #[test]
-fn a_late_abort_that_names_no_object_is_not_of_the_next_transfer() {
+fn a_late_abort_without_an_object_does_not_end_the_next_transfer() {
     let mut client = started(SdoRequest::Upload(VENDOR));
     client.handle_timeout(at(150));
     client.poll_result();
@@ -72,7 +72,7 @@ fn expedited_download() {
 }
 
 #[test]
-fn a_refusal_is_named() {
+fn a_refused_request_ends_with_the_abort_code() {
     let mut client = started(SdoRequest::Upload(STATUS));
     sent(&mut client);
     answer(&mut client, [0x80, 0x41, 0x60, 0x00, 0x00, 0x00, 0x02, 0x06]);
@@ -83,7 +83,7 @@ fn a_refusal_is_named() {
 }
 
 #[test]
-fn silence_times_out_and_the_node_is_told() {
+fn a_request_without_an_answer_times_out_with_an_abort_to_the_node() {
     let mut client = started(SdoRequest::Upload(STATUS));
     sent(&mut client);
     assert_eq!(client.deadline(), at(150));
@@ -97,7 +97,7 @@ fn silence_times_out_and_the_node_is_told() {
 }
 
 #[test]
-fn an_answer_about_another_object_is_passed_over() {
+fn an_answer_about_another_object_is_ignored() {
     let mut client = started(SdoRequest::Upload(STATUS));
     sent(&mut client);
     answer(&mut client, [0x43, 0x18, 0x10, 0x01, 0xfb, 0, 0, 0]);
@@ -131,7 +131,7 @@ fn a_late_answer_is_not_taken_for_the_next_request() {
 
 /// A node may lack the error register for all we care; and the fence is never the object itself.
 #[test]
-fn a_refused_fence_is_a_fence() {
+fn a_refused_fence_counts_as_answered() {
     let register = ObjectAddress::new(0x1001, 0);
     let mut client = started(SdoRequest::Upload(register));
     client.handle_timeout(at(150));
@@ -143,7 +143,7 @@ fn a_refused_fence_is_a_fence() {
 }
 
 #[test]
-fn a_fence_that_is_not_answered_is_the_time_out_of_the_request() {
+fn a_fence_without_an_answer_times_out_as_the_request() {
     let mut client = started(SdoRequest::Upload(STATUS));
     client.handle_timeout(at(150));
     client.start(at(151), SdoRequest::Upload(VENDOR));
@@ -153,7 +153,7 @@ fn a_fence_that_is_not_answered_is_the_time_out_of_the_request() {
 }
 
 #[test]
-fn a_reserved_command_or_a_block_is_an_error() {
+fn a_reserved_command_or_a_block_transfer_is_an_error() {
     for command in [0xa4, 0xc6, 0xe2] {
         let mut client = started(SdoRequest::Upload(VENDOR));
         sent(&mut client);

@@ -31,7 +31,7 @@ fn exchange(server: &mut SdoServer, store: &mut Store, request: [u8; 8]) -> Stri
 }
 
 #[test]
-fn frozen_exchanges() {
+fn expedited_requests_get_the_answers_of_cia_301() {
     let (mut server, mut store) = (SdoServer::new(NODE, TIMEOUT), Store(vec![0xfb, 0, 0, 0]));
     let mut ask = |request| exchange(&mut server, &mut store, request);
     assert_eq!(ask([0x40, 0x00, 0x20, 3, 0, 0, 0, 0]), "585#43002003FB000000");
@@ -86,7 +86,7 @@ fn block_transfer_is_refused() {
 }
 
 #[test]
-fn a_client_that_goes_silent_is_given_up() {
+fn the_server_aborts_when_the_client_falls_silent() {
     let (mut server, mut store) = (SdoServer::new(NODE, TIMEOUT), Store(vec![0; 20]));
     exchange(&mut server, &mut store, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
     assert_eq!(server.deadline(), Time::ZERO + TIMEOUT);

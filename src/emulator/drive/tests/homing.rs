@@ -65,7 +65,7 @@ fn with_switches() -> DriveConfig {
 
 /// Home is zero afterwards; where that is on the encoder.
 #[test]
-fn each_method_makes_its_place_zero() {
+fn after_each_homing_method_home_reads_zero() {
     for (method, home) in [
         (1, -2000.0),
         (17, -2999.0),
@@ -136,7 +136,7 @@ fn a_homing_can_be_interrupted_and_fails_on_the_wrong_switch() {
 
 /// python-canopen does so when it asks again for a homing that is under way.
 #[test]
-fn the_mode_in_force_written_again_interrupts_nothing() {
+fn writing_the_active_mode_again_does_not_interrupt_homing() {
     let mut bench = in_homing(with_switches());
     bench.write(object::HOMING_METHOD, &[34]);
     bench.start();

@@ -16,7 +16,7 @@ fn at_switch(model: Model) -> Bench {
 
 /// 10,000 counts/s and 100,000 counts/s²: 500 counts past the switch, from the moment it closes.
 #[test]
-fn a_limit_switch_stops_the_axis_where_it_closes() {
+fn a_limit_switch_brakes_the_axis_from_where_it_closes() {
     for (model, end, said) in [
         (Model::Generic, DriveState::SwitchOnDisabled, vec![]),
         (Model::Epos4, DriveState::Fault, vec!["085#07FF010000000000"]),
@@ -30,7 +30,7 @@ fn a_limit_switch_stops_the_axis_where_it_closes() {
 }
 
 #[test]
-fn off_a_limit_switch_the_axis_may_move() {
+fn an_axis_may_move_off_a_limit_switch_and_not_further_onto_it() {
     let mut bench = at_switch(Model::Generic);
     bench.pass(Duration::from_secs(1));
     bench.enable();
@@ -43,7 +43,7 @@ fn off_a_limit_switch_the_axis_may_move() {
 }
 
 #[test]
-fn the_safety_input_takes_the_torque_away() {
+fn an_open_safety_input_removes_the_torque() {
     let mut bench = moving();
     bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::EmergencyStop), true);
     bench.take();
@@ -77,7 +77,7 @@ fn a_blocked_axis_falls_behind_and_faults() {
 
 /// 0x6066: it is beyond its window for so long, without a break.
 #[test]
-fn a_blocked_axis_is_given_the_time_of_6066() {
+fn a_blocked_axis_faults_after_the_time_of_6066() {
     let mut bench = moving();
     bench.write(object::FOLLOWING_ERROR_TIMEOUT, &25u16.to_le_bytes());
     bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::Stall), true);
@@ -94,7 +94,7 @@ fn a_blocked_axis_is_given_the_time_of_6066() {
 /// A fault ends the time that ran before it. Enabled anew with a target far off, this axis comes within its
 /// window in 30 ms, and is not beyond it for 25 ms.
 #[test]
-fn the_time_of_6066_begins_anew() {
+fn a_fault_restarts_the_time_of_6066() {
     let mut bench = moving();
     bench.write(object::FOLLOWING_ERROR_TIMEOUT, &25u16.to_le_bytes());
     bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::Stall), true);
@@ -137,7 +137,7 @@ fn an_axis_that_is_released_in_time_catches_up() {
 }
 
 #[test]
-fn a_fault_of_its_own_is_told_with_its_register() {
+fn a_drive_fault_sends_an_emergency_with_its_error_register() {
     for (code, told) in [
         (0x8611, "085#1186210000000000"),
         (0x4210, "085#1042090000000000"),
@@ -177,7 +177,7 @@ fn acceleration_is_limited() {
 }
 
 #[test]
-fn an_epos4_lacks_what_it_lacks() {
+fn an_epos4_lacks_five_objects_and_the_event_timer() {
     let absent = [0x1006, 0x1007, 0x1019, 0x6091, 0x6092].map(|index| ObjectAddress::new(index, 0));
     let event_timer = ObjectAddress::new(0x1800, 5);
     let mut generic = Bench::new(config());
@@ -194,7 +194,7 @@ fn an_epos4_lacks_what_it_lacks() {
 }
 
 #[test]
-fn a_restart_is_told_and_forgets() {
+fn a_restart_sends_boot_up_and_resets_the_objects() {
     let mut bench = moving();
     bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::Restart), true);
     assert_eq!(bench.take(), ["705#00"]);

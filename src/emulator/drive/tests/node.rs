@@ -66,7 +66,7 @@ fn started() -> Drive {
 }
 
 #[test]
-fn it_says_who_it_is() {
+fn a_node_reports_its_identity_and_keeps_it() {
     let mut node = node();
     assert_eq!(sdo(&mut node, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]), "585#43181001FB000000");
     assert_eq!(sdo(&mut node, [0x40, 0x08, 0x10, 0, 0, 0, 0, 0]), "585#410810000E000000");
@@ -117,7 +117,7 @@ fn stopped_answers_nothing_but_nmt() {
 }
 
 #[test]
-fn short_pdos_are_not_used_and_values_out_of_limits_neither() {
+fn short_pdos_and_values_out_of_limits_are_ignored() {
     let mut node = started();
     assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0])), "085#1082110000000000");
     assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0])), "", "said once");
@@ -131,7 +131,7 @@ fn short_pdos_are_not_used_and_values_out_of_limits_neither() {
 }
 
 #[test]
-fn remapping_follows_the_rules() {
+fn remapping_follows_the_rules_of_cia_301() {
     let mut node = node();
     let wide = MappedObject::new(0x607a, 0, 32).to_u32().to_le_bytes();
     let register = MappedObject::new(0x1001, 0, 8).to_u32().to_le_bytes();
@@ -188,7 +188,7 @@ fn event_driven_pdos_come_on_change_and_by_timer() {
 }
 
 #[test]
-fn its_heartbeat_says_its_state() {
+fn the_heartbeat_carries_the_nmt_state() {
     let mut node = node();
     assert_eq!(write(&mut node, 0x1017, 0, &100u16.to_le_bytes()), "");
     assert_eq!(node.deadline(), at(100));
@@ -227,7 +227,7 @@ fn a_lost_heartbeat_raises_8130_and_leaves_operational() {
 }
 
 #[test]
-fn error_behaviour_may_keep_or_stop_the_node() {
+fn error_behaviour_keeps_the_node_operational_or_stops_it() {
     for (behaviour, state) in [(1, NmtState::Operational), (2, NmtState::Stopped)] {
         let mut node = started();
         assert_eq!(write(&mut node, 0x1029, 1, &[behaviour]), "");

@@ -3,7 +3,7 @@
 use super::*;
 
 #[test]
-fn quick_stop_options() {
+fn each_quick_stop_option_brakes_and_ends_as_605a_says() {
     // 0x6085 is 100,000 counts/s²: from 10,000 counts/s 500 counts and 0.1 s.
     // 0x6084 is 10,000 counts/s²: 5000 counts and 1 s.
     let rows = [
@@ -45,7 +45,7 @@ fn halt_brakes_and_holds_while_enabled() {
 }
 
 #[test]
-fn power_off_stops_dead() {
+fn an_axis_that_loses_power_stands_at_once() {
     for (controlword, state) in [
         (0x00, DriveState::SwitchOnDisabled),
         (0x06, DriveState::ReadyToSwitchOn),
