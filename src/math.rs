@@ -13,7 +13,7 @@ mod tests {
     use super::*;
     use nalgebra::ComplexField;
 
-    /// Do not edit: recorded runs replay to these bits. At these arguments other libraries differ in
+    /// Do not edit the snapshot: recorded runs replay to these bits. At these arguments other libraries differ in
     /// the last bit.
     #[test]
     fn functions_return_the_recorded_bits() {
@@ -41,7 +41,7 @@ mod tests {
         assert_eq!(sin_cos(0.7), (sin(0.7), cos(0.7)));
     }
 
-    /// nalgebra uses the same functions for its rotations.
+    /// nalgebra computes rotations by these functions.
     #[test]
     fn nalgebra_returns_the_same_bits() {
         for x in (1..1000).map(|n| 0.01 * f64::from(n)) {

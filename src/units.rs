@@ -72,6 +72,12 @@ impl fmt::Display for Time {
     }
 }
 
+/// The time `ms` milliseconds after the origin.
+#[cfg(test)]
+pub(crate) const fn at_ms(ms: i64) -> Time {
+    Time::from_nanos(ms * 1_000_000)
+}
+
 /// The angle equal to `angle_rad` modulo 2π in (−π, π].
 pub fn wrap_angle(angle_rad: f64) -> f64 {
     let wrapped = angle_rad - 2.0 * PI * (angle_rad / (2.0 * PI)).round();

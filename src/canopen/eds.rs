@@ -146,9 +146,10 @@ fn parse_integer(text: &str, node: NodeId) -> Option<i64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::canopen::sdo::AbortCode;
 
     const NODE: NodeId = NodeId::new(5).unwrap();
-    const SHEET: &str = "\
+    const EDS: &str = "\
 [OptionalObjects]
 SupportedObjects=3
 1=0x1008
@@ -195,23 +196,24 @@ HighLimit=10
 
     #[test]
     fn an_eds_is_written_as_it_was_read() {
-        assert_eq!(Eds::parse(SHEET).to_string(), SHEET);
+        assert_eq!(Eds::parse(EDS).to_string(), EDS);
     }
 
     #[test]
     fn values_have_type_access_limits_and_mapping() {
-        let objects = Eds::parse(SHEET).objects(NODE);
+        let objects = Eds::parse(EDS).objects(NODE);
         assert_eq!(objects.read(ObjectAddress::new(0x1008, 0)).unwrap(), b"a device");
         assert_eq!(objects.integer(ObjectAddress::new(0x1014, 0)), 0x85);
         assert_eq!(objects.read(limit()).unwrap(), (-5i32).to_le_bytes());
-        assert!(objects.parse(limit(), 11_i32.into()).is_err());
+        assert_eq!(objects.parse(limit(), 11_i32.into()), Err(AbortCode::VALUE_TOO_HIGH));
         assert!(objects.check_mappable(limit(), 32, PdoDirection::Receive).is_ok());
-        assert!(objects.parse(ObjectAddress::new(0x607d, 0), 2_u8.into()).is_err(), "read only");
+        let count = ObjectAddress::new(0x607d, 0);
+        assert_eq!(objects.parse(count, 2_u8.into()), Err(AbortCode::READ_ONLY));
     }
 
     #[test]
     fn a_value_can_be_set_and_an_object_removed() {
-        let mut eds = Eds::parse(SHEET);
+        let mut eds = Eds::parse(EDS);
         eds.set("607Dsub1", "DefaultValue", 7);
         eds.set("607Dsub1", "NoSuchKey", 7);
         eds.remove_object(0x1008);
@@ -220,7 +222,8 @@ HighLimit=10
         assert!(
             text.starts_with("[OptionalObjects]\nSupportedObjects=2\n1=0x1014\n2=0x607D\n\n[1014]")
         );
+        assert!(!text.contains("NoSuchKey"), "{text}");
         eds.remove_section("607Dsub1");
-        assert!(eds.objects(NODE).read(limit()).is_err());
+        assert_eq!(eds.objects(NODE).read(limit()), Err(AbortCode::NO_SUCH_SUBINDEX));
     }
 }

@@ -118,15 +118,12 @@ impl HeartbeatProducer {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::units::at_ms;
 
     const NODE: NodeId = NodeId::new(5).unwrap();
     const TIMEOUT: Duration = Duration::from_millis(100);
 
-    fn at(ms: i64) -> Time {
-        Time::from_nanos(ms * 1_000_000)
-    }
-
-    fn beat(state: NmtState) -> Frame {
+    fn heartbeat(state: NmtState) -> Frame {
         heartbeat_frame(NODE, state)
     }
 
@@ -134,55 +131,55 @@ mod tests {
     fn monitoring_starts_with_the_first_heartbeat() {
         let mut consumer = HeartbeatConsumer::new(NODE, TIMEOUT);
         assert_eq!(consumer.deadline(), Time::NEVER);
-        assert_eq!(consumer.handle_timeout(at(10_000)), None);
+        assert_eq!(consumer.handle_timeout(at_ms(10_000)), None);
 
-        let event = consumer.handle_frame(at(10_000), &beat(NmtState::Operational));
+        let event = consumer.handle_frame(at_ms(10_000), &heartbeat(NmtState::Operational));
         assert_eq!(event, Some(HeartbeatEvent::State(NmtState::Operational)));
-        assert_eq!(consumer.handle_frame(at(10_050), &beat(NmtState::Operational)), None);
-        assert_eq!(consumer.handle_timeout(at(10_149)), None);
-        assert_eq!(consumer.handle_timeout(at(10_150)), Some(HeartbeatEvent::Lost));
+        assert_eq!(consumer.handle_frame(at_ms(10_050), &heartbeat(NmtState::Operational)), None);
+        assert_eq!(consumer.handle_timeout(at_ms(10_149)), None);
+        assert_eq!(consumer.handle_timeout(at_ms(10_150)), Some(HeartbeatEvent::Lost));
         assert_eq!(consumer.state(), None);
-        assert_eq!(consumer.handle_timeout(at(20_000)), None, "a loss is reported once");
+        assert_eq!(consumer.handle_timeout(at_ms(20_000)), None, "a loss is reported once");
     }
 
     #[test]
     fn a_node_that_sends_no_heartbeat_by_the_expected_time_is_lost() {
         let mut consumer = HeartbeatConsumer::new(NODE, TIMEOUT);
-        consumer.expect_by(at(500));
-        assert_eq!(consumer.handle_timeout(at(499)), None);
-        assert_eq!(consumer.handle_timeout(at(500)), Some(HeartbeatEvent::Lost));
+        consumer.expect_by(at_ms(500));
+        assert_eq!(consumer.handle_timeout(at_ms(499)), None);
+        assert_eq!(consumer.handle_timeout(at_ms(500)), Some(HeartbeatEvent::Lost));
     }
 
     #[test]
     fn a_boot_up_ends_monitoring_until_the_next_heartbeat() {
         let mut consumer = HeartbeatConsumer::new(NODE, TIMEOUT);
-        consumer.handle_frame(at(0), &beat(NmtState::Operational));
-        let event = consumer.handle_frame(at(10), &beat(NmtState::BootUp));
+        consumer.handle_frame(at_ms(0), &heartbeat(NmtState::Operational));
+        let event = consumer.handle_frame(at_ms(10), &heartbeat(NmtState::BootUp));
         assert_eq!(event, Some(HeartbeatEvent::BootUp));
         assert_eq!(consumer.deadline(), Time::NEVER);
-        let event = consumer.handle_frame(at(20), &beat(NmtState::PreOperational));
+        let event = consumer.handle_frame(at_ms(20), &heartbeat(NmtState::PreOperational));
         assert_eq!(event, Some(HeartbeatEvent::State(NmtState::PreOperational)));
     }
 
     #[test]
     fn a_heartbeat_of_another_node_does_not_prolong_the_timeout() {
         let mut consumer = HeartbeatConsumer::new(NODE, TIMEOUT);
-        consumer.handle_frame(at(0), &beat(NmtState::Operational));
-        consumer.handle_frame(at(90), &Frame::new(0x706, &[5]));
-        assert_eq!(consumer.deadline(), at(100));
+        consumer.handle_frame(at_ms(0), &heartbeat(NmtState::Operational));
+        consumer.handle_frame(at_ms(90), &Frame::new(0x706, &[5]));
+        assert_eq!(consumer.deadline(), at_ms(100));
     }
 
     #[test]
     fn the_producer_keeps_its_period_and_skips_missed_heartbeats() {
-        let mut producer = HeartbeatProducer::new(NODE, TIMEOUT, at(0));
+        let mut producer = HeartbeatProducer::new(NODE, TIMEOUT, at_ms(0));
         assert_eq!(
-            producer.handle_timeout(at(3), NmtState::Operational),
-            Some(beat(NmtState::Operational))
+            producer.handle_timeout(at_ms(3), NmtState::Operational),
+            Some(heartbeat(NmtState::Operational))
         );
-        assert_eq!(producer.deadline(), at(100), "the beat is absolute");
-        assert!(producer.handle_timeout(at(99), NmtState::Operational).is_none());
-        assert!(producer.handle_timeout(at(350), NmtState::Operational).is_some());
-        assert!(producer.handle_timeout(at(350), NmtState::Operational).is_none());
-        assert_eq!(HeartbeatProducer::new(NODE, Duration::ZERO, at(0)).deadline(), Time::NEVER);
+        assert_eq!(producer.deadline(), at_ms(100), "not 103 ms");
+        assert!(producer.handle_timeout(at_ms(99), NmtState::Operational).is_none());
+        assert!(producer.handle_timeout(at_ms(350), NmtState::Operational).is_some());
+        assert!(producer.handle_timeout(at_ms(350), NmtState::Operational).is_none());
+        assert_eq!(HeartbeatProducer::new(NODE, Duration::ZERO, at_ms(0)).deadline(), Time::NEVER);
     }
 }

@@ -289,7 +289,7 @@ mod tests {
         let mut dictionary = dictionary();
         dictionary.set(RW, 7);
         dictionary.set(LIMITED, 300);
-        assert_eq!(dictionary.integer(LIMITED), 44, "cut to its type");
+        assert_eq!(dictionary.integer(LIMITED), 44, "truncated to 8 bits");
         dictionary.reset(0x6070..=0x607f);
         assert_eq!((dictionary.integer(RW), dictionary.integer(LIMITED)), (-5, 44));
     }

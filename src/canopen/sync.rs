@@ -46,10 +46,7 @@ impl SyncProducer {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn at(ms: i64) -> Time {
-        Time::from_nanos(ms * 1_000_000)
-    }
+    use crate::units::at_ms;
 
     #[test]
     fn a_sync_frame_is_empty_or_holds_a_counter() {
@@ -57,14 +54,14 @@ mod tests {
         assert!(is_sync(&sync_frame(), 0x80));
         assert!(is_sync(&Frame::new(0x80, &[7]), 0x80), "with a counter");
         assert!(!is_sync(&Frame::new(0x81, &[]), 0x80));
-        assert!(!is_sync(&Frame::new(0x80, &[0; 8]), 0x80), "an EMCY of node 0 is no SYNC");
+        assert!(!is_sync(&Frame::new(0x80, &[0; 8]), 0x80), "8 bytes are no SYNC");
     }
 
     #[test]
     fn sync_times_are_absolute_and_missed_ones_are_skipped() {
-        let mut sync = SyncProducer::new(Duration::from_millis(10), at(0));
-        assert_eq!((sync.handle_timeout(at(4)), sync.deadline), (Some(0), at(10)));
-        assert_eq!(sync.handle_timeout(at(9)), None);
-        assert_eq!((sync.handle_timeout(at(35)), sync.deadline), (Some(2), at(40)));
+        let mut sync = SyncProducer::new(Duration::from_millis(10), at_ms(0));
+        assert_eq!((sync.handle_timeout(at_ms(4)), sync.deadline), (Some(0), at_ms(10)));
+        assert_eq!(sync.handle_timeout(at_ms(9)), None);
+        assert_eq!((sync.handle_timeout(at_ms(35)), sync.deadline), (Some(2), at_ms(40)));
     }
 }

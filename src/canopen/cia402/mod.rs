@@ -279,7 +279,7 @@ mod tests {
 
         let mut sequence = EnableSequence::default();
         sequence.step(Statusword(0x1637));
-        assert_eq!(sequence.step(fault).0, 0x80, "0x0F before it was low already");
+        assert_eq!(sequence.step(fault).0, 0x80, "the 0x0F before had bit 7 low");
     }
 
     #[test]

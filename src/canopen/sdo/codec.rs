@@ -199,7 +199,7 @@ mod tests {
 
     const VENDOR: ObjectAddress = ObjectAddress::new(0x1018, 1);
 
-    /// Frames as CiA 301 lays them out. Do not edit: they are the standard's, not ours.
+    /// Do not edit: these bytes are from CiA 301.
     #[test]
     fn sdo_frames_have_the_bytes_of_cia_301() {
         let write = |object, value| ClientFrame::Request(SdoRequest::Download(object, value));

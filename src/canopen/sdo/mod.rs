@@ -196,7 +196,7 @@ mod tests {
         assert_eq!(SdoValue::from_bytes(&[]), None);
     }
 
-    /// The table in CiA 301. Do not edit: it is the standard's, not ours.
+    /// Do not edit: this table is from CiA 301.
     #[test]
     fn the_abort_codes_are_those_of_cia_301() {
         let table = [

@@ -1,25 +1,22 @@
-//! The client against answers by the byte.
+//! The client against the answer frames of a node.
 
 use super::*;
 use crate::canopen::sdo::SdoValue;
+use crate::units::at_ms;
 
 const NODE: NodeId = NodeId::new(5).unwrap();
 const VENDOR: ObjectAddress = ObjectAddress::new(0x1018, 1);
 const STATUS: ObjectAddress = ObjectAddress::new(0x6041, 0);
 const TIMEOUT: Duration = Duration::from_millis(150);
 
-fn at(ms: i64) -> Time {
-    Time::from_nanos(ms * 1_000_000)
-}
-
 fn started(request: SdoRequest) -> SdoClient {
     let mut client = SdoClient::new(NODE, TIMEOUT);
-    client.start(at(0), request);
+    client.start(at_ms(0), request);
     client
 }
 
 fn answer(client: &mut SdoClient, bytes: [u8; 8]) {
-    client.handle_frame(at(1), &Frame::new(0x585, &bytes));
+    client.handle_frame(at_ms(1), &Frame::new(0x585, &bytes));
 }
 
 fn sent(client: &mut SdoClient) -> String {
@@ -45,16 +42,20 @@ fn an_abort_without_an_object_ends_the_transfer_under_way() {
     answer(&mut client, [0x80, 0, 0, 0, 0, 0, 0x02, 0x06]);
     let error = client.poll_result().unwrap().unwrap_err();
     assert_eq!(error, SdoError::Aborted(AbortCode::NO_SUCH_OBJECT));
-    assert_eq!(sent(&mut client), "605#4018100100000000", "the node spoke last: no abort goes out");
+    assert_eq!(
+        sent(&mut client),
+        "605#4018100100000000",
+        "the request alone: an abort is not answered"
+    );
 }
 
-/// One that comes after its transfer has timed out is not of the next.
+/// Such an abort may belong to the transfer that timed out.
 #[test]
 fn a_late_abort_without_an_object_does_not_end_the_next_transfer() {
     let mut client = started(SdoRequest::Upload(VENDOR));
-    client.handle_timeout(at(150));
+    client.handle_timeout(at_ms(150));
     client.poll_result();
-    client.start(at(150), SdoRequest::Upload(STATUS));
+    client.start(at_ms(150), SdoRequest::Upload(STATUS));
     answer(&mut client, [0x80, 0, 0, 0, 0, 0, 0x02, 0x06]);
     assert_eq!(client.poll_result(), None);
     answer(&mut client, [0x4f, 0x01, 0x10, 0, 0, 0, 0, 0]);
@@ -86,10 +87,10 @@ fn a_refused_request_ends_with_the_abort_code() {
 fn a_request_without_an_answer_times_out_with_an_abort_to_the_node() {
     let mut client = started(SdoRequest::Upload(STATUS));
     sent(&mut client);
-    assert_eq!(client.deadline(), at(150));
-    client.handle_timeout(at(149));
+    assert_eq!(client.deadline(), at_ms(150));
+    client.handle_timeout(at_ms(149));
     assert_eq!(client.poll_result(), None);
-    client.handle_timeout(at(150));
+    client.handle_timeout(at_ms(150));
     let error = client.poll_result().unwrap().unwrap_err();
     assert_eq!(error.to_string(), "no SDO reply within 150 ms");
     assert_eq!(sent(&mut client), "605#8041600000000405");
@@ -105,19 +106,19 @@ fn an_answer_about_another_object_is_ignored() {
     answer(&mut client, *b"\x000123456");
     answer(&mut client, [0x60, 0x41, 0x60, 0x00, 0, 0, 0, 0]);
     assert_eq!(client.poll_result(), None);
-    assert_eq!(client.deadline(), at(150), "a stale answer does not prolong the wait");
+    assert_eq!(client.deadline(), at_ms(150), "a stale answer does not prolong the wait");
     answer(&mut client, [0x4b, 0x41, 0x60, 0x00, 0x37, 0x02, 0, 0]);
     assert_eq!(client.poll_result(), Some(Ok(SdoReply::Uploaded(0x0237_u16.into()))));
 }
 
-/// Behind a time-out the error register is read first: what comes before its answer is old, even
-/// where it is about the very object that is asked for again.
+/// After a timeout the client first reads the error register as a fence. An answer before that of the fence is
+/// old, even if it is about the object that is requested again.
 #[test]
 fn a_late_answer_is_not_taken_for_the_next_request() {
     let mut client = started(SdoRequest::Upload(STATUS));
-    client.handle_timeout(at(150));
+    client.handle_timeout(at_ms(150));
     sent(&mut client);
-    client.start(at(151), SdoRequest::Upload(STATUS));
+    client.start(at_ms(151), SdoRequest::Upload(STATUS));
     assert_eq!(sent(&mut client), "605#4001100000000000");
     answer(&mut client, [0x4b, 0x41, 0x60, 0x00, 0x11, 0x11, 0, 0]);
     assert_eq!((client.poll_result(), sent(&mut client)), (None, String::new()));
@@ -125,18 +126,18 @@ fn a_late_answer_is_not_taken_for_the_next_request() {
     assert_eq!(sent(&mut client), "605#4041600000000000");
     answer(&mut client, [0x4b, 0x41, 0x60, 0x00, 0x37, 0x02, 0, 0]);
     assert_eq!(client.poll_result(), Some(Ok(SdoReply::Uploaded(0x0237_u16.into()))));
-    client.start(at(200), SdoRequest::Upload(STATUS));
-    assert_eq!(sent(&mut client), "605#4041600000000000", "nothing is owed any more");
+    client.start(at_ms(200), SdoRequest::Upload(STATUS));
+    assert_eq!(sent(&mut client), "605#4041600000000000", "no fence: no old answer is outstanding");
 }
 
-/// A node may lack the error register for all we care; and the fence is never the object itself.
+/// The fence is another object than the requested one.
 #[test]
 fn a_refused_fence_counts_as_answered() {
     let register = ObjectAddress::new(0x1001, 0);
     let mut client = started(SdoRequest::Upload(register));
-    client.handle_timeout(at(150));
+    client.handle_timeout(at_ms(150));
     sent(&mut client);
-    client.start(at(151), SdoRequest::Upload(register));
+    client.start(at_ms(151), SdoRequest::Upload(register));
     assert_eq!(sent(&mut client), "605#4000100000000000");
     answer(&mut client, [0x80, 0x00, 0x10, 0x00, 0x00, 0x00, 0x02, 0x06]);
     assert_eq!(sent(&mut client), "605#4001100000000000");
@@ -145,9 +146,9 @@ fn a_refused_fence_counts_as_answered() {
 #[test]
 fn a_fence_without_an_answer_times_out_as_the_request() {
     let mut client = started(SdoRequest::Upload(STATUS));
-    client.handle_timeout(at(150));
-    client.start(at(151), SdoRequest::Upload(VENDOR));
-    client.handle_timeout(at(301));
+    client.handle_timeout(at_ms(150));
+    client.start(at_ms(151), SdoRequest::Upload(VENDOR));
+    client.handle_timeout(at_ms(301));
     let error = client.poll_result().unwrap().unwrap_err();
     assert_eq!(error, SdoError::Timeout(TIMEOUT));
 }
@@ -170,7 +171,7 @@ fn a_value_in_segments_is_an_error() {
     let mut client = started(SdoRequest::Upload(VENDOR));
     sent(&mut client);
     answer(&mut client, [0x41, 0x08, 0x10, 0, 26, 0, 0, 0]);
-    assert_eq!(client.poll_result(), None, "about another object");
+    assert_eq!(client.poll_result(), None, "an answer about another object");
     answer(&mut client, [0x41, 0x18, 0x10, 0x01, 26, 0, 0, 0]);
     assert_eq!(client.poll_result(), Some(Err(SdoError::TooLong)));
     assert_eq!(sent(&mut client), "605#8018100105000405");
@@ -179,7 +180,7 @@ fn a_value_in_segments_is_an_error() {
 #[test]
 fn a_new_transfer_ends_the_one_under_way() {
     let mut client = started(SdoRequest::Upload(VENDOR));
-    client.start(at(1), SdoRequest::Upload(STATUS));
+    client.start(at_ms(1), SdoRequest::Upload(STATUS));
     assert_eq!(client.poll_result(), None);
     let frames = "605#4018100100000000 605#8018100100000008 605#4001100000000000";
     assert_eq!(sent(&mut client), frames);

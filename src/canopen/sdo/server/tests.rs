@@ -1,4 +1,4 @@
-//! The server alone, by the byte, and with the client over a good and a bad link.
+//! The server by its frames, and together with the client over a link that loses and repeats frames.
 
 use super::super::SdoClient;
 use super::*;
@@ -8,7 +8,7 @@ const NODE: NodeId = NodeId::new(5).unwrap();
 const OBJECT: ObjectAddress = ObjectAddress::new(0x2000, 3);
 const TIMEOUT: Duration = Duration::from_millis(100);
 
-/// One object that can be read and written.
+/// A dictionary of one object.
 struct Store(Vec<u8>);
 
 impl ObjectAccess for Store {
@@ -38,7 +38,7 @@ fn expedited_requests_get_the_answers_of_cia_301() {
     assert_eq!(ask([0x2b, 0x00, 0x20, 3, 0xe8, 3, 0, 0]), "585#6000200300000000");
     assert_eq!(ask([0x40, 0x00, 0x20, 3, 0, 0, 0, 0]), "585#4B002003E8030000");
     assert_eq!(ask([0x40, 0x01, 0x20, 0, 0, 0, 0, 0]), "585#8001200000000206");
-    assert_eq!(ask([0xe0, 0x00, 0x20, 3, 0, 0, 0, 0]), "585#8000200301000405", "reserved");
+    assert_eq!(ask([0xe0, 0x00, 0x20, 3, 0, 0, 0, 0]), "585#8000200301000405", "reserved command");
     assert_eq!(ask([0x80, 0x00, 0x20, 3, 0, 0, 4, 5]), "", "an abort is not answered");
 }
 
@@ -50,7 +50,7 @@ fn segmented_upload() {
     assert_eq!(ask([0x40, 0x00, 0x20, 3, 0, 0, 0, 0]), "585#4100200308000000");
     assert_eq!(ask([0x60, 0, 0, 0, 0, 0, 0, 0]), "585#0061626364656667");
     assert_eq!(ask([0x70, 0, 0, 0, 0, 0, 0, 0]), "585#1D68000000000000");
-    assert_eq!(ask([0x60, 0, 0, 0, 0, 0, 0, 0]), "585#8000000001000405", "nothing is left");
+    assert_eq!(ask([0x60, 0, 0, 0, 0, 0, 0, 0]), "585#8000000001000405", "the upload has ended");
 }
 
 #[test]
@@ -72,8 +72,8 @@ fn segmented_download_is_refused() {
     assert!(store.0.is_empty());
 }
 
-/// CiA 301, table 22: 0504 0001, command specifier not valid or unknown. The request ends the
-/// transfer under way, as any request does.
+/// CiA 301, table 22: 0504 0001, command specifier not valid or unknown. Any new request ends the transfer under
+/// way, also this one.
 #[test]
 fn block_transfer_is_refused() {
     let (mut server, mut store) = (SdoServer::new(NODE, TIMEOUT), Store(vec![0; 20]));
@@ -82,7 +82,7 @@ fn block_transfer_is_refused() {
     assert_eq!(ask([0xc6, 0x00, 0x20, 3, 30, 0, 0, 0]), "585#8000200301000405", "download");
     ask([0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
     assert_eq!(ask([0xa4, 0x00, 0x20, 3, 0x7f, 0, 0, 0]), "585#8000200301000405");
-    assert_eq!(ask([0x60, 0, 0, 0, 0, 0, 0, 0]), "585#8000000001000405", "nothing is left");
+    assert_eq!(ask([0x60, 0, 0, 0, 0, 0, 0, 0]), "585#8000000001000405", "the upload has ended");
 }
 
 #[test]
@@ -95,25 +95,25 @@ fn the_server_aborts_when_the_client_falls_silent() {
     assert_eq!(server.deadline(), Time::NEVER);
 }
 
-/// What the link does with each frame, in turn.
+/// What the link does with one frame.
 #[derive(Debug, Clone, Copy)]
-enum Fate {
+enum Delivery {
     Pass,
     Drop,
     Double,
 }
 
-fn fates() -> impl Strategy<Value = Vec<Fate>> {
-    let fate = prop_oneof![20 => Just(Fate::Pass), 1 => Just(Fate::Drop), 1 => Just(Fate::Double)];
-    proptest::collection::vec(fate, 1..64)
+fn deliveries() -> impl Strategy<Value = Vec<Delivery>> {
+    let delivery = prop_oneof![20 => Just(Delivery::Pass), 1 => Just(Delivery::Drop), 1 => Just(Delivery::Double)];
+    proptest::collection::vec(delivery, 1..64)
 }
 
-/// Runs one transfer in virtual time over a link that follows `fates`, over and over.
-fn transfer(request: SdoRequest, store: &mut Store, fates: &[Fate]) -> Option<SdoReply> {
-    let mut fates = fates.iter().cycle();
-    let mut link = |frame: Frame| match fates.next() {
-        Some(Fate::Drop) => vec![],
-        Some(Fate::Double) => vec![frame; 2],
+/// Runs one transfer in virtual time over a link that repeats `deliveries`.
+fn transfer(request: SdoRequest, store: &mut Store, deliveries: &[Delivery]) -> Option<SdoReply> {
+    let mut deliveries = deliveries.iter().cycle();
+    let mut link = |frame: Frame| match deliveries.next() {
+        Some(Delivery::Drop) => vec![],
+        Some(Delivery::Double) => vec![frame; 2],
         _ => vec![frame],
     };
     let mut now = Time::ZERO;
@@ -129,28 +129,27 @@ fn transfer(request: SdoRequest, store: &mut Store, fates: &[Fate]) -> Option<Sd
             return result.ok();
         } else {
             now = client.deadline().min(server.deadline());
-            assert_ne!(now, Time::NEVER, "the client waits for something that cannot come");
+            assert_ne!(now, Time::NEVER, "no frame and no timeout is left to wait for");
             client.handle_timeout(now);
             server.handle_timeout(now);
         }
     }
 }
 
-/// A write and a read.
 fn requests(data: u32) -> [SdoRequest; 2] {
     [SdoRequest::Download(OBJECT, data.into()), SdoRequest::Upload(OBJECT)]
 }
 
 proptest! {
     #[test]
-    fn a_bad_link_gives_the_right_result_or_an_error(data: u32, fates in fates()) {
+    fn a_bad_link_gives_the_right_result_or_an_error(data: u32, deliveries in deliveries()) {
         let [write, read] = requests(data);
         let bytes = data.to_le_bytes().to_vec();
         let mut store = Store(Vec::new());
-        if transfer(write, &mut store, &fates).is_some() {
+        if transfer(write, &mut store, &deliveries).is_some() {
             prop_assert_eq!(&store.0, &bytes);
         }
-        if let Some(reply) = transfer(read, &mut Store(bytes), &fates) {
+        if let Some(reply) = transfer(read, &mut Store(bytes), &deliveries) {
             prop_assert_eq!(reply, SdoReply::Uploaded(data.into()));
         }
     }
