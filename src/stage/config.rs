@@ -460,7 +460,7 @@ mod tests {
             text(|c| c.rotation.following_error_max = Some(0.0))
                 .starts_with("rotation: a following error of 0 deg: ")
         );
-        // 30 ms at its highest speed are less than half a count.
+        // The travel in 30 ms at the highest speed is less than half a count.
         assert!(text(|c| c.insertion.limits.speed_max = 0.01).ends_with(
             "a following error of 0.0003 mm: less than half a count, or more than 32 bits hold; \
                      it is that of 30 ms at the highest speed: set following_error_mm"

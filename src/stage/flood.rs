@@ -42,21 +42,21 @@ impl FloodWatch {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::units::at_ms;
 
     #[test]
     fn a_flood_is_reported_once_each_time_it_begins() {
-        let at = |ms: i64| Time::from_nanos(ms * 1_000_000);
-        let mut watch = FloodWatch::new(at(0));
+        let mut watch = FloodWatch::new(at_ms(0));
         let mut check = |ms, frames| {
             watch.frames += frames;
-            watch.check(at(ms))
+            watch.check(at_ms(ms))
         };
         assert_eq!(check(50, 30), None, "the window is not over");
         assert_eq!(check(100, 19), None);
         assert_eq!(check(200, 50), Some(50));
-        assert_eq!(check(300, 900), None, "it goes on");
-        assert_eq!(check(400, 1), None, "it is over");
+        assert_eq!(check(300, 900), None, "still the same flood");
+        assert_eq!(check(400, 1), None, "the flood has ended");
         assert_eq!(check(500, 200), Some(200));
-        assert_eq!(check(5000, 7800), None, "of an unknown rate");
+        assert_eq!(check(5000, 7800), None, "the window is too long to give a rate");
     }
 }

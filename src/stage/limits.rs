@@ -253,13 +253,20 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_passes_is_within_every_limit(target in -2.0..151.0_f64, last in -1.0..150.0_f64) {
-            let last = at(last);
-            if let Ok(counts) = check(Sign::Positive, 0).check(target, last) {
-                prop_assert!((-1000..=150_000).contains(&counts));
-                prop_assert!((counts - last.counts).abs() <= 52);
-                prop_assert!((counts as f64 / 1000.0 - target).abs() <= 0.000_5 + 1e-9);
-            }
+        fn a_target_is_accepted_exactly_if_it_is_within_every_limit(
+            last_counts in -1000..=150_000_i64,
+            last_step_counts in -101..=101_i64,
+            step_mm in -0.12..0.12_f64,
+        ) {
+            let last = Commanded { counts: last_counts, step_counts: last_step_counts };
+            let target_mm = last_counts as f64 / 1000.0 + step_mm;
+            let counts = (target_mm * 1000.0).round() as i64;
+            let step_counts = counts - last_counts;
+            let is_within = (-1000..=150_000).contains(&counts)
+                && step_counts.abs() <= 100 + 1
+                && (step_counts - last_step_counts).abs() <= 50 + 2;
+            let accepted = check(Sign::Positive, 0).check(target_mm, last).ok();
+            prop_assert_eq!(accepted, is_within.then_some(counts));
         }
     }
 }

@@ -62,8 +62,8 @@ impl Standstill {
 mod tests {
     use super::*;
 
-    /// How long an axis at `mm_per_s`, with a position every `period_ms`, is watched until it counts as
-    /// standing; `None` if it does not within 3 s.
+    /// Time in ms after which an axis at `mm_per_s`, with a position every `period_ms`, counts as standing; `None`
+    /// if it does not within 3 s.
     fn stands_after_ms(counts_per_mm: f64, mm_per_s: f64, period_ms: u64) -> Option<u64> {
         let mut standstill = Standstill::new(counts_per_mm);
         standstill.watch_from(0);

@@ -1,4 +1,4 @@
-//! Bring-up, frame by frame and against drives that are not as they should be.
+//! Bring-up, frame by frame, and against drives that misbehave.
 
 use super::drive::VENDOR;
 use super::*;
@@ -6,22 +6,22 @@ use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::DriveState;
 use crate::canopen::nmt::{NmtState, heartbeat_frame};
 
-pub(super) fn fault_of(config: StageConfig, spoil: impl FnOnce(&mut Bench)) -> String {
+/// The fault of a bring-up after `setup`. Nothing was powered.
+pub(super) fn fault_of(config: StageConfig, setup: impl FnOnce(&mut Bench)) -> String {
     let mut bench = Bench::new(config);
-    spoil(&mut bench);
+    setup(&mut bench);
     let fault = bench.until_fault();
-    assert!(!bench.until_stopped(), "nobody saw it stand");
+    assert!(!bench.until_stopped(), "no standstill is reported");
     assert!(bench.command(0.0, 0.0).is_err());
-    let powered = bench.sent.iter().any(|(_, f)| matches!(f.cob_id(), Some(0x201 | 0x202)));
-    assert!(!powered, "no set-point was sent");
+    assert!(!bench.has_sent("201#") && !bench.has_sent("202#"), "no set-point was sent");
     fault
 }
 
-/// What the insertion drive is sent, as candump prints it: the order is the contract.
+/// The frames to the insertion drive, as candump prints them. Their order matters.
 #[test]
 fn bring_up_sends_these_frames_in_this_order() {
     let mut bench = Bench::new(config());
-    bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+    bench.until_progress(Progress::Enabling);
     let sent: Vec<String> = bench
         .sent
         .iter()
@@ -34,7 +34,7 @@ fn bring_up_sends_these_frames_in_this_order() {
 #[test]
 fn bring_up_writes_the_configuration_to_both_drives() {
     let mut bench = Bench::new(config());
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
     for drive in [&bench.insertion, &bench.rotation] {
         let id = u32::from(drive.node.get());
         assert_eq!(drive.value(0x1017, 0), 100);
@@ -46,7 +46,7 @@ fn bring_up_writes_the_configuration_to_both_drives() {
         assert_eq!(drive.value(0x1800, 2), 1);
         assert_eq!(drive.value(0x1a00, 1), 0x6041_0010);
         assert_eq!((drive.value(0x60c2, 1), drive.value(0x60c2, 2)), (10, 0xfd));
-        assert_eq!(drive.value(0x1029, 1), 0, "to Pre-operational when the bench falls silent");
+        assert_eq!(drive.value(0x1029, 1), 0, "to NMT pre-operational when the bench falls silent");
         assert_eq!((drive.value(0x6007, 0), drive.value(0x605a, 0)), (3, 6));
         assert_eq!(drive.value(0x607a, 0), drive.counts as u32);
         assert_eq!(drive.state, DriveState::OperationEnabled);
@@ -65,7 +65,7 @@ fn the_identity_and_the_missing_objects_of_a_drive_are_reported() {
     };
     assert_eq!(event, StageEvent::Identity(Axis::Insertion, identity));
     let skipped = Progress::Skipped(Axis::Insertion, ObjectAddress::new(0x1402, 1));
-    bench.run_until(|event| *event == StageEvent::Progress(skipped));
+    bench.until_progress(skipped);
     assert_eq!(skipped.to_string(), "insertion: drive has no 0x1402:01, skipped");
 }
 
@@ -74,7 +74,7 @@ fn both_axes_are_enabled_at_one_sync_and_nothing_moves() {
     let mut bench = Bench::new(config());
     bench.insertion.brake_cycles = 30;
     bench.rotation.charge_cycles = 7;
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
     bench.run_for(Duration::from_millis(200));
     assert_eq!((bench.insertion.counts, bench.rotation.counts), (1000, -20));
     let feedback = bench.until_feedback();
@@ -117,9 +117,9 @@ fn an_axis_that_stands_outside_its_limits_is_not_enabled() {
 
 #[test]
 fn an_absent_drive_is_a_fault_that_says_what_to_check() {
-    let text = fault_of(config(), |bench| bench.insertion.off = true);
+    let fault = fault_of(config(), |bench| bench.insertion.off = true);
     assert_eq!(
-        text,
+        fault,
         "node 1 (insertion): no answer on 601h within 5.0 s, \
          is the drive powered, node-id and bitrate right?"
     );
@@ -132,7 +132,7 @@ fn a_drive_switched_on_late_is_waited_for() {
     bench.run_for(Duration::from_secs(3));
     bench.rotation.off = false;
     bench.receive(heartbeat_frame(bench.rotation.node, NmtState::BootUp));
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
 }
 
 #[test]
@@ -144,20 +144,20 @@ fn a_drive_of_another_vendor_profile_or_mode_is_refused() {
         "node 2 (rotation): 0x1018:01: expected 0x00000022, received 0x000000FB, \
          is this the drive of the configuration?"
     );
-    let text = fault_of(config(), |bench| bench.insertion.set(0x1000, 0, 0x0003_0191_u32));
+    let fault = fault_of(config(), |bench| bench.insertion.set(0x1000, 0, 0x0003_0191_u32));
     assert!(
-        text.starts_with("node 1 (insertion): 0x1000:00: device profile 401 where 402"),
-        "{text}"
+        fault.starts_with("node 1 (insertion): 0x1000:00: device profile 401 where 402"),
+        "{fault}"
     );
-    let text = fault_of(config(), |bench| bench.insertion.set(0x6502, 0, 0x25_u32));
-    assert!(text.contains("lack cyclic synchronous position"), "{text}");
+    let fault = fault_of(config(), |bench| bench.insertion.set(0x6502, 0, 0x25_u32));
+    assert!(fault.contains("lack cyclic synchronous position"), "{fault}");
 }
 
 #[test]
 fn a_written_value_that_reads_back_different_is_a_fault() {
     let mode = ObjectAddress::new(0x6060, 0);
-    let text = fault_of(config(), |bench| bench.insertion.forgets = Some(mode));
-    assert_eq!(text, "node 1 (insertion): 0x6060:00: expected 0x08, received 0x01");
+    let fault = fault_of(config(), |bench| bench.insertion.forgets = Some(mode));
+    assert_eq!(fault, "node 1 (insertion): 0x6060:00: expected 0x08, received 0x01");
 }
 
 #[test]
@@ -165,11 +165,11 @@ fn an_unanswered_sdo_is_retried_and_then_a_fault() {
     let object = ObjectAddress::new(0x1017, 0);
     let mut bench = Bench::new(config());
     bench.insertion.mute = Some((object, 2));
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
 
-    let text = fault_of(config(), |bench| bench.insertion.mute = Some((object, 3)));
+    let fault = fault_of(config(), |bench| bench.insertion.mute = Some((object, 3)));
     assert_eq!(
-        text,
+        fault,
         "node 1 (insertion): 0x1017:00: no SDO reply within 150 ms (attempt 3 of 3), \
          check cable, termination and bus load"
     );
@@ -180,9 +180,9 @@ fn a_refused_raw_sdo_is_a_fault_with_the_abort_code() {
     let raw = |index| RawSdo { bits: 16, index, subindex: 0, value: 7, read_back: true };
     let mut config = config();
     config.insertion.sdo = vec![raw(0x2001), raw(0x2000)];
-    let text = fault_of(config, |bench| bench.insertion.set(0x2001, 0, 0_u16));
+    let fault = fault_of(config, |bench| bench.insertion.set(0x2001, 0, 0_u16));
     assert_eq!(
-        text,
+        fault,
         "node 1 (insertion): 0x2000:00: writing 0x0007 was refused with SDO abort \
          0x06020000 object does not exist; list it in \
          optional_objects if the bench can do without"
@@ -192,15 +192,15 @@ fn a_refused_raw_sdo_is_a_fault_with_the_abort_code() {
 #[test]
 fn an_optional_object_may_be_absent() {
     let object = ObjectAddress::new(0x6007, 0);
-    let text = fault_of(config(), |bench| {
+    let fault = fault_of(config(), |bench| {
         bench.insertion.objects.remove(&object);
     });
-    assert!(text.contains("0x6007:00: writing 0x0003 was refused"), "{text}");
+    assert!(fault.contains("0x6007:00: writing 0x0003 was refused"), "{fault}");
     let mut config = config();
     config.insertion.optional_objects = vec![object.index];
     let mut bench = Bench::new(config);
     bench.insertion.objects.remove(&object);
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
 }
 
 #[test]
@@ -208,8 +208,8 @@ fn a_drive_that_keeps_its_power_is_not_configured() {
     let mut bench = Bench::new(config());
     bench.insertion.state = DriveState::OperationEnabled;
     (bench.insertion.ignores_sdo, bench.insertion.ignores_rpdo) = (true, true);
-    let said = bench.until_fault();
-    assert!(said.contains("the drive keeps its power (statusword 0x0237"), "{said}");
+    let fault = bench.until_fault();
+    assert!(fault.contains("the drive keeps its power (statusword 0x0237"), "{fault}");
     assert!(!bench.insertion.configured_under_power);
 }
 
@@ -217,12 +217,12 @@ fn a_drive_that_keeps_its_power_is_not_configured() {
 fn a_drive_left_enabled_loses_power_before_it_is_configured() {
     let mut bench = Bench::new(config());
     bench.insertion.state = DriveState::OperationEnabled;
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
     assert!(!bench.insertion.configured_under_power);
 }
 
-/// What the insertion drive, left enabled and supervised by an earlier run, is made to do when the
-/// run ends while `object` is waited for: all NMT commands to it and all writes.
+/// An earlier run has left the insertion drive enabled and supervised. The bring-up waits for `object` and is
+/// then stopped: the NMT commands and writes that the drive gets after the stop.
 fn sent_when_interrupted_at(object: ObjectAddress) -> (Bench, Vec<String>) {
     let mut bench = Bench::new(config());
     bench.insertion.state = DriveState::OperationEnabled;
@@ -255,7 +255,7 @@ fn an_interrupted_bring_up_takes_power_off_an_identified_drive() {
     }
     let (bench, sent) = sent_when_interrupted_at(ObjectAddress::new(0x1400, 1));
     assert_eq!(sent, [off, pre_operational, "601#2316100100000000"]);
-    assert_eq!(bench.insertion.value(0x1016, 1), 0, "it is off, and needs no bench");
+    assert_eq!(bench.insertion.value(0x1016, 1), 0, "without power it needs no supervision");
 }
 
 #[test]
@@ -263,7 +263,7 @@ fn a_node_of_unknown_or_wrong_identity_is_not_written_to() {
     for (index, subindex) in [(0x1000, 0), (0x1018, 1), (0x1018, 2)] {
         let (bench, sent) = sent_when_interrupted_at(ObjectAddress::new(index, subindex));
         assert_eq!(sent, [""; 0], "{index:x}");
-        assert_eq!(bench.insertion.state, DriveState::OperationEnabled, "as it was found");
+        assert_eq!(bench.insertion.state, DriveState::OperationEnabled, "left as it was found");
     }
     let mut config = config();
     config.rotation.product_code = Some(0x22);
@@ -271,7 +271,7 @@ fn a_node_of_unknown_or_wrong_identity_is_not_written_to() {
     bench.insertion.state = DriveState::OperationEnabled;
     bench.until_fault();
     bench.until_stopped();
-    assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled, "this one is ours");
+    assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled, "this drive is identified");
     let written = bench.sent.iter().find(|(_, frame)| match (frame.cob_id(), frame.data()) {
         (Some(0x000), [_, node]) => *node != 1,
         (Some(0x602), [command, ..]) => *command != 0x40,
@@ -280,7 +280,7 @@ fn a_node_of_unknown_or_wrong_identity_is_not_written_to() {
     assert_eq!(written, None);
 }
 
-/// The soft limits in counts, wider by what the axis may be from its target: 30 ms at its speed.
+/// The soft limits in counts, wider by the following-error window: 30 ms at the highest speed unless configured.
 #[test]
 fn the_soft_limits_and_windows_are_written_to_the_drives() {
     let mut config = config();
@@ -289,7 +289,7 @@ fn the_soft_limits_and_windows_are_written_to_the_drives() {
     config.insertion.following_error_max = Some(0.5);
     config.insertion.quick_stop_deceleration = Some(20.0);
     let mut bench = Bench::new(config);
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
     let limits = |drive: &TestDrive| [1, 2].map(|end| drive.value(0x607d, end) as i32);
     let per_mm = COUNTS_PER_MM;
     assert_eq!(limits(&bench.insertion), [500 - per_mm * 3 / 2, 500 + per_mm * 301 / 2]);
@@ -298,10 +298,10 @@ fn the_soft_limits_and_windows_are_written_to_the_drives() {
     assert_eq!(bench.insertion.value(0x6065, 0), 2323);
     assert_eq!(bench.rotation.value(0x6065, 0), 7235);
     assert_eq!(bench.insertion.value(0x6085, 0), 92_920);
-    assert_eq!(bench.rotation.value(0x6085, 0), 10_000, "as the drive had it");
+    assert_eq!(bench.rotation.value(0x6085, 0), 10_000, "the drive's own value");
 }
 
-/// A drive that has no 0x6066 is brought up all the same.
+/// The rotation drive has no 0x6066; its bring-up succeeds too.
 #[test]
 fn the_following_error_timeout_is_written_where_the_drive_has_it() {
     let mut config = config();
@@ -309,7 +309,7 @@ fn the_following_error_timeout_is_written_where_the_drive_has_it() {
     config.rotation.following_error_timeout_ms = Some(20);
     let mut bench = Bench::new(config);
     bench.insertion.set(0x6066, 0, 5000_u16);
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
     assert_eq!(bench.insertion.value(0x6066, 0), 20);
 }
 
@@ -318,41 +318,33 @@ fn a_wrapping_axis_gets_no_position_limits_in_its_drive() {
     let mut config = config();
     config.rotation.wraps = true;
     let mut bench = Bench::new(config);
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
     let limits = [1, 2].map(|sub| bench.rotation.value(0x607d, sub) as i32);
-    assert_eq!(limits, [i32::MIN, i32::MAX], "not those of another use");
+    assert_eq!(limits, [i32::MIN, i32::MAX], "the limits of an earlier use are gone");
 }
 
-/// No node answers an SDO in NMT Stopped: one that is silent is first taken out of it.
+/// A node in NMT Stopped answers no SDO, so a silent node is first sent to pre-operational.
 #[test]
 fn a_drive_left_in_nmt_stopped_is_brought_up() {
     let mut bench = Bench::new(config());
     bench.insertion.nmt = NmtState::Stopped;
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
     let first = |start: &str| {
-        let is_it = |(_, frame): &(Time, Frame)| frame.to_string().starts_with(start);
-        bench.sent.iter().position(is_it).expect("sent")
+        let starts = |(_, frame): &(Time, Frame)| frame.to_string().starts_with(start);
+        bench.sent.iter().position(starts).expect("sent")
     };
     let (leave, identify) = (first("000#8001"), first("601#401810"));
     assert!(leave < identify);
-    // The node has left Stopped when it is asked again: that request is answered.
+    // By then the node has left Stopped and answers.
     let asked_after = bench.sent[identify].0.since(bench.sent[leave].0);
     assert_eq!(asked_after, Duration::from_millis(10));
 }
 
-/// Comes to the identity, restarts, and so on.
+/// Restarts the insertion drive `times` times, each time in the same step of its bring-up.
 fn reboot(bench: &mut Bench, times: u32) {
     for _ in 0..times {
-        let identity = |event: &StageEvent| {
-            matches!(
-                event,
-                StageEvent::Progress(Progress::BringUp(
-                    Axis::Insertion,
-                    "taking power off, looking for faults"
-                ))
-            )
-        };
-        bench.run_until(identity);
+        let step = "taking power off, looking for faults";
+        bench.until_progress(Progress::BringUp(Axis::Insertion, step));
         bench.receive(heartbeat_frame(bench.insertion.node, NmtState::BootUp));
     }
 }
@@ -364,9 +356,8 @@ fn a_drive_that_restarts_in_bring_up_is_brought_up_again() {
     bench.rotation.mute = Some((ObjectAddress::new(0x1018, 4), 2));
     reboot(&mut bench, 1);
     bench.insertion.mute = None;
-    let restarted = StageEvent::Progress(Progress::Restarted(Axis::Insertion));
-    bench.run_until(|event| *event == restarted);
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_progress(Progress::Restarted(Axis::Insertion));
+    bench.until_ready();
     assert_eq!(bench.insertion.value(0x1800, 2), 1);
 }
 

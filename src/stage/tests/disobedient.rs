@@ -1,9 +1,9 @@
-//! Drives that do not do what they are told, or say that they will not.
+//! Drives that do not obey, or report that they will not.
 
 use super::*;
 use crate::canopen::cia402::{DriveState, Statusword};
 
-/// Controlwords that the insertion drive was sent by SDO, with the time since the first.
+/// Controlwords that were sent to the insertion drive by SDO, with the time since the first.
 fn by_sdo(bench: &Bench) -> Vec<(Duration, u8)> {
     let mut first = None;
     let controlword = |(time, frame): &(Time, Frame)| match (frame.cob_id(), frame.data()) {
@@ -33,8 +33,8 @@ fn a_drive_that_keeps_its_power_at_the_end_is_a_fault() {
     assert_eq!(bench.rotation.state, DriveState::SwitchOnDisabled);
 }
 
-/// It gets quick stop and then Disable Voltage every 100 ms until the time is over, and keeps
-/// the bench's heartbeat to miss.
+/// The stage repeats quick stop, then Disable Voltage, every 100 ms until the timeout. The drive goes on to
+/// monitor the bench's heartbeat, which may still stop it.
 #[test]
 fn a_drive_that_ignores_commands_gets_them_again_and_keeps_its_watchdog() {
     let mut bench = Bench::ready();
@@ -62,7 +62,7 @@ fn an_axis_that_is_not_seen_to_stand_at_the_end_is_a_fault() {
     bench.drive_on(20);
     bench.stage.disable(bench.now);
     for n in 0..300 {
-        // To and fro by 0.1 mm: within the following error.
+        // Back and forth by 0.1 mm, within the following-error window.
         bench.insertion.counts += if n % 2 == 0 { 465 } else { -465 };
         bench.run_for(Duration::from_millis(10));
     }
@@ -75,7 +75,6 @@ fn an_axis_that_is_not_seen_to_stand_at_the_end_is_a_fault() {
     assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled);
 }
 
-/// A quick stop that a drive did not hear is sent again.
 #[test]
 fn a_quick_stop_that_was_not_obeyed_is_sent_again() {
     let mut bench = Bench::ready();
@@ -85,14 +84,14 @@ fn a_quick_stop_that_was_not_obeyed_is_sent_again() {
     bench.stage.quick_stop(bench.now);
     bench.run_for(Duration::from_millis(50));
     bench.insertion.ignores_sdo = false;
-    assert!(bench.until_stopped(), "seen to stand");
+    assert!(bench.until_stopped(), "standstill is reported");
     let words: Vec<(u128, u8)> = by_sdo(&bench).iter().map(|(t, w)| (t.as_millis(), *w)).collect();
     assert_eq!(words[..2], [(0, 0x02), (100, 0x02)]);
     assert_eq!((words[2].1, words.len()), (0x00, 3));
 }
 
-/// The fault of an enabled drive that showed `bits` and then does not.
-fn fault_of_lost(bits: u16) -> String {
+/// The fault when an enabled drive clears `bits` that it has set so far.
+fn fault_of_cleared(bits: u16) -> String {
     let mut bench = Bench::new(config());
     bench.rotation.extra_bits = bits;
     bench.until_feedback();
@@ -105,23 +104,23 @@ fn fault_of_lost(bits: u16) -> String {
 #[test]
 fn a_drive_that_no_longer_obeys_or_follows_stops_the_run() {
     assert_eq!(
-        fault_of_lost(Statusword::REMOTE),
+        fault_of_cleared(Statusword::REMOTE),
         "rotation: the drive no longer obeys the bus (statusword 0x0037 operation enabled, bit 9 \
          clear): it will ignore a stop; press the emergency stop"
     );
     assert_eq!(
-        fault_of_lost(Statusword::VOLTAGE_ENABLED),
+        fault_of_cleared(Statusword::VOLTAGE_ENABLED),
         "rotation: the drive has lost its supply (statusword 0x0227 operation enabled, bit 4 \
          clear), is an emergency stop pressed, or a fuse blown?"
     );
     assert_eq!(
-        fault_of_lost(Statusword::FOLLOWS_COMMAND),
+        fault_of_cleared(Statusword::FOLLOWS_COMMAND),
         "rotation: the drive ignores its targets (statusword 0x0237 operation enabled, bit 12 \
          clear), does an input or another tool hold it?"
     );
 }
 
-/// It gets no power, or loses it at once: no stop would be obeyed.
+/// Such a drive would ignore a stop, so it gets no power, or loses it at once.
 #[test]
 fn a_drive_that_stops_obeying_during_enabling_is_a_fault() {
     use DriveState as S;
@@ -133,8 +132,8 @@ fn a_drive_that_stops_obeying_during_enabling_is_a_fault() {
             bench.step();
         }
         (bench.rotation.extra_bits, bench.rotation.clear_bits) = (0, Statusword::REMOTE);
-        let said = bench.until_fault();
-        assert!(said.contains("the drive no longer obeys the bus"), "{state:?}: {said}");
+        let fault = bench.until_fault();
+        assert!(fault.contains("the drive no longer obeys the bus"), "{state:?}: {fault}");
         assert!(!bench.events.contains(&StageEvent::Ready), "{state:?}");
     }
 }
@@ -149,10 +148,10 @@ fn an_internal_limit_that_holds_a_drive_for_a_while_is_no_fault() {
     bench.rotation.extra_bits = Statusword::FOLLOWS_COMMAND;
     bench.run_for(Duration::from_millis(100));
     assert!(bench.events.contains(&StageEvent::InternalLimit(Axis::Rotation)));
-    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+    assert_eq!(bench.fault(), None);
 }
 
-/// What a drive never shows is not lost; that it could not be noticed is said once.
+/// The stage cannot notice the loss of a bit that the drive never sets. It reports that once.
 #[test]
 fn a_status_bit_that_a_drive_never_sets_is_reported_and_no_fault() {
     let mut bench = Bench::new(config());
@@ -191,7 +190,7 @@ fn repeated_warnings_are_reported_ever_more_rarely_and_no_fault() {
 fn an_undefined_statusword_is_a_fault() {
     let mut bench = Bench::ready();
     bench.drive_on(10);
-    // Bits 6, 5, 3, 2, 1, 0 of no state.
+    // Bits 6, 5, 3, 2, 1 and 0 match no state.
     (bench.rotation.extra_bits, bench.rotation.clear_bits) = (0x0040, 0x0005);
     assert_eq!(
         bench.until_fault(),
@@ -200,7 +199,7 @@ fn an_undefined_statusword_is_a_fault() {
     );
 }
 
-/// As of an encoder that is read anew when its drive is enabled.
+/// Some drives read their encoder again when they are enabled.
 #[test]
 fn a_position_jump_at_enabling_is_a_fault_and_moves_nothing() {
     let mut bench = Bench::new(config());
@@ -209,12 +208,12 @@ fn a_position_jump_at_enabling_is_a_fault_and_moves_nothing() {
         bench.step();
     }
     bench.insertion.counts += COUNTS_PER_MM;
-    let said = bench.until_fault();
-    assert!(said.starts_with("insertion: following error of -1.000 mm (limit 0."), "{said}");
+    let fault = bench.until_fault();
+    assert!(fault.starts_with("insertion: following error of -1.000 mm (limit 0."), "{fault}");
     let target = |(_, frame): &(Time, Frame)| match (frame.cob_id(), frame.data()) {
         (Some(0x201), [_, _, target @ ..]) => target.try_into().ok().map(i32::from_le_bytes),
         _ => None,
     };
     let targets = bench.sent.iter().filter_map(target).collect::<Vec<_>>();
-    assert!(targets.iter().all(|target| *target == 1000), "{targets:?}");
+    assert!(!targets.is_empty() && targets.iter().all(|at| *at == 1000), "{targets:?}");
 }

@@ -1,4 +1,4 @@
-//! A scripted CiA 402 drive: as much of one as the stage talks to, and the ways it misbehaves.
+//! A scripted CiA 402 drive: the part that the stage uses, and the ways to misbehave.
 
 use std::collections::BTreeMap;
 
@@ -28,52 +28,52 @@ pub(super) struct TestDrive {
     next_heartbeat: Time,
     out: Vec<Frame>,
 
-    /// Not powered: hears and says nothing.
+    /// Without supply: it receives and sends nothing.
     pub(super) off: bool,
-    /// So many requests about this object get no answer.
+    /// This many requests about this object get no answer.
     pub(super) mute: Option<(ObjectAddress, u32)>,
-    /// Was something written while the motor had power?
+    /// Whether an object was written while the motor had power.
     pub(super) configured_under_power: bool,
-    /// TPDOs to lose.
+    /// Number of next TPDOs that are lost.
     pub(super) tpdos_lost: u32,
-    /// Writes are confirmed but not kept.
+    /// Writes of this object are confirmed but not kept.
     pub(super) forgets: Option<ObjectAddress>,
-    /// Bits added to the statusword, and taken from it.
+    /// Bits that are set in the statusword, and then bits that are cleared.
     pub(super) extra_bits: u16,
     pub(super) clear_bits: u16,
-    /// Its controlword changes by SDO alone, or by nothing.
+    /// Ignores controlwords in RPDO1, or those by SDO.
     pub(super) ignores_rpdo: bool,
     pub(super) ignores_sdo: bool,
-    /// The speed at which power was taken away, counts a cycle.
+    /// The highest speed in counts a SYNC at which power was taken off.
     pub(super) coasted_from: i32,
-    /// Cycles between Switch On and Switched On: capacitors.
+    /// SYNCs between Switch On and Switched On, to charge capacitors.
     pub(super) charge_cycles: u32,
-    /// Cycles between Enable Operation and Operation Enabled: a brake.
+    /// SYNCs between Enable Operation and Operation Enabled, to open a brake.
     pub(super) brake_cycles: u32,
     pub(super) heartbeat_off: bool,
-    /// What statusword bits 12 and 13 say in homing mode.
+    /// State of homing, for bits 10, 12 and 13 of the statusword in homing mode.
     pub(super) homing: Homing,
-    /// Cycles that homing takes.
+    /// SYNCs that homing takes.
     pub(super) homing_cycles: u32,
-    /// Cycles for which the bits of the homing before stay when a new one begins.
+    /// SYNCs for which the bits of an earlier homing stay after a new one has begun.
     pub(super) clears_late: u32,
     pub(super) homing_fails: bool,
-    /// Its fault does not end by a reset.
+    /// A reset does not end its fault.
     pub(super) keeps_its_fault: bool,
-    /// Rising edges of Fault Reset seen.
+    /// Number of rising edges of Fault Reset.
     pub(super) resets: u32,
-    /// Its safety input is open: it stays in Switch On Disabled, or goes back there.
+    /// Its safety input is open: it stays in Switch On Disabled, or returns there.
     pub(super) safety_open: bool,
-    /// What it answered to the last SYNC.
+    /// Its answer to the last SYNC.
     pub(super) last_tpdo: Option<Frame>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Homing {
-    Not,
+    NotDone,
     Attained,
     Failed,
-    Under { cycles: u32 },
+    Running { cycles: u32 },
 }
 
 fn at(index: u16, subindex: u8) -> ObjectAddress {
@@ -149,7 +149,7 @@ impl TestDrive {
             charge_cycles: 0,
             brake_cycles: 0,
             heartbeat_off: false,
-            homing: Homing::Not,
+            homing: Homing::NotDone,
             homing_cycles: 20,
             clears_late: 0,
             homing_fails: false,
@@ -203,8 +203,8 @@ impl TestDrive {
             }
         } else if self.nmt == NmtState::Operational {
             if frame.cob_id() == Some(cob::rpdo1(self.node)) {
-                let [c0, c1, t @ ..] = frame.data() else { panic!("an RPDO of no length") };
-                let target = t.try_into().expect("six bytes");
+                let [c0, c1, t @ ..] = frame.data() else { panic!("RPDO1 without a controlword") };
+                let target = t.try_into().expect("RPDO1 has 6 bytes");
                 self.rpdo = Some((u16::from_le_bytes([*c0, *c1]), i32::from_le_bytes(target)));
             } else if is_sync(frame, cob::SYNC) {
                 self.handle_sync();
@@ -231,7 +231,7 @@ impl TestDrive {
         }
         let speed = self.step.abs();
         self.step = match self.state {
-            DriveState::OperationEnabled if self.homes() => self.home(),
+            DriveState::OperationEnabled if self.is_homing_mode() => self.home(),
             DriveState::OperationEnabled => self.target.wrapping_sub(self.counts),
             DriveState::QuickStopActive => self.step - self.step.signum(),
             _ => 0,
@@ -242,15 +242,15 @@ impl TestDrive {
         self.counts = self.counts.wrapping_add(self.step);
     }
 
-    fn homes(&self) -> bool {
+    fn is_homing_mode(&self) -> bool {
         self.value(0x6060, 0) == 6
     }
 
-    /// A cycle of homing: away from the switch by five counts; home reads as the home offset says.
+    /// One SYNC of homing: 5 counts of motion, and at the end a position of minus the home offset.
     fn home(&mut self) -> i32 {
-        let Homing::Under { cycles } = self.homing else { return 0 };
+        let Homing::Running { cycles } = self.homing else { return 0 };
         if cycles > 0 {
-            self.homing = Homing::Under { cycles: cycles - 1 };
+            self.homing = Homing::Running { cycles: cycles - 1 };
             return -5;
         }
         self.homing = if self.homing_fails { Homing::Failed } else { Homing::Attained };
@@ -262,12 +262,12 @@ impl TestDrive {
 
     fn statusword(&self) -> Statusword {
         let homing = match self.homing {
-            _ if !self.homes() => 0,
-            Homing::Not => 0x0400,
+            _ if !self.is_homing_mode() => 0,
+            Homing::NotDone => 0x0400,
             Homing::Attained => 0x1400,
             Homing::Failed => 0x2400,
-            Homing::Under { cycles } if cycles + self.clears_late > self.homing_cycles => 0x1400,
-            Homing::Under { .. } => 0,
+            Homing::Running { cycles } if cycles + self.clears_late > self.homing_cycles => 0x1400,
+            Homing::Running { .. } => 0,
         };
         let bits = Statusword::state_bits(self.state) | 0x0210 | homing | self.extra_bits;
         Statusword(bits & !self.clear_bits)
@@ -277,8 +277,8 @@ impl TestDrive {
         use DriveState as S;
         let rising = controlword & !self.controlword;
         let reset = rising & 0x80 != 0;
-        if rising & 0x10 != 0 && self.homes() && self.state == S::OperationEnabled {
-            self.homing = Homing::Under { cycles: self.homing_cycles };
+        if rising & 0x10 != 0 && self.is_homing_mode() && self.state == S::OperationEnabled {
+            self.homing = Homing::Running { cycles: self.homing_cycles };
         }
         self.controlword = controlword;
         self.resets += u32::from(reset);
@@ -333,8 +333,8 @@ impl TestDrive {
         Ok(ServerFrame::Reply(object, SdoReply::Uploaded(value)))
     }
 
-    /// With the rules of CiA 301 for PDO parameters: a count of entries only while the PDO is
-    /// off, entries only while the count is 0, an identifier only by switching off or on.
+    /// By the rules of CiA 301 for PDO parameters: the number of entries changes only while the PDO is off, an
+    /// entry only while that number is 0, and the identifier only while the PDO is switched off.
     fn write(
         &mut self,
         now: Time,

@@ -1,11 +1,11 @@
-//! From the bring-up to power: what is waited for, and what ends it.
+//! From the bring-up to power: what the stage waits for, and what stops it.
 
 use super::*;
 use crate::canopen::cia402::DriveState;
 use crate::canopen::cob;
 use crate::canopen::nmt::{NmtState, heartbeat_frame};
 
-/// Without leave the drives stay without power, watched, for as long as it takes.
+/// Until then the drives stay supervised and without power.
 #[test]
 fn power_waits_until_it_is_permitted() {
     let mut bench = Bench::new(config());
@@ -18,12 +18,11 @@ fn power_waits_until_it_is_permitted() {
     for drive in [&bench.insertion, &bench.rotation] {
         assert_eq!(drive.state, DriveState::SwitchOnDisabled);
     }
-    assert!(bench.stage.command(SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 }).is_err());
+    assert!(bench.command(0.0, 0.0).is_err());
     bench.stage.permit_power(true);
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
 }
 
-/// A fault that comes while power is awaited ends it, and is not reset.
 #[test]
 fn a_fault_while_power_is_awaited_stops_the_stage_and_is_not_reset() {
     let awaiting = || {
@@ -44,45 +43,43 @@ fn a_fault_while_power_is_awaited_stops_the_stage_and_is_not_reset() {
     assert_eq!((bench.rotation.resets, bench.insertion.state), (0, DriveState::SwitchOnDisabled));
 }
 
-/// A drive that never answers a SYNC gets no power to wait for.
+/// Power is not permitted yet, but the stage does not wait for such a drive.
 #[test]
 fn a_drive_that_never_answers_a_sync_is_a_fault() {
     let mut bench = Bench::new(config());
     bench.stage.permit_power(false);
     bench.rotation.tpdos_lost = u32::MAX;
-    let said = bench.until_fault();
+    let fault = bench.until_fault();
     assert!(
-        said.starts_with("rotation: not in operation enabled within 3000 ms (no TPDO1 was heard)"),
-        "{said}"
+        fault.starts_with("rotation: not in operation enabled within 3000 ms (no TPDO1 was heard)"),
+        "{fault}"
     );
 }
 
-/// An emergency stop that is pressed, or a safety input that is open: letting it go must not be
-/// what begins the motion.
+/// The emergency stop may be pressed, or a safety input open. Releasing it must not start the motion.
 #[test]
 fn a_drive_that_refuses_to_switch_on_is_a_fault_at_once() {
-    let said = "insertion: the drive refused to switch on (statusword 0x0250 switch on disabled); \
+    let refused = "insertion: the drive refused to switch on (statusword 0x0250 switch on disabled); \
                 check safety input";
     let mut bench = Bench::new(config());
     bench.insertion.safety_open = true;
-    bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+    bench.until_progress(Progress::Enabling);
     let begun = bench.now;
-    assert!(bench.until_fault().starts_with(said));
+    assert!(bench.until_fault().starts_with(refused));
     assert!(bench.now.since(begun) < Duration::from_millis(600));
 
     let mut bench = Bench::new(config());
     bench.insertion.charge_cycles = 20;
-    bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+    bench.until_progress(Progress::Enabling);
     bench.run_for(Duration::from_millis(50));
     assert_eq!(bench.insertion.state, DriveState::ReadyToSwitchOn);
     bench.insertion.safety_open = true;
     bench.run_for(Duration::from_millis(20));
     bench.insertion.safety_open = false;
-    assert!(bench.until_fault().starts_with(said));
+    assert!(bench.until_fault().starts_with(refused));
     assert!(!bench.events.contains(&StageEvent::Ready));
 }
 
-/// Nothing but the bench may give it power.
 #[test]
 fn a_drive_enabled_by_something_else_while_power_is_awaited_is_a_fault() {
     for state in [DriveState::SwitchedOn, DriveState::OperationEnabled, DriveState::QuickStopActive]
@@ -92,9 +89,9 @@ fn a_drive_enabled_by_something_else_while_power_is_awaited_is_a_fault() {
         bench.run_until(|event| matches!(event, StageEvent::Located(_)));
         bench.insertion.state = state;
         (bench.insertion.ignores_rpdo, bench.insertion.ignores_sdo) = (true, true);
-        let said = bench.until_fault();
-        let named = said.starts_with("insertion: the drive has power before the bench gave it");
-        assert!(named, "{said}");
+        let fault = bench.until_fault();
+        let expected = "insertion: the drive has power before the bench gave it";
+        assert!(fault.starts_with(expected), "{fault}");
     }
 }
 
@@ -102,13 +99,13 @@ fn a_drive_enabled_by_something_else_while_power_is_awaited_is_a_fault() {
 fn a_drive_that_cannot_be_enabled_is_named() {
     let mut bench = Bench::new(config());
     bench.rotation.brake_cycles = u32::MAX;
-    let text = bench.until_fault();
-    assert!(text.starts_with("rotation: not in operation enabled within 3000 ms"), "{text}");
+    let fault = bench.until_fault();
+    assert!(fault.starts_with("rotation: not in operation enabled within 3000 ms"), "{fault}");
     bench.until_stopped();
     assert_ne!(bench.insertion.state, DriveState::OperationEnabled);
 }
 
-/// The drive is heard before anything may move, and not only after its heartbeat is overdue.
+/// A heartbeat must arrive before anything may move. It is not enough that none is overdue yet.
 #[test]
 fn without_a_heartbeat_the_stage_is_never_ready() {
     let mut bench = Bench::new(config());
@@ -120,15 +117,15 @@ fn without_a_heartbeat_the_stage_is_never_ready() {
     assert!(!bench.events.contains(&StageEvent::Ready));
 }
 
-/// The heartbeat of an earlier run may still say that the node is Operational.
+/// A heartbeat from an earlier run may still say operational.
 #[test]
 fn a_heartbeat_from_before_the_bring_up_does_not_count() {
     let mut bench = Bench::new(config());
     bench.rotation.heartbeat_off = true;
     bench.now = bench.now + Duration::from_millis(200);
     bench.receive(heartbeat_frame(bench.rotation.node, NmtState::Operational));
-    let said = bench.until_fault();
-    assert!(said.starts_with("rotation: no heartbeat for 300 ms"), "{said}");
+    let fault = bench.until_fault();
+    assert!(fault.starts_with("rotation: no heartbeat for 300 ms"), "{fault}");
     assert!(!bench.events.contains(&StageEvent::Ready));
 }
 
@@ -148,10 +145,10 @@ fn a_node_that_ignores_the_start_command_is_named_by_its_state() {
     assert!(said.starts_with(expected), "{said}");
 }
 
-/// Both drives are enabled then, and neither is named for that.
+/// Both drives are enabled, so the fault does not blame the enabling.
 #[test]
 fn a_node_whose_heartbeat_does_not_say_operational_is_a_fault() {
-    for (heard, said) in [
+    for (heard, fault) in [
         (None, "rotation: enabled, but no heartbeat within 3000 ms, is can.heartbeat_ms longer?"),
         (
             Some(NmtState::PreOperational),
@@ -163,23 +160,23 @@ fn a_node_whose_heartbeat_does_not_say_operational_is_a_fault() {
         config.bus.heartbeat_timeout_ms = 60_000;
         let mut bench = Bench::new(config);
         bench.rotation.heartbeat_off = true;
-        bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+        bench.until_progress(Progress::Enabling);
         if let Some(state) = heard {
             bench.receive(heartbeat_frame(bench.rotation.node, state));
         }
-        assert_eq!(bench.until_fault(), said);
+        assert_eq!(bench.until_fault(), fault);
         assert!(!bench.events.contains(&StageEvent::Ready));
     }
 }
 
-/// The last heartbeat comes after the answers to the last SYNC in time.
+/// The last heartbeat arrives within the timeout, but after the last SYNC within it.
 #[test]
 fn drives_enabled_just_as_the_timeout_ends_are_a_fault_that_says_so() {
     let mut config = config();
     config.bus.heartbeat_timeout_ms = 60_000;
     let mut bench = Bench::new(config);
     bench.rotation.heartbeat_off = true;
-    bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+    bench.until_progress(Progress::Enabling);
     let late = bench.now + Duration::from_millis(2_999);
     while bench.stage.deadline() < late {
         bench.step();

@@ -4,13 +4,10 @@ use super::*;
 
 #[test]
 fn an_axis_far_from_its_target_stops_the_run() {
-    // The axis is ahead by 1 mm; 2 SYNC periods and 30 ms at 10 mm/s are 0.5 mm.
+    // The axis is ahead by 1 mm. The limit is the travel in 30 ms and 2 SYNC periods at 10 mm/s.
     let mut bench = Bench::ready();
     bench.drive_on(10);
-    let report = [0x37, 0x02].into_iter().chain((1000 + 5111_i32).to_le_bytes());
-    bench.insertion.tpdos_lost = 1;
-    bench.run_for(Duration::from_millis(10));
-    bench.receive(Frame::new(0x181, &report.collect::<Vec<_>>()));
+    report_counts(&mut bench, 10, 1000 + 5111);
     assert_eq!(
         bench.until_fault(),
         "insertion: following error of -1.000 mm (limit 0.500); is the axis blocked, or the \
@@ -18,22 +15,23 @@ fn an_axis_far_from_its_target_stops_the_run() {
     );
 }
 
-/// The fault of a depth reported `off_mm` from its target, at 10 mm/s at most, if it is one.
+/// Replaces the TPDO1 of the insertion drive after the next SYNC by one with the position `counts`.
+fn report_counts(bench: &mut Bench, sync_ms: u16, counts: i32) {
+    bench.insertion.tpdos_lost = 1;
+    bench.run_for(Duration::from_millis(sync_ms.into()));
+    let [p0, p1, p2, p3] = counts.to_le_bytes();
+    bench.receive(Frame::new(0x181, &[0x37, 0x02, p0, p1, p2, p3]));
+}
+
+/// The fault, if any, when a depth is reported `off_mm` from its target. The axis may move at 10 mm/s.
 fn fault_of_a_depth_off(sync_ms: u16, window_mm: Option<f64>, off_mm: f64) -> Option<String> {
     let mut config = config();
     config.bus.sync_ms = sync_ms;
     config.insertion.following_error_max = window_mm;
     let mut bench = Bench::new(config);
     bench.until_feedback();
-    bench.insertion.tpdos_lost = 1;
-    bench.run_for(Duration::from_millis(sync_ms.into()));
-    let counts = 1000 + (off_mm * f64::from(COUNTS_PER_MM)).round() as i32;
-    let report = [0x37, 0x02].into_iter().chain(counts.to_le_bytes());
-    bench.receive(Frame::new(0x181, &report.collect::<Vec<_>>()));
-    bench.events.iter().find_map(|event| match event {
-        StageEvent::Fault(fault) => Some(fault.clone()),
-        _ => None,
-    })
+    report_counts(&mut bench, sync_ms, 1000 + (off_mm * f64::from(COUNTS_PER_MM)).round() as i32);
+    bench.fault().map(str::to_owned)
 }
 
 #[test]
@@ -66,5 +64,5 @@ fn a_narrow_window_and_a_long_sync_period_let_the_axis_run_at_its_highest_speed(
         bench.command(f64::from(step) * 0.999, 0.0).expect("within limits");
         bench.until_feedback();
     }
-    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+    assert_eq!(bench.fault(), None);
 }

@@ -1,4 +1,4 @@
-//! Drives that are found in fault, and what that excuses.
+//! Drives that are in fault at the start, and which fault is reset.
 
 use super::bring_up::fault_of;
 use super::*;
@@ -7,9 +7,9 @@ use crate::canopen::cia402::DriveState;
 
 #[test]
 fn a_drive_found_in_fault_is_named_or_reset_as_configured() {
-    let text = fault_of(config(), |bench| bench.rotation.state = DriveState::Fault);
+    let fault = fault_of(config(), |bench| bench.rotation.state = DriveState::Fault);
     assert_eq!(
-        text,
+        fault,
         "node 2 (rotation): drive found in fault (statusword 0x0218 fault, \
          0x603F 0x7320 position sensor, 0x1003:01 0x00007320); \
          clear its cause, then: needle-bench stage reset"
@@ -17,7 +17,7 @@ fn a_drive_found_in_fault_is_named_or_reset_as_configured() {
     let config = resetting_config();
     let mut bench = Bench::new(config);
     bench.rotation.state = DriveState::Fault;
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
     assert_eq!(bench.rotation.resets, 1);
 }
 
@@ -26,14 +26,13 @@ fn a_fault_that_a_reset_does_not_end_is_not_reset_again() {
     let mut bench = Bench::new(resetting_config());
     bench.rotation.state = DriveState::Fault;
     bench.rotation.keeps_its_fault = true;
-    let said = bench.until_fault();
-    assert_eq!(said, "rotation: drive in fault (statusword 0x0218 fault)");
+    let fault = bench.until_fault();
+    assert_eq!(fault, "rotation: drive in fault (statusword 0x0218 fault)");
     bench.run_for(Duration::from_secs(5));
     assert_eq!(bench.rotation.resets, 1);
 }
 
-/// Only the fault that a drive was found in is reset: what goes wrong later is of now, and what goes
-/// away by itself must not set the axes going.
+/// A later fault has a cause in this run. If it ended by itself, the axes must not start to move.
 #[test]
 fn a_fault_that_comes_later_is_never_reset() {
     let enabling = StageEvent::Progress(Progress::Enabling);
@@ -44,33 +43,32 @@ fn a_fault_that_comes_later_is_never_reset() {
         bench.run_until(|event| *event == begun);
         bench.rotation.state = DriveState::Fault;
         bench.receive(bench.rotation.emergency(0x9000));
-        let said = bench.until_fault();
-        assert_eq!(said, "rotation: emergency 0x9000 external error (register 0x21)");
+        let fault = bench.until_fault();
+        assert_eq!(fault, "rotation: emergency 0x9000 external error (register 0x21)");
         bench.run_for(Duration::from_secs(5));
         assert_eq!(bench.rotation.resets, 0);
         assert_ne!(bench.insertion.state, DriveState::OperationEnabled);
     }
 }
 
-/// A stage that is about to enable its drives, of which the rotation's was found in Fault and may
-/// be reset.
+/// A stage that is about to enable its drives. The rotation drive was found in fault and may be reset.
 fn enabling_after_a_fault() -> Bench {
     let mut bench = Bench::new(resetting_config());
     bench.rotation.state = DriveState::Fault;
-    bench.run_until(|event| *event == StageEvent::Progress(Progress::Standby));
+    bench.until_progress(Progress::Standby);
     bench
 }
 
-/// Whose fault is gone by itself before it is reset: what comes then is of now.
+/// The found fault ends by itself before the reset.
 #[test]
 fn once_a_found_fault_has_ended_a_new_one_is_not_reset() {
     let mut bench = enabling_after_a_fault();
     bench.rotation.state = DriveState::SwitchOnDisabled;
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
     bench.drive_on(5);
     bench.receive(bench.rotation.emergency(0x7320));
-    let said = bench.until_fault();
-    assert_eq!(said, "rotation: emergency 0x7320 position sensor (register 0x21)");
+    let fault = bench.until_fault();
+    assert_eq!(fault, "rotation: emergency 0x7320 position sensor (register 0x21)");
 
     for state in [DriveState::Fault, DriveState::FaultReactionActive] {
         let mut bench = enabling_after_a_fault();
@@ -78,37 +76,39 @@ fn once_a_found_fault_has_ended_a_new_one_is_not_reset() {
         bench.insertion.charge_cycles = 20;
         bench.run_for(Duration::from_millis(25));
         bench.rotation.state = state;
-        let said = bench.until_fault();
-        assert!(said.starts_with("rotation: drive in fault (statusword 0x02"), "{said}");
+        let fault = bench.until_fault();
+        assert!(fault.starts_with("rotation: drive in fault (statusword 0x02"), "{fault}");
         bench.run_for(Duration::from_secs(5));
         assert_eq!(bench.rotation.resets, 0);
     }
 }
 
-/// 0x603F says which fault it was found in: another one is new, and is not reset.
+/// 0x603F names the fault at the start. An emergency with another code is a new fault.
 #[test]
 fn only_the_emergency_of_the_found_fault_is_ignored() {
     let mut bench = enabling_after_a_fault();
     bench.receive(bench.rotation.emergency(0x7320));
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
     assert_eq!(bench.rotation.resets, 1);
 
     let mut bench = enabling_after_a_fault();
     bench.receive(bench.rotation.emergency(0x9000));
-    let said = bench.until_fault();
-    assert_eq!(said, "rotation: emergency 0x9000 external error (register 0x21)");
+    let fault = bench.until_fault();
+    assert_eq!(fault, "rotation: emergency 0x9000 external error (register 0x21)");
     bench.run_for(Duration::from_secs(5));
     assert_eq!(bench.rotation.resets, 0);
 
     let mut bench = Bench::new(resetting_config());
     bench.rotation.state = DriveState::Fault;
     bench.rotation.objects.remove(&ObjectAddress::new(0x603f, 0));
-    bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+    bench.until_progress(Progress::Enabling);
     bench.receive(bench.rotation.emergency(0x7320));
-    assert!(bench.until_fault().contains("emergency 0x7320"), "it may be any fault");
+    assert!(
+        bench.until_fault().contains("emergency 0x7320"),
+        "without 0x603F no emergency is ignored"
+    );
 }
 
-/// A drive that was found in Fault waits in it, and is reset once power may come.
 #[test]
 fn a_drive_found_in_fault_is_reset_when_power_is_permitted() {
     let mut bench = Bench::new(resetting_config());
@@ -117,7 +117,7 @@ fn a_drive_found_in_fault_is_reset_when_power_is_permitted() {
     bench.run_for(Duration::from_secs(5));
     assert_eq!(bench.rotation.resets, 0);
     bench.stage.permit_power(true);
-    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.until_ready();
     assert_eq!(bench.rotation.resets, 1);
 }
 

@@ -1,4 +1,4 @@
-//! Homing, and the run that asks whether it was done.
+//! Homing, and the check before a run that an axis is homed.
 
 use super::drive::Homing;
 use super::*;
@@ -21,13 +21,13 @@ fn homing_config() -> StageConfig {
 }
 
 /// A stage that is ready to home the insertion.
-fn ready_to_home(spoil: impl FnOnce(&mut Bench)) -> Bench {
+fn ready_to_home(setup: impl FnOnce(&mut Bench)) -> Bench {
     let config = homing_config();
     let nodes = config.nodes();
     let stage = Stage::for_homing(config, INSERTION, Time::from_secs_f64(1.0)).expect("valid");
     let mut bench = Bench::with(stage, nodes);
-    spoil(&mut bench);
-    bench.run_until(|event| *event == StageEvent::Ready);
+    setup(&mut bench);
+    bench.until_ready();
     bench
 }
 
@@ -52,7 +52,7 @@ fn homing_writes_its_parameters_and_finds_home() {
     assert_eq!((drive.value(0x6099, 1), drive.value(0x6099, 2)), (9292, 2323));
     assert_eq!(drive.value(0x609a, 0), 46_460);
     assert_eq!(drive.value(0x607c, 0) as i32, -COUNTS_PER_MM);
-    assert_eq!(drive.value(0x607d, 1) as i32, -5000, "where it stands is not known yet");
+    assert_eq!(drive.value(0x607d, 1) as i32, -5000, "unchanged while the position is unknown");
     assert_eq!((drive.value(0x6060, 0), bench.rotation.value(0x6060, 0)), (6, 8));
 
     home(&mut bench);
@@ -61,19 +61,19 @@ fn homing_writes_its_parameters_and_finds_home() {
     assert!((20..25).contains(&syncs), "{syncs}");
     let words = bench.sent.iter().filter(|(_, frame)| frame.cob_id() == Some(0x201));
     assert!(words.map(|(_, frame)| frame.data()[0]).all(|word| word == 0x1f));
-    assert_eq!(bench.rotation.counts, -20, "the other is held");
+    assert_eq!(bench.rotation.counts, -20, "the other axis is held");
     bench.sent.clear();
     bench.run_for(Duration::from_millis(20));
     assert_eq!(bench.until_feedback().measured.insertion_mm, 1.0);
-    assert!(bench.sent.iter().any(|(_, f)| f.cob_id() == Some(0x201) && f.data()[0] == 0x0f));
+    assert!(bench.has_sent("201#0F"));
 
-    let refused = bench.command(1.0, 0.0).expect_err("it follows no target");
+    let refused = bench.command(1.0, 0.0).expect_err("homing mode");
     assert_eq!(refused.to_string(), "the stage takes no set-points in homing mode");
     bench.stage.disable(bench.now);
     assert!(bench.until_stopped());
 }
 
-/// The bits are not those of the homing before, however late the drive clears them.
+/// The drive clears the bits of the earlier homing late.
 #[test]
 fn the_result_of_an_earlier_homing_is_not_taken_for_the_new_one() {
     for before in [Homing::Attained, Homing::Failed] {
@@ -87,7 +87,7 @@ fn the_result_of_an_earlier_homing_is_not_taken_for_the_new_one() {
     }
 }
 
-/// Bits of the homing before are not believed while the axis is on its way, however long.
+/// The bits of an earlier homing stay during the whole motion.
 #[test]
 fn a_moving_axis_is_not_home_whatever_its_bits_say() {
     let mut bench = ready_to_home(|bench| {
@@ -100,7 +100,7 @@ fn a_moving_axis_is_not_home_whatever_its_bits_say() {
     assert!(syncs >= 300, "{syncs}");
 }
 
-/// As by methods 35 and 37: its bits are never seen clear. They count after a second, standing.
+/// By methods 35 and 37 the bits are never clear. They count after 1 s at standstill.
 #[test]
 fn a_homing_that_takes_no_time_is_accepted_after_a_second() {
     let mut bench = ready_to_home(|bench| {
@@ -126,8 +126,8 @@ fn a_homing_that_fails_or_never_ends_stops_the_stage() {
 
     let mut bench = ready_to_home(|bench| bench.insertion.homing_cycles = u32::MAX);
     home(&mut bench);
-    let text = bench.until_fault();
-    assert!(text.starts_with("insertion: not home within 60.0 s (statusword 0x0237"), "{text}");
+    let fault = bench.until_fault();
+    assert!(fault.starts_with("insertion: not home within 60.0 s (statusword 0x0237"), "{fault}");
     bench.until_stopped();
 }
 
@@ -138,7 +138,7 @@ fn a_stop_ends_a_homing() {
     bench.run_for(Duration::from_millis(50));
     bench.stage.disable(bench.now);
     assert!(bench.until_stopped());
-    assert!(bench.sent.iter().any(|(_, frame)| frame.to_string().starts_with("201#0200")));
+    assert!(bench.has_sent("201#0200"));
     assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Homed { .. })));
 }
 
@@ -165,10 +165,8 @@ fn an_axis_that_needs_homing_is_not_enabled_without_it() {
     let mut bench = Bench::new(homing_config());
     bench.insertion.homing = Homing::Attained;
     let feedback = bench.until_feedback();
-    assert!(
-        (feedback.measured.insertion_mm - 1000.0 / 4646.0).abs() < 1e-9,
-        "from the drive's zero"
-    );
+    let from_zero_mm = 1000.0 / f64::from(COUNTS_PER_MM);
+    assert!((feedback.measured.insertion_mm - from_zero_mm).abs() < 1e-9);
     assert_eq!(bench.insertion.value(0x6060, 0), 8);
 }
 
@@ -181,12 +179,11 @@ fn a_configured_homed_bit_is_read_in_any_mode() {
 
     let mut bench = Bench::new(config);
     bench.insertion.extra_bits = 1 << 15;
-    bench.run_until(|event| *event == StageEvent::Ready);
-    let homing_mode = bench.sent.iter().any(|(_, f)| f.to_string().starts_with("601#2F60600006"));
-    assert!(!homing_mode, "every mode says it");
+    bench.until_ready();
+    assert!(!bench.has_sent("601#2F60600006"), "the drive is not asked in homing mode");
 }
 
-/// With the standard's bit, one minute at most, all else as the drive has it.
+/// Homing by `method` within 1 min; bit 12 is the homed bit, and the drive keeps its own speeds and offset.
 fn homing_by(method: i8) -> HomingConfig {
     HomingConfig {
         method,

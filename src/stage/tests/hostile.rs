@@ -1,11 +1,11 @@
-//! Whatever comes in, nothing goes out that a limit forbids.
+//! No input makes the stage send a target beyond a limit.
 
 use proptest::prelude::*;
 
 use super::*;
 use crate::canopen::CanId;
 
-/// Limits near enough to be run into.
+/// Limits so narrow that random commands reach them.
 fn narrow() -> StageConfig {
     let mut config = config();
     (config.insertion.limits.min, config.insertion.limits.max) = (-0.2, 0.3);
@@ -41,8 +41,8 @@ fn attack() -> impl Strategy<Value = Attack> {
     ]
 }
 
-/// Targets sent with Enable Operation that a SYNC made the drive's, in order. Of several targets before
-/// one SYNC the drive takes the last.
+/// The targets that took effect, in order: sent with Enable Operation and followed by a SYNC. Of several targets
+/// before one SYNC the last takes effect.
 fn targets(bench: &Bench, cob_id: u16) -> Vec<i64> {
     let (mut taken, mut next) = (Vec::new(), None);
     for (_, frame) in &bench.sent {
@@ -129,7 +129,7 @@ proptest! {
         }
         bench.stage.quick_stop(bench.now);
         bench.run_for(Duration::from_secs(7));
-        prop_assert!(!bench.stage.sync_runs(), "it always ends");
+        prop_assert!(!bench.stage.sync_runs(), "a quick stop always ends");
 
         check_all_targets(&bench)?;
     }

@@ -55,8 +55,8 @@ impl StageConfig {
 }
 
 impl AxisConfig {
-    /// An axis of the drive `node` with the common choices: quick stop on its own ramp, quick
-    /// stop too when the bench falls silent, zero where it stands.
+    /// An axis of the drive `node` with the common choices: quick stop on its own ramp, also when the bench falls
+    /// silent; zero where the axis stands.
     pub(crate) fn new(node: NodeId, ratio: CountsRatio, limits: AxisLimits) -> Self {
         AxisConfig {
             node,
@@ -99,7 +99,7 @@ fn config() -> StageConfig {
     StageConfig::new(axis(1, COUNTS_PER_MM, depth), axis(2, COUNTS_PER_TURN, angle))
 }
 
-/// The same; a drive that is found in fault is reset.
+/// The same; a drive that is in fault at the start is reset.
 fn resetting_config() -> StageConfig {
     let mut config = config();
     config.power.fault_reset_on_start = true;
@@ -112,10 +112,10 @@ struct Bench {
     stage: Stage,
     insertion: TestDrive,
     rotation: TestDrive,
-    /// What the stage sent.
+    /// All frames that the stage has sent.
     sent: Vec<(Time, Frame)>,
     events: Vec<StageEvent>,
-    /// The number of events up to the one that was waited for last.
+    /// Number of events that `run_until` has passed.
     seen: usize,
 }
 
@@ -141,11 +141,11 @@ impl Bench {
     /// A bench whose stage is ready and has the positions of its last SYNC.
     fn ready() -> Self {
         let mut bench = Bench::new(config());
-        bench.run_until(|event| matches!(event, StageEvent::Feedback(_)));
+        bench.until_feedback();
         bench
     }
 
-    /// Everything up to and at `self.now`.
+    /// Passes frames on until the stage has no more output at `self.now`.
     fn settle(&mut self) {
         while let Some(output) = self.stage.poll() {
             match output {
@@ -187,7 +187,7 @@ impl Bench {
         }
     }
 
-    /// Runs until an event passes that comes after the one that was waited for last.
+    /// Runs to the first event that `passes` after the event that was waited for last.
     fn run_until(&mut self, mut passes: impl FnMut(&StageEvent) -> bool) -> StageEvent {
         for _ in 0..20_000 {
             if let Some(at) = self.events[self.seen..].iter().position(&mut passes) {
@@ -196,7 +196,15 @@ impl Bench {
             }
             self.step();
         }
-        panic!("never happened; events since: {:?}", &self.events[self.seen..]);
+        panic!("this event never came; events since: {:?}", &self.events[self.seen..]);
+    }
+
+    fn until_ready(&mut self) {
+        self.run_until(|event| *event == StageEvent::Ready);
+    }
+
+    fn until_progress(&mut self, progress: Progress) {
+        self.run_until(|event| *event == StageEvent::Progress(progress));
     }
 
     fn until_fault(&mut self) -> String {
@@ -220,12 +228,24 @@ impl Bench {
         }
     }
 
+    /// The first fault so far.
+    fn fault(&self) -> Option<&str> {
+        self.events.iter().find_map(|event| match event {
+            StageEvent::Fault(fault) => Some(&**fault),
+            _ => None,
+        })
+    }
+
+    /// Whether a frame was sent that begins with `start`, as candump prints it.
+    fn has_sent(&self, start: &str) -> bool {
+        self.sent.iter().any(|(_, frame)| frame.to_string().starts_with(start))
+    }
+
     fn command(&mut self, insertion_mm: f64, rotation_rad: f64) -> Result<(), String> {
         self.stage.command(SetPoint { insertion_mm, rotation_rad })
     }
 
-    /// Moves by `steps` set-points of a millimetre a second and a radian a second; the axes are
-    /// on their way to the last, and so is the feedback.
+    /// Sends `steps` set-points of 1 mm/s and 1 rad/s; returns the feedback while the axes move to the last one.
     fn drive_on(&mut self, steps: usize) -> Feedback {
         let mut feedback = self.until_feedback();
         for step in 1..=steps {

@@ -4,10 +4,10 @@ use super::*;
 use crate::canopen::cia402::DriveState;
 use crate::canopen::nmt::{NmtState, heartbeat_frame};
 
-/// While nothing was sent yet, nothing is, but for reading nobody minds.
+/// The stage only listens at first. A read by another node is no reason to stop.
 #[test]
 fn another_master_heard_before_the_start_is_a_fault_and_nothing_is_sent() {
-    for word in [
+    for frame in [
         Frame::new(0x080, &[]),
         Frame::new(0x202, &[0x0F, 0, 1, 0, 0, 0]),
         heartbeat_frame(node(127), NmtState::Operational),
@@ -15,13 +15,13 @@ fn another_master_heard_before_the_start_is_a_fault_and_nothing_is_sent() {
     ] {
         let mut bench = Bench::new(config());
         bench.receive(Frame::new(0x601, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]));
-        bench.receive(word);
+        bench.receive(frame);
         let fault = bench.until_fault();
         let named = fault.starts_with("another master on the bus: ");
-        assert!(named && fault.contains(&format!("({word})")), "{fault}");
+        assert!(named && fault.contains(&format!("({frame})")), "{fault}");
         assert!(!bench.until_stopped());
         bench.run_for(Duration::from_secs(1));
-        assert_eq!(bench.sent, [], "not a word");
+        assert_eq!(bench.sent, []);
     }
 }
 
@@ -29,14 +29,14 @@ fn another_master_heard_before_the_start_is_a_fault_and_nothing_is_sent() {
 fn nothing_is_sent_while_the_stage_listens_for_another_master() {
     let mut bench = Bench::new(config());
     let begun = bench.now;
-    bench.run_until(|event| *event == StageEvent::Ready);
-    let first = bench.sent.first().expect("it speaks in the end").0;
+    bench.until_ready();
+    let first = bench.sent.first().expect("frames of the bring-up").0;
     assert_eq!(first.since(begun), config().listen_first);
 }
 
 #[test]
 fn another_master_stops_a_stage_at_its_first_frame() {
-    let words = [
+    let frames = [
         (Frame::new(0x201, &[0x0F, 0, 0, 0x25, 0, 0]), "RPDO1 of a drive (201#0F0000250000)"),
         (Frame::new(0x080, &[]), "SYNC (080#)"),
         (Frame::new(0x000, &[0x80, 1]), "an NMT command (000#8001)"),
@@ -46,14 +46,14 @@ fn another_master_stops_a_stage_at_its_first_frame() {
         ),
         (Frame::new(0x77F, &[5]), "a heartbeat of the bench's own node number (77F#05)"),
     ];
-    for (word, named) in words {
+    for (frame, named) in frames {
         let mut bench = Bench::ready();
         bench.drive_on(5);
-        bench.receive(word);
-        let said = bench.until_fault();
+        bench.receive(frame);
+        let fault = bench.until_fault();
         assert!(
-            said.starts_with(&format!("another master on the bus: {named}; stop it")),
-            "{said}"
+            fault.starts_with(&format!("another master on the bus: {named}; stop it")),
+            "{fault}"
         );
         assert!(bench.until_stopped());
     }
@@ -79,7 +79,7 @@ fn drives_that_another_master_sends_to_nmt_stopped_are_stopped() {
     }
 }
 
-/// Another sender's answer may come first and be believed once; that there are two shows at once.
+/// The answer of the other sender may come first and is then used once; two SYNCs show that there are two.
 #[test]
 fn two_senders_of_one_tpdo1_are_a_fault_after_two_syncs() {
     let mut bench = Bench::ready();
@@ -87,11 +87,11 @@ fn two_senders_of_one_tpdo1_are_a_fault_after_two_syncs() {
         bench.until_feedback();
         bench.receive(Frame::new(0x181, &[0x37, 0x12, 1, 0, 0, 0]));
     }
-    let said = bench.until_fault();
-    assert!(said.starts_with("insertion: two TPDO1 that differ after each of 2 SYNCs"), "{said}");
+    let fault = bench.until_fault();
+    assert!(fault.starts_with("insertion: two TPDO1 that differ after each of 2 SYNCs"), "{fault}");
 }
 
-/// The same frame twice is what a bus does that lost an acknowledgement.
+/// A bus repeats a frame after a lost acknowledgement.
 #[test]
 fn a_repeated_tpdo1_is_counted_and_no_fault() {
     let mut bench = Bench::ready();
@@ -102,7 +102,7 @@ fn a_repeated_tpdo1_is_counted_and_no_fault() {
     }
     bench.run_for(Duration::from_millis(100));
     assert_eq!(bench.stage.counters().ignored[Ignored::Unexpected as usize], 20);
-    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+    assert_eq!(bench.fault(), None);
 }
 
 #[test]
@@ -118,7 +118,7 @@ fn a_flood_on_the_drives_own_identifiers_is_reported() {
             bench.run_for(Duration::from_millis(10));
         }
         assert!(bench.events.iter().any(|event| matches!(event, StageEvent::Flood(_))), "{flood}");
-        let told = bench.events.iter().filter(|e| matches!(e, StageEvent::Emergency(..))).count();
-        assert!(told < 20, "one line for each of 200");
+        let emergencies = bench.events.iter().filter(|e| matches!(e, StageEvent::Emergency(..)));
+        assert!(emergencies.count() < 20, "200 emergencies are not reported one by one");
     }
 }

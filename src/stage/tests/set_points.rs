@@ -1,4 +1,4 @@
-//! Set-points: when they leave, and what refuses them.
+//! Set-points: when they are sent, and when they are refused.
 
 use super::*;
 use crate::canopen::cob;
@@ -18,7 +18,7 @@ fn set_points_go_to_both_axes_before_one_sync_and_come_back_measured() {
     let next = bench.until_feedback();
     assert_eq!(next.sync, feedback.sync + 1);
     assert_eq!(next.time.since(feedback.time), Duration::from_millis(10));
-    assert_eq!(next.measured.insertion_mm, next.commanded.insertion_mm, "it is there, and held");
+    assert_eq!(next.measured.insertion_mm, next.commanded.insertion_mm, "reached and held");
     assert_eq!(next.measured.rotation_rad, next.commanded.rotation_rad);
 }
 
@@ -26,7 +26,9 @@ fn set_points_go_to_both_axes_before_one_sync_and_come_back_measured() {
 fn a_later_command_replaces_an_earlier_one() {
     let mut bench = Bench::ready();
     bench.command(0.05, 0.0).expect("within limits");
-    bench.command(-0.02, 0.0).expect("checked from what was sent, not from what was replaced");
+    bench
+        .command(-0.02, 0.0)
+        .expect("its speed counts from the target in force, not from the replaced one");
     let feedback = bench.until_feedback();
     assert!((feedback.commanded.insertion_mm + 0.02).abs() < 1e-3);
 }
@@ -51,7 +53,7 @@ fn set_points_are_sent_at_once_and_held_ones_with_the_sync() {
     assert_eq!([&insertion.1, &rotation.1], ["201#0F00D0040000", "202#0F00A2040000"]);
     assert_eq!([insertion.0, rotation.0], [commanded; 2]);
     assert_eq!(sync, &(commanded + Duration::from_millis(10), "080#".to_owned()));
-    // Without a new one they are held, and that is sent with the SYNC.
+    // Without new ones the last are held, and these are sent with the SYNC.
     bench.sent.clear();
     let sent = until_sync(&mut bench);
     let frames: Vec<&str> = sent.iter().map(|(_, frame)| frame.as_str()).collect();
@@ -59,7 +61,6 @@ fn set_points_are_sent_at_once_and_held_ones_with_the_sync() {
     assert!(sent.iter().all(|(time, _)| *time == sync.0 + Duration::from_millis(10)));
 }
 
-/// The drives have the next targets already when the stop comes.
 #[test]
 fn a_stop_replaces_targets_that_were_sent_ahead_of_the_sync() {
     for quick in [false, true] {
@@ -97,8 +98,12 @@ fn a_late_bench_skips_whole_periods_and_never_bursts() {
     assert!(bench.events.contains(&StageEvent::SyncSkipped { periods: 3, total: 3 }));
     assert_eq!(bench.stage.counters().syncs_skipped, 3);
     bench.run_for(Duration::from_millis(5));
-    assert_eq!(syncs(&bench)[1], due + Duration::from_millis(40), "the beat is absolute");
-    // The next makes 4, another power of two, and the last skips more at once than ever.
+    assert_eq!(
+        syncs(&bench)[1],
+        due + Duration::from_millis(40),
+        "a multiple of the period after the first"
+    );
+    // A total of 4 is a power of two. The last two skip more periods at once than any before.
     for (periods, total, is_reported) in [(1, 4, true), (1, 5, false), (4, 9, true), (5, 14, true)]
     {
         bench.events.clear();
@@ -111,53 +116,32 @@ fn a_late_bench_skips_whole_periods_and_never_bursts() {
     }
 }
 
-/// Holding for one SYNC is no acceleration that was asked for: 10 mm/s² are 4.6 counts a SYNC, per
-/// SYNC, and the axis is on its way at 46 counts a SYNC.
+/// While positions are missing the stage itself holds the axes. The limit of 10 mm/s² allows a change of
+/// 4.6 counts a SYNC, and the axis moves at 46 counts a SYNC.
 #[test]
 fn lost_positions_do_not_count_as_acceleration() {
-    let mut config = config();
-    config.insertion.limits.acceleration_max = Some(10.0);
-    let mut bench = Bench::new(config);
-    let feedback = bench.until_feedback();
-    let (mut at, mut speed) = (feedback.commanded.insertion_mm, 0.0);
-    for sync in 0..100 {
-        if speed < 1.0 {
-            speed += 0.1;
+    for lost in [1_u8, 3] {
+        let mut config = config();
+        config.insertion.limits.acceleration_max = Some(10.0);
+        config.bus.missed_feedback_max = lost;
+        let mut bench = Bench::new(config);
+        let feedback = bench.until_feedback();
+        let (mut at, mut speed) = (feedback.commanded.insertion_mm, 0.0);
+        for sync in 0..100 {
+            speed += if speed < 1.0 { 0.1 } else { 0.0 };
+            at += speed * 0.01;
+            bench.command(at, 0.0).expect("within limits");
+            bench.rotation.tpdos_lost = if sync == 50 { lost.into() } else { 0 };
+            let held = bench.until_feedback().commanded.insertion_mm;
+            assert!((at - held).abs() < 1e-3, "{at} {held}");
         }
-        at += speed * 0.01;
-        bench.command(at, 0.0).expect("within limits");
-        bench.rotation.tpdos_lost = u32::from(sync == 50);
-        let held = bench.until_feedback().commanded.insertion_mm;
-        assert!((at - held).abs() < 1e-3, "{at} {held}");
-    }
-    assert_eq!(bench.stage.counters().feedback_missed, 1);
-    // From a standstill it is one again.
-    bench.run_for(Duration::from_millis(30));
-    bench.until_feedback();
-    let refused = bench.command(at + 0.01, 0.0).expect_err("refused");
-    assert!(refused.to_string().contains("over the limit of 10.000 mm/s²"), "{refused}");
-}
-
-/// As many as may be lost.
-#[test]
-fn positions_that_may_be_lost_are_no_acceleration() {
-    let mut config = config();
-    config.insertion.limits.acceleration_max = Some(10.0);
-    config.bus.missed_feedback_max = 3;
-    let mut bench = Bench::new(config);
-    let feedback = bench.until_feedback();
-    let (mut at, mut speed) = (feedback.commanded.insertion_mm, 0.0);
-    for sync in 0..60 {
-        speed += if speed < 1.0 { 0.1 } else { 0.0 };
-        at += speed * 0.01;
-        bench.command(at, 0.0).expect("within limits");
-        bench.rotation.tpdos_lost = if sync == 50 { 3 } else { 0 };
+        assert_eq!(bench.stage.counters().feedback_missed, u64::from(lost));
+        // At standstill the limit applies again.
+        bench.run_for(Duration::from_millis(50));
         bench.until_feedback();
+        let refused = bench.command(at + 0.01, 0.0).expect_err("refused");
+        assert!(refused.contains("over the limit of 10.000 mm/s²"), "{refused}");
     }
-    assert_eq!(bench.stage.counters().feedback_missed, 3);
-    bench.run_for(Duration::from_millis(50));
-    bench.until_feedback();
-    bench.command(at + 0.01, 0.0).expect_err("from a standstill");
 }
 
 #[test]
@@ -168,7 +152,7 @@ fn no_command_is_taken_on_old_positions() {
     let refused = bench.command(0.01, 0.0).expect_err("refused");
     assert!(refused.ends_with("have not arrived; older ones must not be used"), "{refused}");
     bench.until_feedback();
-    bench.command(0.01, 0.0).expect("fresh again");
+    bench.command(0.01, 0.0).expect("positions of this SYNC");
 }
 
 #[test]
@@ -176,14 +160,16 @@ fn a_refused_command_moves_neither_axis() {
     let mut bench = Bench::ready();
     let refused = bench.command(0.05, 5.0).expect_err("refused");
     assert_eq!(
-        refused.to_string(),
+        refused,
         "rotation: a step of 286.479 deg in one SYNC is 28647.890 deg/s, over the limit of 1145.916 deg/s \
          (stage.rotation.speed_max_deg_per_s)"
     );
     let feedback = bench.until_feedback();
     assert_eq!((feedback.commanded.insertion_mm, feedback.commanded.rotation_rad), (0.0, 0.0));
-    assert!(bench.command(f64::NAN, 0.0).is_err());
-    assert!(bench.command(0.0, f64::INFINITY).is_err());
+    for (insertion_mm, rotation_rad) in [(f64::NAN, 0.0), (0.0, f64::INFINITY)] {
+        let refused = bench.command(insertion_mm, rotation_rad).expect_err("refused");
+        assert!(refused.ends_with("is not a finite number"), "{refused}");
+    }
 }
 
 #[test]
@@ -195,7 +181,7 @@ fn a_wrapping_rotation_continues_past_32_bits() {
     bench.until_feedback();
     bench.drive_on(10);
     let feedback = bench.until_feedback();
-    assert!(bench.rotation.counts < 0, "it wrapped");
+    assert!(bench.rotation.counts < 0, "the count wrapped");
     assert!(
         (feedback.measured.rotation_rad - 0.1).abs() < 1e-4,
         "{}",
@@ -203,7 +189,7 @@ fn a_wrapping_rotation_continues_past_32_bits() {
     );
 }
 
-/// An insertion whose counts fall as it goes on, across the end of 32 bits where its drive wraps.
+/// An insertion whose counts fall with depth, and wrap at the end of 32 bits.
 #[test]
 fn a_reversed_axis_across_32_bits_is_refused_at_its_limits() {
     let mut config = config();
@@ -217,7 +203,7 @@ fn a_reversed_axis_across_32_bits_is_refused_at_its_limits() {
         bench.command(at, 0.0).expect("within limits");
         bench.until_feedback();
     }
-    let refused = bench.command(0.301, 0.0).expect_err("refused").to_string();
+    let refused = bench.command(0.301, 0.0).expect_err("refused");
     assert_eq!(
         refused,
         "insertion: 0.301 mm is over the limit of 0.300 mm (stage.insertion.max_mm)"
@@ -228,12 +214,16 @@ fn a_reversed_axis_across_32_bits_is_refused_at_its_limits() {
         "{}",
         feedback.measured.insertion_mm
     );
-    assert_eq!(bench.insertion.counts, i32::MAX - 1293, "100 - 1394 counts from the end");
+    assert_eq!(
+        bench.insertion.counts,
+        i32::MAX - 1293,
+        "it started 100 counts above the minimum and moved down by 1394"
+    );
     for at in [0.2, 0.1, 0.0, -0.1] {
         bench.command(at, 0.0).expect("within limits");
         bench.until_feedback();
     }
-    let refused = bench.command(-0.101, 0.0).expect_err("refused").to_string();
+    let refused = bench.command(-0.101, 0.0).expect_err("refused");
     assert_eq!(
         refused,
         "insertion: -0.101 mm is under the limit of -0.100 mm (stage.insertion.min_mm)"

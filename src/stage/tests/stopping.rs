@@ -1,4 +1,4 @@
-//! Quick stop and the orderly end: until both axes stand without power.
+//! Quick stop and the orderly end, until both axes stand without power.
 
 use super::*;
 use crate::canopen::cia402::DriveState;
@@ -10,12 +10,12 @@ fn quick_stop_brakes_under_power_until_both_axes_stand() {
     let before = bench.drive_on(50);
     bench.stage.quick_stop(bench.now);
     bench.sent.clear();
-    assert!(bench.until_stopped(), "seen to stand");
-    // From 46 counts a cycle, one less each cycle.
+    assert!(bench.until_stopped(), "standstill is reported");
+    // The drive brakes from 46 counts a SYNC by 1 count a SYNC.
     let travel =
         bench.insertion.counts - 1000 - (before.measured.insertion_mm * 4646.0).round() as i32;
     assert!((1000..=46 * 49 / 2).contains(&travel), "{travel} counts");
-    assert!(bench.insertion.coasted_from <= 3, "power stays on until it stands");
+    assert!(bench.insertion.coasted_from <= 3, "power stays on until standstill");
     assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled);
     assert_eq!(bench.insertion.nmt, NmtState::PreOperational);
 }
@@ -26,13 +26,12 @@ fn an_orderly_end_holds_until_standstill_then_shuts_down() {
     let before = bench.drive_on(20);
     bench.stage.disable(bench.now);
     assert!(bench.until_stopped());
-    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+    assert_eq!(bench.fault(), None);
     assert_eq!(bench.insertion.state, DriveState::ReadyToSwitchOn);
-    assert_eq!(bench.insertion.value(0x1016, 1), 0, "it may live without the bench now");
+    assert_eq!(bench.insertion.value(0x1016, 1), 0, "the drive no longer monitors the bench");
     let held = 1000 + (before.commanded.insertion_mm * f64::from(COUNTS_PER_MM)).round() as i32;
     assert_eq!(bench.insertion.counts, held);
-    let quick = bench.sent.iter().any(|(_, f)| f.cob_id() == Some(0x201) && f.data()[0] == 0x02);
-    assert!(!quick);
+    assert!(!bench.has_sent("201#02"), "no quick stop");
 }
 
 #[test]
@@ -42,7 +41,7 @@ fn a_fault_during_the_orderly_end_makes_it_a_quick_stop() {
     bench.receive(bench.rotation.emergency(0x8611));
     assert!(bench.until_fault().starts_with("rotation: emergency 0x8611"));
     bench.until_stopped();
-    assert!(bench.sent.iter().any(|(_, f)| f.to_string().starts_with("201#0200")));
+    assert!(bench.has_sent("201#0200"));
 }
 
 #[test]
@@ -55,26 +54,26 @@ fn a_quick_stop_ends_the_bring_up() {
     assert!(bench.stage.bring_ups.all(Option::is_none));
 }
 
-/// Five SYNCs of a quick cycle are no time: an axis at 0.4 mm/s moves 2 µm in them.
+/// Five SYNCs of 1 ms are too short: an axis at 0.4 mm/s moves 2 µm meanwhile.
 #[test]
 fn standstill_takes_50_ms_even_with_a_short_sync_period() {
     let mut config = config();
     config.bus.sync_ms = 1;
     let mut bench = Bench::new(config);
-    bench.run_until(|event| matches!(event, StageEvent::Feedback(_)));
+    bench.until_feedback();
     bench.stage.disable(bench.now);
     let begun = bench.now;
-    bench.run_until(|event| *event == StageEvent::Progress(Progress::Disabling));
+    bench.until_progress(Progress::Disabling);
     assert!(bench.now.since(begun) >= Duration::from_millis(50));
 }
 
-/// It hears no PDO any more, but SDOs.
+/// Outside NMT operational a drive ignores PDOs.
 #[test]
 fn a_drive_that_left_nmt_operational_loses_power_by_sdo() {
     let mut bench = Bench::ready();
     bench.drive_on(5);
     bench.rotation.nmt = NmtState::PreOperational;
-    bench.until_fault();
+    assert!(bench.until_fault().starts_with("rotation: no TPDO1 for 2 SYNCs in a row"));
     bench.until_stopped();
     assert_eq!(bench.rotation.state, DriveState::SwitchOnDisabled);
 }
@@ -83,15 +82,15 @@ fn a_drive_that_left_nmt_operational_loses_power_by_sdo() {
 fn a_drive_without_supply_does_not_delay_the_end_beyond_its_timeouts() {
     let mut bench = Bench::ready();
     bench.rotation.off = true;
-    bench.until_fault();
+    assert!(bench.until_fault().starts_with("rotation: no TPDO1 for 2 SYNCs in a row"));
     let began = bench.now;
-    assert!(!bench.until_stopped(), "its standstill was not seen");
-    assert_ne!(bench.rotation.value(0x1016, 1), 0);
+    assert!(!bench.until_stopped(), "its standstill is not reported");
+    assert!(!bench.has_sent("602#2316100100000000"), "its heartbeat consumer stays on");
     assert!(bench.now.since(began) <= 2 * Duration::from_secs(2) + Duration::from_millis(20));
 }
 
-/// Positions by SDO count for the time that they took, also between TPDOs: an axis of 100 counts/mm stands
-/// after half a second.
+/// A position by SDO, also between TPDOs, counts for the time since the position before. Standstill of an axis of
+/// 100 counts/mm takes 0.5 s.
 #[test]
 fn standstill_is_not_early_when_positions_come_by_pdo_and_by_sdo() {
     let mut config = config();
@@ -101,7 +100,7 @@ fn standstill_is_not_early_when_positions_come_by_pdo_and_by_sdo() {
     bench.stage.quick_stop(bench.now);
     let begun = bench.now;
     while !bench.events.contains(&StageEvent::Progress(Progress::Disabling)) {
-        // It is asked for its position after each such SYNC.
+        // After each lost TPDO the stage reads the position by SDO.
         bench.insertion.tpdos_lost = u32::from(bench.stage.sync_count % 10 == 6);
         bench.step();
     }

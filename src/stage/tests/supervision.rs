@@ -1,4 +1,4 @@
-//! What comes from the bus in a run, and what of it stops the run.
+//! Frames from the bus during a run, and which of them stop the run.
 
 use super::*;
 use crate::canopen::cia402::DriveState;
@@ -21,7 +21,7 @@ fn one_lost_tpdo1_is_tolerated_and_two_in_a_row_stop_both_axes() {
         bench.run_for(Duration::from_millis(50));
         assert_eq!(bench.stage.counters().feedback_missed, missed);
     }
-    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+    assert_eq!(bench.fault(), None);
 
     bench.rotation.tpdos_lost = 2;
     assert_eq!(
@@ -62,18 +62,19 @@ fn a_tpdo1_of_another_length_is_named() {
     assert!(bench.until_fault().starts_with("rotation: no TPDO1 for 2 SYNCs in a row"));
 }
 
-fn fault_in_mid_run(spoil: impl FnOnce(&mut Bench)) -> String {
+/// The fault after `disturb` in mid-run. It is the only one; then the axes lose power and the SYNCs end.
+fn fault_in_mid_run(disturb: impl FnOnce(&mut Bench)) -> String {
     let mut bench = Bench::ready();
     bench.drive_on(10);
-    spoil(&mut bench);
+    disturb(&mut bench);
     let fault = bench.until_fault();
-    assert!(bench.command(0.1, 0.1).is_err(), "it takes no command after a fault");
+    assert!(bench.command(0.1, 0.1).is_err(), "no command is accepted after a fault");
     bench.until_stopped();
     for drive in [&bench.insertion, &bench.rotation] {
         assert_ne!(drive.state, DriveState::OperationEnabled, "{fault}");
     }
     let faults = bench.events.iter().filter(|event| matches!(event, StageEvent::Fault(_))).count();
-    assert_eq!(faults, 1, "the first fault is the reason");
+    assert_eq!(faults, 1, "only the first fault is reported");
     bench.sent.clear();
     bench.run_for(Duration::from_secs(1));
     let only_heartbeats = bench.sent.iter().all(|(_, f)| f.to_string() == "77F#05");
@@ -96,8 +97,8 @@ fn what_a_drive_reports_stops_the_run_with_its_reason() {
         "insertion: drive left operation enabled (statusword 0x0233 switched on), \
          was an enable or limit switch opened?"
     );
-    let text = fault_in_mid_run(|bench| bench.rotation.extra_bits = 1 << 13);
-    assert!(text.starts_with("rotation: following error reported by the drive"), "{text}");
+    let fault = fault_in_mid_run(|bench| bench.rotation.extra_bits = 1 << 13);
+    assert!(fault.starts_with("rotation: following error reported by the drive"), "{fault}");
 }
 
 #[test]
@@ -126,7 +127,7 @@ fn the_end_of_an_emergency_is_no_fault() {
     bench.receive(bench.rotation.emergency(0x0000));
     bench.run_for(Duration::from_millis(100));
     assert!(bench.events.iter().any(|event| matches!(event, StageEvent::Emergency(..))));
-    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+    assert_eq!(bench.fault(), None);
 }
 
 #[test]
@@ -148,7 +149,7 @@ fn foreign_and_malformed_frames_are_counted_and_reported_ever_more_rarely() {
         bench.events.iter().filter(is_kind).count()
     };
     assert_eq!((told(Ignored::Foreign), told(Ignored::WrongLength)), (4, 5));
-    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+    assert_eq!(bench.fault(), None);
 }
 
 #[test]
