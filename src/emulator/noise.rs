@@ -139,7 +139,6 @@ mod tests {
         }
     }
 
-    /// Neighbours in number and in seed have nothing to do with one another.
     #[test]
     fn white_noise_is_uncorrelated_between_numbers_and_between_seeds() {
         let noise = WhiteNoise::Gaussian(1.0);
@@ -156,14 +155,13 @@ mod tests {
 
     const INTERVAL_S: f64 = 0.025;
 
-    /// Correlation of positions `lag` apart, for noise of 1 mm.
+    /// Autocovariance of one coordinate at `lag` positions, mm².
     fn autocovariance(noise: CorrelatedNoise, lag: u64) -> f64 {
         let at = |k| noise.draw(7, k, INTERVAL_S);
         (0..40_000).map(|k| at(k).dot(&at(k + lag))).sum::<f64>() / 120_000.0
     }
 
-    /// The spread and its decay are as told, and neighbours in seed have nothing to do with one
-    /// another.
+    /// Noise of neighbouring seeds is uncorrelated.
     #[test]
     fn correlated_noise_decays_as_configured() {
         let noise = CorrelatedNoise { sd_mm: 0.5, time_s: 0.2 };
@@ -177,8 +175,7 @@ mod tests {
         assert!((apart / 120_000.0).abs() < 0.012);
     }
 
-    /// It is one process: the change from one position to the next is AR(1)'s, across the ends of
-    /// every bridge.
+    /// The noise is drawn in bridges. Their ends do not show in the changes from one position to the next.
     #[test]
     fn correlated_noise_is_an_ar1_process() {
         let noise = CorrelatedNoise { sd_mm: 1.0, time_s: 0.2 };
@@ -195,7 +192,6 @@ mod tests {
         assert!((neighbours / square).abs() < 0.012, "the changes are white");
     }
 
-    /// A mean of many positions has the variance that is stated.
     #[test]
     fn a_long_mean_has_the_stated_variance() {
         let noise = CorrelatedNoise { sd_mm: 0.5, time_s: 0.2 };

@@ -111,15 +111,24 @@ mod tests {
     use crate::geometry::FixedAngles;
     use crate::needle::TorsionConfig;
 
+    fn needle() -> Needle {
+        Needle::new(1.0 / 122.0).unwrap()
+    }
+
+    /// The tip at `from`, advanced by `along_mm` with a turn of `turn_rad`.
+    fn step(from: &Pose, along_mm: f64, turn_rad: f64) -> Pose {
+        needle().step(from, Increment::new(along_mm, turn_rad).unwrap())
+    }
+
     fn tissue() -> Tissue {
         twisting(0.0)
     }
 
-    /// A needle whose shaft has a play of `half_width_rad`.
+    /// A needle whose shaft has a torsion band of `half_width_rad`.
     fn twisting(half_width_rad: f64) -> Tissue {
         let torsion =
             Torsion::new(TorsionConfig { half_width_rad, ..TorsionConfig::default() }).unwrap();
-        Tissue::new(Needle::new(1.0 / 122.0).unwrap(), torsion, Pose::identity())
+        Tissue::new(needle(), torsion, Pose::identity())
     }
 
     #[test]
@@ -130,10 +139,9 @@ mod tests {
             tissue.advance(f64::from(n), 0.05 * f64::from(n));
             path.push(*tissue.tip_true());
         }
-        let needle = Needle::new(1.0 / 122.0).unwrap();
         let mut expected = Pose::identity();
         for _ in 0..50 {
-            expected = needle.step(&expected, Increment::new(1.0, 0.05).unwrap());
+            expected = step(&expected, 1.0, 0.05);
         }
         assert!((tissue.tip_true().translation - expected.translation).norm() < 1e-9);
         tissue.advance(20.0, 2.5);
@@ -161,8 +169,7 @@ mod tests {
         tissue.advance(10.0, 0.0);
         assert!((tissue.tip_true().translation - deepest.translation).norm() < 1e-9);
         tissue.advance(12.0, 0.0);
-        let on =
-            Needle::new(1.0 / 122.0).unwrap().step(&deepest, Increment::new(2.0, 0.0).unwrap());
+        let on = step(&deepest, 2.0, 0.0);
         assert!((tissue.tip_true().translation - on.translation).norm() < 1e-9);
     }
 
@@ -170,28 +177,25 @@ mod tests {
         (a.translation - b.translation).norm() + (a.rotation.matrix() - b.rotation.matrix()).norm()
     }
 
-    /// One move across the old depth slides to it and cuts from there; of a turn on the way, the
-    /// part in the channel comes first.
+    /// A move across the deepest point slides to it and cuts from there. A turn on the way is split in proportion.
     #[test]
     fn one_move_from_the_channel_into_new_tissue_cuts_from_the_deepest_point() {
-        let needle = Needle::new(1.0 / 122.0).unwrap();
         for turn_rad in [0.0, 0.7] {
             let mut tissue = tissue();
             tissue.advance(10.0, 0.0);
             let deepest = *tissue.tip_true();
             tissue.advance(5.0, 0.0);
             tissue.advance(12.0, turn_rad);
-            let rolled = needle.step(&deepest, Increment::new(0.0, turn_rad * 5.0 / 7.0).unwrap());
-            let on = needle.step(&rolled, Increment::new(2.0, turn_rad * 2.0 / 7.0).unwrap());
+            let rolled = step(&deepest, 0.0, turn_rad * 5.0 / 7.0);
+            let on = step(&rolled, 2.0, turn_rad * 2.0 / 7.0);
             assert!(distance(tissue.tip_true(), &on) < 1e-9);
         }
     }
 
-    /// A turn in the channel stays while the needle slides, and bends what it cuts next; the
-    /// channel stays where it is.
+    /// A turn in the channel is kept while the needle slides, and bends what it cuts next. The channel itself does
+    /// not move.
     #[test]
     fn a_turn_in_the_channel_is_kept() {
-        let needle = Needle::new(1.0 / 122.0).unwrap();
         let mut tissue = tissue();
         tissue.advance(5.0, 0.0);
         let halfway = *tissue.tip_true();
@@ -200,19 +204,18 @@ mod tests {
         tissue.advance(8.0, 0.0);
         tissue.advance(8.0, 1.2);
         tissue.advance(5.0, 1.2);
-        let turned = Increment::new(0.0, 1.2).unwrap();
-        assert!(distance(tissue.tip_true(), &needle.step(&halfway, turned)) < 1e-9);
+        assert!(distance(tissue.tip_true(), &step(&halfway, 0.0, 1.2)) < 1e-9);
         tissue.advance(10.0, 1.2);
-        let rolled = needle.step(&deepest, turned);
+        let rolled = step(&deepest, 0.0, 1.2);
         assert!(distance(tissue.tip_true(), &rolled) < 1e-9);
         tissue.advance(12.0, 1.2);
-        let on = needle.step(&rolled, Increment::new(2.0, 0.0).unwrap());
+        let on = step(&rolled, 2.0, 0.0);
         assert!(distance(tissue.tip_true(), &on) < 1e-9);
         tissue.advance(5.0, 1.2);
-        assert!(distance(tissue.tip_true(), &needle.step(&halfway, turned)) < 1e-9);
+        assert!(distance(tissue.tip_true(), &step(&halfway, 0.0, 1.2)) < 1e-9);
     }
 
-    /// A shaft without torsion: what was cut with the base turning is retraced with the base's roll.
+    /// Without torsion the tip keeps the roll of the base, whatever the turns along the channel.
     #[test]
     fn the_channel_does_not_turn_the_tip() {
         let mut tissue = tissue();
@@ -221,8 +224,7 @@ mod tests {
         tissue.advance(10.0, 3.0);
         for rotation_rad in [3.0, 0.4] {
             tissue.advance(5.0, rotation_rad);
-            let turned = Increment::new(0.0, rotation_rad - 1.0).unwrap();
-            let rolled = Needle::new(1.0 / 122.0).unwrap().step(&halfway, turned);
+            let rolled = step(&halfway, 0.0, rotation_rad - 1.0);
             assert!(distance(tissue.tip_true(), &rolled) < 1e-9);
         }
     }
@@ -231,11 +233,7 @@ mod tests {
     #[test]
     fn in_air_the_tip_turns_with_the_base() {
         let mut tissue = twisting(0.5);
-        let turned = |rad| {
-            Needle::new(1.0 / 122.0)
-                .unwrap()
-                .step(&Pose::identity(), Increment::new(0.0, rad).unwrap())
-        };
+        let turned = |rad| step(&Pose::identity(), 0.0, rad);
         tissue.advance(0.0, 0.4);
         assert!(distance(tissue.tip_true(), &turned(0.4)) < 1e-9);
         tissue.advance(10.0, 2.0);
@@ -244,18 +242,17 @@ mod tests {
         assert!(distance(tissue.tip_true(), &turned(0.3)) < 1e-9);
     }
 
-    /// Nothing of the channel is left, nor of the shaft's torsion: the next insertion is as the first one
-    /// of a needle with this roll.
+    /// The channel and the torsion of the shaft are gone: the next insertion is like the first one of a needle with
+    /// this roll.
     #[test]
     fn a_needle_pulled_out_enters_fresh_tissue() {
         let mut tissue = twisting(0.5);
         tissue.advance(10.0, 2.0);
         tissue.advance(0.05, 2.0);
         let out = *tissue.tip_true();
-        let turned = Needle::new(1.0 / 122.0).unwrap();
-        let straight = turned.step(&Pose::identity(), Increment::new(0.0, 2.0).unwrap());
+        let straight = step(&Pose::identity(), 0.0, 2.0);
         assert!((out.rotation.matrix() - straight.rotation.matrix()).norm() < 1e-3);
-        let mut first = Tissue::new(turned, tissue.torsion, out);
+        let mut first = Tissue::new(needle(), tissue.torsion, out);
         for n in 1..=10 {
             let deeper_mm = f64::from(n);
             tissue.advance(0.05 + deeper_mm, 2.0 + 0.2 * deeper_mm);
@@ -264,11 +261,9 @@ mod tests {
         }
     }
 
-    /// Cutting or in the channel, the base turns through the band before the tip follows.
+    /// This holds while the needle cuts, and in the channel.
     #[test]
     fn the_tip_turns_once_the_base_has_crossed_the_torsion_band() {
-        let needle = Needle::new(1.0 / 122.0).unwrap();
-        let step = |from: &Pose, l, turned| needle.step(from, Increment::new(l, turned).unwrap());
         let mut tissue = twisting(0.5);
         tissue.advance(10.0, 0.4);
         let straight = step(&Pose::identity(), 10.0, 0.0);

@@ -193,7 +193,6 @@ mod tests {
         assert_eq!(truth.x_pb(), &pose(1.0));
     }
 
-    /// The tracker's k-th position carries the k-th noise, whoever asked for others before.
     #[test]
     fn the_kth_position_has_the_kth_noise() {
         for noise in [WhiteNoise::Uniform(1.0), WhiteNoise::Gaussian(0.5)] {
@@ -219,7 +218,11 @@ mod tests {
         for (n, (sample, truth)) in samples.iter().enumerate() {
             let measured = &samples[n - n % 5];
             assert_eq!(sample.x_ts, measured.0.x_ts);
-            assert_eq!(truth.x_pb().translation.z, n as f64, "the truth of the stamp's time");
+            assert_eq!(
+                truth.x_pb().translation.z,
+                n as f64,
+                "the true pose at the time of the stamp"
+            );
         }
         assert_ne!(samples[4].0.x_ts, samples[5].0.x_ts);
         assert_eq!(samples[9].0.acquisition_time, Time::from_secs_f64(0.225));
@@ -231,7 +234,7 @@ mod tests {
             start_mm: Vector3::new(0.0, 5.0, 100.0),
             drift_mm_per_mm: Vector3::new(0.0, 0.03, 0.0),
         };
-        assert_eq!(target.position_mm(-1.0), target.start_mm, "not before the insertion");
+        assert_eq!(target.position_mm(-1.0), target.start_mm, "no drift before the insertion");
         assert!((target.position_mm(100.0) - Vector3::new(0.0, 8.0, 100.0)).norm() < 1e-12);
     }
 }

@@ -334,10 +334,7 @@ impl VirtualStage {
 mod tests {
     use super::*;
     use crate::config::Config;
-
-    fn at(ms: i64) -> Time {
-        Time::from_nanos(ms * 1_000_000)
-    }
+    use crate::units::at_ms;
 
     fn stage(faults: &[&str]) -> VirtualStage {
         let set = format!("emulator.fault=[{}]", faults.join(", "));
@@ -345,8 +342,7 @@ mod tests {
         VirtualStage::new(config.virtual_stage().expect("valid"), Time::ZERO)
     }
 
-    /// What the insertion drive answers to a request for its statusword, by its first byte; `None` if
-    /// nothing comes.
+    /// First byte of the statusword that the insertion drive sends on request; `None` without an answer.
     fn statusword(stage: &mut VirtualStage, now: Time) -> Option<u8> {
         stage.handle_frame(now, &Frame::new(0x601, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]));
         let answers = std::iter::from_fn(|| stage.poll()).filter_map(|output| match output {
@@ -376,7 +372,7 @@ mod tests {
             (750, None),
             (850, with_voltage),
         ] {
-            assert_eq!(statusword(&mut stage, at(ms)), answer, "at {ms} ms");
+            assert_eq!(statusword(&mut stage, at_ms(ms)), answer, "at {ms} ms");
             let is_down = (500..800).contains(&ms);
             assert_eq!(stage.bus_fault(), is_down.then_some(FaultKind::BusDown), "at {ms} ms");
         }
@@ -387,9 +383,9 @@ mod tests {
         for (down, answers) in [("", 1), (r#"{ kind = "bus-down", at_s = 0.15 }"#, 0)] {
             let stuck = r#"{ kind = "bus-stuck", at_s = 0.1, duration_s = 0.1 }"#;
             let mut stage = stage(&[stuck, down]);
-            assert_eq!(statusword(&mut stage, at(120)), None);
+            assert_eq!(statusword(&mut stage, at_ms(120)), None);
             assert_eq!(stage.frames_held(), 1);
-            [160, 250].into_iter().for_each(|ms| stage.handle_timeout(at(ms)));
+            [160, 250].into_iter().for_each(|ms| stage.handle_timeout(at_ms(ms)));
             let frames = std::iter::from_fn(|| stage.poll());
             let frames = frames.filter(|output| matches!(output, StageOutput::Frame(_)));
             assert_eq!((frames.count(), stage.frames_held()), (answers, 0));

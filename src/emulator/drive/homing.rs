@@ -185,7 +185,7 @@ mod tests {
         home_counts: Some(2000),
     };
 
-    /// (method, from, home): where zero is found with an index pulse every 300 counts.
+    /// Rows are (method, start, home), with an index pulse every 300 counts.
     #[test]
     fn every_homing_method_finds_its_home() {
         for (method, from, home) in [

@@ -54,7 +54,7 @@ impl Inputs {
 mod tests {
     use super::*;
 
-    /// A wire that is broken opens both of the normally closed switches.
+    /// A broken wire opens both normally closed switches.
     #[test]
     fn both_limit_switches_may_be_stuck() {
         let inputs = Inputs { stuck: [true; 2], ..Inputs::default() };

@@ -133,60 +133,57 @@ impl Motion {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn at(ms: i64) -> Time {
-        Time::from_nanos(ms * 1_000_000)
-    }
+    use crate::units::at_ms;
 
     const PERIOD: Duration = Duration::from_millis(10);
 
     #[test]
     fn linear_motion_ends_exactly() {
-        let motion = Motion::linear(at(0), 0.1, 1e9 + 1.0, PERIOD);
-        assert_eq!(motion.position_at(at(0)), 0.1);
-        assert_eq!(motion.position_at(at(10)), 1e9 + 1.0);
-        assert_eq!(motion.position_at(at(99)), 1e9 + 1.0);
-        assert_eq!(motion.velocity_at(at(11)), 0.0);
+        let motion = Motion::linear(at_ms(0), 0.1, 1e9 + 1.0, PERIOD);
+        assert_eq!(motion.position_at(at_ms(0)), 0.1);
+        assert_eq!(motion.position_at(at_ms(10)), 1e9 + 1.0);
+        assert_eq!(motion.position_at(at_ms(99)), 1e9 + 1.0);
+        assert_eq!(motion.velocity_at(at_ms(11)), 0.0);
     }
 
     #[test]
     fn braking_starts_at_speed_and_stands_on_a_whole_count() {
-        let motion = Motion::linear(at(0), 0.0, -100.0, PERIOD);
-        let brake = motion.brake(at(5), 1e5);
-        assert_eq!(brake.position_at(at(5)), -50.0);
-        assert!((brake.velocity_at(at(5)) + 1e4).abs() < 1e-6);
+        let motion = Motion::linear(at_ms(0), 0.0, -100.0, PERIOD);
+        let brake = motion.brake(at_ms(5), 1e5);
+        assert_eq!(brake.position_at(at_ms(5)), -50.0);
+        assert!((brake.velocity_at(at_ms(5)) + 1e4).abs() < 1e-6);
         let end = brake.end().unwrap();
         assert_eq!(brake.position_at(end), -550.0, "v²/2a = 500 counts");
         assert!((end.as_secs_f64() - 0.105).abs() < 1e-9);
-        assert!(brake.velocity_at(at(55)) < 0.0 && brake.velocity_at(end) == 0.0);
+        assert!(brake.velocity_at(at_ms(55)) < 0.0 && brake.velocity_at(end) == 0.0);
     }
 
     #[test]
     fn a_position_on_the_way_has_the_time_at_which_it_is_reached() {
-        let motion = Motion::linear(at(0), 0.0, -100.0, PERIOD);
-        assert_eq!(motion.reaches(at(0), -40.0), Some(at(4)));
-        assert_eq!(motion.reaches(at(6), -40.0), None, "past it");
-        assert_eq!(motion.reaches(at(0), 40.0), None, "the other way");
-        assert_eq!(motion.reaches(at(0), -100.5), None, "too far");
-        assert_eq!(motion.reaches(at(0), -100.0), Some(at(10)));
-        let brake = motion.brake(at(5), 1e5);
-        let reached = brake.reaches(at(5), -400.0).unwrap();
+        let motion = Motion::linear(at_ms(0), 0.0, -100.0, PERIOD);
+        assert_eq!(motion.reaches(at_ms(0), -40.0), Some(at_ms(4)));
+        assert_eq!(motion.reaches(at_ms(6), -40.0), None, "already passed");
+        assert_eq!(motion.reaches(at_ms(0), 40.0), None, "in the other direction");
+        assert_eq!(motion.reaches(at_ms(0), -100.5), None, "too far");
+        assert_eq!(motion.reaches(at_ms(0), -100.0), Some(at_ms(10)));
+        let brake = motion.brake(at_ms(5), 1e5);
+        let reached = brake.reaches(at_ms(5), -400.0).unwrap();
         assert!((brake.position_at(reached) + 400.0).abs() < 1e-3);
     }
 
     #[test]
     fn a_standing_axis_does_not_move_to_brake() {
         let hold = Motion::Hold { at: 3.25 };
-        assert_eq!(hold.brake(at(1), 1.0), hold);
+        assert_eq!(hold.brake(at_ms(1), 1.0), hold);
     }
 
     #[test]
     fn an_early_sync_ends_the_period_and_a_stray_one_does_not() {
-        let mut motion = Motion::linear(at(0), 0.0, 100.0, PERIOD);
-        motion.align_to_sync(at(2));
-        assert_eq!(motion.position_at(at(2)), 20.0);
-        motion.align_to_sync(at(9));
-        assert_eq!(motion.position_at(at(9)), 100.0);
-        assert_eq!(motion.velocity_at(at(9)), 10_000.0);
+        let mut motion = Motion::linear(at_ms(0), 0.0, 100.0, PERIOD);
+        motion.align_to_sync(at_ms(2));
+        assert_eq!(motion.position_at(at_ms(2)), 20.0);
+        motion.align_to_sync(at_ms(9));
+        assert_eq!(motion.position_at(at_ms(9)), 100.0);
+        assert_eq!(motion.velocity_at(at_ms(9)), 10_000.0);
     }
 }

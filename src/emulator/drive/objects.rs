@@ -58,7 +58,7 @@ mod tests {
     use crate::canopen::eds::Eds;
     use crate::canopen::{NodeId, ObjectAddress};
 
-    /// A value of a type that is not known, or a number that cannot be read, would be left out.
+    /// `Eds::objects` leaves out a value of unknown type and a number that it cannot read.
     #[test]
     fn every_default_value_of_the_data_sheet_is_an_object() {
         let objects = Eds::parse(GENERIC).objects(const { NodeId::new(5).unwrap() });

@@ -107,7 +107,7 @@ mod tests {
         Time::from_secs_f64(seconds)
     }
 
-    /// Up in 0.5 s (250 counts), along, down in as much.
+    /// It accelerates in 0.5 s over 250 counts, and brakes in the same.
     #[test]
     fn a_long_move_is_a_trapezoid() {
         let profile = profile(0.0, -1500.0);
@@ -128,7 +128,7 @@ mod tests {
     }
 
     proptest! {
-        /// It moves without a jump, never faster than it may, and stands at the target at the end.
+        /// The axis moves without a jump and within its speed, and stands at the target at the end.
         #[test]
         fn moves_are_smooth_and_end_at_their_target(
             from in -5000.0..5000.0f64,

@@ -59,7 +59,7 @@ mod tests {
     use super::*;
     use DriveState as S;
 
-    /// Every state against every command: rows as in the standard's table. `-` is no transition.
+    /// Rows and columns are as in the standard. `-` is no transition.
     #[test]
     fn every_state_answers_every_command_as_in_cia_402() {
         let columns = [0x00, 0x02, 0x06, 0x07, 0x0f];

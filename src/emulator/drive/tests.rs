@@ -40,7 +40,7 @@ impl Bench {
         bench
     }
 
-    /// A drive at `start_counts`, mapped for cyclic work and enabled, holding its position.
+    /// An enabled drive that holds its position at `start_counts`, with PDOs mapped for CSP.
     fn enabled_at(start_counts: i64) -> Self {
         let mut bench = Bench::new(DriveConfig { start_counts, ..config() });
         bench.map_cyclic();
@@ -186,7 +186,7 @@ fn a_drive_identifies_itself_and_refuses_invalid_writes() {
     let mut bench = Bench::new(config());
     assert_eq!(bench.read(ObjectAddress::new(0x1000, 0)), [0x92, 0x01, 0x02, 0x00]);
     let name = bench.sdo(SdoRequest::Upload(ObjectAddress::new(0x1008, 0)));
-    assert_eq!(name, Err(SdoError::TooLong), "in segments");
+    assert_eq!(name, Err(SdoError::TooLong), "a text comes in segments");
     assert_eq!(bench.read(ObjectAddress::new(0x1018, 2)), [0x52, 0x65, 0, 0]);
     assert_eq!(bench.read(object::SUPPORTED_MODES), [0xa0, 0, 0, 0]);
     assert_eq!(bench.read(object::STATUSWORD), [0x50, 0x00]);
@@ -201,15 +201,15 @@ fn a_drive_identifies_itself_and_refuses_invalid_writes() {
 #[test]
 fn the_default_tpdo1_reports_each_change_of_state() {
     let mut bench = Bench::new(config());
-    let word = |bench: &mut Bench, frame| {
+    let mut answer = |frame| {
         bench.pass(PERIOD);
         bench.give(frame)
     };
-    assert_eq!(word(&mut bench, nmt_frame(NmtCommand::StartRemoteNode, None)), ["185#5002"]);
+    assert_eq!(answer(nmt_frame(NmtCommand::StartRemoteNode, None)), ["185#5002"]);
     for (controlword, status) in
         [(0x06, "185#3102"), (0x07, "185#3302"), (0x0f, "185#3706"), (0x00, "185#5002")]
     {
-        assert_eq!(word(&mut bench, Frame::new(0x205, &[controlword, 0])), [status]);
+        assert_eq!(answer(Frame::new(0x205, &[controlword, 0])), [status]);
     }
 }
 
@@ -228,10 +228,10 @@ fn targets_are_reached_exactly_one_period_later() {
     for target in [1010, 1030, 1031, 990] {
         let before = bench.position();
         bench.command(0x0f, target);
-        assert_eq!(bench.position(), before, "a PDO alone moves nothing");
+        assert_eq!(bench.position(), before, "a PDO moves nothing before the SYNC");
         bench.give(sync_frame());
         let (_, sampled) = bench.sample.unwrap();
-        assert_eq!(f64::from(sampled), before, "measured is true at SYNC");
+        assert_eq!(f64::from(sampled), before, "the TPDO has the position at the SYNC");
         bench.pass(PERIOD / 4);
         assert_eq!(bench.position(), before + (target as f64 - before) / 4.0);
         bench.pass(PERIOD - PERIOD / 4);
@@ -294,6 +294,7 @@ fn a_stale_target_is_refused_after_re_enabling() {
         bench.pass(PERIOD);
     }
     assert_eq!((bench.state(), bench.position()), (DriveState::Fault, 500_000.0));
+    assert_eq!(bench.emergencies, ["085#1186210000000000"]);
 }
 
 #[test]
@@ -319,7 +320,7 @@ fn software_limits_clip_the_target() {
     bench.cycle(0x0f, -150);
     assert_eq!(bench.position(), -50.0);
     assert!(bench.sample.unwrap().0.has(Statusword::INTERNAL_LIMIT));
-    // Enabled anew, it has had no target yet.
+    // A drive that is enabled again has no target yet.
     for controlword in [0x00, 0x06, 0x0f] {
         bench.write(object::CONTROLWORD, &[controlword, 0]);
     }
@@ -358,7 +359,7 @@ fn limit_switches_show_in_60fd() {
     assert_eq!(bench.read(object::DIGITAL_INPUTS), [2, 0, 0, 0]);
 }
 
-/// Anything a bus may bring.
+/// Anything that may come from the bus, or happen to the supply.
 #[derive(Debug, Clone)]
 enum Input {
     Command(u16, i32),
@@ -392,8 +393,7 @@ fn inputs() -> impl Strategy<Value = Vec<Input>> {
 }
 
 proptest! {
-    /// It never moves without power, never starts to move outside Operational, and never faster
-    /// than it can.
+    /// Outside NMT operational it does not gain speed either.
     #[test]
     fn an_axis_moves_only_with_power_and_within_its_speed(inputs in inputs()) {
         let mut bench = Bench::enabled_at(0);
@@ -423,7 +423,7 @@ proptest! {
             prop_assert!(moved == 0.0 || powered, "{moved} counts in {state}");
             let speed = bench.drive.axis.motion.velocity_at(bench.now).abs();
             if !operational {
-                prop_assert!(speed <= speed_before + 1e-6, "gains speed out of Operational");
+                prop_assert!(speed <= speed_before + 1e-6, "gains speed outside NMT operational");
             }
             let reach = 200_001.0 * bench.now.seconds_after(then);
             // A SYNC in the second half of a period ends that period: half a step at most.

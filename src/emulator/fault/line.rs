@@ -113,30 +113,27 @@ impl Fault {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::units::at_ms;
     use proptest::prelude::*;
 
     fn frame(number: u8) -> Frame {
         Frame::new(0x181, &[number, 0xFF])
     }
 
-    fn at(ms: i64) -> Time {
-        Time::from_nanos(ms * 1_000_000)
-    }
-
-    /// What arrives, and when in ms, of frames 0 to 3 sent 10 ms apart; the fault begins with frame 1 and
-    /// ends with frame 2.
+    /// The frames that arrive of frames 0 to 3, sent 10 ms apart, with the time in ms. The fault acts on frames 1
+    /// and 2.
     fn arrivals(fault: &Fault) -> Vec<(i64, Vec<u8>)> {
         let mut line = FaultyLine::default();
         let mut arrivals = Vec::new();
         for ms in 0..60 {
             if ms == 10 {
-                line.add(fault.clone(), None, at(30));
+                line.add(fault.clone(), None, at_ms(30));
             }
             if ms % 10 == 0 && ms < 40 {
-                line.handle(at(ms), &frame(ms as u8 / 10));
+                line.handle(at_ms(ms), &frame(ms as u8 / 10));
             }
-            assert!(line.deadline() >= at(ms), "nothing is forgotten");
-            while let Some(frame) = line.poll(at(ms)) {
+            assert!(line.deadline() >= at_ms(ms), "no frame is overdue");
+            while let Some(frame) = line.poll(at_ms(ms)) {
                 arrivals.push((ms, frame.data().to_vec()));
             }
         }
@@ -159,7 +156,11 @@ mod tests {
         let swapped = once(Fault::of(FaultKind::Reorder));
         assert_eq!(order(swapped), [(0, 0), (20, 2), (20, 1), (30, 3)]);
         let pairs = arrivals(&Fault::of(FaultKind::Reorder));
-        assert_eq!(order(pairs), [(0, 0), (20, 2), (20, 1), (30, 3)], "not held until it ends");
+        assert_eq!(
+            order(pairs),
+            [(0, 0), (20, 2), (20, 1), (30, 3)],
+            "frame 1 is not held until the fault ends"
+        );
         let corrupt = |byte| Fault { byte, ..Fault::of(FaultKind::Corrupt) };
         let resize = |length| Fault { length, ..Fault::of(FaultKind::Resize) };
         let second = |fault| once(fault)[1].1.clone();
@@ -179,24 +180,24 @@ mod tests {
             line.add(Fault::of(kind), id.map(CanId::Base), Time::NEVER);
         };
         add(&mut line, FaultKind::Drop, Some(0x182));
-        line.handle(at(0), &frame(7));
-        assert_eq!(line.poll(at(0)), Some(frame(7)));
+        line.handle(at_ms(0), &frame(7));
+        assert_eq!(line.poll(at_ms(0)), Some(frame(7)));
         add(&mut line, FaultKind::Drop, Some(0x181));
         add(&mut line, FaultKind::Duplicate, None);
-        line.handle(at(0), &frame(7));
-        assert_eq!(line.poll(at(0)), None);
+        line.handle(at_ms(0), &frame(7));
+        assert_eq!(line.poll(at_ms(0)), None);
     }
 
     proptest! {
-        /// Without faults a line is a wire: all arrives, at once and in order.
+        /// Every frame arrives at once and in order.
         #[test]
         fn a_line_without_faults_changes_nothing(numbers: Vec<u8>) {
             let mut line = FaultyLine::default();
             for &number in &numbers {
-                line.handle(at(5), &frame(number));
+                line.handle(at_ms(5), &frame(number));
             }
             let arrived: Vec<u8> =
-                std::iter::from_fn(|| line.poll(at(5))).map(|frame| frame.data()[0]).collect();
+                std::iter::from_fn(|| line.poll(at_ms(5))).map(|frame| frame.data()[0]).collect();
             prop_assert_eq!(arrived, numbers);
         }
     }

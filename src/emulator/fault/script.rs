@@ -110,10 +110,7 @@ impl Script {
 mod tests {
     use super::super::FaultKind;
     use super::*;
-
-    fn at(ms: i64) -> Time {
-        Time::from_nanos(ms * 1_000_000)
-    }
+    use crate::units::at_ms;
 
     fn at_mm(mm: f64) -> Fault {
         Fault { at_mm: Some(mm), ..Fault::of(FaultKind::Stall) }
@@ -124,25 +121,31 @@ mod tests {
         let deep = at_mm(10.0);
         let [after, duration] = [5, 20].map(|ms| Some(Duration::from_millis(ms)));
         let timed = Fault { start_after: after, duration, ..Fault::of(FaultKind::Silent) };
-        let mut script = Script::new(&[deep.clone(), timed.clone()], at(100));
-        assert_eq!(script.poll(at(100), 0.0), None);
-        assert_eq!(script.deadline(), at(101), "a depth is looked for every millisecond");
-        assert_eq!(script.poll(at(106), 9.0), Some(ScriptEvent::Begins(timed.clone(), at(126))));
-        assert_eq!(script.poll(at(107), 10.0), Some(ScriptEvent::Begins(deep, Time::NEVER)));
-        assert_eq!(script.poll(at(107), 10.0), None);
-        assert_eq!(script.deadline(), at(126));
-        assert_eq!(script.poll(at(126), 0.0), Some(ScriptEvent::Ends(timed)));
-        assert_eq!((script.poll(at(900), 99.0), script.deadline()), (None, Time::NEVER));
+        let mut script = Script::new(&[deep.clone(), timed.clone()], at_ms(100));
+        assert_eq!(script.poll(at_ms(100), 0.0), None);
+        assert_eq!(script.deadline(), at_ms(101), "depths are checked every millisecond");
+        assert_eq!(
+            script.poll(at_ms(106), 9.0),
+            Some(ScriptEvent::Begins(timed.clone(), at_ms(126)))
+        );
+        assert_eq!(script.poll(at_ms(107), 10.0), Some(ScriptEvent::Begins(deep, Time::NEVER)));
+        assert_eq!(script.poll(at_ms(107), 10.0), None);
+        assert_eq!(script.deadline(), at_ms(126));
+        assert_eq!(script.poll(at_ms(126), 0.0), Some(ScriptEvent::Ends(timed)));
+        assert_eq!((script.poll(at_ms(900), 99.0), script.deadline()), (None, Time::NEVER));
     }
 
-    /// Withdrawing passes depths too.
+    /// A withdrawal passes depths too.
     #[test]
     fn a_depth_triggers_in_either_direction() {
-        let mut script = Script::new(&[at_mm(-3.0), at_mm(0.0)], at(0));
-        assert_eq!(script.poll(at(0), 0.0), Some(ScriptEvent::Begins(at_mm(0.0), Time::NEVER)));
-        assert_eq!(script.poll(at(1), 5.0), None);
-        assert_eq!(script.poll(at(2), -2.9), None);
-        assert_eq!(script.poll(at(3), -3.1), Some(ScriptEvent::Begins(at_mm(-3.0), Time::NEVER)));
+        let mut script = Script::new(&[at_mm(-3.0), at_mm(0.0)], at_ms(0));
+        assert_eq!(script.poll(at_ms(0), 0.0), Some(ScriptEvent::Begins(at_mm(0.0), Time::NEVER)));
+        assert_eq!(script.poll(at_ms(1), 5.0), None);
+        assert_eq!(script.poll(at_ms(2), -2.9), None);
+        assert_eq!(
+            script.poll(at_ms(3), -3.1),
+            Some(ScriptEvent::Begins(at_mm(-3.0), Time::NEVER))
+        );
     }
 
     #[test]
@@ -150,11 +153,13 @@ mod tests {
         let [after, period, duration] = [0, 2, 5].map(|ms| Some(Duration::from_millis(ms)));
         let frame = Some("181#01".to_owned());
         let foreign = Fault::of(FaultKind::Foreign);
-        let mut script =
-            Script::new(&[Fault { start_after: after, frame, period, duration, ..foreign }], at(0));
+        let mut script = Script::new(
+            &[Fault { start_after: after, frame, period, duration, ..foreign }],
+            at_ms(0),
+        );
         let mut seen = Vec::new();
         for ms in 0..10 {
-            while let Some(change) = script.poll(at(ms), 0.0) {
+            while let Some(change) = script.poll(at_ms(ms), 0.0) {
                 seen.push((ms, matches!(change, ScriptEvent::Foreign(_))));
             }
         }

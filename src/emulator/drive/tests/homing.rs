@@ -14,7 +14,7 @@ fn in_homing(config: DriveConfig) -> Bench {
 }
 
 impl Bench {
-    /// Bit 4 rises.
+    /// Starts homing by a rising bit 4.
     fn start(&mut self) -> Statusword {
         self.control(0x1f)
     }
@@ -63,7 +63,7 @@ fn with_switches() -> DriveConfig {
     DriveConfig { switches, start_counts: 300, ..config() }
 }
 
-/// Home is zero afterwards; where that is on the encoder.
+/// Rows are (method, true position of home).
 #[test]
 fn after_each_homing_method_home_reads_zero() {
     for (method, home) in [
@@ -81,7 +81,7 @@ fn after_each_homing_method_home_reads_zero() {
         assert_eq!((bits(bench.status()), bench.position()), ((true, true), home), "{method}");
         assert_eq!(bench.reported(), 0, "method {method}");
         assert_eq!(bench.emergencies, [""; 0]);
-        // Asked again in this mode, with or without power, it says that it is homed.
+        // Back in homing mode, also without power, the drive still reports that it is homed.
         bench.write(object::MODES_OF_OPERATION, &[8]);
         bench.write(object::CONTROLWORD, &[0, 0]);
         bench.write(object::MODES_OF_OPERATION, &[6]);
@@ -89,7 +89,7 @@ fn after_each_homing_method_home_reads_zero() {
     }
 }
 
-/// Zero lies the offset from home (CiA 402-2, 0x607C), and targets are counted from zero.
+/// Zero is home plus the offset (CiA 402-2, 0x607C).
 #[test]
 fn after_homing_targets_count_from_zero() {
     let mut bench = in_homing(with_switches());
@@ -134,7 +134,7 @@ fn a_homing_can_be_interrupted_and_fails_on_the_wrong_switch() {
     assert_eq!(bench.state(), DriveState::OperationEnabled);
 }
 
-/// python-canopen does so when it asks again for a homing that is under way.
+/// python-canopen writes it again during a homing.
 #[test]
 fn writing_the_active_mode_again_does_not_interrupt_homing() {
     let mut bench = in_homing(with_switches());

@@ -1,4 +1,4 @@
-//! Switches, safety input, a blocked axis, faults of the drive's own, and whose habits it has.
+//! Switches, the safety input, a blocked axis, drive faults, and the models of drives.
 
 use super::*;
 use crate::emulator::drive::objects::MAX_ACCELERATION;
@@ -14,17 +14,17 @@ fn at_switch(model: Model) -> Bench {
     bench
 }
 
-/// 10,000 counts/s and 100,000 counts/s²: 500 counts past the switch, from the moment it closes.
+/// From 10,000 counts/s by 100,000 counts/s²: 500 counts past the switch.
 #[test]
 fn a_limit_switch_brakes_the_axis_from_where_it_closes() {
-    for (model, end, said) in [
+    for (model, end, emergencies) in [
         (Model::Generic, DriveState::SwitchOnDisabled, vec![]),
         (Model::Epos4, DriveState::Fault, vec!["085#07FF010000000000"]),
     ] {
         let mut bench = at_switch(model);
         bench.pass(Duration::from_secs(1));
         assert_eq!((bench.position(), bench.state()), (750.0, end), "{model:?}");
-        assert_eq!(bench.emergencies, said);
+        assert_eq!(bench.emergencies, emergencies);
         assert_eq!(bench.read(object::DIGITAL_INPUTS), [2, 0, 0, 0]);
     }
 }
@@ -39,7 +39,7 @@ fn an_axis_may_move_off_a_limit_switch_and_not_further_onto_it() {
     }
     assert_eq!((bench.position(), bench.state()), (500.0, DriveState::OperationEnabled));
     bench.cycle(0x0f, 510);
-    assert_ne!(bench.state(), DriveState::OperationEnabled, "further on to the switch");
+    assert_ne!(bench.state(), DriveState::OperationEnabled, "further onto the switch");
 }
 
 #[test]
@@ -53,7 +53,7 @@ fn an_open_safety_input_removes_the_torque() {
     assert_eq!(bench.read(object::DIGITAL_INPUTS), [8, 0, 0, 0]);
     bench.cycle(0x00, 300);
     bench.cycle(0x80, 300);
-    assert_eq!(bench.state(), DriveState::Fault, "not while it is open");
+    assert_eq!(bench.state(), DriveState::Fault, "no reset while the input is open");
     bench.drive.apply_fault(bench.now, &Fault::of(FaultKind::EmergencyStop), false);
     bench.enable();
 }
@@ -75,7 +75,7 @@ fn a_blocked_axis_falls_behind_and_faults() {
     assert_eq!(bench.emergencies, ["085#1186210000000000"]);
 }
 
-/// 0x6066: it is beyond its window for so long, without a break.
+/// 0x6066 is the time beyond the window, without a break.
 #[test]
 fn a_blocked_axis_faults_after_the_time_of_6066() {
     let mut bench = moving();
@@ -88,11 +88,10 @@ fn a_blocked_axis_faults_after_the_time_of_6066() {
         bench.command(0x0f, target);
         bench.give(sync_frame());
     }
-    assert_eq!(target, 2700, "three periods more than at once");
+    assert_eq!(target, 2700, "three periods later than without 0x6066");
 }
 
-/// A fault ends the time that ran before it. Enabled anew with a target far off, this axis comes within its
-/// window in 30 ms, and is not beyond it for 25 ms.
+/// After a reset and with a far target, the axis is beyond its window for less than 25 ms.
 #[test]
 fn a_fault_restarts_the_time_of_6066() {
     let mut bench = moving();
@@ -138,7 +137,7 @@ fn an_axis_that_is_released_in_time_catches_up() {
 
 #[test]
 fn a_drive_fault_sends_an_emergency_with_its_error_register() {
-    for (code, told) in [
+    for (code, emergency) in [
         (0x8611, "085#1186210000000000"),
         (0x4210, "085#1042090000000000"),
         (0x2310, "085#1023030000000000"),
@@ -151,7 +150,7 @@ fn a_drive_fault_sends_an_emergency_with_its_error_register() {
             true,
         );
         bench.take();
-        assert_eq!(bench.emergencies, [told]);
+        assert_eq!(bench.emergencies, [emergency]);
         assert_eq!(bench.read(object::ERROR_CODE), code.to_le_bytes());
         bench.pass(Duration::from_secs(1));
         assert_eq!(bench.state(), DriveState::Fault);

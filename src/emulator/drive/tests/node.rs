@@ -1,15 +1,11 @@
-//! The drive's communication: each of its PDOs carries the target position, which limits of the test bound.
+//! The drive's communication. Each PDO of the test's drive carries the target position, from -1000 to 1000 counts.
 
 use super::*;
 use crate::canopen::CanId;
 use crate::canopen::eds::Eds;
-use crate::canopen::nmt::parse_heartbeat;
+use crate::units::at_ms;
 
 const TARGET: ObjectAddress = object::TARGET_POSITION;
-
-fn at(ms: i64) -> Time {
-    Time::from_nanos(ms * 1_000_000)
-}
 
 fn node() -> Drive {
     let sheet = objects::data_sheet(&config()).to_string();
@@ -38,7 +34,7 @@ fn sent(node: &mut Drive) -> String {
 }
 
 fn give(node: &mut Drive, ms: i64, frame: Frame) -> String {
-    node.handle_frame(at(ms), &frame);
+    node.handle_frame(at_ms(ms), &frame);
     sent(node)
 }
 
@@ -50,7 +46,7 @@ fn sdo(node: &mut Drive, bytes: [u8; 8]) -> String {
     give(node, 0, Frame::new(0x605, &bytes))
 }
 
-/// Writes by expedited SDO; empty on success, else the abort code as on the bus.
+/// Writes by expedited SDO. Returns the bytes of the abort code, or nothing on success.
 fn write(node: &mut Drive, index: u16, sub: u8, data: &[u8]) -> String {
     let [low, high] = index.to_le_bytes();
     let mut bytes = [0x23 | (4 - data.len() as u8) << 2, low, high, sub, 0, 0, 0, 0];
@@ -103,7 +99,7 @@ fn pdos_flow_in_operational_only() {
     nmt(&mut node, 4, NmtCommand::EnterPreOperational);
     nmt(&mut node, 5, NmtCommand::StartRemoteNode);
     give(&mut node, 6, sync_frame());
-    assert_eq!(target(&node), 0, "what was latched is gone with the state");
+    assert_eq!(target(&node), 0, "an RPDO before the SYNC is dropped on leaving operational");
 }
 
 #[test]
@@ -120,7 +116,7 @@ fn stopped_answers_nothing_but_nmt() {
 fn short_pdos_and_values_out_of_limits_are_ignored() {
     let mut node = started();
     assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0])), "085#1082110000000000");
-    assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0])), "", "said once");
+    assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0])), "", "reported once");
     assert_eq!(give(&mut node, 2, Frame::new(0x205, &[0, 0, 1, 0])), "085#0000000000000000");
     give(&mut node, 10, sync_frame());
     assert_eq!(target(&node), 0);
@@ -139,8 +135,8 @@ fn remapping_follows_the_rules_of_cia_301() {
     let on = 0x4000_0185u32.to_le_bytes();
     let off = 0xc000_0185u32.to_le_bytes();
     let other = 0x4000_0187u32.to_le_bytes();
-    assert_eq!(write(&mut node, 0x1a00, 0, &[0]), "00000106", "the PDO still exists");
-    assert_eq!(write(&mut node, 0x1800, 1, &other), "30000906", "the PDO still exists");
+    assert_eq!(write(&mut node, 0x1a00, 0, &[0]), "00000106", "the PDO is still valid");
+    assert_eq!(write(&mut node, 0x1800, 1, &other), "30000906", "the PDO is still valid");
     assert_eq!(write(&mut node, 0x1800, 1, &off), "");
     assert_eq!(write(&mut node, 0x1a00, 1, &register), "00000106", "still mapped");
     assert_eq!(write(&mut node, 0x1a00, 0, &[0]), "");
@@ -155,7 +151,11 @@ fn remapping_follows_the_rules_of_cia_301() {
     assert_eq!(write(&mut node, 0x1a00, 0, &[2]), "");
     assert_eq!(write(&mut node, 0x1800, 2, &[245]), "30000906", "reserved type");
     assert_eq!(write(&mut node, 0x1800, 2, &[2]), "");
-    assert_eq!(write(&mut node, 0x1800, 1, &0x605u32.to_le_bytes()), "30000906", "an SDO's");
+    assert_eq!(
+        write(&mut node, 0x1800, 1, &0x605u32.to_le_bytes()),
+        "30000906",
+        "the identifier of an SDO"
+    );
     assert_eq!(write(&mut node, 0x1800, 1, &on), "");
     assert_eq!(write(&mut node, 0x1a00, 0, &[0]), "00000106");
 
@@ -166,7 +166,7 @@ fn remapping_follows_the_rules_of_cia_301() {
     assert_eq!(write(&mut node, 0x607a, 0, &[7, 0, 0, 0]), "");
     assert_eq!(nmt(&mut node, 30, NmtCommand::ResetCommunication), "705#00");
     assert_eq!(sdo(&mut node, [0x40, 0x00, 0x1a, 0, 0, 0, 0, 0]), "585#4F001A0001000000");
-    assert_eq!(target(&node), 7, "objects of the axis stay");
+    assert_eq!(target(&node), 7, "objects of the axis keep their values");
 }
 
 #[test]
@@ -178,12 +178,12 @@ fn event_driven_pdos_come_on_change_and_by_timer() {
     assert_eq!(nmt(&mut node, 0, NmtCommand::StartRemoteNode), "185#00000000");
     assert_eq!(give(&mut node, 5, Frame::new(0x205, &[7, 0, 0, 0])), "185#07000000");
     assert_eq!(give(&mut node, 6, Frame::new(0x205, &[7, 0, 0, 0])), "");
-    assert_eq!(node.deadline(), at(105));
-    node.handle_timeout(at(105));
+    assert_eq!(node.deadline(), at_ms(105));
+    node.handle_timeout(at_ms(105));
     assert_eq!(sent(&mut node), "185#07000000");
     assert_eq!(give(&mut node, 105, Frame::new(0x205, &[8, 0, 0, 0])), "", "inhibited");
-    assert_eq!(node.deadline(), at(106));
-    node.handle_timeout(at(106));
+    assert_eq!(node.deadline(), at_ms(106));
+    node.handle_timeout(at_ms(106));
     assert_eq!(sent(&mut node), "185#08000000");
 }
 
@@ -191,11 +191,11 @@ fn event_driven_pdos_come_on_change_and_by_timer() {
 fn the_heartbeat_carries_the_nmt_state() {
     let mut node = node();
     assert_eq!(write(&mut node, 0x1017, 0, &100u16.to_le_bytes()), "");
-    assert_eq!(node.deadline(), at(100));
-    node.handle_timeout(at(100));
+    assert_eq!(node.deadline(), at_ms(100));
+    node.handle_timeout(at_ms(100));
     assert_eq!(sent(&mut node), "705#7F");
     nmt(&mut node, 150, NmtCommand::StopRemoteNode);
-    node.handle_timeout(at(200));
+    node.handle_timeout(at_ms(200));
     assert_eq!(sent(&mut node), "705#04");
     nmt(&mut node, 210, NmtCommand::EnterPreOperational);
     assert_eq!(write(&mut node, 0x607a, 0, &[7, 0, 0, 0]), "");
@@ -207,23 +207,26 @@ fn the_heartbeat_carries_the_nmt_state() {
 #[test]
 fn a_lost_heartbeat_raises_8130_and_leaves_operational() {
     let mut node = started();
-    assert_eq!(write(&mut node, 0x6007, 0, &[0, 0]), "", "no fault of the axis");
+    assert_eq!(write(&mut node, 0x6007, 0, &[0, 0]), "", "the axis does not react");
     let supervise = (u32::from(MASTER.get()) << 16 | 50).to_le_bytes();
     assert_eq!(write(&mut node, 0x1016, 1, &supervise), "");
-    assert_eq!(write(&mut node, 0x1016, 2, &supervise), "43000406", "twice the same node");
-    assert_eq!(node.deadline(), Time::NEVER, "nothing is expected before the first");
-    let beat = heartbeat_frame(MASTER, NmtState::Operational);
-    assert!(parse_heartbeat(&beat).is_some());
-    give(&mut node, 10, beat);
-    assert_eq!(node.deadline(), at(60));
-    node.handle_timeout(at(60));
+    assert_eq!(
+        write(&mut node, 0x1016, 2, &supervise),
+        "43000406",
+        "the node is monitored already"
+    );
+    assert_eq!(node.deadline(), Time::NEVER, "monitoring starts with the first heartbeat");
+    let heartbeat = heartbeat_frame(MASTER, NmtState::Operational);
+    give(&mut node, 10, heartbeat);
+    assert_eq!(node.deadline(), at_ms(60));
+    node.handle_timeout(at_ms(60));
     assert_eq!(sent(&mut node), "085#3081117F00000000");
     assert_eq!(node.nmt_state(), NmtState::PreOperational);
-    assert_eq!(give(&mut node, 70, beat), "085#0000000000000000");
+    assert_eq!(give(&mut node, 70, heartbeat), "085#0000000000000000");
 
     nmt(&mut node, 70, NmtCommand::StartRemoteNode);
     let lost = give(&mut node, 80, heartbeat_frame(MASTER, NmtState::BootUp));
-    assert_eq!(lost, "085#3081117F00000000", "a restart of the master is a loss too");
+    assert_eq!(lost, "085#3081117F00000000", "a boot-up of the master is a loss too");
 }
 
 #[test]
@@ -231,9 +234,9 @@ fn error_behaviour_keeps_the_node_operational_or_stops_it() {
     for (behaviour, state) in [(1, NmtState::Operational), (2, NmtState::Stopped)] {
         let mut node = started();
         assert_eq!(write(&mut node, 0x1029, 1, &[behaviour]), "");
-        write(&mut node, 0x1016, 1, &[50, 0, 127, 0]);
+        assert_eq!(write(&mut node, 0x1016, 1, &[50, 0, 127, 0]), "");
         give(&mut node, 10, heartbeat_frame(MASTER, NmtState::Operational));
-        node.handle_timeout(at(60));
+        node.handle_timeout(at_ms(60));
         assert_eq!(node.nmt_state(), state);
     }
 }
