@@ -13,7 +13,7 @@ use nalgebra::Vector3;
 use std::f64::consts::FRAC_PI_4;
 use std::time::Duration;
 
-/// Where a tracker sees its sensor, by the base's true rotation, rad.
+/// Position of the sensor, mm, by the true rotation of the base, rad.
 type Sensor = fn(f64) -> Vector3<f64>;
 
 struct Bench {
@@ -23,11 +23,11 @@ struct Bench {
     /// The true depth, mm, and rotation, rad, at power-on.
     start: (f64, f64),
     was_enabled: bool,
-    /// Once the drives were enabled, RPDO1 with this controlword does not reach the insertion drive.
-    loses: Option<u8>,
-    /// Once the drives were enabled, no SDO write of the controlword reaches the insertion drive.
+    /// Once a drive was enabled, RPDO1 with this controlword does not reach the insertion drive.
+    lost_controlword: Option<u8>,
+    /// Once a drive was enabled, no SDO write of the controlword reaches the insertion drive.
     is_deaf: bool,
-    /// None without a tracker.
+    /// `None` without a tracker.
     sensor: Option<Sensor>,
     samples: u32,
 }
@@ -55,7 +55,7 @@ impl Bench {
             stage,
             start,
             was_enabled: false,
-            loses: None,
+            lost_controlword: None,
             is_deaf: false,
             sensor: None,
             samples: 0,
@@ -67,7 +67,7 @@ impl Bench {
         let is_sdo = frame.cob_id() == Some(0x601)
             && matches!(frame.data(), [_, 0x40, 0x60, ..])
             && self.is_deaf;
-        self.was_enabled && (self.loses.is_some_and(is_of) || is_sdo)
+        self.was_enabled && (self.lost_controlword.is_some_and(is_of) || is_sdo)
     }
 
     fn settle(&mut self) {
@@ -98,7 +98,7 @@ impl Bench {
         }
     }
 
-    /// With ±0.1 mm of noise on each coordinate.
+    /// A position of the sensor with ±0.1 mm of noise on each coordinate.
     fn sample(&mut self, sensor: Sensor) -> Input {
         self.samples += 1;
         let noise = |step: f64| 0.2 * (f64::from(self.samples) * step).fract() - 0.1;
@@ -132,7 +132,7 @@ impl Bench {
         while self.operation.outcome().is_none() {
             self.step();
             steps += 1;
-            assert!(steps < 1_000_000, "it does not end");
+            assert!(steps < 1_000_000, "the operation does not end");
         }
         for drive in self.stage.drives() {
             assert_ne!(drive.state(), DriveState::OperationEnabled, "power is off");
@@ -166,7 +166,7 @@ fn a_jog_moves_its_axis_and_no_other() {
         assert!((insertion_mm - expected.0).abs() < 2e-4, "{insertion_mm}");
         assert!((rotation_rad - expected.1).abs() < 2e-4, "{rotation_rad}");
         let [moved] = bench.operation.moves() else { panic!("one move") };
-        let distance_moved = moved.to - moved.from.expect("it began somewhere");
+        let distance_moved = moved.to - moved.from.expect("a start position");
         assert!((distance_moved - distance).abs() < 2e-4, "{moved:?}");
     }
 }
@@ -187,7 +187,7 @@ fn a_goal_out_of_the_limits_is_refused_before_anything_moves() {
 #[test]
 fn a_move_whose_drive_keeps_its_power_is_not_completed() {
     let mut bench = Bench::new(&config(&[]), Operation::Move(by(Axis::Insertion, 2.0)));
-    bench.loses = Some(0x06);
+    bench.lost_controlword = Some(0x06);
     assert_eq!(
         bench.reason(),
         "stage: insertion: the drive still has power 2000 ms after shutdown (statusword 0x1237 \
@@ -224,7 +224,7 @@ fn withdrawing_never_pushes() {
     assert_eq!(bench.travel(), (0.0, 0.0));
 }
 
-/// At 2 mm/s and 21.5 mm/s²: under 0.15 mm from the stop to standstill, a SYNC included.
+/// From 2 mm/s by 21.5 mm/s² the axis stands within 0.15 mm, one SYNC included.
 #[test]
 fn an_operator_a_bus_fault_and_a_drive_fault_stop_an_operation() {
     let inputs = [
@@ -258,7 +258,7 @@ fn an_axis_that_does_not_reach_its_goal_is_an_error() {
     let mut moving = moving::Moving::new(way, feedback(0.0).measured).unwrap();
     assert_eq!(moving.has_arrived(&feedback(0.0)), Ok(false));
     for _ in 0..10 {
-        moving.advance(std::time::Duration::from_millis(10));
+        moving.advance(Duration::from_millis(10));
     }
     assert_eq!(moving.has_arrived(&feedback(0.1)), Ok(false));
     assert_eq!(moving.has_arrived(&feedback(2.0)), Ok(false));
@@ -269,8 +269,7 @@ fn an_axis_that_does_not_reach_its_goal_is_an_error() {
     );
 }
 
-/// From 1 mm on, onto the negative limit switch at -0.8 mm and off it: the home position, which the
-/// drive counts from there on.
+/// From 1 mm onto the negative limit switch at -0.8 mm and off it again. There the drive sets its zero.
 #[test]
 fn homing_finds_the_switch_and_ends_without_power() {
     let config = config(&[
@@ -292,15 +291,12 @@ fn homing_finds_the_switch_and_ends_without_power() {
     assert_eq!(moves, [(Axis::Insertion, None), (Axis::Rotation, None)]);
     assert_eq!(bench.operation.moves()[0].to, 0.0);
 
-    // Homed, it may be moved by who asks for that; the drive itself remembers.
-    let needs_home =
-        Config::from_sources(&[], &["stage.insertion.reference=\"homing\"".to_owned()]);
-    let needs_home = needs_home.unwrap();
+    // The drive remembers that it is homed, so an axis that needs homing may be jogged now.
+    let needs_homing = self::config(&["stage.insertion.reference=homing"]);
     let jog = Operation::Move(by(Axis::Insertion, 2.0));
-    let stage = needs_home.stage.to_stage(&needs_home.can).unwrap();
-    let homed = bench.stage;
+    let stage = needs_homing.stage.to_stage(&needs_homing.can).unwrap();
     let operation = OperationConfig { stage, operation: jog }.begin(bench.now).unwrap();
-    let mut bench = Bench { operation, stage: homed, ..bench };
+    let mut bench = Bench { operation, ..bench };
     assert_eq!(bench.run(), Outcome::Completed);
     assert!((bench.travel().0 - 0.2).abs() < 1e-3, "{}", bench.travel().0);
 }
@@ -322,7 +318,7 @@ fn prove_completes_when_both_drives_miss_the_silent_bench() {
     assert_eq!(bench.travel(), (0.0, 0.0));
 }
 
-/// A drive may have missed an earlier bench, and have said so twice before it was brought up.
+/// Before the bring-up the drive reports twice that it missed the heartbeat of an earlier bench.
 #[test]
 fn prove_completes_after_a_drive_has_repeated_an_earlier_emergency() {
     let mut bench = Bench::new(&config(&[]), Operation::Prove);
@@ -333,7 +329,7 @@ fn prove_completes_after_a_drive_has_repeated_an_earlier_emergency() {
     assert_eq!(bench.run(), Outcome::Completed);
 }
 
-/// By 6007 = 0 its emergency message is all that it does.
+/// With 6007 = 0 the drive reports the lost heartbeat and does nothing else.
 #[test]
 fn prove_fails_on_a_drive_that_misses_the_bench_and_goes_on() {
     let config = config(&["stage.rotation.abort_connection_option=0"]);
@@ -345,15 +341,15 @@ fn prove_fails_on_a_drive_that_misses_the_bench_and_goes_on() {
     assert!(reason.ends_with("see abort_connection_option (0x6007)"), "{reason}");
 }
 
-/// Home is inside the limits by what the bench was told, and outside by what the drive makes of it.
+/// Home is inside the limits by the configuration, but outside by the offset in the drive.
 #[test]
 fn a_home_outside_the_axis_limits_is_an_error() {
     let mut drives = config(&["stage.insertion.homing.method=37"]);
     let mut bench = Bench::new(&drives, Operation::Prove);
-    // 607C as the drive may have been left by the maker's own tool.
+    // A tool of the manufacturer may have left this 607C.
     let offset = (5 * 4646_i32).to_le_bytes();
     let [a, b, c, d] = offset;
-    let left = crate::canopen::Frame::new(0x601, &[0x23, 0x7C, 0x60, 0, a, b, c, d]);
+    let left = Frame::new(0x601, &[0x23, 0x7C, 0x60, 0, a, b, c, d]);
     bench.stage.handle_frame(bench.now, &left);
     drives.stage.rotation.homing = None;
     let stage = drives.stage.to_stage(&drives.can).unwrap();
@@ -369,20 +365,20 @@ fn a_home_outside_the_axis_limits_is_an_error() {
     );
 }
 
-/// Its heartbeat consumer is switched off behind the bench's back.
+/// Another sender switches its heartbeat consumer off.
 #[test]
 fn prove_fails_on_a_drive_that_does_not_miss_the_bench() {
     let mut bench = Bench::new(&config(&[]), Operation::Prove);
     while bench.stage.drives()[1].state() != DriveState::OperationEnabled {
         bench.step();
     }
-    let no_consumer = crate::canopen::Frame::new(0x602, &[0x23, 0x16, 0x10, 1, 0, 0, 0, 0]);
+    let no_consumer = Frame::new(0x602, &[0x23, 0x16, 0x10, 1, 0, 0, 0, 0]);
     bench.stage.handle_frame(bench.now, &no_consumer);
     let reason = bench.reason();
     assert!(reason.starts_with("rotation: no emergency 0x8130 within "), "{reason}");
 }
 
-/// A check of handedness whose sensor is seen there.
+/// A check of handedness with this sensor.
 fn answer(sensor: Option<Sensor>) -> Bench {
     let config = config(&[]);
     let settings = AnswerSettings {
@@ -395,7 +391,7 @@ fn answer(sensor: Option<Sensor>) -> Bench {
     bench
 }
 
-/// 3 mm off the axis, anywhere, in a tracker frame of the bench's hand.
+/// A sensor 3 mm off the axis, in a right-handed tracker frame.
 fn off_axis(turned_rad: f64) -> Vector3<f64> {
     Vector3::new(20.0 + 3.0 * (turned_rad + 0.7).cos(), 3.0 * (turned_rad + 0.7).sin() - 4.0, 5.0)
 }
@@ -405,7 +401,8 @@ fn a_sensor_off_the_axis_proves_the_handedness() {
     let mut bench = answer(Some(off_axis));
     assert_eq!(bench.run(), Outcome::Completed);
     let (insertion_mm, rotation_rad) = bench.travel();
-    assert!(insertion_mm.abs() < 2e-4 && rotation_rad.abs() < 0.003, "{rotation_rad}: it is back");
+    assert!(insertion_mm.abs() < 2e-4, "{insertion_mm} mm");
+    assert!(rotation_rad.abs() < 0.003, "the base is turned back: {rotation_rad} rad");
 }
 
 #[test]
@@ -422,10 +419,10 @@ fn a_sensor_that_moves_wrongly_fails_the_check_with_a_cause() {
         (turned, "is the registration turned?"),
         (|_| off_axis(0.0), "handedness cannot be seen; mount it off the axis"),
     ];
-    for (sensor, why) in cases {
+    for (sensor, cause) in cases {
         let mut bench = answer(Some(sensor));
         let reason = bench.reason();
-        assert!(reason.starts_with("tracker: ") && reason.contains(why), "{reason}");
+        assert!(reason.starts_with("tracker: ") && reason.contains(cause), "{reason}");
         assert!(reason.len() < 200, "{} characters", reason.len());
     }
 }
@@ -459,11 +456,11 @@ fn a_sensor_that_is_not_seen_fails_the_check_before_any_motion() {
     assert_eq!(bench.travel(), (0.0, 0.0));
 }
 
-/// A drive that noticed, stands, and keeps its power is no success; nor is one that nobody has seen.
+/// The drive notices the lost heartbeat and stands, but keeps its power.
 #[test]
 fn prove_fails_on_a_drive_that_keeps_its_power() {
     let mut bench = Bench::new(&config(&[]), Operation::Prove);
-    assert_eq!(bench.run(), Outcome::Completed, "power off is seen, though no TPDO comes");
+    assert_eq!(bench.run(), Outcome::Completed, "power off is seen by SDO, without a TPDO");
     let mut bench = Bench::new(&config(&[]), Operation::Prove);
     bench.is_deaf = true;
     let reason = bench.reason();
@@ -471,7 +468,7 @@ fn prove_fails_on_a_drive_that_keeps_its_power() {
     assert!(reason.contains("press the emergency stop"), "{reason}");
 }
 
-/// No cable is left wound up.
+/// Otherwise the cable would stay wound up.
 #[test]
 fn a_base_is_turned_back_before_a_check_of_handedness_fails() {
     let mut bench = answer(Some(|_| off_axis(0.0)));

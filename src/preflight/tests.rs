@@ -47,7 +47,7 @@ fn status() -> AxisStatus {
     }
 }
 
-/// The verdicts of `checks`, P, W or F each.
+/// The verdicts of `checks`: P, W or F for each.
 fn verdicts(checks: &[Check]) -> String {
     checks.iter().map(|check| check.verdict.to_string().remove(0)).collect()
 }
@@ -69,12 +69,12 @@ fn a_bus_that_restarts_by_itself_or_is_down_fails() {
     assert_eq!((row.verdict, row.found.as_str()), (Verdict::Fail, "no interface can0"));
     let next = row.next_step.as_ref().unwrap();
     assert!(next.ends_with("sudo ip link set can0 up type can bitrate 1000000 restart-ms 0"));
-    // What is not known is no PASS; a virtual interface has neither rate nor counters.
-    let told = || BusFacts { bit_rate: None, restart_ms: None, errors: None, ..facts() };
-    assert_eq!(verdicts(&bus(&config, Ok(Some(told())))), "PWWW");
+    // An unknown value is no PASS, except on a virtual interface, which has neither rate nor counters.
+    let unknown = || BusFacts { bit_rate: None, restart_ms: None, errors: None, ..facts() };
+    assert_eq!(verdicts(&bus(&config, Ok(Some(unknown())))), "PWWW");
     let mut emulated = rig(&[]);
     emulated.stage.hardware = false;
-    assert_eq!(verdicts(&bus(&emulated, Ok(Some(told())))), "PPPP");
+    assert_eq!(verdicts(&bus(&emulated, Ok(Some(unknown())))), "PPPP");
     let memory = rig(&["emulator.rehearse=true"]);
     let [row] = &bus(&memory, Err(String::new()))[..] else { panic!("one row") };
     assert_eq!((row.verdict, row.found.as_str()), (Verdict::Pass, "memory: not a CAN interface"));
@@ -86,17 +86,21 @@ fn a_drive_that_a_run_would_refuse_fails() {
     let of = |status: AxisStatus| verdicts(&drive(&config, Axis::Insertion, Ok(status)));
     assert_eq!(of(status()), "PPPP");
     assert_eq!(of(AxisStatus { homed: Some(false), ..status() }), "PPFP");
-    assert_eq!(of(AxisStatus { homed: None, ..status() }), "PPPP", "the run asks it");
-    // 50 mm from there are over the limit of 60 mm.
+    assert_eq!(
+        of(AxisStatus { homed: None, ..status() }),
+        "PPPP",
+        "unknown here; the run asks the drive"
+    );
+    // An insertion of 50 mm from there exceeds the limit of 60 mm.
     assert_eq!(of(AxisStatus { position: Some(10.01), ..status() }), "PPPF");
     assert_eq!(of(AxisStatus { position: Some(-1.01), ..status() }), "PPPF");
-    // Jogged to 10 mm: to the next count beyond.
+    // A jog to 10 mm ends at the next whole count, just beyond.
     let to_a_count = 46_457.0 * 127.0 / 590_000.0;
     assert_eq!(of(AxisStatus { position: Some(to_a_count), ..status() }), "PPPP");
     let known = vec![EmcyCode::HEARTBEAT];
     assert_eq!(of(AxisStatus { error_history: known, ..status() }), "PWPP");
     assert_eq!(of(AxisStatus { statusword: Statusword(0x8208), ..status() }), "FPPP");
-    // Operation enabled, quick stop active, switched on: each has power.
+    // Operation enabled, quick stop active and switched on have power.
     for powered in [0x8227, 0x8217, 0x8233] {
         assert_eq!(of(AxisStatus { statusword: Statusword(powered), ..status() }), "WPPP");
     }
@@ -109,14 +113,14 @@ fn a_drive_that_a_run_would_refuse_fails() {
         assert_eq!(of(silent), "F");
     }
     assert_eq!(verdicts(&drive(&config, Axis::Insertion, Err("silent".to_owned()))), "F");
-    // As the example comes.
+    // The example file accepts any product code.
     assert_eq!(verdicts(&drive(&rig(&[]), Axis::Insertion, Ok(status()))), "WPPP");
     let resets = rig(&["stage.fault_reset_on_start=true", "stage.insertion.product_code=7"]);
     let faulty = AxisStatus { statusword: Statusword(0x8208), ..status() };
     assert_eq!(verdicts(&drive(&resets, Axis::Insertion, Ok(faulty))), "PPPP");
 }
 
-/// `count` positions, 25 ms apart, received `late_s` after their stamp.
+/// The report on 80 positions, 25 ms apart, each received `late_s` after its stamp.
 fn listened(config: &Config, late_s: f64, at: impl Fn(u32) -> Vector3<f64>) -> TrackerReport {
     let gate = config.tracker.to_gate().unwrap_or_else(|_| config.tracker.to_unregistered_gate());
     let mut listening = Listening::new(gate, 1_000_000_000);
@@ -149,14 +153,14 @@ fn a_tracker_is_judged_by_its_positions_noise_and_stamps() {
     assert!((quiet.stamp_skew_s.unwrap() - 0.02).abs() < 1e-9, "{quiet:?}");
     // The rig has no workspace yet.
     assert_eq!(verdicts(&tracker(&config, &quiet)), "PPPPW");
-    // What was not measured is no PASS.
-    let deaf = TrackerReport { noise_sd_mm: None, stamp_skew_s: None, ..quiet.clone() };
-    assert_eq!(verdicts(&tracker(&config, &deaf)), "PPWWW");
+    // A value that was not measured is no PASS.
+    let unmeasured = TrackerReport { noise_sd_mm: None, stamp_skew_s: None, ..quiet.clone() };
+    assert_eq!(verdicts(&tracker(&config, &unmeasured)), "PPWWW");
     let unstamped = rig(&[REGISTRATION, "tracker.stamp=\"receive\""]);
-    assert_eq!(verdicts(&tracker(&unstamped, &deaf)), "PPWPW", "no stamp is used");
+    assert_eq!(verdicts(&tracker(&unstamped, &unmeasured)), "PPWPW", "no stamp is used");
     let noisy = listened(&config, -2.0, jitter(3.0));
     assert_eq!(verdicts(&tracker(&config, &noisy)), "PPWWW");
-    // A tool that is carried about is not noisy.
+    // A tool that is moved is not noisy.
     let moved = listened(&config, 0.0, |k| Vector3::new(0.5 * f64::from(k) + 0.1, 0.0, 0.0));
     assert_eq!(verdicts(&tracker(&config, &moved)), "PPPPW");
     let two = listened(&config, 0.0, |k| Vector3::new(1.0, 2.0, f64::from(k % 2) * 80.0 + 0.1));
@@ -168,7 +172,7 @@ fn a_tracker_is_judged_by_its_positions_noise_and_stamps() {
     assert_eq!(quiet.last_position_bench_mm, Some([0.7, 2.0, 3.0]));
 }
 
-/// A run would refuse every position outside, and not say where it was.
+/// A run refuses such positions without a word on where they are.
 #[test]
 fn a_tip_outside_the_workspace_fails() {
     const BOX: &str =
@@ -193,9 +197,9 @@ fn a_tip_outside_the_workspace_fails() {
         )
     );
     let outside = listened(&config, 0.0, |k| Vector3::new(99.0, f64::from(k), 0.5));
-    assert_eq!((outside.accepted, outside.refused), (0, 80), "as a run counts them");
+    assert_eq!((outside.accepted, outside.refused), (0, 80), "counted as in a run");
     assert_eq!(verdicts(&tracker(&config, &outside)), "FWPPF");
-    // Where the tracker stands is not known.
+    // Without a registration the position in the bench frame is unknown.
     let unregistered = at(&rig(&[BOX]), 99.0);
     assert_eq!(unregistered.verdict, Verdict::Warn, "{unregistered:?}");
 }
@@ -213,8 +217,8 @@ fn the_plane_is_checked_from_the_last_position() {
     let far = plane(&config, &at(80.0)).unwrap();
     assert_eq!(far.verdict, Verdict::Fail);
     assert!(far.next_step.unwrap().contains("out of reach"));
-    let told = rig(&[REGISTRATION, "insertion.plane_out_of_reach=\"insert\""]);
-    assert_eq!(plane(&told, &at(80.0)).unwrap().verdict, Verdict::Warn, "as the run judges it");
+    let inserts = rig(&[REGISTRATION, "insertion.plane_out_of_reach=\"insert\""]);
+    assert_eq!(plane(&inserts, &at(80.0)).unwrap().verdict, Verdict::Warn, "as the run judges it");
     assert_eq!(plane(&rig(&[]), &at(1.5)), None, "not without a registration");
 }
 
@@ -227,14 +231,18 @@ fn missing_poor_or_old_calibrations_do_not_pass() {
     let of = |sets: &[&str]| verdicts(&calibrations(&rig(sets), NOW_UNIX_US));
     const OFFSET: &str = "tracker.tip_offset_mm=[0.0, 0.0, 7.0]";
     assert_eq!(of(&[OFFSET]), "FWW", "missing");
-    assert_eq!(of(&[FIT]), "WWW", "113 days, and the tip's default");
+    assert_eq!(of(&[FIT]), "WWW", "113 days old, and the default tip");
     assert_eq!(of(&[FIT, "calibration.max_age_days=120"]), "PWW");
     assert_eq!(of(&[&FIT.replace("0.4", "1.4"), "calibration.max_age_days=120"]), "FWW");
-    // Typed in: nothing shows when and how they were measured.
+    // Values without a fit do not show when and how they were measured.
     assert_eq!(of(&[REGISTRATION, OFFSET]), "WWW");
     let mut emulated = rig(&[REGISTRATION]);
     emulated.stage.hardware = false;
-    assert_eq!(verdicts(&calibrations(&emulated, NOW_UNIX_US)), "PPP", "it is as it was typed in");
+    assert_eq!(
+        verdicts(&calibrations(&emulated, NOW_UNIX_US)),
+        "PPP",
+        "an emulated needle is exactly as configured"
+    );
     let points = "tracker.registration={ fiducials = [\
         { tracker_mm = [0.0, 0.0, 0.0], bench_mm = [0.0, 0.0, 0.0] }, \
         { tracker_mm = [50.0, 0.0, 0.0], bench_mm = [50.0, 0.0, 0.0] }, \
@@ -252,7 +260,7 @@ fn missing_poor_or_old_calibrations_do_not_pass() {
     }
 }
 
-/// A run notices a registration that is turned about the needle only where the roll at the start is told.
+/// A run notices a registration that is turned about the needle only if the roll at the start is known.
 #[test]
 fn an_unknown_roll_at_the_start_is_a_warning() {
     let of = |sd_deg: f64| {
@@ -283,7 +291,11 @@ fn a_proof_counts_while_it_is_young_and_its_keys_unchanged() {
         (Verdict::Pass, "3 h ago")
     );
     let ahead = of(Some(&earlier("2026-11-22T12:40:00.000000Z", &[])));
-    assert_eq!((ahead.verdict, ahead.found.as_str()), (Verdict::Pass, "0 h ago"), "two clocks");
+    assert_eq!(
+        (ahead.verdict, ahead.found.as_str()),
+        (Verdict::Pass, "0 h ago"),
+        "a date slightly ahead, from another clock"
+    );
     let changed = earlier("2026-11-22T09:00:00.000000Z", &["can.heartbeat_timeout_ms"]);
     assert_eq!(of(Some(&changed)).verdict, Verdict::Warn);
     for date in ["2026-01-22T09:00:00.000000Z", "2027-01-22T09:00:00.000000Z"] {
@@ -314,7 +326,7 @@ fn a_full_disk_fails() {
 fn the_worst_verdict_stays_and_the_next_step_is_under_its_line() {
     let checks = [
         Check::new("disk", "9 MB free", "at least 100 MB").with(Verdict::Fail, "make room"),
-        // A later warning does not lessen a failure.
+        // A later warning does not replace a failure.
         Check::unlimited("bus", "can0").with(Verdict::Fail, "a").with(Verdict::Warn, "b"),
         Check::new("tip", "fine", "fine"),
     ];

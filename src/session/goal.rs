@@ -229,7 +229,7 @@ mod tests {
         config.session().unwrap().goal.unwrap()
     }
 
-    /// The plan before a run cannot know where the tip will be seen.
+    /// The plan before a run does not know the measured start.
     #[test]
     fn a_tip_that_is_seen_at_an_obstacle_is_refused() {
         let ball =
@@ -241,13 +241,12 @@ mod tests {
             why.contains("[0.0, 6.0, 4.0], where the tip is seen: the start is 1.1 mm from"),
             "{why}"
         );
-        let why = goal.check_start(&Vector3::new(3.0, -1.0, 4.0)).map(|()| "is clear");
-        assert_eq!(why, Ok("is clear"));
+        assert_eq!(goal.check_start(&Vector3::new(3.0, -1.0, 4.0)), Ok(()));
         let why = goal.check_start(&Vector3::new(0.0, 70.0, 60.0)).unwrap_err();
         assert!(why.contains("the target is out of reach"), "{why}");
     }
 
-    /// From there the path that is known does not lead on, and one expansion finds no other.
+    /// The known path does not continue from there, and one expansion finds no other.
     #[test]
     fn a_tip_that_is_seen_where_the_budget_finds_no_path_is_refused() {
         let ball =
@@ -259,7 +258,7 @@ mod tests {
         assert!(why.contains("goal.step_expansions_max, 1, was spent"), "{why}");
     }
 
-    /// The start is on the wall at z = 0. The room beyond it is there alone.
+    /// The start lies on the face z = 0 of the workspace. Only near it may the tip be outside.
     #[test]
     fn a_tip_outside_the_workspace_is_refused_except_at_the_start() {
         let goal = goal(&[]);
@@ -268,7 +267,6 @@ mod tests {
         assert!(why.contains("outside goal.workspace_mm"), "{why}");
     }
 
-    /// The insertion is long enough for the path, or there is none.
     #[test]
     fn the_depth_limits_the_length_of_the_path() {
         let goal = goal(&["insertion.depth_mm=130"]);

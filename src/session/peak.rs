@@ -27,7 +27,7 @@ mod tests {
     };
     use proptest::prelude::*;
 
-    /// An axis at its limits, and where it was last told to be.
+    /// An axis with limits, and its last target.
     struct Limited {
         check: LimitCheck,
         last: Commanded,
@@ -60,8 +60,8 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(2000))]
 
-        /// Steered from one extreme to the other, held and released at any moment, an insertion to any
-        /// depth keeps to limits that are no higher than its peaks.
+        /// The limits are the peaks themselves. The insertion is steered from one extreme to the other, held and
+        /// released at any moment.
         #[test]
         fn an_insertion_keeps_to_its_peaks(
             depth_mm in 0.05..20.0f64,
@@ -99,7 +99,7 @@ mod tests {
                 match event {
                     0 => insertion.profile.hold(braking),
                     1 => insertion.profile.release(None),
-                    // A step begins at rest.
+                    // A step begins at standstill.
                     4 if insertion.is_standing(last_mm) => insertion.profile.release(Some(part.abs())),
                     4 => {}
                     5 => insertion.set_speed(speed * (1.0 - 0.9 * part.abs())).expect("within"),
@@ -116,7 +116,7 @@ mod tests {
         }
     }
 
-    /// The bound is no higher than it has to be.
+    /// This shows that the bound is not too high.
     #[test]
     fn a_profile_reaches_its_peak_acceleration() {
         let mut highest = 0.0f64;

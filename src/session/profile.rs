@@ -120,8 +120,7 @@ mod tests {
     use proptest::prelude::*;
 
     proptest! {
-        /// The goal is reached exactly, within the limits on the way, in about the time that the
-        /// trapezoid takes.
+        /// The goal is reached exactly, in about the time of the trapezoid.
         #[test]
         fn reaches_the_goal_within_the_limits(goal in 0.01..300.0f64, speed in 0.1..10.0f64, acceleration in 1.0..100.0f64) {
             let period = Duration::from_millis(10);
@@ -142,8 +141,8 @@ mod tests {
             prop_assert_eq!(profile.advance(period), goal);
         }
 
-        /// A hold ends where it was said to end at the latest, and no sooner than braking in whole
-        /// periods does; released, the way goes on to the goal.
+        /// The hold ends at most at `hold_depth_mm`, and at most the travel of a period before it. After its
+        /// release the profile goes on to the goal.
         #[test]
         fn holds_within_its_braking_distance(speed in 0.1..10.0f64, braking in 1.0..100.0f64, after in 1..300u32) {
             let period = Duration::from_millis(10);

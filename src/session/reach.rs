@@ -106,8 +106,15 @@ mod tests {
             "the plane is out of reach: the tip is -100.0 mm off it, heading 0 ± 24 deg; the way into \
              it takes 189 mm at least, insertion.depth_mm is 150"
         );
-        assert!(reach(&["insertion.depth_mm=10"], 5.0).is_ok(), "a trial");
-        assert!(reach(&["insertion.depth_mm=10"], 30.0).is_err());
+        assert!(
+            reach(&["insertion.depth_mm=10"], 5.0).is_ok(),
+            "a short insertion is judged as a deeper one"
+        );
+        let error = reach(&["insertion.depth_mm=10"], 30.0).unwrap_err();
+        assert!(
+            error.starts_with("the plane is out of reach: the tip is 30.0 mm off it"),
+            "{error}"
+        );
     }
 
     #[test]
@@ -122,20 +129,27 @@ mod tests {
                       target, 3.0 mm, corrects 1.3 at most (plus 1.8 for noise); goal.tolerance_mm is 1";
         assert_eq!(at(3.0, 5.0, &[]).unwrap_err(), missed);
         assert_eq!(at(3.0, -5.0, &[]).unwrap_err(), missed);
-        // A heading that is known leaves less, or leads there.
+        // A known heading leaves less reach, or leads to the target.
         let known = "observer.invariant.start_sd.pitch_deg=1";
-        assert!(at(30.0, 10.0, &[known]).is_err());
+        let is_missed = |result: Result<(), String>| {
+            result.is_err_and(|error| error.starts_with("the target is out of reach: the tip is "))
+        };
+        assert!(is_missed(at(30.0, 10.0, &[known])));
         assert_eq!(at(30.0, 10.0, &[known, "observer.start.pitch_deg=-20"]), Ok(()));
         assert_eq!(at(30.0, -10.0, &[known, "observer.start.pitch_deg=20"]), Ok(()));
-        assert!(at(30.0, -10.0, &[known, "observer.start.pitch_deg=-20"]).is_err());
+        assert!(is_missed(at(30.0, -10.0, &[known, "observer.start.pitch_deg=-20"])));
     }
 
-    /// A heading that is known to lead away leaves less of the depth.
+    /// The heading is known to 1 deg.
     #[test]
     fn a_heading_away_from_the_plane_is_refused_and_toward_it_accepted() {
         let known = "observer.invariant.start_sd.pitch_deg=1";
         let away = ["insertion.depth_mm=60", "observer.start.pitch_deg=20", known];
-        assert!(reach(&away, 5.0).is_err());
+        let error = reach(&away, 5.0).unwrap_err();
+        assert!(
+            error.starts_with("the plane is out of reach: the tip is 5.0 mm off it"),
+            "{error}"
+        );
         let toward = ["insertion.depth_mm=60", "observer.start.pitch_deg=-20", known];
         assert_eq!(reach(&toward, 5.0), Ok(()));
     }

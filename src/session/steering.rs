@@ -234,7 +234,7 @@ mod tests {
         }
     }
 
-    /// A lost observer is not one that has no estimate yet: the needle does not go on unturned.
+    /// An observer without an estimate yet lets the needle go on unturned. A lost one must not.
     #[test]
     fn a_lost_observer_ends_the_run() {
         let config = Config::from_sources(&[], &[]).unwrap().session().unwrap();
@@ -251,8 +251,7 @@ mod tests {
         }
     }
 
-    /// Standard deviation of x after 60 mm straight ahead with `per_mm` positions a millimetre, each
-    /// sent so many times.
+    /// Standard deviation of x after an arc of 60 mm with `per_mm` positions a mm, each sent `times` times.
     fn x_sd_mm(per_mm: u32, times: u32) -> f64 {
         let config = Config::from_sources(&[], &[]).unwrap().session().unwrap();
         let mut steering = Steering::new(&config).unwrap();
@@ -272,15 +271,15 @@ mod tests {
         steering.estimate().unwrap().sd.unwrap()[0]
     }
 
-    /// A position that is sent five times does not count for five, whose standard deviation would
-    /// be √5 times less.
+    /// Five independent positions would lower it by √5.
     #[test]
     fn repeated_positions_do_not_lower_the_standard_deviation() {
-        let [repeated, five] = [(4, 5), (20, 1)].map(|(per_mm, times)| x_sd_mm(per_mm, times));
-        assert!(repeated > 1.8 * five, "{repeated} {five}");
+        let [repeated, independent] =
+            [(4, 5), (20, 1)].map(|(per_mm, times)| x_sd_mm(per_mm, times));
+        assert!(repeated > 1.8 * independent, "{repeated} {independent}");
     }
 
-    /// Positions of correlated noise, told to be so, count for less from the first on.
+    /// Positions with correlated noise count for less from the first one on.
     #[test]
     fn configured_correlated_noise_raises_the_standard_deviation() {
         let sd_mm = |noise| {
@@ -292,14 +291,14 @@ mod tests {
             }
             steering.estimate().unwrap().sd.unwrap()[0]
         };
-        let told = |correlated_sd_mm| {
+        let configured = |correlated_sd_mm| {
             Some(PositionNoise {
                 white_sd_mm: 0.577,
                 correlated_sd_mm,
                 correlation_time: Duration::from_millis(200),
             })
         };
-        let [unknown, white, coloured] = [None, told(0.0), told(1.0)].map(sd_mm);
+        let [unknown, white, coloured] = [None, configured(0.0), configured(1.0)].map(sd_mm);
         assert!(white <= unknown && unknown < 0.5 * coloured, "{white} {unknown} {coloured}");
     }
 }

@@ -420,7 +420,7 @@ mod tests {
     use crate::tracker::Validity;
     use nalgebra::Vector3;
 
-    /// The records after `count` samples, of which those numbered `lost` are out of view.
+    /// The records of `count` samples, of which those in `lost` are out of view.
     fn records(count: i64, lost: std::ops::Range<i64>, is_inserting: bool) -> Vec<Record> {
         let config = Config::from_sources(&[], &[]).unwrap().session().unwrap();
         let mut tracking = Tracking::new(&config);
@@ -443,11 +443,12 @@ mod tests {
     #[test]
     fn a_tip_lost_before_the_insertion_is_not_recovered_by_the_model() {
         let records = records(9, 3..8, false);
-        let says = |part: &str| {
-            let said = |record: &Record| matches!(record, Record::Event { text, .. } if text.contains(part));
-            records.iter().any(said)
+        let has_event = |part: &str| {
+            records
+                .iter()
+                .any(|record| matches!(record, Record::Event { text, .. } if text.contains(part)))
         };
-        assert!(says("lost, 5 refused") && !says("found"), "{records:?}");
+        assert!(has_event("lost, 5 refused") && !has_event("found"), "{records:?}");
     }
 
     #[test]

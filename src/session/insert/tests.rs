@@ -1,4 +1,4 @@
-//! Insertions on the virtual stage, with a tracker of the test's own.
+//! Insertions on the virtual stage, with a tracker that each test scripts.
 
 use crate::canopen::Frame;
 use crate::config::Config;
@@ -14,11 +14,11 @@ struct Bench {
     session: Session,
     stage: VirtualStage,
     tool: String,
-    /// Where the tip is seen, 40 times a second from `next_sample` on.
+    /// Measured tip position, 40 times a second from `next_sample` on.
     tip_mm: Vector3<f64>,
     next_sample: Time,
     samples: u32,
-    /// Each position is received together with one from before, which is so far behind, mm.
+    /// Each position is received together with an earlier one, which is this far behind, mm.
     behind_mm: Option<f64>,
     /// RPDO1 and SDO requests do not reach the insertion drive.
     is_deaf: bool,
@@ -121,11 +121,23 @@ impl Bench {
         }
         self.session.outcome().unwrap().stop_reason().expect("stopped").to_owned()
     }
+
+    /// Another master enables the insertion drive, with `pause` after each controlword; the run stops for it.
+    fn enable_from_elsewhere(&mut self, pause: Duration) {
+        for controlword in [0x06, 0x07, 0x0F] {
+            let write = Frame::new(0x601, &[0x2B, 0x40, 0x60, 0, controlword, 0, 0, 0]);
+            self.stage.handle_frame(self.now, &write);
+            self.run_for(pause);
+        }
+        let reason = self.reason();
+        let expected = "stage: insertion: the drive has power before the bench gave it any";
+        assert!(reason.starts_with(expected), "{reason}");
+    }
 }
 
 const CONFIGURED: &str = "both drives are configured";
 
-/// The mean that decides takes 0.5 s, and the run waits 0.3 s for a tip.
+/// The mean that decides takes 0.5 s. The tip times out after 0.3 s.
 #[test]
 fn a_start_out_of_reach_is_refused_for_that_and_not_for_the_tip_timeout() {
     let mut bench = Bench::new(&["tracker.timeout_s=0.3", "insertion.depth_mm=150"]);
@@ -136,11 +148,11 @@ fn a_start_out_of_reach_is_refused_for_that_and_not_for_the_tip_timeout() {
     assert!(reason.starts_with("insertion: the plane is out of reach"), "{reason}");
 }
 
-/// The same, where the mean is within reach, although the first position is not.
+/// The first position is out of reach, the mean is not.
 #[test]
 fn a_start_whose_mean_is_within_reach_begins_although_the_tip_times_out() {
     let seen_at = |x_mm: f64, then_mm: f64, phase_ms: u64| {
-        // 0.5 s are no whole number of SYNCs.
+        // 0.5 s is no whole number of these SYNCs.
         let sets = ["tracker.timeout_s=0.3", "insertion.depth_mm=150", "can.sync_ms=12"];
         let mut bench = Bench::new(&sets);
         bench.tip_mm.x = x_mm;
@@ -156,7 +168,7 @@ fn a_start_whose_mean_is_within_reach_begins_although_the_tip_times_out() {
         }
         Err(bench.reason())
     };
-    // The nearest millimetre from which the plane is out of reach.
+    // The smallest distance in whole mm from which the plane is out of reach.
     let refused_mm = (40..100)
         .map(f64::from)
         .find(|x_mm| seen_at(*x_mm, *x_mm, 150).is_err())
@@ -167,7 +179,7 @@ fn a_start_whose_mean_is_within_reach_begins_although_the_tip_times_out() {
     }
 }
 
-/// The stamp of receipt is right for the last of them, and too late for the others.
+/// The time of receipt fits only the last of them. For the others it is too late.
 #[test]
 fn of_positions_received_at_once_only_the_last_corrects() {
     let mut bench = Bench::new(&["insertion.depth_mm=10", "insertion.plane_out_of_reach=insert"]);
@@ -178,26 +190,17 @@ fn of_positions_received_at_once_only_the_last_corrects() {
     }
     for step in &bench.steps {
         let tip_mm = step.tip_meas_mm.expect("a position");
-        assert!(tip_mm.z >= 0.0, "{tip_mm}, 0.5 mm behind");
+        assert!(tip_mm.z >= 0.0, "{tip_mm} is 0.5 mm behind");
     }
 }
 
-/// The bench has given it no power, but must not claim that it has none.
+/// The drive ignores the bench. The bench has given it no power, but must not claim that it has none.
 #[test]
 fn power_from_another_master_that_stays_on_is_reported_at_the_end() {
     let mut bench = Bench::new(&[]);
     bench.run_until(CONFIGURED);
     bench.is_deaf = true;
-    for controlword in [0x06, 0x07, 0x0F] {
-        let write = Frame::new(0x601, &[0x2B, 0x40, 0x60, 0, controlword, 0, 0, 0]);
-        bench.stage.handle_frame(bench.now, &write);
-        bench.run_for(Duration::from_millis(200));
-    }
-    let reason = bench.reason();
-    assert!(
-        reason.starts_with("stage: insertion: the drive has power before the bench gave it any"),
-        "{reason}"
-    );
+    bench.enable_from_elsewhere(Duration::from_millis(200));
     let at_end = bench.session.stage_at_end();
     let unknown = at_end.unknown.unwrap_or("nothing");
     assert!(at_end.had_power && unknown.contains("press the emergency stop"), "{unknown}");
@@ -208,15 +211,7 @@ fn power_from_another_master_that_stays_on_is_reported_at_the_end() {
 fn power_from_another_master_that_the_stop_took_off_is_reported_at_the_end() {
     let mut bench = Bench::new(&[]);
     bench.run_until(CONFIGURED);
-    for controlword in [0x06, 0x07, 0x0F] {
-        let write = Frame::new(0x601, &[0x2B, 0x40, 0x60, 0, controlword, 0, 0, 0]);
-        bench.stage.handle_frame(bench.now, &write);
-    }
-    let reason = bench.reason();
-    assert!(
-        reason.starts_with("stage: insertion: the drive has power before the bench gave it any"),
-        "{reason}"
-    );
+    bench.enable_from_elsewhere(Duration::ZERO);
     let at_end = bench.session.stage_at_end();
     assert!(at_end.had_power, "{at_end:?}");
     assert_eq!(at_end.unknown, None);
