@@ -51,22 +51,3 @@ impl StageSection {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use crate::config::{Config, Source};
-
-    #[test]
-    fn the_stage_keeps_the_following_error_windows_in_mm_and_rad() {
-        let text = "[stage.insertion]\nfollowing_error_mm = 0.7\n\
-                    [stage.rotation]\nfollowing_error_deg = 3.6\n";
-        let windows = |text: &str| {
-            let source = Source { name: "bench.toml", text };
-            let config = Config::from_sources(&[source], &[]).expect("valid");
-            let stage = config.stage.to_stage(&config.can).expect("a stage");
-            [stage.insertion.following_error_max, stage.rotation.following_error_max]
-        };
-        assert_eq!(windows(text), [Some(0.7), Some(3.6f64.to_radians())]);
-        assert_eq!(windows(""), [None, None]);
-    }
-}

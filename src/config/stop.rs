@@ -156,7 +156,7 @@ mod tests {
         assert_eq!(rig.stage.power.stop_timeout, Duration::from_secs(4));
     }
 
-    /// Each of these a run refuses.
+    /// A run refuses each of these values.
     #[test]
     fn an_error_elsewhere_does_not_prevent_a_stop() {
         let elsewhere = [
@@ -182,16 +182,16 @@ mod tests {
             let stop = read(RIG, &[set]).unwrap_or_else(|error| panic!("{set}: {error}"));
             assert_eq!(nodes(&stop), [1, 2], "{set}");
         }
-        let all = read(RIG, &elsewhere).expect("all of them");
-        assert_eq!(all.stage.insertion.ratio, CountsRatio::new(100, 1).unwrap(), "a coarse one");
-        assert_eq!(all.stage.power.stop_timeout, Duration::from_secs(2), "as by default");
+        let all = read(RIG, &elsewhere).expect("all at once");
+        assert_eq!(all.stage.insertion.ratio, CountsRatio::new(100, 1).unwrap(), "a default");
+        assert_eq!(all.stage.power.stop_timeout, Duration::from_secs(2), "the default");
         assert_eq!(
             (all.stage.bus.sdo_timeout(), all.stage.bus.sdo_attempts),
             (Duration::from_millis(150), 3)
         );
     }
 
-    /// A stage that cannot work so is stopped; it is given the time that its counts need to stand.
+    /// Such a stage is stopped too. The timeout grows to what the coarse counts need to detect standstill.
     #[test]
     fn a_scale_or_a_time_that_a_run_refuses_does_not_prevent_a_stop() {
         let stop_timeout = |set| read(RIG, &[set]).unwrap().stage.power.stop_timeout;
@@ -207,7 +207,7 @@ mod tests {
         );
     }
 
-    /// As it may be saved half-way through an edit, while a needle moves.
+    /// A file may be saved half-way through an edit, while a needle moves.
     #[test]
     fn bus_and_nodes_are_read_from_a_file_with_broken_toml_elsewhere() {
         let appended =
@@ -233,11 +233,14 @@ mod tests {
         let dotted =
             "can.interface = \"can0\"\nstage.insertion.node = 1\nstage.rotation.node = 2\nx =\n";
         assert_eq!(nodes(&read(dotted, &[]).unwrap()), [1, 2]);
-        // The keys below a header that cannot be read are of no table, nor of the one before.
+        // Keys below a broken header belong to no table, not even to the table before.
         let headless =
             "[can]\ninterface = \"can0\"\n[stage.insertion]\nnode = 1\n[stage.rotation\nnode = 2\n";
-        let said = read(headless, &[]).unwrap_err();
-        assert!(said.ends_with("stage.rotation.node is not given, and a stop needs it"), "{said}");
+        let error = read(headless, &[]).unwrap_err();
+        assert!(
+            error.ends_with("stage.rotation.node is not given, and a stop needs it"),
+            "{error}"
+        );
         let indented = "[can]\ninterface = \"can0\"\n  [stage.insertion]\n  node = 1\n\t[stage.rotation]\nnode = 2\n\
                         [tracker]\n=\n";
         assert_eq!(nodes(&read(indented, &[]).unwrap()), [1, 2]);
@@ -252,14 +255,14 @@ mod tests {
         assert_eq!((stop.interface.to_string().as_str(), nodes(&stop)), ("can1", [5, 6]));
         assert_eq!(stop.stage.insertion.ratio, CountsRatio::new(100, 1).unwrap());
         assert_eq!(stop.stage.rotation.ratio, CountsRatio::new(500, 1).unwrap());
-        // Nor one that is TOML.
+        // Broken TOML does not matter then.
         assert_eq!(nodes(&read("[can\n", &sets).unwrap()), [5, 6]);
-        let said = read("[can\n", &sets[1..]).unwrap_err();
-        assert!(said.starts_with("rig.toml:1:"), "{said}");
-        assert!(said.ends_with("\ncan.interface is not given, and a stop needs it"), "{said}");
+        let error = read("[can\n", &sets[1..]).unwrap_err();
+        assert!(error.starts_with("rig.toml:1:"), "{error}");
+        assert!(error.ends_with("\ncan.interface is not given, and a stop needs it"), "{error}");
     }
 
-    /// Only an emulated stage has the nodes of the virtual one.
+    /// Only on a virtual bus do the nodes default to those of the virtual stage.
     #[test]
     fn a_stop_without_interface_or_nodes_is_refused() {
         assert_eq!(
@@ -281,14 +284,14 @@ mod tests {
             ("stage.rotation.node=two", "stage.rotation.node is \"two\", expected"),
             ("stage.rotation.node=1", "stage.rotation.node is 1, the same as stage.insertion.node"),
         ] {
-            let said = read(RIG, &[set]).unwrap_err();
-            assert!(said.starts_with(&format!("--set {problem}")), "{set}: {said}");
+            let error = read(RIG, &[set]).unwrap_err();
+            assert!(error.starts_with(&format!("--set {problem}")), "{set}: {error}");
         }
         let without = RIG.replace("node = 2 ", "nod = 2 ").replace("node = 2\n", "nod = 2\n");
         assert_ne!(without, RIG);
-        let said = read(&without, &[]).unwrap_err();
-        assert!(said.contains("stage.rotation.node is missing"), "{said}");
-        let said = read(&without, &["stage.hardware=false"]).unwrap_err();
-        assert_eq!(said, "stage.rotation.node is not given, and a stop needs it");
+        let error = read(&without, &[]).unwrap_err();
+        assert!(error.contains("stage.rotation.node is missing"), "{error}");
+        let error = read(&without, &["stage.hardware=false"]).unwrap_err();
+        assert_eq!(error, "stage.rotation.node is not given, and a stop needs it");
     }
 }

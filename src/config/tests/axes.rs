@@ -1,12 +1,7 @@
-//! What an axis, its drive and its operations are told.
+//! Keys of an axis, its drive and its operations.
 
-use crate::config::{Config, Source};
+use super::*;
 use crate::stage::{HomingConfig, Reference};
-
-fn refusal(text: &str) -> String {
-    let source = Source { name: "bench.toml", text };
-    Config::from_sources(&[source], &[]).expect_err("refused").to_string()
-}
 
 #[test]
 fn a_homing_reference_without_a_zero_in_counts_is_refused() {
@@ -17,25 +12,17 @@ fn a_homing_reference_without_a_zero_in_counts_is_refused() {
     );
 }
 
-/// Three jogs of 15° by limits of 20° that count from each jog's start would end at 45°.
+/// Otherwise three jogs of 15° would end at 45° in spite of limits of 20°, which count from each start.
 #[test]
 fn limits_of_a_real_axis_without_a_fixed_zero_are_refused() {
-    let rig = include_str!("../../../bench-config/rig-epos4.toml");
-    let load = |sets: &[&str]| {
-        let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
-        Config::from_sources(&[Source { name: "rig.toml", text: rig }], &sets)
-    };
     let absolute = "stage.rotation.reference=absolute";
-    let said = load(&[absolute, "stage.rotation.zero=start"]).expect_err("refused").to_string();
-    assert!(
-        said.starts_with(
-            "--set stage.rotation.zero is \"start\": its limits of -720 to 720 deg would count anew \
-             from each start"
-        ),
-        "{said}"
-    );
-    assert!(load(&[absolute, "stage.rotation.zero=-1234"]).is_ok());
-    assert!(load(&[absolute, "stage.rotation.zero=start", "stage.rotation.wraps=true"]).is_ok());
+    let error =
+        load(RIG, &[absolute, "stage.rotation.zero=start"]).expect_err("refused").to_string();
+    let expected = "--set stage.rotation.zero is \"start\": its limits of -720 to 720 deg would count anew \
+                    from each start";
+    assert!(error.starts_with(expected), "{error}");
+    loaded(RIG, &[absolute, "stage.rotation.zero=-1234"]);
+    loaded(RIG, &[absolute, "stage.rotation.zero=start", "stage.rotation.wraps=true"]);
 }
 
 #[test]
@@ -46,12 +33,11 @@ fn a_home_outside_the_limits_is_refused() {
          stage.insertion.zero = 0, allowed: stage.insertion.min_mm to stage.insertion.max_mm, \
          which are -1 and 310"
     );
-    let text = "stage.insertion.homing.offset_mm = 5\nstage.insertion.zero = -23230\n";
-    let source = Source { name: "bench.toml", text };
-    assert!(Config::from_sources(&[source], &[]).is_ok(), "the axis reads 0 there");
+    // With this zero the axis reads 0 at home.
+    loaded("stage.insertion.homing.offset_mm = 5\nstage.insertion.zero = -23230\n", &[]);
 }
 
-/// Towards the switch at the other end every millimetre of the way would be beyond it.
+/// The whole range of the axis would lie beyond that switch.
 #[test]
 fn a_homing_that_seeks_the_wrong_end_is_refused() {
     let homing = |method: i8, sign: i8, limits: &str| {
@@ -73,8 +59,7 @@ fn a_homing_that_seeks_the_wrong_end_is_refused() {
          the withdrawn end: home is 0.000 mm, the limits of -310 to 1 mm go 310.0 mm beyond it; is it 2?"
     );
     for text in [homing(17, 1, ""), homing(2, -1, ""), homing(18, 1, deep), homing(24, 1, "")] {
-        let source = Source { name: "bench.toml", text: &text };
-        assert!(Config::from_sources(&[source], &[]).is_ok(), "{text}");
+        loaded(&text, &[]);
     }
 }
 
@@ -87,7 +72,7 @@ fn a_withdrawal_speed_over_the_axis_limit_is_refused() {
     );
 }
 
-/// Each with both keys and both numbers; at the bound itself nothing is refused.
+/// The error names both keys and both numbers. The bound itself is allowed.
 #[test]
 fn accelerations_over_the_axis_limits_are_refused() {
     let braking = "tracker.hold_braking_mm_per_s2 = 10\ntracker.hold_after_mm = 2\n";
@@ -99,9 +84,8 @@ fn accelerations_over_the_axis_limits_are_refused() {
              as hard, and stage.{axis}.acceleration_max_{unit}_per_s2 is 11.2"
         )
     };
-    let said = refusal(&along(11.2));
     assert_eq!(
-        said.lines().collect::<Vec<_>>(),
+        refusal(&along(11.2)).lines().collect::<Vec<_>>(),
         [
             peak("insertion.acceleration_mm_per_s2", "9.955", "mm", "insertion"),
             peak("stage.insertion.jog_acceleration_mm_per_s2", "9.955", "mm", "insertion"),
@@ -114,7 +98,7 @@ fn accelerations_over_the_axis_limits_are_refused() {
     );
     let about = |max: f64| format!("stage.rotation.acceleration_max_deg_per_s2 = {max:?}\n");
     assert_eq!(
-        refusal(&about(3600.0)),
+        load(&about(3600.0), &[]).expect_err("refused").to_string(),
         "bench.toml:1: control.nested_saturation.rotation_max_deg_per_mm is 60: reversed from one \
          SYNC to the next at 2 mm/s, that is 24000 deg/s², over stage.rotation.acceleration_max_deg_per_s2 = \
          3600; turn or insert more slowly, or raise the limit"
@@ -127,8 +111,7 @@ fn accelerations_over_the_axis_limits_are_refused() {
          stage.rotation.acceleration_max_deg_per_s2 is 24000"
     );
     for text in [along(11.25), about(24_000.0)] {
-        let source = Source { name: "bench.toml", text: &text };
-        Config::from_sources(&[source], &[]).unwrap_or_else(|error| panic!("{error}"));
+        loaded(&text, &[]);
     }
 }
 
@@ -136,8 +119,7 @@ fn accelerations_over_the_axis_limits_are_refused() {
 fn the_stage_gets_the_homing_of_its_axes() {
     let text = "[stage.insertion]\nreference = \"homing\"\nzero = -500\n\
                 [stage.rotation.homing]\nspeed_zero_deg_per_s = 180.0\n";
-    let source = Source { name: "bench.toml", text };
-    let config = Config::from_sources(&[source], &[]).expect("valid");
+    let config = loaded(text, &[]);
     let stage = config.stage.to_stage(&config.can).expect("a stage");
     assert_eq!(stage.insertion.reference, Reference::Homing);
     assert_eq!(stage.insertion.zero, Some(-500));
@@ -148,36 +130,27 @@ fn the_stage_gets_the_homing_of_its_axes() {
     assert_eq!((rotation.method, rotation.speed_zero), (37, Some(std::f64::consts::PI)));
 }
 
-const RIG: &str = include_str!("../../../bench-config/rig-epos4.toml");
-
-/// What a message advises is allowed.
 #[test]
 fn an_advised_rotation_or_speed_is_allowed() {
-    let told = |deg_per_mm: &str, mm_per_s: &str| {
+    let refused_rotation = |deg_per_mm: &str, mm_per_s: &str| {
         let sets = [
             format!("control.nested_saturation.rotation_max_deg_per_mm={deg_per_mm}"),
             format!("insertion.speed_mm_per_s={mm_per_s}"),
             "stage.rotation.speed_max_deg_per_s=50".to_owned(),
         ];
-        let message = said("", &sets.each_ref().map(String::as_str)).err().unwrap_or_default();
+        let error = load("", &sets.each_ref().map(String::as_str)).err().map(|e| e.to_string());
         let of_rotation = "control.nested_saturation.rotation_max_deg_per_mm is ";
-        message.lines().find(|line| line.contains(of_rotation)).map(str::to_owned)
+        error?.lines().find(|line| line.contains(of_rotation)).map(str::to_owned)
     };
-    let refused = told("30", "3").expect("90 deg/s is over 50");
+    let error = refused_rotation("30", "3").expect("90 deg/s is over 50");
     let advice = "turn by 16.6666 deg/mm or insert at 1.6666 mm/s";
-    assert!(refused.ends_with(advice), "{refused}");
-    assert_eq!([told("16.6666", "3"), told("30", "1.6666")], [None, None]);
-}
-
-fn said(text: &str, sets: &[&str]) -> Result<Config, String> {
-    let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
-    let source = Source { name: "rig.toml", text };
-    Config::from_sources(&[source], &sets).map_err(|error| error.to_string())
+    assert!(error.ends_with(advice), "{error}");
+    assert_eq!([refused_rotation("16.6666", "3"), refused_rotation("30", "1.6666")], [None, None]);
 }
 
 #[test]
 fn options_by_which_a_real_drive_would_not_stop_are_refused() {
-    for (key, allowed, refused) in [
+    for (key, allowed, refused_values) in [
         ("abort_connection_option", &[1, 2, 3][..], &[-1, 0, 4][..]),
         ("communication_error_behaviour", &[0, 2], &[1, 3]),
         ("quick_stop_option", &[1, 2, 3, 5, 6, 7], &[-1, 0, 4, 8]),
@@ -185,18 +158,16 @@ fn options_by_which_a_real_drive_would_not_stop_are_refused() {
     ] {
         let set = |value| format!("stage.rotation.{key}={value}");
         for value in allowed {
-            assert!(said(RIG, &[&set(value)]).is_ok(), "{key} = {value}");
+            loaded(RIG, &[&set(value)]);
         }
-        for value in refused {
-            let message = said(RIG, &[&set(value)]).unwrap_err();
+        for value in refused_values {
+            let error = refused(RIG, &[&set(value)]);
             let expected =
                 format!("--set stage.rotation.{key} is {value}, allowed with stage.hardware");
-            assert!(message.starts_with(&expected), "{message}");
+            assert!(error.starts_with(&expected), "{error}");
         }
-        assert!(
-            said("", &[&set(refused.last().unwrap())]).is_ok(),
-            "an emulated one may be told so"
-        );
+        // An emulated drive may have such a value.
+        loaded("", &[&set(refused_values.last().unwrap())]);
     }
 }
 
@@ -207,26 +178,27 @@ fn objects_that_move_or_supervise_an_axis_are_not_optional() {
         0x6060, 0x6061, 0x6064, 0x607A, 0x607C, 0x607D, 0x6085, 0x6098,
     ] {
         let set = format!("stage.insertion.optional_objects=[0x60C2, {index}]");
-        let message = said("", &[&set]).unwrap_err();
+        let error = set_refusal(&[&set]);
         let expected = format!(
             "--set stage.insertion.optional_objects[1] is 0x{index:04X}, which is not optional"
         );
-        assert!(message.starts_with(&expected), "{message}");
+        assert!(error.starts_with(&expected), "{error}");
     }
     let sets = ["stage.rotation.wraps=true", "stage.rotation.optional_objects=[0x607D]"];
-    assert!(said("", &sets).is_ok(), "an axis that goes round has no limits of its own");
+    // A wrapping axis has no position limits.
+    loaded("", &sets);
     let others = "stage.rotation.optional_objects=[0x1005, 0x1029, 0x1401, 0x605A, 0x605E, \
                   0x6065, 0x6066, 0x6099, 0x609A, 0x60C2, 0x6502]";
-    assert!(said("", &[others]).is_ok());
-    assert!(said(RIG, &[others]).is_ok());
+    loaded("", &[others]);
+    loaded(RIG, &[others]);
 }
 
 #[test]
 fn a_following_error_timeout_longer_than_the_benchs_is_refused() {
     let timeout = |ms| format!("stage.insertion.following_error_timeout_ms={ms}");
-    assert!(said("", &[&timeout(20)]).is_ok());
+    loaded("", &[&timeout(20)]);
     assert_eq!(
-        said("", &[&timeout(21)]).unwrap_err(),
+        set_refusal(&[&timeout(21)]),
         "--set stage.insertion.following_error_timeout_ms is 21, allowed: up to 20 \
          (twice can.sync_ms), so that the drive notices no later than the bench"
     );
@@ -260,18 +232,20 @@ fn raw_sdos_to_objects_that_the_bench_writes_are_refused() {
         (0x1400, "maps the PDOs"),
         (0x1BFF, "maps the PDOs"),
     ] {
-        let message = said("", &[&raw(index)]).unwrap_err();
+        let error = set_refusal(&[&raw(index)]);
         let key = format!("--set stage.insertion.sdo[0].index is 0x{index:04X}, not for raw SDOs");
-        assert!(message.starts_with(&key) && message.contains(instead), "{message}");
+        assert!(error.starts_with(&key) && error.contains(instead), "{error}");
     }
     for object in ["0x6099, subindex = 2", "0x609A, subindex = 0", "0x607C, subindex = 0"] {
         let raw = format!("stage.rotation.sdo=[{{ index = {object}, value = 0, bits = 32 }}]");
-        assert!(said("", &[&raw]).is_ok(), "no key sets it");
+        // Without a homing no key sets these objects.
+        loaded("", &[&raw]);
         let homing = "stage.rotation.homing={ method = 37, timeout_s = 10, homed_bit = 12, \
                       speed_zero_deg_per_s = 9, acceleration_deg_per_s2 = 9, offset_deg = 9 }";
-        let message = said("", &[&raw, homing]).unwrap_err();
-        assert!(message.contains("not for raw SDOs: homing."), "{message}");
+        let error = set_refusal(&[&raw, homing]);
+        assert!(error.contains("not for raw SDOs: homing."), "{error}");
     }
-    assert!(said("", &[&raw(0x2000)]).is_ok());
-    assert!(said(RIG, &[]).is_ok(), "6085 in the drive's own units, where no key sets it");
+    loaded("", &[&raw(0x2000)]);
+    // The rig sets 6085 in the drive's own units, and no key sets it.
+    loaded(RIG, &[]);
 }

@@ -1,4 +1,4 @@
-//! Keys that are each right and do not go together.
+//! Keys that are valid alone and contradict each other.
 
 use super::*;
 
@@ -14,7 +14,7 @@ fn two_alternatives_in_one_source_are_refused() {
         "bench.toml:1: emulator.noise.sd_mm is given along with emulator.noise.uniform_mm: give \
          one of the two"
     );
-    // The command line is one source.
+    // All `--set` together are one source.
     for (one, other) in [
         ("needle.radius_mm=100", "needle.curvature_per_mm=0.01"),
         ("emulator.noise.sd_mm=1", "emulator.noise.uniform_mm=1"),
@@ -22,11 +22,11 @@ fn two_alternatives_in_one_source_are_refused() {
         ("tracker.tip_file=tip.toml", "tracker.tip_offset_mm=[0,0,1]"),
     ] {
         for sets in [[one, other], [other, one]] {
-            let said = set_refusal(&sets);
-            assert!(said.contains("given along with"), "{sets:?}: {said}");
+            let error = set_refusal(&sets);
+            assert!(error.contains("given along with"), "{sets:?}: {error}");
         }
     }
-    // The same key again takes the place of what was given before.
+    // A repeated key replaces its earlier value.
     let radius = loaded("", &["needle.radius_mm=100", "needle.radius_mm=120"]);
     assert_eq!(radius.number("needle.radius_mm"), 120.0);
 }
@@ -102,14 +102,13 @@ fn contradictory_keys_are_refused_with_both_values() {
          drives"
     );
     assert!(load("", &["can.interface=vxcan0", on_a_wire[1]]).is_ok());
-    let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
     assert_eq!(
-        load(&rig, &["can.interface=udp"]).expect_err("refused").to_string(),
+        refused(RIG, &["can.interface=udp"]),
         "--set can.interface is \"udp\", a bus made for tests, but stage.hardware is true: name the \
          interface of the real stage, such as \"can0\""
     );
     assert_eq!(
-        load(&rig, &["can.interface=memory"]).expect_err("refused").to_string(),
+        refused(RIG, &["can.interface=memory"]),
         "--set can.interface is \"memory\", a bus made for tests, but stage.hardware is true: name \
          the interface of the real stage, such as \"can0\"\n\
          --set can.interface: tracker.source is \"openigtlink\", but can.interface = \"memory\" is \
@@ -142,11 +141,8 @@ fn tracker_keys_that_contradict_the_source_are_refused() {
         "bench.toml:1: tracker.file is \"tip.csv\", allowed with tracker.source = \"ndjson\" or \
          \"csv\", which is \"emulated\""
     );
-    let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
     assert_eq!(
-        load(&rig, &["tracker.source=csv", "tracker.file=tip.csv"])
-            .expect_err("refused")
-            .to_string(),
+        refused(RIG, &["tracker.source=csv", "tracker.file=tip.csv"]),
         "--set tracker.file is \"tip.csv\", but stage.hardware is true: a recording does not see the \
          needle that would move"
     );
@@ -203,7 +199,7 @@ fn noise_that_lasts_longer_than_the_insertion_is_refused() {
         "--set tracker.noise.correlation_time_s is 126, allowed: up to the 125.000 s of the insertion; \
          noise that lasts longer is an error of the registration, tracker.registration.sd_mm"
     );
-    // What is advised is allowed: 125.0006 s are not rounded up.
+    // The advised value is itself allowed: 125.0006 s are rounded down.
     let longer = set_refusal(&["insertion.depth_mm=250.0012", &noise("125.001")]);
     assert!(longer.contains("allowed: up to the 125.000 s"), "{longer}");
     assert_eq!(
@@ -235,7 +231,7 @@ fn a_target_move_without_a_tool_or_faster_than_the_needle_is_refused() {
     );
 }
 
-/// Only a path to a target goes around them.
+/// Only a path to a target leads around obstacles.
 #[test]
 fn obstacles_on_the_way_into_the_plane_are_refused() {
     assert_eq!(
@@ -246,7 +242,7 @@ fn obstacles_on_the_way_into_the_plane_are_refused() {
          \"target\""
     );
     for drawn in ["study.target_depth_mm=[20, 90]", "study.obstacles=1"] {
-        let said = set_refusal(&[drawn]);
-        assert!(said.contains(" has no effect, since goal.kind is \"plane\""), "{said}");
+        let error = set_refusal(&[drawn]);
+        assert!(error.contains(" has no effect, since goal.kind is \"plane\""), "{error}");
     }
 }

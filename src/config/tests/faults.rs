@@ -15,7 +15,7 @@ fn faults_are_read_in_the_order_of_the_file() {
         &[],
     );
     let stage = config.virtual_stage().expect("valid");
-    let told: Vec<_> =
+    let read: Vec<_> =
         stage.faults.iter().map(|f| (f.at_mm, f.start_after, f.to_string())).collect();
     let at = |ms| Some(Duration::from_millis(ms));
     let expected = [
@@ -23,19 +23,19 @@ fn faults_are_read_in_the_order_of_the_file() {
         (None, at(1500), "both drives: fault 0x8611 following error"),
         (None, at(0), "foreign frame 181#0102 every 20 ms"),
     ];
-    assert_eq!(told, expected.map(|(mm, after, text)| (mm, after, text.to_owned())));
+    assert_eq!(read, expected.map(|(mm, after, text)| (mm, after, text.to_owned())));
     let again = loaded(&config.to_toml().expect("TOML"), &[]);
     assert_eq!(again, config);
 }
 
-/// The bench's heartbeat is the one that drives watch.
+/// The drives monitor the heartbeat of the bench.
 #[test]
 fn a_heartbeat_fault_toward_the_drives_hits_the_bench_node() {
     let set = "emulator.fault=[{ at_s = 1, kind = \"drop\", frames = \"heartbeat\", \
                toward = \"drives\" }]";
     let stage = loaded("", &[set, "can.bench_node=100"]).virtual_stage().expect("valid");
-    let told = stage.faults[0].to_string();
-    assert_eq!(told, "both drives: heartbeats of node 100 to the drives lost");
+    let fault = stage.faults[0].to_string();
+    assert_eq!(fault, "both drives: heartbeats of node 100 to the drives lost");
 }
 
 #[test]
@@ -90,18 +90,17 @@ fn a_fault_without_a_key_it_needs_is_refused() {
             "emulator.fault=[{{ at_mm = 1, kind = \"drop\", frames = \"{frames}\", \
              toward = \"{toward}\" }}]"
         );
-        let refused = set_refusal(&[&set]);
+        let error = set_refusal(&[&set]);
         let expected = format!("emulator.fault[0]: frames = \"{frames}\" needs toward = ");
-        assert!(refused.contains(&expected), "{refused}");
+        assert!(error.contains(&expected), "{error}");
     }
     assert_eq!(
         set_refusal(&["emulator.fault=[{ at_mm = 1, at_s = 2, kind = \"stall\" }]"]),
         "--set emulator.fault[0].at_s is given along with emulator.fault[0].at_mm: give one of \
          the two"
     );
-    let refused =
-        set_refusal(&["emulator.fault=[{ at_mm = 1, kind = \"foreign\", frame = \"1\" }]"]);
-    assert!(refused.contains("emulator.fault[0].frame is \"1\", allowed: a frame"), "{refused}");
+    let error = set_refusal(&["emulator.fault=[{ at_mm = 1, kind = \"foreign\", frame = \"1\" }]"]);
+    assert!(error.contains("emulator.fault[0].frame is \"1\", allowed: a frame"), "{error}");
 }
 
 #[test]
@@ -124,9 +123,9 @@ fn a_key_that_the_kind_of_fault_does_not_have_is_refused() {
         ("foreign", "axis = \"rotation\""),
         ("emergency-stop", "period_ms = 5"),
     ] {
-        let said =
+        let error =
             set_refusal(&[&format!("emulator.fault=[{{ at_s = 1, kind = \"{kind}\", {key} }}]")]);
-        assert!(said.contains("has no such key, only at_mm, at_s, duration_s"), "{said}");
+        assert!(error.contains("has no such key, only at_mm, at_s, duration_s"), "{error}");
     }
 }
 
@@ -150,7 +149,7 @@ fn switches_are_converted_to_counts_of_the_drive() {
     };
     assert_eq!((insertion.switches, insertion.model), (counts, Model::Epos4));
     assert_eq!(rotation.switches, Switches::default());
-    // A drive that counts the other way has them the other way round.
+    // A drive with the opposite sign has its switches swapped.
     let turned = loaded("", &[switches, "stage.insertion.sign=-1"]).virtual_stage().expect("valid");
     let counts = Switches {
         negative_counts: Some(-10 * 4646),

@@ -1,4 +1,4 @@
-//! What loads, and to what.
+//! Configurations that load, and what they become.
 
 use super::*;
 use crate::config::needle::Arc;
@@ -6,7 +6,7 @@ use crate::config::warnings::section_name;
 use crate::control::ControlKind;
 use crate::emulator::{self, CorrelatedNoise};
 use crate::keys::{Kind, find};
-use crate::stage::RawSdo;
+use crate::stage::{RawSdo, StageConfig};
 
 #[test]
 fn every_shipped_configuration_loads_and_reads_back_the_same() {
@@ -100,7 +100,6 @@ fn an_alternative_replaces_the_other_one_of_an_earlier_source() {
     assert_eq!(noise("emulator.noise = {}", &["emulator.noise={uniform_mm=2}"]), (Some(2.0), None));
 }
 
-/// Noise that is correlated in time is added to the white part.
 #[test]
 fn correlated_noise_is_read_besides_white_noise() {
     let tracker = |set: &str| loaded("", &[set]).emulator.to_tracker();
@@ -112,7 +111,7 @@ fn correlated_noise_is_read_besides_white_noise() {
     assert_eq!(tracker.correlated, Some(CorrelatedNoise { sd_mm: 0.4, time_s: 0.2 }));
 }
 
-/// The warning of a section without effect finds the section by its kind.
+/// The warning about a section without effect finds the section by this name.
 #[test]
 fn each_observer_and_each_law_has_its_section() {
     for (table, kinds) in [("observer", ObserverKind::KIND), ("control", ControlKind::KIND)] {
@@ -124,7 +123,7 @@ fn each_observer_and_each_law_has_its_section() {
     }
 }
 
-/// A limit in the section of a law that is not chosen limits nothing.
+/// A limit in the section of another control law would limit nothing.
 #[test]
 fn shipped_files_give_no_warning_and_keys_without_effect_do() {
     let warnings = |name: &str, text: &str| {
@@ -134,10 +133,9 @@ fn shipped_files_give_no_warning_and_keys_without_effect_do() {
     for (name, text) in shipped() {
         assert_eq!(warnings(&name, &text), [""; 0]);
     }
-    let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
-    let config = loaded(&rig, &[]);
+    let config = loaded(RIG, &[]);
     let rotation = config.control.rotation_max_rad_per_mm() * config.insertion.speed_mm_per_s;
-    assert_eq!(rotation, 20f64.to_radians(), "per s, as the file says");
+    assert_eq!(rotation, 20f64.to_radians(), "20 deg/s, as the file says");
     assert_eq!(
         warnings("a.toml", "[observer]\nshadows = []\nfinite_difference.baseline_mm = 3\n"),
         ["a.toml:3: observer.finite_difference.baseline_mm has no effect, since observer.kind is \
@@ -151,12 +149,12 @@ fn shipped_files_give_no_warning_and_keys_without_effect_do() {
     ] {
         assert_eq!(warnings("a.toml", text), [""; 0]);
     }
-    for (text, told) in [
+    for (text, expected) in [
         ("observer = { kind = \"coupled\", coupled.gains = \"placed\" }", "15% of 300 insertions"),
         ("observer.kind = \"finite-difference\"", "its roll is noise"),
     ] {
         let warnings = warnings("a.toml", text);
-        assert!(matches!(&warnings[..], [warning] if warning.contains(told)), "{warnings:?}");
+        assert!(matches!(&warnings[..], [warning] if warning.contains(expected)), "{warnings:?}");
         assert!(warnings[0].len() < 200, "{}", warnings[0]);
     }
     assert_eq!(warnings("a.toml", "observer.kind = \"coupled\""), [""; 0]);
@@ -209,13 +207,14 @@ fn the_columns_of_a_recording_are_read_with_their_units() {
 
 #[test]
 fn the_rig_file_lacks_only_a_registration() {
-    let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
-    let config = loaded(&rig, &[]);
+    let config = loaded(RIG, &[]);
     assert!(config.stage.hardware);
     assert_eq!(config.stage.insertion.product_code, None);
-    assert!(config.session().is_err());
+    let error = config.session().expect_err("no registration").to_string();
+    assert!(error.starts_with("tracker.registration is missing"), "{error}");
     let pose = "{x_mm=1, y_mm=2, z_mm=3, yaw_deg=0, pitch_deg=90, roll_deg=0}";
-    let config = loaded(&rig, &[&format!("tracker.registration={pose}")]);
+    let config = loaded(RIG, &[&format!("tracker.registration={pose}")]);
+    assert!(config.session().is_ok());
     let registration = config.tracker.to_registration().expect("given");
     let on_axis = registration.x_wt().transform(&nalgebra::Vector3::z());
     assert!((on_axis - nalgebra::Vector3::new(2.0, 2.0, 3.0)).norm() < 1e-12);
@@ -224,7 +223,8 @@ fn the_rig_file_lacks_only_a_registration() {
 #[test]
 fn the_stage_gets_counts_mm_and_radians() {
     let config = loaded(
-        "[stage.rotation]\nfollowing_error_deg = 3.6\ncounts_per_turn = { counts = 1000, turns = 1 }\n\
+        "[stage.insertion]\nfollowing_error_mm = 0.7\n\
+         [stage.rotation]\nfollowing_error_deg = 3.6\ncounts_per_turn = { counts = 1000, turns = 1 }\n\
          optional_objects = [0x60C2]\nsign = -1\n\
          [[stage.rotation.sdo]]\nindex = 0x2310\nsubindex = 1\nvalue = -2\nbits = 16\n\
          [[stage.rotation.sdo]]\nindex = 0x1010\nsubindex = 1\nvalue = 0x65766173\nbits = 32\n\
@@ -242,7 +242,13 @@ fn the_stage_gets_counts_mm_and_radians() {
         RawSdo { bits: 32, index: 0x1010, subindex: 1, value: 0x6576_6173, read_back: false },
     );
     assert_eq!(rotation.sdo, [first, second]);
-    assert_eq!(rotation.following_error_max, Some(3.6f64.to_radians()));
+    let windows = |stage: &StageConfig| {
+        [&stage.insertion, &stage.rotation].map(|axis| axis.following_error_max)
+    };
+    assert_eq!(windows(&stage), [Some(0.7), Some(3.6f64.to_radians())]);
+    let default = loaded("", &[]);
+    let default = default.stage.to_stage(&default.can).expect("a stage");
+    assert_eq!(windows(&default), [None, None]);
     assert_eq!(stage.bus.heartbeat_timeout_ms, 100);
 }
 
@@ -261,7 +267,7 @@ fn every_shipped_file_names_the_schema() {
     }
 }
 
-/// `NEEDLE_RECORD_ANEW=1` writes the files anew from the declarations.
+/// With `NEEDLE_RECORD_ANEW=1` the test writes both files from the declarations.
 #[test]
 fn the_shipped_reference_and_schema_are_current() {
     let schema = format!("{:#}\n", Config::json_schema());
@@ -291,8 +297,7 @@ fn the_reference_lists_the_words_of_nested_keys() {
     }
 }
 
-/// What is drawn lies in its range, is drawn again by the same seed, and does not depend on what
-/// else is drawn.
+/// The same seed draws the same trial. A value does not depend on which others are drawn.
 #[test]
 fn a_trial_is_drawn_within_its_ranges_by_its_seed() {
     let ranges = ["study.curvature_error=[-0.3, 0.3]", "study.torsion_half_width_deg=[30, 50]"];
@@ -317,7 +322,7 @@ fn a_trial_is_drawn_within_its_ranges_by_its_seed() {
     assert_ne!(wide.drawn(1).unwrap().emulator, wide.drawn(2).unwrap().emulator);
 }
 
-/// The record of a trial can be read, whatever is drawn; ranges whose ends a key does not allow are refused.
+/// This keeps the record of every trial readable.
 #[test]
 fn a_range_that_exceeds_that_of_its_key_is_refused() {
     let curved = ["emulator.radius_mm=20", "study.curvature_error=[-0.5, 1.0]"];
@@ -329,7 +334,7 @@ fn a_range_that_exceeds_that_of_its_key_is_refused() {
             assert_eq!(loaded(&drawn.to_toml().unwrap(), &[]), drawn);
         }
     }
-    for (sets, said) in [
+    for (sets, error) in [
         (
             [curved[0], "study.curvature_error=[-0.5, 1.5]"],
             "study.curvature_error = [-0.5, 1.5] may draw emulator.curvature_per_mm = 0.125, allowed: \
@@ -340,11 +345,10 @@ fn a_range_that_exceeds_that_of_its_key_is_refused() {
             "study.creep_error = [0, 1.5] may draw emulator.torsion.creep_mm = 125, allowed: 0 to 100 mm",
         ),
     ] {
-        assert_eq!(loaded("", &sets).drawn(1).expect_err("refused").to_string(), said);
+        assert_eq!(loaded("", &sets).drawn(1).expect_err("refused").to_string(), error);
     }
 }
 
-/// Each constant of a creeping shaft is drawn by itself.
 #[test]
 fn the_two_constants_of_creep_are_drawn_independently() {
     let torsion = "emulator.torsion.creep_mm=0.75";
@@ -363,7 +367,7 @@ fn the_two_constants_of_creep_are_drawn_independently() {
     assert!(correlation.abs() < 0.15, "{correlation}");
 }
 
-/// Spheres that can have no room are drawn so often and no more.
+/// The number of attempts to place a sphere is limited.
 #[test]
 fn obstacles_that_have_no_room_are_refused() {
     let goal = ["goal.kind=\"target\"", "goal.position_mm=[0.0, 0.0, 100.0]"];
@@ -384,8 +388,8 @@ fn a_calibration_file_that_cannot_be_used_hides_no_other_error() {
         false => Err("cannot be read".to_owned()),
     };
     let sources = [Source { name: "bench.toml", text }];
-    let said = Config::with_warnings(&sources, &[], &read).unwrap_err();
-    let said: Vec<&str> = said.problems.iter().map(|p| p.message.as_str()).collect();
+    let error = Config::with_warnings(&sources, &[], &read).unwrap_err();
+    let messages: Vec<&str> = error.problems.iter().map(|p| p.message.as_str()).collect();
     for problem in [
         "bench.toml:1: insertion.depth_mm is -1",
         "bench.toml:5: needle.needle_file: cannot be read; needle-bench calibrate needle --out",
@@ -393,19 +397,19 @@ fn a_calibration_file_that_cannot_be_used_hides_no_other_error() {
         "tip.toml:1: needle.radius_mm does not belong in a file for tracker.tip_file",
         "bench.toml:10: tracker.hold_after_mm is -3",
     ] {
-        assert!(said.iter().any(|said| said.starts_with(problem)), "{problem}: {said:#?}");
+        assert!(messages.iter().any(|m| m.starts_with(problem)), "{problem}: {messages:#?}");
     }
     let of_files = ["tracker.registration", "needle.radius_mm", "needle.curvature_per_mm"];
     let is_missing =
-        |said: &&str| of_files.iter().any(|key| said.contains(&format!("{key} is missing")));
-    assert!(!said.iter().any(is_missing), "{said:#?}");
+        |message: &&str| of_files.iter().any(|key| message.contains(&format!("{key} is missing")));
+    assert!(!messages.iter().any(is_missing), "{messages:#?}");
 }
 
-/// It would be replaced without a word.
+/// The file would silently replace it.
 #[test]
 fn a_value_that_the_calibration_file_holds_too_is_refused() {
     let read = |_: &Path| Err("cannot be read".to_owned());
-    let said = |text: &str, sets: &[&str]| {
+    let error_of = |text: &str, sets: &[&str]| {
         let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
         let error = Config::with_warnings(&[Source { name: "bench.toml", text }], &sets, &read);
         error.expect_err("refused").to_string()
@@ -416,24 +420,23 @@ fn a_value_that_the_calibration_file_holds_too_is_refused() {
         (format!("[needle]\n{needle}\ntorsion.creep_mm = 3"), "needle.torsion"),
         (format!("needle.{needle}\nevaluation.axis = [0, 1, 0]"), "evaluation.axis"),
     ] {
-        let said = said(&text, &[]);
+        let error = error_of(&text, &[]);
         let expected = format!("needle.needle_file is given along with {key}: give one of the two");
-        assert!(said.starts_with("bench.toml:") && said.contains(&expected), "{said}");
+        assert!(error.starts_with("bench.toml:") && error.contains(&expected), "{error}");
     }
     let sets = ["tracker.registration_file=r.toml", "tracker.registration.sd_mm=0.3"];
     assert_eq!(
-        said("", &sets),
+        error_of("", &sets),
         "--set tracker.registration_file is given along with tracker.registration.sd_mm: give one of \
          the two"
     );
-    // A source above the one that names the file may change what the file holds.
-    let over = said(&format!("needle.{needle}"), &["needle.tip_ahead_mm=3"]);
-    assert!(over.starts_with("bench.toml:1: needle.needle_file: cannot be read"), "{over}");
-    let over = said("", &["needle.needle_file=needle.toml", "needle.tip_ahead_mm=3"]);
-    assert!(over.starts_with("--set needle.needle_file: cannot be read"), "{over}");
+    // A later source may change a value of the file that an earlier source names.
+    let later = error_of(&format!("needle.{needle}"), &["needle.tip_ahead_mm=3"]);
+    assert!(later.starts_with("bench.toml:1: needle.needle_file: cannot be read"), "{later}");
+    let later = error_of("", &["needle.needle_file=needle.toml", "needle.tip_ahead_mm=3"]);
+    assert!(later.starts_with("--set needle.needle_file: cannot be read"), "{later}");
 }
 
-/// A registration or a tip that is changed by hand is no longer the measured one.
 #[test]
 fn a_value_set_over_a_calibration_drops_its_fit() {
     let origin =

@@ -1,4 +1,4 @@
-//! Configurations taken and refused.
+//! Configurations that load, and those that are refused.
 
 use std::path::Path;
 
@@ -11,6 +11,8 @@ mod contradictions;
 mod faults;
 mod loads;
 mod refusals;
+
+const RIG: &str = include_str!("../../../bench-config/rig-epos4.toml");
 
 /// Maximum length of a line of an error message, in characters.
 const MESSAGE_MAX: usize = 200;
@@ -25,7 +27,7 @@ fn loaded(text: &str, sets: &[&str]) -> Config {
     load(text, sets).unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// What is said of a file.
+/// The error of a file.
 #[track_caller]
 fn refusal(text: &str) -> String {
     refused(text, &[])
@@ -33,14 +35,14 @@ fn refusal(text: &str) -> String {
 
 #[track_caller]
 fn refused(text: &str, sets: &[&str]) -> String {
-    let said = load(text, sets).expect_err("refused").to_string();
-    for line in said.lines() {
+    let error = load(text, sets).expect_err("refused").to_string();
+    for line in error.lines() {
         assert!(line.chars().count() <= MESSAGE_MAX, "{} characters: {line}", line.chars().count());
     }
-    said
+    error
 }
 
-/// What is said of `--set` alone.
+/// The error of `--set` alone.
 #[track_caller]
 fn set_refusal(sets: &[&str]) -> String {
     refused("", sets)
@@ -61,7 +63,7 @@ fn shipped() -> Vec<(String, String)> {
     files
 }
 
-/// The dotted names of `keys` and of those inside them.
+/// The dotted names of `keys` and of the keys inside them.
 fn dotted(keys: &[keys::Key], path: &str) -> Vec<String> {
     let inside = |key: keys::Key| {
         let at = value::join(path, key.name);
@@ -97,7 +99,7 @@ fn value() -> impl Strategy<Value = String> {
     })
 }
 
-/// A known key, part of one, or something else.
+/// A known key, the section of one, or an unknown key.
 fn key() -> impl Strategy<Value = String> {
     let known = dotted(Config::KEYS, "");
     (prop::sample::select(known), 0..4usize, "[a-z_]{1,8}").prop_map(|(known, change, other)| {

@@ -1,4 +1,4 @@
-//! What is refused, and in which words.
+//! Configurations that are refused, and the text of the error.
 
 use super::*;
 
@@ -169,17 +169,17 @@ fn a_ratio_with_one_number_is_refused() {
 
 #[test]
 fn a_real_stage_without_nodes_scales_and_signs_is_refused() {
-    let said = refusal(
+    let error = refusal(
         "stage.hardware = true\ncan.interface = \"can0\"\ntracker.source = \"openigtlink\"",
     );
     for key in ["insertion.node", "insertion.counts_per_mm.counts", "insertion.sign"] {
         assert!(
-            said.contains(&format!("stage.{key} is missing and has no default here")),
-            "{said}"
+            error.contains(&format!("stage.{key} is missing and has no default here")),
+            "{error}"
         );
     }
-    assert_eq!(said.lines().count(), 11, "{said}");
-    assert_eq!(said.lines().last(), Some("and 6 more"));
+    assert_eq!(error.lines().count(), 11, "{error}");
+    assert_eq!(error.lines().last(), Some("and 6 more"));
 }
 
 #[test]
@@ -211,10 +211,10 @@ fn text_that_is_not_toml_is_refused_with_its_place() {
         "--set plane: x_mm is given twice: keep one"
     );
     for (written, unit) in [("20 mm", "mm"), ("20mm # deep", "mm"), ("20 mm/s²", "mm/s²")] {
-        let said = refusal(&format!("[insertion]\ndepth_mm = {written}\n"));
-        let (_, said) = said.split_once(": ").expect("a place");
+        let error = refusal(&format!("[insertion]\ndepth_mm = {written}\n"));
+        let (_, error) = error.split_once(": ").expect("a place");
         assert_eq!(
-            said,
+            error,
             format!("depth_mm is 20 {unit}: write only the number, in the unit of the key's name")
         );
     }
@@ -232,9 +232,9 @@ fn text_that_is_not_toml_is_refused_with_its_place() {
 #[test]
 fn all_problems_are_reported_at_once_in_the_order_of_the_file() {
     let text = "[insertion]\nstep_mm = 99\ndpth_mm = 1\nmode = \"fast\"\n[can]\nsync_ms = true\n";
-    let said = load(text, &["record.dir=3"]).expect_err("refused").to_string();
+    let error = load(text, &["record.dir=3"]).expect_err("refused").to_string();
     assert_eq!(
-        said,
+        error,
         "bench.toml:2: insertion.step_mm is 99, allowed: 0.1 to 10 mm\n\
          bench.toml:3: unknown key \"insertion.dpth_mm\"; did you mean \"insertion.depth_mm\"?\n\
          bench.toml:4: insertion.mode is \"fast\", allowed: \"continuous\" or \"stepwise\"\n\
@@ -243,7 +243,7 @@ fn all_problems_are_reported_at_once_in_the_order_of_the_file() {
     );
 }
 
-/// As in a file, where it is a table in the place of a value.
+/// In a file this is a table in place of a value.
 #[test]
 fn a_key_below_a_value_is_refused() {
     assert_eq!(
@@ -264,12 +264,15 @@ fn a_key_below_a_value_is_refused() {
         "stage.insertion.following_error_mm.x=1",
         "control.kind.x=1",
     ] {
-        let said = set_refusal(&[set]);
-        assert!(said.contains("unknown key; ") && said.contains("has no keys below it"), "{said}");
+        let error = set_refusal(&[set]);
+        assert!(
+            error.contains("unknown key; ") && error.contains("has no keys below it"),
+            "{error}"
+        );
     }
 }
 
-/// The planner's lattice would have no end of headings.
+/// The planner's lattice would have headings without end.
 #[test]
 fn a_curvature_under_that_of_the_largest_radius_is_refused() {
     assert_eq!(
