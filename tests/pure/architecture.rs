@@ -64,7 +64,7 @@ fn named(code: &str) -> BTreeSet<String> {
 }
 
 #[test]
-fn the_arrows_point_one_way() {
+fn a_folder_uses_only_the_folders_that_the_table_grants() {
     let granted = granted();
     let sources = sources();
     let folders: BTreeSet<&String> = sources.iter().map(|(folder, ..)| folder).collect();
@@ -88,7 +88,7 @@ fn the_arrows_point_one_way() {
 
 /// What the table grants has no cycle.
 #[test]
-fn the_table_has_no_cycle() {
+fn the_table_of_folders_has_no_cycle() {
     let mut open = granted();
     while !open.is_empty() {
         let free: Vec<String> = open

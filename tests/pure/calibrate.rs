@@ -65,7 +65,7 @@ fn run_dir(scratch: &Scratch, said: &Said) -> PathBuf {
 /// From points to a run that knows where its tracker stands: the record has the pose, its error
 /// and its origin, and makes the run again without the file.
 #[test]
-fn a_registration_is_computed_named_and_recorded() {
+fn a_registration_is_computed_used_from_its_file_and_recorded() {
     let scratch = Scratch::new();
     scratch.write("points.csv", &fiducials(0.3));
     let said = calibrate(&scratch, &["registration", "points.csv", "--out", "registration.toml"]);
@@ -112,7 +112,7 @@ fn a_registration_is_computed_named_and_recorded() {
 
 /// The same points in the configuration itself give the same pose.
 #[test]
-fn fiducials_can_stand_in_the_configuration() {
+fn fiducials_in_the_configuration_give_the_same_run_as_the_file() {
     let scratch = Scratch::new();
     let csv = fiducials(0.3);
     let mut config = String::new();
@@ -189,7 +189,7 @@ fn a_calibration_is_not_overwritten() {
 }
 
 #[test]
-fn a_calibration_file_that_is_none_is_refused_by_name_and_line() {
+fn a_file_that_is_not_a_calibration_is_refused_with_file_and_line() {
     let scratch = Scratch::new();
     let mut screens = String::new();
     for text in [
@@ -238,7 +238,7 @@ fn the_tip_on_the_sensor_is_computed_and_used() {
 
 /// Without orientations the circle is told, and nothing that a run could not apply is written.
 #[test]
-fn a_tip_without_orientations_is_told_and_not_corrected() {
+fn without_orientations_the_tip_offset_is_reported_but_not_corrected() {
     let scratch = Scratch::new();
     scratch.write("turn.csv", &turning(4));
     let said = calibrate(&scratch, &["tip", "turn.csv"]);
@@ -253,7 +253,7 @@ fn a_tip_without_orientations_is_told_and_not_corrected() {
 
 /// A preset sets what it is made of, and each of that can be set still.
 #[test]
-fn a_preset_of_the_emulated_tracker_lies_under_what_is_given() {
+fn given_settings_override_a_preset_of_the_emulated_tracker() {
     let scratch = Scratch::new();
     let config = printed(&scratch, &["--set", "emulator.tracker=ultrasound"]);
     assert_eq!(number(&config, "emulator.noise.sd_mm"), 0.94);
@@ -269,7 +269,7 @@ fn a_preset_of_the_emulated_tracker_lies_under_what_is_given() {
 
 /// Every preset steers, the bench being told latency, kind and noise.
 #[test]
-fn every_preset_makes_a_run() {
+fn a_run_completes_with_every_tracker_preset() {
     let scratch = Scratch::new();
     for (preset, kind, latency_ms, noise_sd_mm) in [
         ("electromagnetic-near", "electromagnetic", 10, 0.05),

@@ -21,7 +21,7 @@ fn recorded(scratch: &Scratch) {
 }
 
 #[test]
-fn what_it_finds_evaluates_the_insertions() {
+fn a_calibrated_needle_evaluates_an_insertion_that_was_left_out() {
     let scratch = Scratch::new();
     recorded(&scratch);
     let found = needle_bench(
@@ -72,7 +72,7 @@ fn a_calibration_is_not_overwritten() {
 }
 
 #[test]
-fn recordings_that_say_too_little_are_refused_by_name() {
+fn too_few_or_unusable_recordings_are_refused_with_the_reason() {
     let scratch = Scratch::new();
     recorded(&scratch);
     scratch.write("plain.csv", "insertion_mm,rotation_rad,x_mm,y_mm,z_mm\n0,0,0,0,0\n");

@@ -81,7 +81,7 @@ fn the_noise_of_a_recording_becomes_a_configuration() {
 }
 
 #[test]
-fn what_is_no_recording_at_rest_is_refused_by_name() {
+fn a_file_that_is_not_a_recording_at_rest_is_refused_with_the_reason() {
     let scratch = Scratch::new();
     let refused = |arguments: &[&str]| {
         let arguments = [&["calibrate", "tracker"], arguments].concat();

@@ -57,7 +57,7 @@ fn a_run_without_arguments_completes_and_leaves_its_record() {
 }
 
 #[test]
-fn a_live_view_that_cannot_be_served_is_known_before_there_is_a_run() {
+fn a_live_view_whose_port_is_taken_is_refused_before_the_run() {
     let scratch = Scratch::new();
     let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
     let live = format!("--live={}", taken.local_addr().expect("an address"));
@@ -68,7 +68,7 @@ fn a_live_view_that_cannot_be_served_is_known_before_there_is_a_run() {
 }
 
 #[test]
-fn json_keeps_the_contract() {
+fn run_json_has_its_documented_keys() {
     let scratch = Scratch::new();
     let said =
         needle_bench(&scratch, &["run", "--json", "--quiet", "--set", "insertion.depth_mm=200"]);
@@ -90,7 +90,7 @@ fn json_keeps_the_contract() {
 /// A plane that the depth cannot reach is refused before the axes have power, with the key that lets
 /// the run pass; it then ends by saying how far off it is.
 #[test]
-fn a_plane_out_of_reach_is_refused_or_told_at_the_end() {
+fn a_plane_out_of_reach_is_refused_or_reported_at_the_end() {
     let scratch = Scratch::new();
     let far = ["--set", "emulator.start.x_mm=100", "--set", "insertion.depth_mm=150"];
     for sets in [&["--set", "emulator.start.x_mm=500"][..], &far] {
@@ -176,7 +176,7 @@ fn the_recorded_configuration_repeats_the_run() {
 }
 
 #[test]
-fn a_run_that_is_stopped_says_why_last_and_exits_1() {
+fn a_stopped_run_ends_with_its_reason_and_exits_1() {
     let scratch = Scratch::new();
     // The bevel has to be turned back by more than that to come into the plane.
     let said = needle_bench(&scratch, &["run", "-q", "--set", "stage.rotation.min_deg=-10"]);
@@ -194,7 +194,7 @@ fn a_run_that_is_stopped_says_why_last_and_exits_1() {
 
 /// Bad input: what is said, and that nothing was begun.
 #[test]
-fn bad_configurations_are_refused_by_name() {
+fn bad_configurations_are_refused_with_the_key() {
     let scratch = Scratch::new();
     let texts = [
         "[insertion]\nspeed_mm_s = 1\n",
@@ -223,7 +223,7 @@ fn bad_configurations_are_refused_by_name() {
 }
 
 #[test]
-fn bad_arguments_are_refused_by_name() {
+fn bad_arguments_are_refused_with_the_argument() {
     let scratch = Scratch::new();
     let commands: &[&[&str]] = &[
         &["run", "absent.toml"],
@@ -247,7 +247,7 @@ fn bad_arguments_are_refused_by_name() {
 /// An argument that is no text is an error of usage, whatever else is mistyped.
 #[cfg(unix)]
 #[test]
-fn an_argument_that_is_no_text_is_refused() {
+fn an_argument_that_is_not_utf_8_is_refused() {
     use std::os::unix::ffi::OsStrExt;
     let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
     command.arg("rnu").arg(std::ffi::OsStr::from_bytes(b"\xff.toml"));
@@ -256,7 +256,7 @@ fn an_argument_that_is_no_text_is_refused() {
 
 /// However long a list of what is allowed, or a reason, is.
 #[test]
-fn no_line_is_longer_than_a_reader_follows() {
+fn every_line_of_a_message_is_under_200_characters() {
     let scratch = Scratch::new();
     let silent = "emulator.fault=[{ kind = \"emergency-stop\", at_mm = 1 }]";
     let far = ["--set", "emulator.start.x_mm=100", "--set", "insertion.depth_mm=100"];
@@ -277,7 +277,7 @@ fn no_line_is_longer_than_a_reader_follows() {
 
 /// Of a file that is none of text the first byte that shows it is named.
 #[test]
-fn a_binary_file_is_no_configuration() {
+fn a_binary_file_is_refused_as_configuration() {
     let scratch = Scratch::new();
     let mut screens = String::new();
     for bytes in [&b"name = \"a\"\n\0"[..], b"\x7fELF\xff"] {
@@ -288,7 +288,7 @@ fn a_binary_file_is_no_configuration() {
 }
 
 #[test]
-fn a_record_folder_that_is_a_file_is_named() {
+fn a_record_folder_that_is_a_file_is_refused() {
     let scratch = Scratch::new();
     scratch.write("taken", "");
     let said = needle_bench(&scratch, &["run", "--set", "record.dir=taken"]);
@@ -298,7 +298,7 @@ fn a_record_folder_that_is_a_file_is_named() {
 
 /// A limit on the law that does not steer limits nothing.
 #[test]
-fn a_section_without_effect_is_said_so() {
+fn a_section_without_effect_is_warned_about() {
     let scratch = Scratch::new();
     let limit = "[control.feedback_linearization]\nrotation_max_deg_per_mm = 20\n";
     scratch.write("bench.toml", limit);
@@ -315,7 +315,7 @@ fn a_section_without_effect_is_said_so() {
 
 /// With `--json` there is one object on stdout even where nothing came of the command.
 #[test]
-fn json_is_said_of_what_failed_too() {
+fn json_is_printed_for_failed_commands_too() {
     let scratch = Scratch::new();
     let mut screens = String::new();
     for (arguments, status) in [
@@ -340,7 +340,7 @@ fn json_is_said_of_what_failed_too() {
 /// Neither a stderr that takes nothing nor a stdout that nobody reads stops a run.
 #[cfg(target_os = "linux")]
 #[test]
-fn a_run_does_not_depend_on_who_listens() {
+fn a_full_stderr_or_a_closed_stdout_does_not_stop_a_run() {
     let scratch = Scratch::new();
     let run = || {
         let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
@@ -390,7 +390,7 @@ fn a_blocked_stderr_does_not_hold_a_run_up() {
 }
 
 #[test]
-fn the_virtual_stage_serves_for_a_sane_time() {
+fn the_virtual_stage_refuses_a_duration_out_of_range() {
     for seconds in ["1e30", "0", "-1", "nan", "soon"] {
         let output = Command::new(env!("CARGO_BIN_EXE_vcan-stage"))
             .arg(format!("--for={seconds}"))
@@ -403,7 +403,7 @@ fn the_virtual_stage_serves_for_a_sane_time() {
 
 /// An interface that is not there is the environment's failure: nothing is begun.
 #[test]
-fn an_absent_can_interface_names_the_next_step() {
+fn an_absent_can_interface_is_reported_with_the_next_step() {
     let scratch = Scratch::new();
     let vcan = repository("bench-config/vcan.toml");
     for command in [&["run", &vcan][..], &["check", &vcan, "--connect"]] {
@@ -419,7 +419,7 @@ fn an_absent_can_interface_names_the_next_step() {
 }
 
 #[test]
-fn check_says_what_a_run_would_start_with() {
+fn check_passes_on_the_emulated_stage_and_prints_what_it_read() {
     let scratch = Scratch::new();
     let said = needle_bench(&scratch, &["check", "--json"]);
     assert_eq!(said.status, 0, "{}", said.stderr);
@@ -436,7 +436,7 @@ fn check_says_what_a_run_would_start_with() {
 
 /// A rig's configuration as it comes: readable, and refused until the tracker is registered.
 #[test]
-fn a_rig_without_registration_does_not_move() {
+fn a_rig_without_registration_is_refused() {
     let scratch = Scratch::new();
     let said = needle_bench(&scratch, &["run", &repository("bench-config/rig-epos4.toml")]);
     assert_eq!(said.status, 2);
@@ -445,7 +445,7 @@ fn a_rig_without_registration_does_not_move() {
 
 /// A script says that it has read the list.
 #[test]
-fn a_run_on_hardware_asks_where_there_is_a_terminal_and_is_refused_elsewhere() {
+fn a_run_on_hardware_without_a_terminal_needs_yes_and_a_preflight_that_passes() {
     let scratch = Scratch::new();
     let rig = repository("bench-config/rig-epos4.toml");
     let registration = "tracker.registration={ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, \

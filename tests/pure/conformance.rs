@@ -45,7 +45,7 @@ fn page_and_code(page: &str) -> (String, String) {
 }
 
 #[test]
-fn every_row_has_tests_that_are_run() {
+fn every_row_of_conformance_names_tests_that_are_run() {
     let (table, code) = page_and_code("docs/conformance.md");
     let names = named(&table);
     assert!(names.len() > 50, "{}", names.len());
@@ -55,7 +55,7 @@ fn every_row_has_tests_that_are_run() {
 }
 
 #[test]
-fn every_test_that_the_hazards_name_is_there() {
+fn every_test_that_hazards_names_exists() {
     let (tables, code) = page_and_code("docs/hazards.md");
     let is_word = |name: &&str| {
         name.contains('_') && name.chars().all(|c| c == '_' || c.is_ascii_alphanumeric())
@@ -75,7 +75,7 @@ fn names_are_read_from_the_last_cell() {
 }
 
 #[test]
-fn a_function_is_no_test_and_neither_is_an_ignored_one() {
+fn helpers_and_ignored_tests_do_not_count() {
     let code = "#[test]\n/// Why.\nfn run() {}\nfn helper() {}\n\
                 #[test]\n#[ignore = \"slow\"]\nfn ignored() {}\n";
     assert_eq!(["run", "helper", "ignored", "gone"].map(|name| tests_of(name, code)), [1, 0, 0, 0]);

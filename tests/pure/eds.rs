@@ -25,7 +25,7 @@ fn written(settings: &[&str]) -> PathBuf {
 
 /// The lists of objects name every index that has a section, and no other.
 #[test]
-fn the_lists_of_a_sheet_are_its_objects() {
+fn the_object_lists_of_a_sheet_name_every_object_in_it() {
     let makes = [(&[] as &[&str], 62), (&["emulator.drives=\"epos4\""], 56)];
     for (settings, objects) in makes {
         let dir = written(settings);
@@ -49,7 +49,7 @@ fn the_lists_of_a_sheet_are_its_objects() {
 }
 
 #[test]
-fn python_canopen_loads_them() {
+fn python_canopen_loads_the_sheets() {
     let Some(python) = python() else { return };
     let dir = written(&["can.interface=\"vcan0\"", "emulator.drives=\"generic\""]);
     let mut command = Command::new(python);

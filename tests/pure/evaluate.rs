@@ -81,7 +81,7 @@ fn the_observers_never_see_the_recorded_orientation() {
 }
 
 #[test]
-fn a_recording_that_is_none_is_refused_by_line() {
+fn a_position_that_is_not_finite_is_refused_with_its_line() {
     let scratch = Scratch::new();
     scratch.write("bad.csv", "insertion_mm,rotation_rad,x_mm,y_mm,z_mm\n0,0,0,0,inf\n");
     insta::assert_snapshot!(refusals(&scratch, &[&["evaluate", "bad.csv"]]));
@@ -89,7 +89,7 @@ fn a_recording_that_is_none_is_refused_by_line() {
 
 /// A recording that counts twice would make the figures look surer than they are.
 #[test]
-fn a_recording_counts_once() {
+fn a_recording_given_twice_is_refused() {
     let scratch = Scratch::new();
     scratch.write("a.csv", &recording());
     scratch.write("copy.csv", &recording().replacen('\n', "\n\n", 1));
@@ -100,7 +100,7 @@ fn a_recording_counts_once() {
 
 /// No file is a file to evaluate, a folder or a binary neither: bad arguments.
 #[test]
-fn what_cannot_be_read_is_refused_by_name() {
+fn unreadable_files_are_refused_with_their_names() {
     let scratch = Scratch::new();
     std::fs::create_dir(scratch.path().join("folder")).unwrap();
     std::fs::write(scratch.path().join("binary"), [0xFF, 0xFE, 0x00]).unwrap();
@@ -110,7 +110,7 @@ fn what_cannot_be_read_is_refused_by_name() {
 
 /// A number at the end of what a float holds is an error with its line, and never a hang.
 #[test]
-fn a_number_beyond_any_needle_is_refused_by_line() {
+fn huge_numbers_are_refused_with_the_line() {
     let scratch = Scratch::new();
     let header = "insertion_mm,rotation_rad,x_mm,y_mm,z_mm";
     let mut screens = String::new();
@@ -132,7 +132,7 @@ fn an_insertion_too_short_to_score_is_refused_with_its_depth() {
 }
 
 #[test]
-fn a_byte_order_mark_is_no_column() {
+fn a_byte_order_mark_is_ignored() {
     let scratch = Scratch::new();
     scratch.write("bom.csv", &format!("\u{feff}{}", recording()));
     let said = needle_bench(&scratch, &["evaluate", "bom.csv"]);
@@ -142,7 +142,7 @@ fn a_byte_order_mark_is_no_column() {
 /// A needle as in bench-config/recordings.toml, from the start: told, the roll is right, and untold
 /// it is found.
 #[test]
-fn a_roll_that_is_not_told_is_found() {
+fn an_unknown_roll_at_the_start_is_estimated() {
     let needle = Needle::new(0.0129).unwrap().with_tip_ahead(6.6).unwrap();
     let creeping = TorsionConfig {
         offset_rad: 30.4f64.to_radians(),

@@ -2,6 +2,7 @@
 //! fast as the machine.
 
 mod architecture;
+mod arguments;
 mod calibrate;
 mod calibrate_needle;
 mod calibrate_tracker;
@@ -13,7 +14,6 @@ mod evaluate;
 mod faults;
 mod fuzz;
 mod kinematics_reference;
-mod names;
 mod openigtlink_vectors;
 mod paper_figures;
 mod plan;

@@ -107,7 +107,7 @@ fn all_fixtures_in_one_stream_come_out_in_order() {
 }
 
 #[test]
-fn malformed_messages_are_refused_by_the_right_name() {
+fn malformed_messages_are_refused_with_the_right_error() {
     let Some(vectors) = vectors() else { return };
     let mut refused = 0;
     for Vector { name, bytes, .. } in vectors.iter().filter(|vector| !vector.positive) {

@@ -51,7 +51,7 @@ fn json_has_the_plan() {
 }
 
 #[test]
-fn none_is_said_with_its_reason_and_the_nearest_point() {
+fn no_plan_is_reported_with_the_reason_and_the_nearest_point() {
     let scratch = Scratch::new();
     let aside = BALL.replace("[0.0, 0.0, 120.0]", "[0.0, 60.0, 70.0]");
     let (status, json) = plan(&scratch, &aside, &[]);
@@ -77,7 +77,7 @@ fn none_is_said_with_its_reason_and_the_nearest_point() {
 
 /// A run keeps more than the clearance where it can, and refuses a path that cannot keep `goal.reserve_mm`.
 #[test]
-fn the_reserve_of_a_run_is_said() {
+fn plan_reports_the_reserve_of_a_run() {
     let scratch = Scratch::new();
     let (_, json) = plan(&scratch, BALL, &[]);
     assert_eq!((&json["run_reserve_mm"], &json["run_refusal"]), (&2.0.into(), &Value::Null));
@@ -105,7 +105,7 @@ fn the_reserve_of_a_run_is_said() {
 /// Around obstacles 15% of the curvature are left unused, unless another margin is given; what is refused for it
 /// says so, and a run records it.
 #[test]
-fn the_margin_of_the_curvature_is_said_and_recorded() {
+fn the_curvature_margin_is_reported_and_recorded() {
     let scratch = Scratch::new();
     let far = BALL.replace("[0.0, 0.0, 120.0]", "[0.0, 44.0, 100.0]");
     let far = far.replace("[0.0, 1.0, 60.0]", "[0.0, -60.0, 20.0]");
@@ -155,7 +155,7 @@ fn the_example_has_a_plan_and_a_picture() {
 
 /// What cannot be meant is bad usage, in `check` as in `plan`.
 #[test]
-fn goals_that_cannot_be_meant_are_refused_by_name() {
+fn contradictory_goals_are_refused_with_the_key() {
     let scratch = Scratch::new();
     let obstacle = |text: &str| {
         format!("[goal]\nkind = \"target\"\nposition_mm = [0, 0, 100]\n[[goal.obstacle]]\n{text}\n")
@@ -229,7 +229,7 @@ pose = { x_mm = -9.5, y_mm = -4.5, z_mm = 55.0, yaw_deg = 0.0, pitch_deg = 0.0, 
 ";
 
 #[test]
-fn a_mask_is_kept_clear_of() {
+fn a_path_keeps_clear_of_a_mask() {
     let scratch = Scratch::new();
     let write = |bytes: Vec<u8>| std::fs::write(scratch.path().join("mask.nii"), bytes).unwrap();
     write(nifti([20, 10, 10], [1.0; 3], &[1; 2000]));
@@ -273,7 +273,7 @@ fn a_mask_is_kept_clear_of() {
 }
 
 #[test]
-fn what_is_no_mask_is_refused() {
+fn a_file_that_is_not_a_mask_is_refused() {
     let scratch = Scratch::new();
     scratch.write("goal.toml", MASK);
     let mut turned = nifti([2, 2, 2], [1.0; 3], &[1; 8]);

@@ -32,7 +32,7 @@ fn frame(text: &str) -> Frame {
 }
 
 #[test]
-fn what_was_asked_of_real_drives_is_asked_alike_and_their_answers_are_read() {
+fn sdo_requests_are_those_sent_to_real_drives_and_their_answers_are_read() {
     for [request, answer] in ASKED.map(|pair| pair.map(frame)) {
         let node = NodeId::new((request.cob_id().unwrap() & 0x7F) as u8).unwrap();
         let ClientFrame::Request(asked) = ClientFrame::decode(request.data()).unwrap() else {
@@ -68,7 +68,7 @@ fn state(pdo: &str) -> DriveState {
 
 /// The maxon EPOS and the drive on node 5, by PDO; the EPOS does not say that it has voltage.
 #[test]
-fn real_drives_are_seen_to_be_enabled_step_by_step() {
+fn statuswords_of_real_drives_are_read_while_they_are_enabled() {
     let enabled = [
         DriveState::SwitchOnDisabled,
         DriveState::ReadyToSwitchOn,
@@ -88,7 +88,7 @@ fn real_drives_are_seen_to_be_enabled_step_by_step() {
 }
 
 #[test]
-fn real_drives_say_when_they_are_up_and_are_started() {
+fn boot_up_and_nmt_frames_of_real_drives_are_read() {
     let node = |id| NodeId::new(id).unwrap();
     for (said, id) in [("703#00", 3), ("702#00", 2), ("701#00", 1)] {
         assert_eq!(parse_heartbeat(&frame(said)), Some((node(id), NmtState::BootUp)));

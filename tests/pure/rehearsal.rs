@@ -36,7 +36,7 @@ fn manifest(scratch: &Scratch, said: &Said) -> serde_json::Value {
 }
 
 #[test]
-fn the_rig_of_the_worked_example_passes() {
+fn the_rig_of_the_worked_example_completes_a_rehearsal_and_replays() {
     let scratch = Scratch::new();
     let said = rehearse(&scratch, &["run", "--rehearse", "--json", "-q"], &[]);
     assert_eq!(said.status, 0, "{}", said.screen());
@@ -70,7 +70,7 @@ fn the_rig_of_the_worked_example_passes() {
 }
 
 #[test]
-fn what_was_measured_at_the_rig_is_used_as_it_is() {
+fn a_rehearsal_uses_the_calibrations_of_the_rig() {
     let scratch = Scratch::new();
     let said = rehearse(&scratch, &["run", "--rehearse", "--json", "-q"], &MEASURED);
     assert_eq!(said.status, 0, "{}", said.screen());
@@ -120,7 +120,7 @@ fn every_operation_can_be_rehearsed() {
 
 /// The axis is where the file's own homing leaves it, and is homed like a real one.
 #[test]
-fn a_homing_that_is_not_the_rigs_is_found_in_rehearsal() {
+fn a_rehearsal_refuses_a_homing_that_does_not_suit_the_rig() {
     let scratch = Scratch::new();
     let home = ["stage", "home", "--rehearse", "--axis", "insertion", "-q"];
     for method in [1, 2, 17, 18, 24, 33, 34, 35, 37] {
@@ -143,7 +143,7 @@ fn a_homing_that_is_not_the_rigs_is_found_in_rehearsal() {
 }
 
 #[test]
-fn a_calibration_file_that_is_not_there_is_named_with_what_writes_it() {
+fn a_missing_calibration_file_is_refused_with_the_command_that_writes_it() {
     let scratch = Scratch::new();
     for (file, command) in [("registration", "registration"), ("tip", "tip")] {
         let set = format!("tracker.{file}_file=\"none.toml\"");
@@ -202,7 +202,7 @@ fn a_turn_of_the_base_calibrates_the_tip() {
 
 /// The axis reads 0 wherever it starts, and may go back no further than its limit from there.
 #[test]
-fn the_withdrawal_that_a_run_names_is_one_that_the_stage_takes() {
+fn a_withdrawal_is_refused_past_the_soft_limit_and_made_within_it() {
     let scratch = Scratch::new();
     let start = ["--set", "stage.insertion.zero=\"start\""];
     let withdraw = [&["stage", "--virtual", "withdraw", "--by", "13.0mm"], &start[..]].concat();
@@ -227,7 +227,7 @@ fn handedness_can_be_proved_on_the_emulated_stage() {
 /// From insertions to a file that the configuration names: three runs with a sensor of six degrees of
 /// freedom, whose needle is not the one that the bench believes in.
 #[test]
-fn runs_calibrate_the_needle_and_its_file_is_named() {
+fn rehearsed_runs_calibrate_the_needle_and_the_file_is_used() {
     let scratch = Scratch::new();
     let needle = ["emulator.curvature_per_mm=0.0095", "emulator.noise={ sd_mm = 0.05 }"];
     let sensor = "tracker.tip_offset_mm=[0.5, 0.0, 0.0]";
@@ -275,7 +275,7 @@ fn every_command_of_the_protocol_is_on_a_line_of_its_own() {
 /// Each command of docs/rig.md in its order, rehearsed on the worked example where that is possible. The live
 /// test follows those that need a rig.
 #[test]
-fn the_worked_protocol_is_what_the_program_understands() {
+fn every_command_of_the_protocol_is_accepted() {
     let scratch = Scratch::new();
     fs::copy(repository("bench-config/rig-epos4.toml"), scratch.path().join("my-rig.toml"))
         .unwrap();

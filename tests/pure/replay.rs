@@ -120,7 +120,7 @@ pub(super) fn replayed(scratch: &Scratch, run: &std::path::Path, more: &[&str]) 
 }
 
 #[test]
-fn every_recorded_run_comes_out_as_it_was() {
+fn every_recorded_run_replays_identically() {
     let scratch = Scratch::new();
     if std::env::var_os(recorded::ANEW).is_some() {
         for (name, config) in RECORDED {
@@ -234,7 +234,7 @@ fn a_run_whose_bus_never_comes_back_replays() {
 }
 
 #[test]
-fn what_was_changed_is_named() {
+fn a_replay_reports_the_first_difference() {
     let run = Run::load("default");
     assert_eq!(run.difference(), "");
 
@@ -346,7 +346,7 @@ fn a_cut_record_is_replayed_as_far_as_it_goes() {
 /// Drives that a dead bus hides say nothing for the seconds that a stop may take; what the tracker
 /// says in them is recorded as it comes, so that a bench killed there loses none of it.
 #[test]
-fn no_sample_waits_for_drives_that_are_gone() {
+fn samples_are_recorded_at_once_while_a_stop_waits_for_silent_drives() {
     let scratch = Scratch::new();
     let gone = "emulator.fault = [{ kind = \"bus-full\", at_mm = 6.0 }]";
     let config = format!("insertion.depth_mm = 10\ninsertion.speed_mm_per_s = 5\n{gone}\n");
@@ -380,7 +380,7 @@ fn a_row_that_lacks_values_is_a_difference() {
 }
 
 #[test]
-fn what_does_not_fit_is_refused() {
+fn a_mixed_lossy_or_malformed_record_is_refused() {
     let (run, other) = (Run::load("default"), Run::load("paper"));
     let mixed = Run { can: other.can.clone(), ..run.clone() };
     let refusal = mixed.refusal();

@@ -17,7 +17,7 @@ fn assert_identical(said: &Said) {
 }
 
 #[test]
-fn a_run_replays_through_the_command_line_and_answers_what_if() {
+fn replay_repeats_a_run_answers_what_if_and_refuses_an_edited_one() {
     let scratch = Scratch::new();
     let run_dir = run(&scratch, "insertion.depth_mm = 5\ninsertion.speed_mm_per_s = 5");
     let said = replayed(&scratch, &run_dir, &[]);
@@ -95,7 +95,7 @@ fn a_run_replays_through_the_command_line_and_answers_what_if() {
 }
 
 #[test]
-fn a_folder_that_is_none_is_refused() {
+fn a_folder_that_is_not_a_run_is_refused() {
     let scratch = Scratch::new();
     let said = replayed(&scratch, scratch.path(), &["--json"]);
     assert_eq!(said.status, 2);
@@ -104,7 +104,7 @@ fn a_folder_that_is_none_is_refused() {
 
 /// Completed, refused, and stopped by a fault on the way.
 #[test]
-fn an_operation_replays() {
+fn every_operation_replays() {
     let scratch = Scratch::new();
     let by_hand = ["--set", "emulator.insertion_start_mm=30"];
     let faulty = [
@@ -133,7 +133,7 @@ fn an_operation_replays() {
 }
 
 #[test]
-fn a_changed_operation_is_named() {
+fn a_replay_reports_a_changed_operation() {
     let scratch = Scratch::new();
     let run_dir = operated(&scratch, &["jog", "--axis", "insertion", "--by", "2mm"]);
     let rewrite = |arguments: &[&str]| {

@@ -44,7 +44,7 @@ fn assert_all(text: &str, parts: &[&str]) {
 }
 
 #[test]
-fn a_run_is_told_on_one_screen_and_on_one_page() {
+fn review_shows_a_run_on_one_screen_and_writes_one_page() {
     let scratch = Scratch::new();
     let note = "<script src='https://x'>third</script> & last try";
     let about = ["--operator", "J. Doe", "--phantom", "gelatin 10 %", "--note", note];
@@ -96,7 +96,7 @@ fn assert_is_well_formed(page: &str) {
 
 /// The recorded jog turned the base and held the insertion.
 #[test]
-fn an_operation_is_drawn_as_the_axes_moved() {
+fn the_page_of_an_operation_shows_the_motion_of_both_axes() {
     let scratch = Scratch::new();
     let jog = repository("tests/recorded/jog");
     let said = review(&scratch, &[&jog, "--html", "page.html"]);
@@ -106,7 +106,7 @@ fn an_operation_is_drawn_as_the_axes_moved() {
 }
 
 #[test]
-fn the_page_goes_where_it_is_asked_to() {
+fn html_and_no_html_decide_where_the_page_goes() {
     let scratch = Scratch::new();
     let dir = run(&scratch, &["--set", "record.operator=M. Doe"]);
     assert_eq!(review(&scratch, &[&dir, "--no-html"]).status, 0);
@@ -124,7 +124,7 @@ fn the_page_goes_where_it_is_asked_to() {
 }
 
 #[test]
-fn two_runs_differ_in_their_configuration_and_then_in_their_figures() {
+fn a_comparison_lists_configurations_before_figures() {
     let scratch = Scratch::new();
     let a = run(&scratch, &[]);
     let b = run(&scratch, &["--set", "needle.radius_mm=121.0"]);
@@ -141,7 +141,7 @@ fn two_runs_differ_in_their_configuration_and_then_in_their_figures() {
 }
 
 #[test]
-fn a_campaign_says_what_counts_and_what_does_not() {
+fn a_campaign_lists_counted_and_excluded_runs() {
     let scratch = Scratch::new();
     let runs: Vec<String> = ["1", "2", "3", "4"]
         .iter()
@@ -205,7 +205,7 @@ fn a_flag_that_does_not_apply_is_refused() {
 }
 
 #[test]
-fn a_run_that_goes_on_is_not_taken_for_one_left_behind() {
+fn a_run_still_being_written_is_not_offered_for_repair() {
     let scratch = Scratch::new();
     let dir = run(&scratch, &[]);
     leave_open(&scratch, &dir);
@@ -249,7 +249,7 @@ fn copy_folder(from: &Path, to: &Path) {
 /// By its own account something is missing: that is not called whole, and its figures are those of
 /// its steps wherever they are shown.
 #[test]
-fn a_record_that_lacks_something_is_incomplete() {
+fn a_repaired_record_is_incomplete_wherever_it_is_shown() {
     let scratch = Scratch::new();
     let dir = run(&scratch, &[]);
     leave_open(&scratch, &dir);
@@ -266,7 +266,7 @@ fn a_record_that_lacks_something_is_incomplete() {
 }
 
 #[test]
-fn what_is_no_report_of_ours_is_not_overwritten() {
+fn a_file_that_is_not_our_report_is_not_overwritten() {
     let scratch = Scratch::new();
     let dir = run(&scratch, &[]);
     let report = scratch.path().join(&dir).join("report.html");
@@ -283,7 +283,7 @@ fn what_is_no_report_of_ours_is_not_overwritten() {
 
 /// A pipe has no end, and a huge number no place on an axis.
 #[test]
-fn what_is_in_a_files_place_holds_nobody_up() {
+fn huge_numbers_or_a_pipe_as_steps_csv_do_not_hang_review() {
     let scratch = Scratch::new();
     let dir = run(&scratch, &[]);
     let steps = scratch.path().join(&dir).join("steps.csv");
@@ -310,7 +310,7 @@ fn what_is_in_a_files_place_holds_nobody_up() {
 }
 
 #[test]
-fn verdicts_stay_and_the_last_counts() {
+fn all_verdicts_are_kept_and_the_last_counts() {
     let scratch = Scratch::new();
     let dir = run(&scratch, &[]);
     for (verdict, reason) in [("invalid", "wrong gain"), ("valid", "it was the other run")] {
@@ -324,7 +324,7 @@ fn verdicts_stay_and_the_last_counts() {
 }
 
 #[test]
-fn a_record_left_open_is_shown_and_closed() {
+fn an_open_record_is_shown_and_closed_by_repair() {
     let scratch = Scratch::new();
     let dir = run(&scratch, &[]);
     leave_open(&scratch, &dir);
@@ -349,7 +349,7 @@ fn a_record_left_open_is_shown_and_closed() {
 
 /// `run.rrd` follows from the rest of the record.
 #[test]
-fn a_recording_that_is_gone_is_made_again() {
+fn a_missing_run_rrd_is_made_again_by_repair() {
     let scratch = Scratch::new();
     let dir = run(&scratch, &[]);
     let recording = scratch.path().join(&dir).join("run.rrd");
@@ -366,7 +366,7 @@ fn a_recording_that_is_gone_is_made_again() {
 }
 
 #[test]
-fn what_is_no_record_is_named() {
+fn bad_records_and_verdicts_are_refused() {
     let scratch = Scratch::new();
     let whole = named(&scratch, &run(&scratch, &[]));
     fs::create_dir(scratch.path().join("empty")).expect("a folder");

@@ -205,7 +205,7 @@ impl Dialogue for Deaf {
 
 /// Whether a drive answers or not, it is told to brake and then to take its power off.
 #[test]
-fn a_drive_that_is_not_heard_is_stopped_all_the_same() {
+fn a_drive_whose_answers_are_lost_is_stopped_and_loses_power() {
     for lost in [0, 1, 5] {
         let mut bench = Bench::moving();
         let mut stop = Deaf { quick_stop: QuickStop::new(&bench.config, bench.now), lost };
@@ -248,7 +248,7 @@ impl Dialogue for Blind {
 
 /// That nobody can say whether it stands is no reason to leave it under power.
 #[test]
-fn a_stop_that_sees_nothing_takes_power_off_and_says_what_it_did_not_see() {
+fn a_stop_without_statuswords_takes_power_off_and_says_it_is_unconfirmed() {
     let mut bench = Bench::moving();
     let mut quick_stop = Blind(QuickStop::new(&bench.config, bench.now));
     bench.talk(&mut quick_stop);
@@ -262,7 +262,7 @@ fn a_stop_that_sees_nothing_takes_power_off_and_says_what_it_did_not_see() {
 }
 
 #[test]
-fn status_of_drives_that_are_moving_disturbs_nothing() {
+fn status_does_not_disturb_a_moving_run() {
     let mut bench = Bench::moving();
     let mut reader = StatusReader::new(&bench.config, bench.now);
     bench.talk(&mut reader);

@@ -165,7 +165,7 @@ impl Bench {
 }
 
 #[test]
-fn fifteen_millimetres_and_five_turns_to_the_count() {
+fn both_drives_follow_every_set_point_to_the_count() {
     let mut bench = Bench::new();
     let mut feedback = bench.feedback();
     assert_eq!((feedback.measured.insertion_mm, feedback.measured.rotation_rad), (0.0, 0.0));
@@ -199,7 +199,7 @@ fn fifteen_millimetres_and_five_turns_to_the_count() {
 }
 
 #[test]
-fn an_emergency_stop_of_one_drive_stops_both() {
+fn a_power_loss_of_one_drive_stops_both() {
     let mut bench = Bench::new();
     bench.drive_on(100);
     bench.drives[1].apply_fault(bench.now, &Fault::of(FaultKind::NoVoltage), true);

@@ -7,7 +7,7 @@ fn stage(scratch: &Scratch, arguments: &[&str]) -> Said {
 }
 
 #[test]
-fn status_says_who_and_where_and_moves_nothing() {
+fn status_shows_identity_and_position_and_leaves_no_record() {
     let scratch = Scratch::new();
     let said = stage(&scratch, &["status", "--set", "emulator.insertion_start_mm=12.5"]);
     assert_eq!((said.status, said.stderr.as_str()), (0, ""));
@@ -84,7 +84,7 @@ fn a_jog_goes_to_a_position_at_a_speed() {
 }
 
 #[test]
-fn limits_refuse_with_the_number() {
+fn a_jog_past_a_limit_is_refused_with_the_limit() {
     let scratch = Scratch::new();
     let said = stage(&scratch, &["jog", "--axis", "insertion", "--by", "311mm"]);
     assert_eq!(said.status, 1);
@@ -114,7 +114,7 @@ fn limits_refuse_with_the_number() {
 }
 
 #[test]
-fn what_cannot_be_meant_is_bad_usage() {
+fn unusable_arguments_are_bad_usage() {
     let scratch = Scratch::new();
     let operations: &[&[&str]] = &[
         &["jog", "--axis", "insertion", "--by", "2"],
@@ -141,7 +141,7 @@ fn what_cannot_be_meant_is_bad_usage() {
 
 /// A limit set before the operation holds, whatever is set after it.
 #[test]
-fn settings_add_up_wherever_they_stand() {
+fn settings_before_and_after_the_operation_both_apply() {
     let scratch = Scratch::new();
     let [limit, jog] = [["--set", "stage.insertion.max_mm=5"], ["--axis", "insertion"]];
     let other = ["--set", "name=x", "--set", "insertion.depth_mm=4"];
@@ -188,7 +188,7 @@ fn withdraw_comes_back_to_where_the_axis_reads_zero() {
 }
 
 #[test]
-fn home_finds_home_and_a_run_asks_for_it() {
+fn home_homes_both_axes_and_other_commands_ask_for_it() {
     let scratch = Scratch::new();
     let said = stage(&scratch, &["home", "-q", "--set", "emulator.insertion_start_mm=5"]);
     assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
@@ -210,7 +210,7 @@ fn home_finds_home_and_a_run_asks_for_it() {
 }
 
 #[test]
-fn prove_shows_that_the_drives_miss_the_bench() {
+fn prove_shows_that_both_drives_notice_a_silent_bench() {
     let scratch = Scratch::new();
     let said = stage(&scratch, &["prove"]);
     assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
@@ -231,7 +231,7 @@ fn prove_shows_that_the_drives_miss_the_bench() {
 
 /// An operator who forgot `--config` must not take the emulated stage for the rig.
 #[test]
-fn nothing_is_done_to_a_stage_that_nobody_named() {
+fn an_operation_without_a_named_stage_is_refused() {
     let scratch = Scratch::new();
     scratch.write("memory.toml", "can.interface = \"memory\"\n");
     let mut screens = String::new();
@@ -253,7 +253,7 @@ fn nothing_is_done_to_a_stage_that_nobody_named() {
 }
 
 #[test]
-fn a_stop_of_nothing_is_refused() {
+fn a_stop_without_an_interface_and_nodes_is_refused() {
     let scratch = Scratch::new();
     let commands: &[&[&str]] = &[
         &["stop"],

@@ -24,7 +24,7 @@ fn column(rows: &[Vec<String>], name: &str) -> usize {
 }
 
 #[test]
-fn json_keeps_the_contract() {
+fn study_json_has_its_documented_keys() {
     let scratch = Scratch::new();
     let said = needle_bench(
         &scratch,
@@ -56,7 +56,7 @@ fn json_keeps_the_contract() {
 
 /// What is said of the trials that failed repeats one of them.
 #[test]
-fn a_failed_trial_is_repeated_by_the_command_that_is_named() {
+fn the_command_that_a_study_prints_repeats_a_failed_trial() {
     let scratch = Scratch::new();
     scratch.write("my rig.toml", "insertion.depth_mm = 60\n");
     let set = "study.x_mm=[30, 40]";
@@ -108,7 +108,7 @@ fn every_position_steers_better_than_one_a_step() {
 
 /// The trials do not depend on how many threads make them, nor on how many trials there are.
 #[test]
-fn threads_change_nothing() {
+fn trials_do_not_depend_on_the_number_of_threads() {
     let scratch = Scratch::new();
     let one = rows(&scratch, &["--trials", "6", "--threads", "1"]);
     assert_eq!(one.len(), 7);
@@ -120,7 +120,7 @@ fn threads_change_nothing() {
 /// `run --seed` is the trial with that seed: through whole sessions the same (JSON may lose the last
 /// bit), and without them but for what the encoders round.
 #[test]
-fn a_run_repeats_a_trial() {
+fn a_run_with_the_seed_of_a_trial_repeats_it() {
     let scratch = Scratch::new();
     let whole = rows(&scratch, &["--trials", "2", "--through-session"]);
     let short = rows(&scratch, &["--trials", "2"]);
@@ -156,7 +156,7 @@ fn the_record_of_a_drawn_run_repeats_it() {
 }
 
 #[test]
-fn what_cannot_be_studied_is_refused() {
+fn bad_ranges_counts_and_stages_of_a_study_are_refused() {
     let scratch = Scratch::new();
     let on_vcan = ["--set", "can.interface=vcan0", "--set", "tracker.source=openigtlink"];
     let registered = [
@@ -179,7 +179,7 @@ fn what_cannot_be_studied_is_refused() {
 
 /// A study first records the times of one insertion. Its needle starts at the roll that is configured.
 #[test]
-fn a_roll_that_is_told_can_be_studied() {
+fn a_known_roll_at_the_start_can_be_studied() {
     let scratch = Scratch::new();
     let told = [
         "insertion.depth_mm=100",

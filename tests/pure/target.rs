@@ -70,7 +70,7 @@ fn least_distance_mm(scratch: &Scratch, json: &Value) -> f64 {
 /// In the plane and in space the tip comes to the target around the balls and stops there, and the run
 /// replays.
 #[test]
-fn a_run_comes_to_its_target() {
+fn a_run_reaches_its_target_and_replays() {
     for in_plane in ["goal.in_plane=true", "goal.in_plane=false"] {
         let scratch = Scratch::new();
         let said = run(&scratch, &[in_plane]);
@@ -122,7 +122,7 @@ fn a_start_with_a_path_is_not_refused() {
 
 /// A target that moves by 3 mm, as a tool of its own, is met, and the run replays.
 #[test]
-fn a_target_that_moves_is_met_and_replays() {
+fn a_moving_target_is_reached_and_the_run_replays() {
     let scratch = Scratch::new();
     let drift = "emulator.target_drift_mm_per_mm=[0.0, 0.033, 0.0]";
     let said = run(&scratch, &["goal.tool=TargetToTracker", drift]);
@@ -140,7 +140,7 @@ fn a_target_that_moves_is_met_and_replays() {
 
 /// What cannot be reached is refused before anything moves, with the nearest point.
 #[test]
-fn what_is_out_of_reach_is_refused_before_power() {
+fn an_unreachable_target_is_refused_before_power() {
     for (set, reason) in [
         ("goal.position_mm=[0.0, 60.0, 60.0]", "the target is out of reach"),
         ("goal.position_mm=[0.0, 40.0, 10.0]", "mm from the target"),
@@ -181,7 +181,7 @@ fn a_curvature_so_wrong_that_no_path_is_left_ends_the_run() {
 
 /// A run that completes is not one that arrives.
 #[test]
-fn a_target_that_is_missed_is_not_said_to_be_met() {
+fn a_missed_target_is_reported_as_missed() {
     let scratch = Scratch::new();
     let said = run(&scratch, &["goal.tolerance_mm=0.0001"]);
     let json = said.json();
@@ -201,7 +201,7 @@ fn a_target_that_is_missed_is_not_said_to_be_met() {
 
 /// A tip off the plane is not where its path in the plane is.
 #[test]
-fn a_tip_off_the_plane_keeps_clear_of_what_is_beside_the_plane() {
+fn a_tip_off_the_plane_keeps_clear_of_obstacles_beside_the_plane() {
     let run = |z_mm: f64| {
         let start =
             "emulator.start={x_mm=8.0,y_mm=0.0,z_mm=0.0,yaw_deg=0.0,pitch_deg=0.0,roll_deg=0.0}";
@@ -282,7 +282,7 @@ fn a_study_draws_targets_and_obstacles() {
 
 /// Whatever the noise. Without a reserve of the clearance, these three are lost.
 #[test]
-fn the_shipped_example_arrives() {
+fn the_shipped_example_reaches_its_target() {
     let example = repository("bench-config/target.toml");
     for seed in [1, 4, 9] {
         let set = format!("emulator.seed={seed}");

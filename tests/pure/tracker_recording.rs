@@ -36,7 +36,7 @@ fn depth_mm(steps_csv: &str, time_s: f64) -> f64 {
 }
 
 #[test]
-fn a_recorded_tracker_that_stalls_is_noticed_before_a_millimetre() {
+fn a_recorded_stall_of_the_tracker_holds_the_needle_within_1_mm() {
     let Some(file) = data("tracker-recordings/phantomA_closedloop_03.csv") else { return };
     let scratch = Scratch::new();
     let file = format!("tracker.file={:?}", file.display().to_string());

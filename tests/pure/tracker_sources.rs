@@ -40,7 +40,7 @@ fn steps(dir: &Path) -> Vec<Vec<f64>> {
 
 /// The record of a run, given again as the tracker, makes that run again.
 #[test]
-fn the_bench_s_own_samples_make_the_same_run_again() {
+fn recorded_samples_as_the_tracker_repeat_the_run() {
     let scratch = Scratch::new();
     let first = recorded(&scratch, &[]);
     let file = format!("tracker.file={}", first.join("tracker.ndjson").display());
@@ -80,7 +80,7 @@ fn a_recording_that_ends_stops_the_run() {
 
 /// Every bad line is named; the good ones are taken.
 #[test]
-fn a_bad_line_is_named_and_costs_nothing_but_itself() {
+fn a_malformed_line_is_reported_and_skipped() {
     let scratch = Scratch::new();
     let first = recorded(&scratch, &[]);
     let mut lines: Vec<String> =
@@ -107,7 +107,7 @@ fn a_bad_line_is_named_and_costs_nothing_but_itself() {
 
 /// What cannot be a recording is refused before anything moves.
 #[test]
-fn a_wrong_file_or_mapping_is_refused_by_name() {
+fn a_wrong_file_or_mapping_is_refused_with_the_reason() {
     let scratch = Scratch::new();
     scratch.write("tip.csv", "t,x,y,z\n0,1,2,3\n0.1,1,two,3\n");
     let time = "tracker.csv.time={s=\"t\"}";
@@ -163,7 +163,7 @@ fn check_listens_to_a_recording() {
 /// A real recording of another lab, as it is: the sender's frozen stamps, robot columns in metres
 /// among those of the tip.
 #[test]
-fn a_recording_of_another_lab_is_taken_by_its_columns() {
+fn a_recording_of_another_lab_is_read_by_its_column_names() {
     let Some(path) = data("tracker-recordings/phantomA_closedloop_03.csv") else { return };
     let scratch = Scratch::new();
     let file = format!("tracker.file={}", path.display());

@@ -47,7 +47,7 @@ fn the_run_does_not_depend_on_frames_or_signs() {
 /// A position that is late by a known latency is applied at its own depth: at 5 mm/s, 175 ms
 /// unaccounted for are 0.875 mm along the path, and accounted for are nothing.
 #[test]
-fn a_known_latency_does_no_harm() {
+fn a_known_latency_causes_no_error_along_the_path() {
     let late = |stamp: &str, known_ms: &str| {
         noiseless(&[
             "insertion.speed_mm_per_s=5",
@@ -81,7 +81,7 @@ fn the_finite_difference_observer_can_steer_without_noise() {
 /// A step may take longer than the stage's history lasts. The session then predicts the observers in
 /// between, and the estimate is as good.
 #[test]
-fn slow_insertions_lose_nothing_of_the_path() {
+fn slow_insertions_are_estimated_as_well_as_fast_ones() {
     let slow =
         noiseless(&["insertion.depth_mm=60", "can.sync_ms=5", "insertion.speed_mm_per_s=0.2"]);
     let quick = noiseless(&["insertion.depth_mm=60", "can.sync_ms=5"]);

@@ -34,7 +34,7 @@ fn foreign_and_misshapen_frames_have_no_effect() {
 
 /// What is left to do after a set-point is due as soon as it may have left, and then is done.
 #[test]
-fn a_set_point_waits_for_no_observer() {
+fn observers_are_updated_after_the_set_points_are_sent() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
     bench.run_to_mm(5.0);
     let mut answered = 0;
@@ -92,14 +92,14 @@ fn a_bus_that_fails() {
 }
 
 #[test]
-fn an_operator_who_stops() {
+fn a_stop_by_the_operator() {
     let stops = stopped(&[], |bench| bench.hand(Input::Stop("operator: interrupted".to_owned())));
-    documented(&stops, "an_operator_who_stops", 0.0, "operator: interrupted");
+    documented(&stops, "a_stop_by_the_operator", 0.0, "operator: interrupted");
 }
 
 /// From listening over standby and enabling to the insertion; these drives are brought up in no time.
 #[test]
-fn an_operator_who_stops_at_any_moment() {
+fn a_stop_by_the_operator_at_any_moment() {
     let listens = Duration::from_millis(100);
     let mut states = Vec::new();
     for ms in [0, 50, 99, 101, 120, 150, 200, 260, 400, 3000] {
@@ -156,7 +156,7 @@ fn a_bench_that_dies() {
 
 /// A stop in which the bench does not see the drives any more says so, however it ends.
 #[test]
-fn a_bench_held_up_in_its_stop_claims_nothing() {
+fn a_bench_that_stalls_in_its_stop_reports_what_it_does_not_know() {
     for drives_answer in [true, false] {
         let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
         bench.run_to_mm(10.0);
@@ -174,7 +174,7 @@ fn a_bench_held_up_in_its_stop_claims_nothing() {
 
 /// However long the drives bear it: what the bench knows of the tip is too old by then.
 #[test]
-fn a_bench_held_up_for_longer_than_a_tip_is_fresh_only_stops() {
+fn the_longest_stall_is_the_shorter_of_heartbeat_and_tip_timeout() {
     for (timeout_ms, max_ms) in [(100, 100), (3000, 500)] {
         let timeout = format!("can.heartbeat_timeout_ms={timeout_ms}");
         let mut bench = Bench::new(configured(&["insertion.depth_mm=30", &timeout]));
@@ -184,7 +184,7 @@ fn a_bench_held_up_for_longer_than_a_tip_is_fresh_only_stops() {
 }
 
 #[test]
-fn a_bench_held_up_for_less_than_the_heartbeat_goes_on() {
+fn a_stall_shorter_than_the_heartbeat_timeout_is_tolerated() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
     bench.run_to_mm(10.0);
     bench.hold_up_for(Duration::from_millis(60));

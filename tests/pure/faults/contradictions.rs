@@ -100,7 +100,7 @@ fn are_found(what: &str, mut found_mm: Vec<f64>) {
 /// From any start, the default noise. `NEEDLE_STARTS=300` makes the figures of `docs/hazards.md`.
 /// `NEEDLE_ROTATIONS=FILE` keeps how the base was turned, for `docs/handedness_bound.py`.
 #[test]
-fn the_wrong_hand_is_found_from_every_start() {
+fn wrong_handedness_is_found_from_every_start() {
     let mut rotations = String::from("start,depth_mm,rotation_rad\n");
     let found_mm: Vec<f64> = (1..=starts_or(16))
         .map(|seed| {
@@ -130,7 +130,7 @@ fn the_wrong_hand_is_found_from_every_start() {
 /// From the default start, with other noise each time. `NEEDLE_STARTS=100` makes the figures of
 /// `docs/hazards.md`.
 #[test]
-fn the_wrong_hand_is_found_whatever_the_noise() {
+fn wrong_handedness_is_found_whatever_the_noise() {
     for speed in ["1.0", "2.0"] {
         let found_mm = |change: fn(&mut SessionConfig), sample: fn(&mut Sample)| {
             let found_mm = (1..=starts_or(2)).map(|seed| {
@@ -156,7 +156,7 @@ fn the_wrong_hand_is_found_whatever_the_noise() {
 /// A shaft that twists by 0.57°/mm, which nobody told, is no mirrored needle. Where the watch took a
 /// rigid shaft for forty times as likely as one that twists, this insertion was stopped after 64.5 mm.
 #[test]
-fn a_twist_that_is_not_told_is_no_wrong_hand() {
+fn unknown_torsion_is_not_taken_for_wrong_handedness() {
     let text = include_str!("../../../bench-config/study.toml");
     let sets = ["study.torsion_half_width_deg_per_mm=[0,0.6]", "insertion.depth_mm=120"];
     let sources = [Source { name: "study.toml", text }];
@@ -182,7 +182,7 @@ fn a_twist_that_is_not_told_is_no_wrong_hand() {
 
 /// A tracker of 0.1 mm that is told as such is contradicted much sooner.
 #[test]
-fn a_good_tracker_shows_the_wrong_hand_sooner() {
+fn a_precise_tracker_shows_wrong_handedness_sooner() {
     let run = |speed: &str| {
         let (mut session, stage) = steered(&[
             speed,
@@ -193,7 +193,7 @@ fn a_good_tracker_shows_the_wrong_hand_sooner() {
         session.stage.rotation.sign = Sign::Negative;
         contradicted((session, stage), 0.0, |_| {})
     };
-    is_documented("a_good_tracker_shows_the_wrong_hand_sooner", 20.0, run);
+    is_documented("a_precise_tracker_shows_wrong_handedness_sooner", 20.0, run);
 }
 
 /// A registration that is turned about the needle gives the path of another roll at the start: only
@@ -227,20 +227,20 @@ fn a_registration_that_is_tilted() {
 
 /// The axis goes one and a half times as far as the bench commands.
 #[test]
-fn a_stage_whose_scale_is_wrong() {
+fn a_wrong_scale_of_the_stage() {
     let run = |speed: &str| {
         let (session, mut stage) = steered(&[speed]);
         stage.insertion.1 /= 1.5;
         contradicted((session, stage), 0.0, |_| {})
     };
-    is_documented("a_stage_whose_scale_is_wrong", 15.0, run);
+    is_documented("a_wrong_scale_of_the_stage", 15.0, run);
 }
 
 #[test]
-fn a_scale_that_is_wrong() {
+fn a_wrong_scale_of_the_tracker() {
     let scaled = |sample: &mut Sample| sample.position_mm *= 1.1;
     let run = |speed: &str| contradicted(steered(&[speed]), 0.0, scaled);
-    is_documented("a_scale_that_is_wrong", 30.0, run);
+    is_documented("a_wrong_scale_of_the_tracker", 30.0, run);
 }
 
 /// Noise of its own on a position that stands still.
@@ -311,7 +311,7 @@ fn a_frozen_position_is_held_whatever_the_noise() {
 /// A moment in which noise lets a frozen stream agree with the model ends a hold, where that is
 /// allowed. All holds together last no longer than one may.
 #[test]
-fn a_frozen_position_goes_no_further_by_holds_that_end_by_themselves() {
+fn automatic_resume_takes_a_frozen_position_no_further() {
     let inserted_mm = frozen_tries().map(|(struck_mm, seed)| {
         let seed_set = format!("emulator.seed={seed}");
         let run = steered(&[&seed_set, "tracker.resume=\"automatic\""]);
@@ -352,7 +352,7 @@ fn a_jump_is_held_whatever_the_noise() {
 /// Ten positions a second are too few to lose the track for certain: the observer may come to believe the jump.
 /// It is said all the same, but for a few draws of the noise.
 #[test]
-fn a_jump_that_a_slow_stream_hides_is_said() {
+fn a_jump_that_a_slow_stream_hides_is_reported() {
     let said = (1..=40).filter(|seed| {
         let seed = format!("emulator.seed={seed}");
         let noise = "emulator.noise={ sd_mm = 0.6 }";
@@ -405,7 +405,7 @@ fn a_stream_at_half_speed() {
 /// The reason names the scale and not a frozen stream, but for some draws of the noise.
 /// `NEEDLE_STARTS=30` makes the figures of `docs/hazards.md`.
 #[test]
-fn a_stream_at_half_speed_is_named() {
+fn a_stream_at_half_speed_is_reported_with_its_scale() {
     for speed in [1.0, 2.0] {
         let mut named = 0;
         let held_mm = frozen_tries().map(|(struck_mm, seed)| {

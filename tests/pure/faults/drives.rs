@@ -19,7 +19,7 @@ fn set_voltage(bench: &mut Bench, drives: &[usize], on: bool) {
 }
 
 #[test]
-fn one_lost_answer() {
+fn one_lost_tpdo_is_tolerated() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
     bench.run_to_mm(10.0);
     let mut lost = 0;
@@ -35,25 +35,25 @@ fn one_lost_answer() {
 }
 
 #[test]
-fn answers_of_one_drive_lost() {
+fn tpdos_of_one_drive_lost() {
     for (cob_id, axis) in [(TPDOS[0], "insertion"), (TPDOS[1], "rotation")] {
         let stops = stopped(&[], |bench| bench.lose(move |input| is_frame(input, &[cob_id])));
         let reason = format!(
             "stage: {axis}: no TPDO1 for 2 SYNCs in a row, check bus load, cable and the drive"
         );
         match axis {
-            "insertion" => documented(&stops, "answers_of_one_drive_lost", 30.0, &reason),
+            "insertion" => documented(&stops, "tpdos_of_one_drive_lost", 30.0, &reason),
             _ => assert!(stops.iter().all(|stop| stop.bench.reason() == reason)),
         }
     }
 }
 
 #[test]
-fn answers_of_both_drives_lost() {
+fn tpdos_of_both_drives_lost() {
     let stops = stopped(&[], |bench| bench.lose(|input| is_frame(input, &TPDOS)));
     let reason =
         "stage: insertion: no TPDO1 for 2 SYNCs in a row, check bus load, cable and the drive";
-    documented(&stops, "answers_of_both_drives_lost", 30.0, reason);
+    documented(&stops, "tpdos_of_both_drives_lost", 30.0, reason);
 }
 
 #[test]
@@ -133,12 +133,12 @@ fn a_heartbeat_lost() {
 }
 
 #[test]
-fn another_master() {
+fn an_nmt_command_of_another_master() {
     // Enter Pre-operational, to all.
     let stops = stopped(&[], |bench| bench.inject(Frame::new(0x000, &[0x80, 0])));
     let reason = "stage: another master on the bus: an NMT command (000#8000); stop it, or give it \
                   other nodes: two masters cannot share an axis";
-    documented(&stops, "another_master", 0.0, reason);
+    documented(&stops, "an_nmt_command_of_another_master", 0.0, reason);
 }
 
 #[test]
@@ -213,10 +213,10 @@ fn a_drive_that_no_longer_obeys_the_bus() {
 }
 
 #[test]
-fn a_drive_that_says_it_has_no_voltage() {
+fn a_drive_that_reports_no_voltage() {
     let reason = "the drive has lost its supply (statusword 0x1227 operation enabled, bit 4 clear), is \
                   an emergency stop pressed, or a fuse blown?";
-    a_lost_flag("a_drive_that_says_it_has_no_voltage", Statusword::VOLTAGE_ENABLED, reason);
+    a_lost_flag("a_drive_that_reports_no_voltage", Statusword::VOLTAGE_ENABLED, reason);
 }
 
 #[test]
@@ -227,7 +227,7 @@ fn a_drive_that_ignores_its_targets() {
 }
 
 #[test]
-fn a_drive_that_warns() {
+fn a_warning_of_a_drive_is_reported_and_tolerated() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
     bench.run_to_mm(10.0);
     let mut answers = 0;
@@ -317,7 +317,7 @@ fn a_drive_that_stands_off_its_target() {
 
 /// A real drive may hold its target a few counts short: that is near enough, after a while.
 #[test]
-fn a_depth_that_is_reached_but_for_a_few_counts() {
+fn a_depth_short_by_a_few_counts_is_accepted() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
     bench.run_to_mm(10.0);
     bench.change_depth(|counts| counts - 20);

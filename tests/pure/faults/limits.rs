@@ -54,7 +54,7 @@ fn limits([mm_per_s2, deg_per_s2]: [f64; 2]) -> [String; 2] {
 
 /// Holds among steps, before the last of them and while the needle brakes at the end.
 #[test]
-fn a_run_at_the_limits_of_its_accelerations() {
+fn a_run_at_its_acceleration_limits_completes() {
     for (sets, peaks, end_mm) in RUNS {
         let common = [
             "insertion.depth_mm=12",

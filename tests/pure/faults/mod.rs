@@ -18,4 +18,4 @@ mod scripted;
 mod stream;
 mod target;
 mod tracker;
-mod tracker_goes_on;
+mod tracker_tolerated;

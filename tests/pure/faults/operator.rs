@@ -59,7 +59,7 @@ fn commanded_mm(bench: &Bench) -> f64 {
 }
 
 #[test]
-fn a_hold_by_the_operator_ends_on_the_operator_s_word_only() {
+fn only_the_operator_ends_a_hold_by_the_operator() {
     for resume in ["stop", "automatic", "operator"] {
         let mut bench = bench(&[&format!("tracker.resume={resume}"), "tracker.hold_timeout_s=1"]);
         bench.run_to_mm(5.0);
@@ -92,7 +92,7 @@ fn a_hold_by_the_operator_ends_on_the_operator_s_word_only() {
 
 /// Steps are exact, at rest in between, in both modes.
 #[test]
-fn single_steps_end_where_they_were_asked_to() {
+fn single_steps_end_at_the_depth_asked_for() {
     for mode in ["continuous", "stepwise"] {
         let mut bench = bench(&[&format!("insertion.mode={mode}")]);
         bench.run_to_mm(5.0);
@@ -136,7 +136,7 @@ fn a_step_that_the_tracker_interrupts_stays_held() {
 
 /// With `tracker.resume = "operator"` a hold by the tracker ends on purpose only, in its time.
 #[test]
-fn a_hold_by_the_tracker_that_the_operator_may_end() {
+fn a_hold_by_the_tracker_is_ended_by_the_operator_or_by_its_timeout() {
     for asks in [true, false] {
         let mut bench = bench(&["tracker.resume=operator"]);
         bench.run_to_mm(5.0);
@@ -320,7 +320,7 @@ proptest! {
     /// that is held and has braked, or withdraws, or breaks the limits of speed and acceleration; a hold
     /// by the operator or after a step ends on a command only; every run stops when it is asked to.
     #[test]
-    fn any_commands_in_any_order(
+    fn no_commands_in_any_order_move_a_held_needle_or_break_a_limit(
         resume in prop::sample::select(vec!["stop", "automatic", "operator"]),
         mode in prop::sample::select(vec!["continuous", "stepwise"]),
         happenings in prop::collection::vec((happening(), prop_oneof![Just(0u64), 0..40u64, 0..1500u64]), 1..40),

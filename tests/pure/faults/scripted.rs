@@ -221,7 +221,7 @@ fn a_bus_that_holds_frames() {
 
 /// Where answers may be missing for longer, frames that do not leave are what stops the run.
 #[test]
-fn frames_that_nobody_confirms_stop_the_run() {
+fn unconfirmed_frames_stop_the_run() {
     let fault = r#"kind = "bus-stuck", duration_s = 0.05"#;
     for at_mm in DEPTHS_MM {
         let run = run(&[fault], at_mm, &["can.missed_feedback_max=20"]);
@@ -427,7 +427,7 @@ fn frames_of_the_wrong_length() {
 }
 
 #[test]
-fn a_flood() {
+fn a_flood_of_foreign_frames_is_reported_and_tolerated() {
     let flood = r#"kind = "foreign", frame = "333#0011223344556677", period_ms = 0.25"#;
     is_harmless(flood, "a flood on the bus: ");
     // Under a drive's own identifiers.
@@ -439,7 +439,7 @@ fn a_flood() {
 
 /// Frames doubled, a little late or out of order cost nothing.
 #[test]
-fn a_bus_that_is_a_little_disorderly() {
+fn duplicated_late_and_reordered_frames_are_tolerated() {
     for fault in [
         r#"kind = "duplicate", count = 50"#,
         r#"kind = "delay", delay_ms = 4, count = 50"#,

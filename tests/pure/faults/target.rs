@@ -65,12 +65,12 @@ fn a_target_that_jumps() {
 }
 
 #[test]
-fn a_target_that_is_no_number() {
+fn a_target_position_that_is_not_finite() {
     is_lost(&changed(|sample| sample.position_mm.y = f64::NAN), "finite: position");
 }
 
 #[test]
-fn a_target_whose_stream_comes_to_be_of_another_frame() {
+fn a_target_stream_that_changes_its_frame() {
     let turned = |sample: &mut Sample| sample.position_mm.swap_rows(0, 2);
     is_lost(&changed(turned), "mm from goal.position_mm (limit 10.0)");
 }
@@ -145,7 +145,7 @@ fn a_target_that_moves_where_no_path_may_end() {
 
 /// The needle follows the target to where that is in the end.
 #[test]
-fn a_target_that_moves_is_met() {
+fn a_moving_target_is_reached() {
     let mut bench = bench(&["emulator.target_drift_mm_per_mm=[0.0, 0.05, 0.0]"]);
     bench.run_to_end();
     assert!(bench.completed(), "{}", bench.reason());

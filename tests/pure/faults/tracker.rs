@@ -108,7 +108,7 @@ fn a_tracker_that_hangs_up() {
 }
 
 #[test]
-fn positions_that_are_no_numbers() {
+fn positions_that_are_not_numbers() {
     let stops = changed(&[], |sample| sample.position_mm.x = f64::NAN);
     for stop in &stops {
         let (refused, first) = (refusals(&stop.bench).len(), stop.struck);
@@ -117,7 +117,7 @@ fn positions_that_are_no_numbers() {
         assert!(later.into_iter().all(|step| step.tip_meas_mm.is_none()), "no NaN is a tip");
     }
     let counted = stops[0].bench.reason();
-    held(&stops, "positions_that_are_no_numbers", 510.0, &counted);
+    held(&stops, "positions_that_are_not_numbers", 510.0, &counted);
     assert!(counted.contains("; finite: position (NaN, "), "{counted}");
 }
 
@@ -216,7 +216,7 @@ fn a_position_that_drifts() {
 }
 
 #[test]
-fn another_tool() {
+fn a_stream_of_another_tool() {
     let mut bench = Bench::new(configured(&[]));
     bench.change_samples(|sample| sample.tool = "StylusToTracker".to_owned());
     let stop = Stop::of(bench, |_| ());
@@ -224,7 +224,7 @@ fn another_tool() {
     stop.never_had_power();
     documented(
         &[stop],
-        "another_tool",
+        "a_stream_of_another_tool",
         5000.0,
         "tracker: no tip within 5.0 s; tracker: 127.0.0.1:18944 sent 200 messages, none of \
          \"NeedleToTracker\"; saw \"StylusToTracker\"; set tracker.tool",
@@ -232,7 +232,7 @@ fn another_tool() {
 }
 
 #[test]
-fn a_needle_out_of_view_is_told_from_another_tool_in_view() {
+fn another_tool_in_place_of_the_needle_is_reported_as_out_of_view() {
     let stops = changed(&[], |sample| sample.tool = "StylusToTracker".to_owned());
     let end = "; the link is up: the tool is out of view, or the source has stopped sending";
     assert!(stops.iter().all(|stop| stop.bench.reason().ends_with(end)));
@@ -313,7 +313,7 @@ fn a_needle_nothing_like_its_model() {
 
 /// Positions that never agree with one another are no tip to begin with.
 #[test]
-fn positions_all_over_the_place() {
+fn positions_that_never_agree() {
     let stop = Stop::of(Bench::new(configured(&["emulator.noise={uniform_mm=100.0}"])), |_| ());
     assert_eq!(stop.travel(), [(0.0, 0.0); 2]);
     stop.never_had_power();

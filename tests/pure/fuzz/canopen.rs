@@ -164,7 +164,7 @@ fn is_sdo(frame: &Frame) {
 }
 
 #[test]
-fn a_drive_answers_what_it_is_asked_and_stays_itself() {
+fn an_emulated_drive_sends_few_frames_and_keeps_its_node() {
     fuzz(&transfers(), |input, _| {
         let mut drive = Drive::new(DriveConfig::new(NODE, 1, 2));
         let mut now = Time::ZERO;
@@ -184,7 +184,7 @@ fn a_drive_answers_what_it_is_asked_and_stays_itself() {
 }
 
 #[test]
-fn what_is_understood_could_have_been_sent() {
+fn a_decoded_frame_encodes_back_to_itself() {
     let corpus: Vec<Vec<u8>> = [
         Frame::new(0x081, &[0x11, 0x86, 0x21, 0, 0, 0, 0, 0]),
         Frame::new(0x0FF, &[0, 0, 0, 1, 2, 3, 4, 5]),

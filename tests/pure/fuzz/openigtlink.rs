@@ -84,7 +84,7 @@ fn repair(message: &mut [u8]) {
 }
 
 #[test]
-fn a_message_is_read_or_refused() {
+fn a_decoded_message_encodes_back_to_itself() {
     fuzz(&corpus(), |input, mutator| {
         let mut input = input.to_vec();
         if mutator.below(2) == 0 {
@@ -107,7 +107,7 @@ fn a_message_is_read_or_refused() {
 }
 
 #[test]
-fn a_stream_cut_anywhere_gives_the_same() {
+fn a_stream_cut_anywhere_gives_the_same_events() {
     let stream = |messages: &[Vec<u8>]| messages.concat();
     let corpus: Vec<Vec<u8>> = corpus().chunks(4).map(stream).collect();
     fuzz(&corpus, |input, mutator| {
@@ -119,7 +119,7 @@ fn a_stream_cut_anywhere_gives_the_same() {
 }
 
 #[test]
-fn lines_are_read_or_refused() {
+fn ndjson_cut_anywhere_gives_the_same_events() {
     let line = concat!(
         r#"{"receive_time_ns":1020000000,"source_unix_ns":1700000001000000000,"tool":"N","#,
         r#""position_tracker_mm":[0.1,"NaN",1e-7],"orientation_tracker_wxyz":[1.0,0.0,0.0,0.0],"#,

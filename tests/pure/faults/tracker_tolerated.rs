@@ -47,7 +47,7 @@ fn spikes_of_one_and_of_two_samples() {
 }
 
 #[test]
-fn every_other_position_infinite_costs_nothing_but_those() {
+fn every_other_position_infinite_costs_only_those_samples() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
     let mut n = 0;
     bench.change_samples(move |sample| {
@@ -93,7 +93,7 @@ fn frames_that_are_sent_five_times() {
 
 /// Its followers would be 10 s old, or stamped backwards, for a minute.
 #[test]
-fn one_stamp_ahead() {
+fn one_stamp_10_s_ahead() {
     let run = tolerated(&["tracker.stamp=\"source\""], |bench| {
         let mut n = 0;
         bench.change_samples(move |sample| {
@@ -104,7 +104,7 @@ fn one_stamp_ahead() {
         });
     });
     assert_eq!(run.0.session.gate_counts().of(GateName::Stamp), 1 + learnt(&run.0));
-    went_on(&run, "one_stamp_ahead", 0.25);
+    went_on(&run, "one_stamp_10_s_ahead", 0.25);
 }
 
 /// Samples refused while the sender's clock was learnt.
@@ -129,7 +129,7 @@ fn a_sender_whose_clock_is_set_ahead() {
 }
 
 #[test]
-fn stamps_that_are_not_looked_at_do_no_harm() {
+fn wrong_stamps_do_no_harm_where_stamps_are_not_used() {
     let (bench, _) = tolerated(&["tracker.stamp=\"receive\""], |bench| {
         bench.change_samples(move |sample| {
             sample.source_unix_ns = sample.source_unix_ns.map(|ns| ns - 10_000_000_000);
@@ -186,7 +186,7 @@ fn a_track_lost_for_a_moment() {
 }
 
 #[test]
-fn a_hold_that_ends_by_itself_where_it_is_allowed_to() {
+fn automatic_resume_ends_a_hold_when_the_tip_is_seen_again() {
     let run = tolerated(&["tracker.resume=\"automatic\""], |bench| {
         silent_for(bench, Duration::from_secs(2));
     });
@@ -199,11 +199,11 @@ fn a_hold_that_ends_by_itself_where_it_is_allowed_to() {
     assert!(told[0].contains("; insertion held; the link is up"), "{told:?}");
     assert!(told[1].starts_with("the tip is seen again; insertion goes on, held for 1."));
     assert!(bench.steps().enumerate().all(|(n, step)| step.step as usize == n));
-    went_on(&run, "a_hold_that_ends_by_itself_where_it_is_allowed_to", 1.0);
+    went_on(&run, "automatic_resume_ends_a_hold_when_the_tip_is_seen_again", 1.0);
 }
 
 #[test]
-fn a_hold_that_may_end_by_itself_ends_some_time() {
+fn automatic_resume_stops_the_run_after_the_hold_timeout() {
     let sets =
         ["tracker.resume=\"automatic\"", "tracker.hold_timeout_s=2", "insertion.depth_mm=30"];
     let mut bench = Bench::new(configured(&sets));
@@ -218,7 +218,7 @@ fn a_hold_that_may_end_by_itself_ends_some_time() {
 
 /// A silence that is over is not why the run ends.
 #[test]
-fn the_reason_is_what_holds_the_insertion_in_the_end() {
+fn the_stop_reason_is_the_last_cause_of_the_hold() {
     let sets =
         ["tracker.resume=\"automatic\"", "tracker.hold_timeout_s=4", "insertion.depth_mm=30"];
     let mut bench = Bench::new(configured(&sets));
@@ -235,7 +235,7 @@ fn the_reason_is_what_holds_the_insertion_in_the_end() {
 /// Silences of 2 s, 0.2 s of the stream between them: each hold may end by itself, but all of them
 /// together have the time of one. Holds that are far from one another have their own.
 #[test]
-fn holds_in_a_row_last_no_longer_than_one() {
+fn holds_in_a_row_share_one_timeout() {
     let sets = |depth| ["tracker.resume=\"automatic\"", "tracker.hold_timeout_s=4", depth];
     let mut bench = Bench::new(configured(&sets("insertion.depth_mm=30")));
     bench.run_to_mm(10.0);

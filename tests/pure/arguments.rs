@@ -6,7 +6,7 @@ use std::process::Command;
 
 /// The configuration is the first argument, or named; one of the two.
 #[test]
-fn every_command_takes_its_configuration_both_ways() {
+fn every_command_takes_its_configuration_as_argument_or_flag() {
     let scratch = Scratch::new();
     // A key that no configuration has: each command says that it has read the file.
     scratch.write("rig.toml", "[nowhere]\nkey = 1\n");
@@ -52,7 +52,7 @@ fn every_command_takes_its_configuration_both_ways() {
 }
 
 #[test]
-fn a_mistyped_command_or_flag_is_put_right() {
+fn a_mistyped_command_or_flag_is_answered_with_a_suggestion() {
     let scratch = Scratch::new();
     for (typed, meant) in [
         (&["chekc"][..], "'check'"),
@@ -68,7 +68,7 @@ fn a_mistyped_command_or_flag_is_put_right() {
 }
 
 #[test]
-fn completions_and_man_pages_follow_the_command_line() {
+fn completions_and_man_pages_name_the_commands() {
     let scratch = Scratch::new();
     for shell in ["bash", "zsh", "fish"] {
         let said = needle_bench(&scratch, &["generate", shell]);
@@ -84,7 +84,7 @@ fn completions_and_man_pages_follow_the_command_line() {
 }
 
 #[test]
-fn a_script_that_nobody_reads_is_an_error_and_no_panic() {
+fn generate_exits_3_on_a_full_device_and_0_on_a_closed_pipe() {
     let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
     let full = fs::OpenOptions::new().write(true).open("/dev/full").expect("a full device");
     let status = command.args(["generate", "bash"]).stdout(full).status().expect("it starts");
@@ -132,7 +132,7 @@ fn the_summary_of_stage_names_every_operation() {
 }
 
 #[test]
-fn a_review_without_a_path_is_of_the_newest_run() {
+fn review_without_a_path_shows_the_newest_run() {
     let scratch = Scratch::new();
     let said = needle_bench(&scratch, &["review"]);
     assert_eq!(said.status, 2);
