@@ -1,4 +1,4 @@
-//! The arrows and the purity that ARCHITECTURE.md states.
+//! The invariants that ARCHITECTURE.md marks as tested.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The table of ARCHITECTURE.md: folder to the folders it may use.
+/// The table of ARCHITECTURE.md: for each folder those that it may use.
 fn granted() -> BTreeMap<String, BTreeSet<String>> {
     let text = std::fs::read_to_string(root().join("ARCHITECTURE.md")).unwrap();
     text.lines()
@@ -21,7 +21,7 @@ fn granted() -> BTreeMap<String, BTreeSet<String>> {
         .collect()
 }
 
-/// Every source file of `src`, by folder; what stands under `#[cfg(test)]` is left out.
+/// Folder, path and code of every source file in `src`, without tests and comments.
 fn sources() -> Vec<(String, PathBuf, String)> {
     fn walk(dir: &Path, found: &mut Vec<PathBuf>) {
         for entry in std::fs::read_dir(dir).unwrap() {
@@ -86,7 +86,6 @@ fn a_folder_uses_only_the_folders_that_the_table_grants() {
     }
 }
 
-/// What the table grants has no cycle.
 #[test]
 fn the_table_of_folders_has_no_cycle() {
     let mut open = granted();
@@ -101,7 +100,7 @@ fn the_table_of_folders_has_no_cycle() {
     }
 }
 
-/// The folders that touch the outside.
+/// The folders that are not pure.
 const OUTSIDE: [&str; 4] = ["transport", "telemetry", "runtime", "cli"];
 
 #[test]
@@ -129,11 +128,11 @@ fn pure_code_names_no_clock_file_socket_or_thread() {
     }
 }
 
-/// `f64::sin` and its like call the system's library, whose last bits differ: a run would not replay
-/// on another machine.
+/// The system's library rounds sines and logarithms differently on each machine: a run would not replay
+/// bit for bit.
 #[test]
 fn pure_code_takes_its_sines_from_math() {
-    let of_the_system = [
+    let of_the_system_library = [
         "sin", "cos", "tan", "sin_cos", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh",
         "asinh", "acosh", "atanh", "exp", "exp2", "exp_m1", "ln", "ln_1p", "log2", "log10", "powf",
         "cbrt", "hypot", "mul_add",
@@ -142,13 +141,13 @@ fn pure_code_takes_its_sines_from_math() {
         if OUTSIDE.contains(&folder.as_str()) {
             continue;
         }
-        for function in of_the_system {
+        for function in of_the_system_library {
             for called in [format!(".{function}("), format!("f64::{function}")] {
-                assert!(!code.contains(&called), "{}: {called}..), not math's", file.display());
+                assert!(!code.contains(&called), "{}: {called} is not from math", file.display());
             }
         }
         assert!(folder == "math" || !code.contains("libm::"), "{} names libm", file.display());
-        // The order of the first two, and the products of the others, are not the same everywhere.
+        // The first two iterate, and the others multiply, in an order that differs between machines.
         for word in ["HashMap", "HashSet", "DMatrix", "DVector"] {
             assert!(!code.contains(word), "{} names {word}", file.display());
         }
@@ -163,7 +162,7 @@ fn only_telemetry_names_rerun() {
     }
 }
 
-/// The scan itself sees what it is to see.
+/// If the scan found nothing, every test above would pass.
 #[test]
 fn the_scan_finds_paths() {
     assert_eq!(named("use crate::needle::{A, B};\nfn f() { crate::stage::g() }").len(), 2);

@@ -1,14 +1,14 @@
-//! How commands take their configuration, and what is generated from the command line.
+//! How commands take their configuration; help, completions and man pages.
 
 use crate::support::program::{Scratch, needle_bench};
 use std::fs;
 use std::process::Command;
 
-/// The configuration is the first argument, or named; one of the two.
+/// Either of the two, not both.
 #[test]
 fn every_command_takes_its_configuration_as_argument_or_flag() {
     let scratch = Scratch::new();
-    // A key that no configuration has: each command says that it has read the file.
+    // The unknown key shows that the command has read the file.
     scratch.write("rig.toml", "[nowhere]\nkey = 1\n");
     scratch.write("points.csv", "");
     for command in [
@@ -40,12 +40,12 @@ fn every_command_takes_its_configuration_as_argument_or_flag() {
             said.stderr
         });
         assert_eq!(said[0], said[1], "{command:?}");
-        // `stop` needs [can] and the nodes alone, and misses those.
+        // `stop` reads [can] and the nodes only, and the file has none.
         let expected = if command.contains(&"stop") { "stage.insertion.node" } else { "rig.toml:" };
         assert!(said[0].contains(expected), "{command:?}: {}", said[0]);
         let twice = [&named[..], &["rig.toml"]].concat();
         let said = needle_bench(&scratch, &twice);
-        // Where the first argument is one of many files, the TOML file among them is the configuration.
+        // A command that takes many files finds its configuration among them by the extension.
         let refused = ["cannot be used with", "two configurations, rig.toml and rig.toml"];
         assert!(refused.iter().any(|text| said.stderr.contains(text)), "{}", said.screen());
     }
@@ -86,10 +86,10 @@ fn completions_and_man_pages_name_the_commands() {
 #[test]
 fn generate_exits_3_on_a_full_device_and_0_on_a_closed_pipe() {
     let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
-    let full = fs::OpenOptions::new().write(true).open("/dev/full").expect("a full device");
+    let full = fs::OpenOptions::new().write(true).open("/dev/full").expect("/dev/full");
     let status = command.args(["generate", "bash"]).stdout(full).status().expect("it starts");
     assert_eq!(status.code(), Some(3));
-    // As `needle-bench generate bash | true`: the reader has read all that it wanted.
+    // As in `needle-bench generate bash | true`.
     let (reader, closed) = std::io::pipe().expect("a pipe");
     drop(reader);
     let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
@@ -97,18 +97,20 @@ fn generate_exits_3_on_a_full_device_and_0_on_a_closed_pipe() {
     assert_eq!(status.code(), Some(0));
 }
 
-/// With what a help is for: something to copy.
+/// The commands that this help lists, without `help`.
+fn commands_in(help: &str) -> Vec<&str> {
+    let commands = help.split_once("Commands:\n").expect("a list of commands").1;
+    let lines = commands.lines().take_while(|line| !line.is_empty());
+    let lines = lines.filter(|line| line.starts_with("  ") && !line.starts_with("   "));
+    let names = lines.filter_map(|line| line.split_whitespace().next());
+    names.filter(|name| *name != "help").collect()
+}
+
 #[test]
 fn the_help_of_each_command_has_an_example() {
     let scratch = Scratch::new();
     let help = needle_bench(&scratch, &["--help"]).stdout;
-    let commands = help.lines().skip_while(|line| *line != "Commands:").skip(1);
-    let names: Vec<&str> = commands
-        .take_while(|line| !line.is_empty())
-        .filter(|line| line.starts_with("  ") && !line.starts_with("   "))
-        .filter_map(|line| line.split_whitespace().next())
-        .filter(|name| *name != "help")
-        .collect();
+    let names = commands_in(&help);
     assert!(names.len() >= 12, "{names:?}");
     for name in names {
         let help = needle_bench(&scratch, &[name, "--help"]).stdout;
@@ -116,17 +118,13 @@ fn the_help_of_each_command_has_an_example() {
     }
 }
 
-/// The summary of `stage` names all that it does.
 #[test]
 fn the_summary_of_stage_names_every_operation() {
     let help = needle_bench(&Scratch::new(), &["stage", "--help"]).stdout;
-    let (summary, rest) = help.split_once("Usage:").expect("a summary");
-    let commands = rest.split_once("Commands:\n").expect("commands").1;
-    let names = commands.lines().take_while(|line| !line.is_empty());
-    let names = names.filter(|line| line.starts_with("  ") && !line.starts_with("   "));
-    let names: Vec<&str> = names.filter_map(|line| line.split_whitespace().next()).collect();
+    let (summary, _) = help.split_once("Usage:").expect("a summary");
+    let names = commands_in(&help);
     assert!(names.contains(&"reset"), "{help}");
-    for name in names.iter().filter(|name| **name != "help") {
+    for name in names {
         assert!(summary.contains(name), "{name}: {summary}");
     }
 }
@@ -141,7 +139,7 @@ fn review_without_a_path_shows_the_newest_run() {
         let set = format!("name={name}");
         let run = ["run", "-q", "--set", "insertion.depth_mm=2", "--set", &set];
         assert_eq!(needle_bench(&scratch, &run).status, 0);
-        // Folders are named by the second.
+        // The name of a folder has the second at which the run started.
         std::thread::sleep(std::time::Duration::from_millis(1100));
     }
     let json = needle_bench(&scratch, &["review", "--json"]).json();

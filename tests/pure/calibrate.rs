@@ -1,11 +1,11 @@
-//! `needle-bench calibrate`, its results in use, and the presets of the emulated tracker.
+//! `needle-bench calibrate`, the use of its results, and the presets of the emulated tracker.
 
 use crate::support::program::{Said, Scratch, needle_bench, refusals};
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
 const FIDUCIALS: &str = "x_tracker_mm,y_tracker_mm,z_tracker_mm,x_bench_mm,y_bench_mm,z_bench_mm\n";
-/// On the bench, mm.
+/// The fiducials on the bench, mm.
 const POINTS_MM: [[f64; 3]; 6] = [
     [-60.0, -60.0, 0.0],
     [60.0, -60.0, 0.0],
@@ -15,8 +15,8 @@ const POINTS_MM: [[f64; 3]; 6] = [
     [40.0, 0.0, 120.0],
 ];
 
-/// The points seen by a tracker that stands at (100, −50, 20), a quarter turned about z, with
-/// errors of at most `error_mm`.
+/// The fiducials as a tracker at (100, −50, 20), turned by 90° about z, sees them, with errors of at most
+/// `error_mm`.
 fn fiducials(error_mm: f64) -> String {
     let mut csv = FIDUCIALS.to_owned();
     for (n, [x, y, z]) in (0i32..).zip(POINTS_MM) {
@@ -45,7 +45,7 @@ fn calibrate(scratch: &Scratch, arguments: &[&str]) -> Said {
     needle_bench(scratch, &[&["calibrate"], arguments].concat())
 }
 
-/// The configuration as used.
+/// The configuration that `check --print` gives with these arguments.
 fn printed(scratch: &Scratch, arguments: &[&str]) -> toml::Table {
     let said = needle_bench(scratch, &[&["check", "--print"], arguments].concat());
     assert_eq!(said.status, 0, "{}", said.stderr);
@@ -58,12 +58,7 @@ fn number(config: &toml::Table, path: &str) -> f64 {
     table[key].as_float().unwrap_or_else(|| panic!("{path} is {:?}", table[key]))
 }
 
-fn run_dir(scratch: &Scratch, said: &Said) -> PathBuf {
-    scratch.path().join(said.json()["run_dir"].as_str().expect("a run folder"))
-}
-
-/// From points to a run that knows where its tracker stands: the record has the pose, its error
-/// and its origin, and makes the run again without the file.
+/// The record of the run has the pose, its error and its origin, so it repeats the run without the file.
 #[test]
 fn a_registration_is_computed_used_from_its_file_and_recorded() {
     let scratch = Scratch::new();
@@ -100,17 +95,16 @@ fn a_registration_is_computed_used_from_its_file_and_recorded() {
     ];
     let said = needle_bench(&scratch, &run);
     assert_eq!(said.status, 0, "{}", said.stderr);
-    let dir = run_dir(&scratch, &said);
+    let dir = said.run_dir(&scratch);
     let config = std::fs::read_to_string(dir.join("config.toml")).unwrap();
     assert!(config.contains("[tracker.registration.fit]") && !config.contains("registration_file"));
     std::fs::remove_file(folder.join("r.toml")).unwrap();
     let again =
         needle_bench(&scratch, &["run", dir.join("config.toml").to_str().unwrap(), "--json"]);
     let steps = |dir: PathBuf| std::fs::read_to_string(dir.join("steps.csv")).unwrap();
-    assert_eq!(steps(dir), steps(run_dir(&scratch, &again)));
+    assert_eq!(steps(dir), steps(again.run_dir(&scratch)));
 }
 
-/// The same points in the configuration itself give the same pose.
 #[test]
 fn fiducials_in_the_configuration_give_the_same_run_as_the_file() {
     let scratch = Scratch::new();
@@ -127,7 +121,7 @@ fn fiducials_in_the_configuration_give_the_same_run_as_the_file() {
     }
     scratch.write("rig.toml", &config);
     scratch.write("points.csv", &csv);
-    // The file holds the error that the pose has as deep as the run goes.
+    // The error of the pose in the file depends on the depth.
     let depth = "insertion={ depth_mm = 10, plane_out_of_reach = \"insert\" }";
     let written = ["registration", "points.csv", "--out", "r.toml", "--set", depth];
     assert_eq!(calibrate(&scratch, &written).status, 0);
@@ -135,7 +129,7 @@ fn fiducials_in_the_configuration_give_the_same_run_as_the_file() {
         let common = ["run", "--json", "-q", "--set", depth];
         let said = needle_bench(&scratch, &[&common, arguments].concat());
         assert_eq!(said.status, 0, "{}", said.stderr);
-        let text = std::fs::read_to_string(run_dir(&scratch, &said).join("steps.csv")).unwrap();
+        let text = std::fs::read_to_string(said.run_dir(&scratch).join("steps.csv")).unwrap();
         let last = text.lines().last().unwrap().to_owned();
         last.split(',').filter_map(|field| field.parse().ok()).collect::<Vec<f64>>()
     };
@@ -176,7 +170,6 @@ fn bad_fiducials_are_refused_with_what_to_do() {
     insta::assert_snapshot!(screens);
 }
 
-/// A calibration is not written over another one.
 #[test]
 fn a_calibration_is_not_overwritten() {
     let scratch = Scratch::new();
@@ -228,7 +221,7 @@ fn the_tip_on_the_sensor_is_computed_and_used() {
     }
     assert!(number(&config, "tracker.tip_tilt.pitch_deg").abs() < 1e-6);
     assert_eq!(config["tracker"]["tip_fit"]["points"].as_integer(), Some(90));
-    // The sensor may be ahead of the tip.
+    // With a negative distance the sensor is ahead of the tip.
     let behind = calibrate(&scratch, &["tip", "turn.csv", "--along-mm", "-7", "--json"]);
     assert_eq!(behind.status, 0, "{}", behind.stderr);
     let behind = behind.json();
@@ -236,7 +229,7 @@ fn the_tip_on_the_sensor_is_computed_and_used() {
     assert!((along_mm.unwrap() + 7.0).abs() < 1e-9, "{behind}");
 }
 
-/// Without orientations the circle is told, and nothing that a run could not apply is written.
+/// A run could not apply such an offset, so the result is 0.
 #[test]
 fn without_orientations_the_tip_offset_is_reported_but_not_corrected() {
     let scratch = Scratch::new();
@@ -251,7 +244,6 @@ fn without_orientations_the_tip_offset_is_reported_but_not_corrected() {
     insta::assert_snapshot!(screens);
 }
 
-/// A preset sets what it is made of, and each of that can be set still.
 #[test]
 fn given_settings_override_a_preset_of_the_emulated_tracker() {
     let scratch = Scratch::new();
@@ -267,7 +259,7 @@ fn given_settings_override_a_preset_of_the_emulated_tracker() {
     insta::assert_snapshot!(refusals(&scratch, &[&unknown]));
 }
 
-/// Every preset steers, the bench being told latency, kind and noise.
+/// The bench knows the preset's kind, latency and noise.
 #[test]
 fn a_run_completes_with_every_tracker_preset() {
     let scratch = Scratch::new();

@@ -1,11 +1,11 @@
-//! `needle-bench calibrate needle`: from recorded insertions to a configuration that evaluates them.
+//! `needle-bench calibrate needle`: recorded insertions become a configuration.
 
 use crate::support::program::{Scratch, needle_bench, refusals};
 use crate::support::recording::{recording, to_and_fro};
 use needle_bench::needle::{Needle, Torsion, TorsionConfig};
 
-/// Four insertions of a needle that bends at 0.012 per mm, its tip 6 mm ahead, on a shaft that
-/// creeps.
+/// Four insertions of a needle with a curvature of 0.012 per mm, its tip 6 mm ahead, and a shaft that creeps
+/// in torsion.
 fn recorded(scratch: &Scratch) {
     let needle = Needle::new(0.012).unwrap().with_tip_ahead(6.0).unwrap();
     let creeping = TorsionConfig {
@@ -41,7 +41,7 @@ fn a_calibrated_needle_evaluates_an_insertion_that_was_left_out() {
     near(&json["evaluation"]["bend_axis"][0], 1.0, 1e-3);
     near(&json["needle"]["fit"]["insertions"], 3.0, 0.1);
 
-    // The result is a configuration, provenance included, and good for the insertion left out.
+    // The result is a configuration and fits the insertion that was left out.
     let said = needle_bench(
         &scratch,
         &[
@@ -69,6 +69,8 @@ fn a_calibration_is_not_overwritten() {
     scratch.write("needle.toml", "mine");
     let arguments = ["calibrate", "needle", "a.csv", "b.csv", "c.csv", "--out", "needle.toml"];
     insta::assert_snapshot!(refusals(&scratch, &[&arguments]));
+    let kept = std::fs::read_to_string(scratch.path().join("needle.toml")).unwrap();
+    assert_eq!(kept, "mine");
 }
 
 #[test]
@@ -82,7 +84,7 @@ fn too_few_or_unusable_recordings_are_refused_with_the_reason() {
         &scratch,
         &[
             &["calibrate", "needle", "a.csv", "b.csv"],
-            // One recording taken three times would be known without any error.
+            // One recording given three times would have no scatter.
             &["calibrate", "needle", "a.csv", "a.csv", "a.csv"],
             &["calibrate", "needle", "a.csv", "b.csv", "again.csv"],
             &["calibrate", "needle", "a.csv", "plain.csv"],

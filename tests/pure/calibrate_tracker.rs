@@ -1,4 +1,4 @@
-//! `needle-bench calibrate tracker`, and its result in use.
+//! `needle-bench calibrate tracker`, and the use of its result.
 
 use crate::support::needed::data;
 use crate::support::program::{Scratch, needle_bench};
@@ -6,7 +6,7 @@ use nalgebra::Vector3;
 use needle_bench::emulator::{CorrelatedNoise, TrackerModel, WhiteNoise};
 use std::time::Duration;
 
-/// A tracker at rest for a minute, half of whose variance is correlated over 0.2 s.
+/// A tracker with half of its variance correlated over 0.2 s.
 fn model() -> TrackerModel {
     TrackerModel {
         noise: WhiteNoise::Gaussian(0.4),
@@ -22,7 +22,7 @@ fn positions() -> impl Iterator<Item = (u64, Vector3<f64>)> {
     (0..2400).map(|k| (k, Vector3::new(100.0, -20.0, 5.0) + model().noise_mm(k)))
 }
 
-/// As `tracker record` writes it.
+/// A minute at rest, as `tracker record` writes it.
 fn csv() -> String {
     let rows = positions().map(|(k, p_mm)| {
         let ns = k * 25_000_000;
@@ -45,7 +45,7 @@ fn ndjson(tool: &str) -> String {
     positions().map(line).collect::<Vec<_>>().join("\n")
 }
 
-/// What is measured is what is made, and goes into a configuration as it is printed.
+/// The printed result is a configuration, and has the noise of the model within its standard errors.
 #[test]
 fn the_noise_of_a_recording_becomes_a_configuration() {
     let scratch = Scratch::new();
@@ -76,7 +76,7 @@ fn the_noise_of_a_recording_becomes_a_configuration() {
     let (of_csv, of_lines) =
         (noise["white_sd_mm"].as_float(), &json["tracker"]["noise"]["white_sd_mm"]);
     assert!((of_csv.unwrap() - of_lines.as_f64().unwrap()).abs() < 1e-5);
-    assert_eq!(json["fit"]["latency_jitter_ms"], serde_json::Value::Null, "it has no stamps");
+    assert_eq!(json["fit"]["latency_jitter_ms"], serde_json::Value::Null, "without stamps");
     assert!(json["fit"]["axes"][2]["drift_mm_per_min"]["error"].as_f64().unwrap() > 0.0);
 }
 
@@ -102,8 +102,7 @@ fn a_file_that_is_not_a_recording_at_rest_is_refused_with_the_reason() {
     insta::assert_snapshot!(screens.concat());
 }
 
-/// A recorded closed-loop placement at two rows a second: half of them repeat a frozen tip, and the
-/// rest are too few.
+/// A real recording at two rows a second: two thirds of the rows repeat a frozen tip, and the others are too few.
 #[test]
 fn a_recording_of_a_frozen_stream_is_too_short() {
     let Some(path) = data("tracker-recordings/phantomA_closedloop_03.csv") else { return };

@@ -1,13 +1,10 @@
-//! `can.log` in the eyes of a program nobody here wrote: Wireshark's CANopen dissector names every
-//! frame of a run as CiA 301 has it.
-//!
-//! tshark is Debian's.
+//! Wireshark's CANopen dissector reads `can.log` and names every frame as CiA 301 does.
 
 use crate::support::needed::skip;
 use crate::support::program::{Scratch, needle_bench, repository};
 use std::process::Command;
 
-/// What tshark says of a frame of the predefined connection set: the beginning of its summary.
+/// How tshark's summary of a frame of the predefined connection set begins.
 fn expected(frame: &str) -> &'static str {
     let (id, data) = frame.split_once('#').expect("id#data");
     let id = u16::from_str_radix(id, 16).expect("a base identifier");
@@ -29,7 +26,7 @@ fn expected(frame: &str) -> &'static str {
         (0x700, _, "04") => "NMT Error Control: Stopped",
         (0x700, _, "05") => "NMT Error Control: Operational",
         (0x700, _, "7F") => "NMT Error Control: Pre-operational",
-        _ => panic!("no frame of a run: {frame}"),
+        _ => panic!("a run sends no such frame: {frame}"),
     }
 }
 
@@ -59,13 +56,15 @@ fn wiresharks_dissector_names_every_frame() {
     tshark.args(["-T", "fields", "-e", "can.id", "-e", "_ws.col.Info"]);
     let output = match tshark.output() {
         Ok(output) => output,
-        Err(error) => return skip(&format!("tshark: {error}"), "install it"),
+        Err(error) => {
+            return skip(&format!("tshark: {error}"), "install it (Debian package tshark)");
+        }
     };
     let text = String::from_utf8(output.stdout).expect("UTF-8");
     assert_eq!(text.lines().count(), lines.len());
-    for (line, said) in lines.iter().zip(text.lines()) {
+    for (line, dissected) in lines.iter().zip(text.lines()) {
         let frame = line.split(' ').nth(2).expect("a frame");
-        let (_, info) = said.split_once('\t').expect("two fields");
+        let (_, info) = dissected.split_once('\t').expect("two fields");
         assert!(info.starts_with(expected(frame)), "{frame}: {info}");
         assert!(!info.contains("Malformed"), "{frame}: {info}");
     }

@@ -1,4 +1,4 @@
-//! The command line as its user meets it: whole runs, exit statuses, messages.
+//! The command line: whole runs, exit statuses, messages.
 
 use crate::support::program::{Scratch, needle_bench, refusals, repository};
 use serde_json::Value;
@@ -15,9 +15,8 @@ const FILES: [&str; 7] = [
     "run.rrd",
 ];
 
-fn run_dir(scratch: &Scratch, json: &Value) -> std::path::PathBuf {
-    scratch.path().join(json["run_dir"].as_str().expect("a run folder"))
-}
+const RUN_5_MM: [&str; 4] =
+    ["run", "--json", "--set", "insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }"];
 
 #[test]
 fn a_console_needs_a_terminal() {
@@ -26,7 +25,7 @@ fn a_console_needs_a_terminal() {
     assert_eq!(said.status, 2);
     assert!(said.stderr.contains("--console needs a terminal"), "{}", said.stderr);
     assert!(!scratch.path().join("runs").exists());
-    // Before anything else: a preflight takes seconds.
+    // This is checked before the preflight, which takes seconds.
     let rig = repository("bench-config/rig-epos4.toml");
     let said = needle_bench(&scratch, &["run", &rig, "--rehearse", "--console"]);
     assert!(said.stderr.starts_with("error: --console needs a terminal"), "{}", said.stderr);
@@ -84,11 +83,11 @@ fn run_json_has_its_documented_keys() {
             assert!(json[key][coordinate].is_f64(), "{key}.{coordinate} in {json}");
         }
     }
-    assert!(run_dir(&scratch, &json).is_dir());
+    assert!(said.run_dir(&scratch).is_dir());
 }
 
-/// A plane that the depth cannot reach is refused before the axes have power, with the key that lets
-/// the run pass; it then ends by saying how far off it is.
+/// The refusal comes before power and names the key that allows the run, which then ends with the distance from
+/// the plane.
 #[test]
 fn a_plane_out_of_reach_is_refused_or_reported_at_the_end() {
     let scratch = Scratch::new();
@@ -105,7 +104,7 @@ fn a_plane_out_of_reach_is_refused_or_reported_at_the_end() {
         assert!(reason.ends_with("; see insertion.plane_out_of_reach"), "{reason}");
         assert!(reason.chars().count() <= 200, "{reason}");
         assert_eq!(json["emulated"]["end"]["insertion_true_mm"], 0.0);
-        let events = std::fs::read_to_string(run_dir(&scratch, &json).join("events.log")).unwrap();
+        let events = std::fs::read_to_string(said.run_dir(&scratch).join("events.log")).unwrap();
         assert!(!events.contains("operation enabled"), "{events}");
     }
     let insert = "insertion={ depth_mm = 10, plane_out_of_reach = \"insert\" }";
@@ -122,39 +121,31 @@ fn a_plane_out_of_reach_is_refused_or_reported_at_the_end() {
     assert!(json["plane_missed_by_mm"].as_f64().is_some_and(|mm| mm > 4.0), "{json}");
 }
 
-/// The same seed gives the same steps to the last bit; another seed gives others.
+/// To the last bit. Another seed gives another run.
 #[test]
 fn a_seed_repeats_a_run() {
     let scratch = Scratch::new();
     let steps = |seed: &str| {
         let depth = "insertion={ depth_mm = 40, plane_out_of_reach = \"insert\" }";
         let said = needle_bench(&scratch, &["run", "--json", "-q", "--seed", seed, "--set", depth]);
-        std::fs::read_to_string(run_dir(&scratch, &said.json()).join("steps.csv")).unwrap()
+        std::fs::read_to_string(said.run_dir(&scratch).join("steps.csv")).unwrap()
     };
     let first = steps("7");
     assert_eq!(first, steps("7"));
     assert_ne!(first, steps("8"));
 }
 
-/// Two runs within one second have a folder each.
+/// The name of a folder has the second at which its run started; these two start within one second.
 #[test]
 fn a_run_folder_is_never_overwritten() {
     let scratch = Scratch::new();
-    let arguments = [
-        "run",
-        "--json",
-        "-q",
-        "--set",
-        "insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }",
-    ];
-    let first = run_dir(&scratch, &needle_bench(&scratch, &arguments).json());
+    let first = needle_bench(&scratch, &RUN_5_MM).run_dir(&scratch);
     let before = std::fs::read(first.join("steps.csv")).unwrap();
-    let second = run_dir(&scratch, &needle_bench(&scratch, &arguments).json());
+    let second = needle_bench(&scratch, &RUN_5_MM).run_dir(&scratch);
     assert_ne!(first, second);
     assert_eq!(std::fs::read(first.join("steps.csv")).unwrap(), before);
 }
 
-/// The configuration in the run folder makes the same run again.
 #[test]
 fn the_recorded_configuration_repeats_the_run() {
     let scratch = Scratch::new();
@@ -167,10 +158,9 @@ fn the_recorded_configuration_repeats_the_run() {
         "--set",
         "emulator.seed=5",
     ];
-    let first = run_dir(&scratch, &needle_bench(&scratch, &arguments).json());
+    let first = needle_bench(&scratch, &arguments).run_dir(&scratch);
     let config = first.join("config.toml").display().to_string();
-    let second =
-        run_dir(&scratch, &needle_bench(&scratch, &["run", &config, "--json", "-q"]).json());
+    let second = needle_bench(&scratch, &["run", &config, "--json", "-q"]).run_dir(&scratch);
     let read = |dir: &Path| std::fs::read_to_string(dir.join("steps.csv")).unwrap();
     assert_eq!(read(&first), read(&second));
 }
@@ -178,7 +168,7 @@ fn the_recorded_configuration_repeats_the_run() {
 #[test]
 fn a_stopped_run_ends_with_its_reason_and_exits_1() {
     let scratch = Scratch::new();
-    // The bevel has to be turned back by more than that to come into the plane.
+    // To come into the plane the base has to turn further back than this limit.
     let said = needle_bench(&scratch, &["run", "-q", "--set", "stage.rotation.min_deg=-10"]);
     assert_eq!(said.status, 1, "{}{}", said.stdout, said.stderr);
     let last = said.stdout.lines().last().unwrap();
@@ -192,7 +182,6 @@ fn a_stopped_run_ends_with_its_reason_and_exits_1() {
     assert_eq!(Some(last.trim_start_matches("stopped: ")), manifest["stop_reason"].as_str());
 }
 
-/// Bad input: what is said, and that nothing was begun.
 #[test]
 fn bad_configurations_are_refused_with_the_key() {
     let scratch = Scratch::new();
@@ -244,7 +233,7 @@ fn bad_arguments_are_refused_with_the_argument() {
     insta::assert_snapshot!(refusals(&scratch, commands));
 }
 
-/// An argument that is no text is an error of usage, whatever else is mistyped.
+/// It is bad usage, also after a mistyped command.
 #[cfg(unix)]
 #[test]
 fn an_argument_that_is_not_utf_8_is_refused() {
@@ -254,16 +243,16 @@ fn an_argument_that_is_not_utf_8_is_refused() {
     assert_eq!(command.output().unwrap().status.code(), Some(2));
 }
 
-/// However long a list of what is allowed, or a reason, is.
+/// Commands with long reasons and long lists of allowed values.
 #[test]
 fn every_line_of_a_message_is_under_200_characters() {
     let scratch = Scratch::new();
-    let silent = "emulator.fault=[{ kind = \"emergency-stop\", at_mm = 1 }]";
+    let fault = "emulator.fault=[{ kind = \"emergency-stop\", at_mm = 1 }]";
     let far = ["--set", "emulator.start.x_mm=100", "--set", "insertion.depth_mm=100"];
     for arguments in [
         &["check", "--set", "emulator.fault=[{ kind = \"x\" }]"][..],
         &["check", "--set", "tracker.latency_ms=600"],
-        &["run", "--set", silent],
+        &["run", "--set", fault],
         &[&["run"][..], &far].concat(),
         &["stop", "--set", "can.interface=can9", "--set", "stage.insertion.node=1"],
         &["stage", "--virtual", "status"],
@@ -275,7 +264,7 @@ fn every_line_of_a_message_is_under_200_characters() {
     }
 }
 
-/// Of a file that is none of text the first byte that shows it is named.
+/// The message names the first byte that is not text.
 #[test]
 fn a_binary_file_is_refused_as_configuration() {
     let scratch = Scratch::new();
@@ -296,7 +285,7 @@ fn a_record_folder_that_is_a_file_is_refused() {
     insta::assert_snapshot!(said.screen());
 }
 
-/// A limit on the law that does not steer limits nothing.
+/// A limit of a law that does not steer has no effect.
 #[test]
 fn a_section_without_effect_is_warned_about() {
     let scratch = Scratch::new();
@@ -313,7 +302,7 @@ fn a_section_without_effect_is_warned_about() {
     assert_eq!(needle_bench(&scratch, &chosen).stderr, "");
 }
 
-/// With `--json` there is one object on stdout even where nothing came of the command.
+/// One object on stdout.
 #[test]
 fn json_is_printed_for_failed_commands_too() {
     let scratch = Scratch::new();
@@ -337,20 +326,13 @@ fn json_is_printed_for_failed_commands_too() {
     insta::assert_snapshot!(screens);
 }
 
-/// Neither a stderr that takes nothing nor a stdout that nobody reads stops a run.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_full_stderr_or_a_closed_stdout_does_not_stop_a_run() {
     let scratch = Scratch::new();
     let run = || {
         let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
-        command.args([
-            "run",
-            "--json",
-            "--set",
-            "insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }",
-        ]);
-        command.current_dir(scratch.path());
+        command.args(RUN_5_MM).current_dir(scratch.path());
         command
     };
     let full = std::fs::File::options().write(true).open("/dev/full").unwrap();
@@ -364,22 +346,17 @@ fn a_full_stderr_or_a_closed_stdout_does_not_stop_a_run() {
     assert_eq!(unread.wait().unwrap().code(), Some(0));
 }
 
-/// A stderr that is never read, full from the start: the run ends all the same.
+/// The pipe is full from the start, and nothing reads it.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_blocked_stderr_does_not_hold_a_run_up() {
     use std::io::Write as _;
     let scratch = Scratch::new();
     let (unread, mut writer) = std::io::pipe().unwrap();
-    // A pipe holds 64 KiB until it blocks.
+    // The capacity of a pipe is 64 KiB.
     writer.write_all(&[b'.'; 1 << 16]).unwrap();
     let status = Command::new(env!("CARGO_BIN_EXE_needle-bench"))
-        .args([
-            "run",
-            "--json",
-            "--set",
-            "insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }",
-        ])
+        .args(RUN_5_MM)
         .current_dir(scratch.path())
         .stdout(Stdio::null())
         .stderr(writer)
@@ -401,7 +378,7 @@ fn the_virtual_stage_refuses_a_duration_out_of_range() {
     }
 }
 
-/// An interface that is not there is the environment's failure: nothing is begun.
+/// A failure of the environment (exit 3), before any run folder.
 #[test]
 fn an_absent_can_interface_is_reported_with_the_next_step() {
     let scratch = Scratch::new();
@@ -411,7 +388,7 @@ fn an_absent_can_interface_is_reported_with_the_next_step() {
             command.iter().copied().chain(["--set", "can.interface=vcan97"]).collect();
         let said = needle_bench(&scratch, &arguments);
         assert_eq!(said.status, 3, "{}", said.stderr);
-        // With CAN in the kernel the interface is missing, without CAN the kernel's support is.
+        // The message differs if the kernel has no CAN support.
         assert!(said.stderr.contains("vcan97"), "{}", said.stderr);
         assert!(said.stderr.contains("sudo "), "{}", said.stderr);
         assert!(!scratch.path().join("runs").exists());
@@ -434,7 +411,7 @@ fn check_passes_on_the_emulated_stage_and_prints_what_it_read() {
     assert_eq!(printed.stdout, again.stdout);
 }
 
-/// A rig's configuration as it comes: readable, and refused until the tracker is registered.
+/// The rig's configuration as shipped.
 #[test]
 fn a_rig_without_registration_is_refused() {
     let scratch = Scratch::new();
@@ -443,7 +420,6 @@ fn a_rig_without_registration_is_refused() {
     assert!(said.stderr.contains("tracker.registration"), "{}", said.stderr);
 }
 
-/// A script says that it has read the list.
 #[test]
 fn a_run_on_hardware_without_a_terminal_needs_yes_and_a_preflight_that_passes() {
     let scratch = Scratch::new();
@@ -459,17 +435,14 @@ fn a_run_on_hardware_without_a_terminal_needs_yes_and_a_preflight_that_passes() 
         said.stderr
     );
     let said = needle_bench(&scratch, &[&["run", &rig, "--yes", "--json"][..], &sets].concat());
-    assert_eq!(said.status, 3, "a list with a FAIL never moves: {}", said.stderr);
+    assert_eq!(said.status, 3, "{}", said.stderr);
     let json = said.json();
     assert_eq!(json["outcome"], serde_json::Value::Null);
     let checks = json["preflight"].as_array().unwrap();
     for check in checks {
-        let is_told = |key: &str| check[key].as_str().is_some_and(|text| !text.is_empty());
+        let has = |key: &str| check[key].as_str().is_some_and(|text| !text.is_empty());
         let passes = check["verdict"] == "PASS";
-        assert!(
-            is_told("found") && is_told("limit") && (passes || is_told("next_step")),
-            "{check}"
-        );
+        assert!(has("found") && has("limit") && (passes || has("next_step")), "{check}");
     }
     let verdict = |name: &str| {
         let check = checks.iter().find(|check| check["name"] == name);
@@ -482,7 +455,7 @@ fn a_run_on_hardware_without_a_terminal_needs_yes_and_a_preflight_that_passes() 
     assert_eq!(verdict("tip"), "WARN", "the placeholder");
     assert!(said.stderr.ends_with("nothing has moved\n"), "{}", said.stderr);
     assert!(!scratch.path().join("runs").exists());
-    // Looking at it needs no registration; the list says that a run would.
+    // `check` runs without a registration, and lists it as a FAIL.
     let said =
         needle_bench(&scratch, &["check", &rig, "--connect", "--listen", "0.1", sets[2], sets[3]]);
     assert_eq!(said.status, 3, "{}", said.stderr);

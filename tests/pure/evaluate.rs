@@ -1,4 +1,4 @@
-//! `needle-bench evaluate` over recordings: synthetic ones, and real ones where they are at hand.
+//! `needle-bench evaluate` over synthetic recordings, and over real ones if `NEEDLE_DATA` has them.
 
 use crate::support::needed::data;
 use crate::support::program::{Scratch, needle_bench, refusals};
@@ -13,7 +13,7 @@ fn recording() -> String {
 
 const IN_LINE: [&str; 4] =
     ["--set", "evaluation.axis=[0,0,1]", "--set", "evaluation.bend_axis=[1,0,0]"];
-/// What the bench believes of that needle.
+/// The true parameters of that needle.
 const RIGID: [&str; 8] = [
     "--set",
     "needle.curvature_per_mm=0.0125",
@@ -33,7 +33,7 @@ fn a_needle_without_torsion_is_followed_by_all_observers() {
     let mut arguments = vec!["evaluate", "a.csv", "b.csv", "--json"];
     arguments.extend(IN_LINE);
     arguments.extend(RIGID);
-    // As the paper does it: its observer needs some distance between two positions.
+    // The finite differences need some distance between two positions.
     arguments.extend(["--set", "observer.samples=\"one-per-step\""]);
     arguments.extend(["--set", "observer.finite_difference.baseline_mm=2"]);
     let said = needle_bench(&scratch, &arguments);
@@ -45,8 +45,8 @@ fn a_needle_without_torsion_is_followed_by_all_observers() {
     for observer in observers {
         assert!(observer["roll_rms_deg"]["median"].as_f64().unwrap() < 2.0, "{observer}");
         assert!(observer["roll_rms_deg"]["p90"].is_f64());
-        // Only observers that start from the truth predict exactly; the corrected position of the
-        // finite differences is exact, and not what is scored.
+        // The prediction is scored. It is exact for observers that start from the truth, and not for finite
+        // differences.
         let position_mm = observer["position_rms_mm"].as_f64().unwrap();
         let exact = position_mm < 1e-9;
         assert_eq!(exact, observer["observer"] != "finite-difference", "{observer}");
@@ -76,6 +76,7 @@ fn the_observers_never_see_the_recorded_orientation() {
         needle_bench(&scratch, &arguments).json()
     };
     let (with, without) = (evaluate("with.csv"), evaluate("without.csv"));
+    assert!(with["position_rms_mm"].is_f64() && with["roll_rms_deg"]["median"].is_f64(), "{with}");
     assert_eq!(with["position_rms_mm"], without["position_rms_mm"]);
     assert!(without["roll_rms_deg"]["median"].is_null());
 }
@@ -87,7 +88,7 @@ fn a_position_that_is_not_finite_is_refused_with_its_line() {
     insta::assert_snapshot!(refusals(&scratch, &[&["evaluate", "bad.csv"]]));
 }
 
-/// A recording that counts twice would make the figures look surer than they are.
+/// Counted twice, a recording would make the figures look more certain than they are.
 #[test]
 fn a_recording_given_twice_is_refused() {
     let scratch = Scratch::new();
@@ -98,7 +99,6 @@ fn a_recording_given_twice_is_refused() {
     insta::assert_snapshot!(said);
 }
 
-/// No file is a file to evaluate, a folder or a binary neither: bad arguments.
 #[test]
 fn unreadable_files_are_refused_with_their_names() {
     let scratch = Scratch::new();
@@ -108,7 +108,7 @@ fn unreadable_files_are_refused_with_their_names() {
     insta::assert_snapshot!(refusals(&scratch, &files.each_ref().map(|command| &command[..])));
 }
 
-/// A number at the end of what a float holds is an error with its line, and never a hang.
+/// Such a number must not make `evaluate` hang.
 #[test]
 fn huge_numbers_are_refused_with_the_line() {
     let scratch = Scratch::new();
@@ -139,8 +139,7 @@ fn a_byte_order_mark_is_ignored() {
     assert_eq!(said.status, 0, "{}", said.stderr);
 }
 
-/// A needle as in bench-config/recordings.toml, from the start: told, the roll is right, and untold
-/// it is found.
+/// A needle as in bench-config/recordings.toml, evaluated with the roll at the start known and unknown.
 #[test]
 fn an_unknown_roll_at_the_start_is_estimated() {
     let needle = Needle::new(0.0129).unwrap().with_tip_ahead(6.6).unwrap();
@@ -159,12 +158,12 @@ fn an_unknown_roll_at_the_start_is_estimated() {
     let json = needle_bench(&scratch, &arguments).json();
     assert!(json["roll_rms_deg"]["median"].as_f64().unwrap() < 1.0, "{json}");
     assert!(json["roll_unknown_rms_deg"]["median"].as_f64().unwrap() < 10.0, "{json}");
-    // The finite differences have no start that they could be told.
+    // The finite differences use no start.
     assert!(json["observers"][2]["roll_unknown_rms_deg"]["median"].is_null());
 }
 
-/// Insertions of a real needle, recorded by others (`$NEEDLE_DATA/steered-insertions`). The paper's
-/// observers know no torsion, and are poor; what is asserted of them is that they give figures.
+/// Insertions of a real needle, recorded by others (`$NEEDLE_DATA/steered-insertions`). The paper's observers
+/// do not model torsion and are poor, so their limits are wide.
 #[test]
 fn real_insertions_are_scored() {
     let Some(insertions) = data("steered-insertions") else { return };

@@ -1,6 +1,6 @@
-//! The exact step against values computed elsewhere by matrix exponentials.
+//! The exact step against values that were computed independently by matrix exponentials.
 //!
-//! Emulator and bench share the kinematics, so an error there would cancel in every other test.
+//! Emulator and bench share the kinematics, so an error in it would cancel in every other test.
 
 use nalgebra::Vector3;
 use needle_bench::geometry::{FixedAngles, Pose};

@@ -1,5 +1,4 @@
-//! Tests that need neither sockets of the host nor its clock: they run side by side, and are as
-//! fast as the machine.
+//! Tests that need neither the host's sockets nor its clock, so all of them run in parallel.
 
 mod architecture;
 mod arguments;

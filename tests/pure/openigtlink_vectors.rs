@@ -1,8 +1,8 @@
 //! The OpenIGTLink codec against messages made by others: the reference library's own fixtures,
-//! and malformed messages with the error each must give.
+//! and malformed messages, each with the error that it must give.
 //!
-//! The vectors are not part of the project. They are read from `$NEEDLE_DATA/openigtlink`
-//! (`../shared/data/openigtlink` unless set): one message a line, `pos|neg name hex`.
+//! The vectors are not part of the project. `$NEEDLE_DATA/openigtlink/vectors.txt` has one message a line:
+//! `pos|neg name hex`.
 
 use crate::support::needed::data;
 use needle_bench::tracker::openigtlink::{
@@ -15,7 +15,7 @@ struct Vector {
     bytes: Vec<u8>,
 }
 
-/// The vectors, where the folder of data is there.
+/// The vectors, or `None` without the folder of data.
 fn vectors() -> Option<Vec<Vector>> {
     let text = std::fs::read_to_string(data("openigtlink/vectors.txt")?).expect("a text");
     let vector = |line: &str| {
@@ -111,7 +111,7 @@ fn malformed_messages_are_refused_with_the_right_error() {
     let Some(vectors) = vectors() else { return };
     let mut refused = 0;
     for Vector { name, bytes, .. } in vectors.iter().filter(|vector| !vector.positive) {
-        // The content of types that are skipped is nobody's business here.
+        // The decoder skips the content of the other types.
         let skipped = name.starts_with("content_")
             && !["content_transform", "content_position"].iter().any(|read| name.starts_with(read));
         let error = match decode(bytes) {
@@ -130,7 +130,6 @@ fn malformed_messages_are_refused_with_the_right_error() {
             () if says(": CRC ") => "[CRC_MISMATCH]",
             () => "[MALFORMED]",
         };
-        // A header of zeros only is refused by its version as soon as it is whole.
         assert!(name.ends_with(right), "{name}: {error}");
     }
     assert!(refused >= 17, "{refused} refused");

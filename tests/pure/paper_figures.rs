@@ -1,4 +1,4 @@
-//! The paper's Figures 3 and 4, from the shipped configurations through the command line.
+//! The paper's Figures 3 and 4, from the shipped configurations.
 
 use crate::support::program::{Scratch, needle_bench, repository};
 use std::collections::HashMap;
@@ -6,7 +6,7 @@ use std::collections::HashMap;
 const COORDINATES: [(&str, &str); 6] =
     [("x", "mm"), ("y", "mm"), ("z", "mm"), ("yaw", "rad"), ("pitch", "rad"), ("roll", "rad")];
 
-/// steps.csv of a run, a map of columns a row.
+/// The rows of a run's steps.csv, each as a map from column to number.
 fn steps(config: &str, sets: &[&str]) -> Vec<HashMap<String, f64>> {
     let scratch = Scratch::new();
     let config = repository(config);
@@ -32,7 +32,7 @@ fn error(row: &HashMap<String, f64>, (name, unit): (&str, &str)) -> f64 {
     if unit == "rad" { needle_bench::units::wrap_angle(difference) } else { difference }
 }
 
-/// Figure 3: without noise all six errors go to zero.
+/// Figure 3.
 #[test]
 fn without_noise_all_six_errors_vanish() {
     let rows = steps("bench-config/paper-fig3.toml", &[]);
@@ -40,20 +40,20 @@ fn without_noise_all_six_errors_vanish() {
     let (first, last) = (&rows[0], &rows[300]);
     assert!((last["insertion_mm"] - 300.0).abs() < 1e-3);
     for angle in [("yaw", "rad"), ("pitch", "rad"), ("roll", "rad")] {
-        assert!(error(first, angle).abs() > 0.05, "the observer starts wrong in {}", angle.0);
+        assert!(error(first, angle).abs() > 0.05, "no error of {} at the start", angle.0);
     }
     for coordinate in COORDINATES {
         let at_end = error(last, coordinate).abs();
         assert!(at_end < 1e-6, "{}: {at_end} {}", coordinate.0, coordinate.1);
     }
-    // A sample each millimetre, taken where the needle stood.
+    // One sample per millimetre, of the true position.
     for (step, row) in rows.iter().enumerate() {
         assert!((row["insertion_mm"] - step as f64).abs() < 1e-3);
         assert!((row["x_meas_mm"] - row["x_true_mm"]).abs() < 1e-9);
     }
 }
 
-/// Figure 4: with ±1 mm uniform noise the run settles and the errors stay small.
+/// Figure 4: uniform noise of ±1 mm.
 #[test]
 fn with_noise_the_run_settles() {
     for seed in 1..=5 {

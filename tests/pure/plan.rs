@@ -1,4 +1,4 @@
-//! `needle-bench plan`: what it prints, and what it refuses.
+//! `needle-bench plan`: its output and its refusals.
 
 use crate::support::program::{Scratch, needle_bench, refusals, repository};
 use flate2::Compression;
@@ -43,7 +43,7 @@ fn json_has_the_plan() {
     let arcs = json["arcs"].as_array().unwrap();
     let length_mm: f64 = arcs.iter().map(|arc| arc["length_mm"].as_f64().unwrap()).sum();
     assert!((length_mm - number("length_mm")).abs() < 1e-9);
-    // In the plane the needle bends to one side or the other: roll 0 bends toward -y.
+    // In the plane the roll is 0 or 180 deg; roll 0 bends toward -y.
     let first = arcs.iter().find(|arc| arc["curvature_per_mm"].as_f64() > Some(0.0)).unwrap();
     let roll_deg = first["roll_deg"].as_f64().unwrap();
     let bends_down = rows[40][1] < 0.0;
@@ -65,7 +65,7 @@ fn no_plan_is_reported_with_the_reason_and_the_nearest_point() {
     assert!(said.stdout.contains("nearest     0.0, "), "{}", said.stdout);
     let (status, json) = plan(&scratch, BALL, &["--set", "goal.expansions_max=2"]);
     assert_eq!((status, &json["status"]), (1, &Value::from("budget")));
-    assert!(json["nearest_distance_mm"].as_f64().unwrap() > 10.0, "not what was not tried: {json}");
+    assert!(json["nearest_distance_mm"].as_f64().unwrap() > 10.0, "{json}");
     let said = needle_bench(&scratch, &["plan", "goal.toml", "--set", "goal.expansions_max=2"]);
     let raise = "raise goal.expansions_max, which is 2\nnearest";
     assert!(
@@ -75,7 +75,8 @@ fn no_plan_is_reported_with_the_reason_and_the_nearest_point() {
     );
 }
 
-/// A run keeps more than the clearance where it can, and refuses a path that cannot keep `goal.reserve_mm`.
+/// A run begins with a path that keeps more than the clearance, and refuses one that cannot keep
+/// `goal.reserve_mm`.
 #[test]
 fn plan_reports_the_reserve_of_a_run() {
     let scratch = Scratch::new();
@@ -92,7 +93,7 @@ fn plan_reports_the_reserve_of_a_run() {
     assert_eq!((status, &json["status"]), (1, &Value::from("none")));
     assert_eq!([&json["run_reserve_mm"], &json["reason"]], [&Value::Null, &refusal.into()]);
     assert!(refusal.contains("none was found that keeps goal.reserve_mm, 40,"), "{refusal}");
-    assert!(json["path"].is_array(), "the path that was found is shown");
+    assert!(json["path"].is_array(), "no path without the reserve: {json}");
     let said = needle_bench(&scratch, &[&["plan", "goal.toml"], &reserve[..]].concat());
     assert!(said.stdout.starts_with(&format!("none: {refusal}\nlength ")), "{}", said.stdout);
     let run = needle_bench(&scratch, &[&["run", "goal.toml", "--json"], &reserve[..]].concat());
@@ -102,8 +103,7 @@ fn plan_reports_the_reserve_of_a_run() {
     assert_eq!([&json["run_reserve_mm"], &json["run_refusal"]], [&Value::Null; 2]);
 }
 
-/// Around obstacles 15% of the curvature are left unused, unless another margin is given; what is refused for it
-/// says so, and a run records it.
+/// Around obstacles a plan leaves 15% of the curvature unused by default. A refusal for that names the key.
 #[test]
 fn the_curvature_margin_is_reported_and_recorded() {
     let scratch = Scratch::new();
@@ -153,7 +153,6 @@ fn the_example_has_a_plan_and_a_picture() {
     }
 }
 
-/// What cannot be meant is bad usage, in `check` as in `plan`.
 #[test]
 fn contradictory_goals_are_refused_with_the_key() {
     let scratch = Scratch::new();
@@ -195,23 +194,23 @@ fn a_plan_needs_a_target() {
     insta::assert_snapshot!(refusals(&scratch, &[&["plan", "--set", "goal.kind=plane"]]));
 }
 
-/// Where a header has its units (`xyzt_units`).
+/// The offset of `xyzt_units` in a header.
 const UNITS: usize = 123;
 
-/// An image of `size` voxels of `spacing_mm` with the `values`, in the single-file form of NIfTI-1.
+/// A NIfTI-1 image in one file: `size` voxels of `spacing_mm` with these `values`.
 fn nifti(size: [u16; 3], spacing_mm: [f32; 3], values: &[u8]) -> Vec<u8> {
     let mut bytes = vec![0; 352];
     let mut put = |at: usize, value: &[u8]| bytes[at..at + value.len()].copy_from_slice(value);
     put(0, &348i32.to_le_bytes());
     let dim = [3, size[0], size[1], size[2], 1, 1, 1, 1];
     dim.iter().enumerate().for_each(|(i, count)| put(40 + 2 * i, &count.to_le_bytes()));
-    // Unsigned bytes.
+    // Type of the voxels: unsigned bytes.
     put(70, &2i16.to_le_bytes());
     put(72, &8i16.to_le_bytes());
     let sides = [1.0, spacing_mm[0], spacing_mm[1], spacing_mm[2]];
     sides.iter().enumerate().for_each(|(i, side)| put(76 + 4 * i, &side.to_le_bytes()));
     put(108, &352f32.to_le_bytes());
-    // mm.
+    // Unit: mm.
     put(UNITS, &[2]);
     put(344, b"n+1\0");
     bytes.extend(values);
@@ -240,7 +239,8 @@ fn a_path_keeps_clear_of_a_mask() {
     for [_, y, z] in rows.iter().filter(|row| (54.5..64.5).contains(&row[2])) {
         assert!(y.abs() >= 7.0, "{y} at {z}");
     }
-    // However large the workspace, what is drawn is the mask: 20 by 10 mm from above, 10 by 10 from the side.
+    // The picture shows the mask in the size of the mask (20 by 10 mm from above, 10 by 10 from the side), however
+    // large the workspace is.
     let large = "goal.workspace_mm={ min=[-1000, -1000, 0], max=[1000, 1000, 1000] }";
     let drawn = ["plan", "goal.toml", "--out", "mask.svg", "--set", large];
     let said = needle_bench(&scratch, &drawn);
@@ -248,7 +248,7 @@ fn a_path_keeps_clear_of_a_mask() {
     let svg = std::fs::read_to_string(scratch.path().join("mask.svg")).unwrap();
     let squares = svg.matches("<polygon").count();
     assert!((25 + 50..=36 + 66).contains(&squares), "{squares} squares of 2 mm");
-    // A run reads it as well, and a replay again.
+    // A run and its replay read the mask too.
     let start = "emulator.start={ x_mm=0, y_mm=0, z_mm=0, yaw_deg=0, pitch_deg=0, roll_deg=0 }";
     let fast = "insertion.speed_mm_per_s=5";
     let known = "observer.invariant.start_sd={ yaw_deg=3, pitch_deg=3, roll_deg=5 }";
@@ -310,7 +310,7 @@ fn a_file_that_is_not_a_mask_is_refused() {
     insta::assert_snapshot!(screens);
 }
 
-/// A wrong checksum, and a file that was cut after its voxels.
+/// With a wrong checksum, and cut before the checksum.
 #[test]
 fn a_damaged_compressed_mask_is_refused() {
     let scratch = Scratch::new();

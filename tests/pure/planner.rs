@@ -1,4 +1,4 @@
-//! The planner against an exhaustive search, on planar scenes of circles and rectangles.
+//! The planner against an exhaustive search, in planar scenes of circles and rectangles.
 
 use crate::support::program::repository;
 use nalgebra::Vector3;
@@ -9,11 +9,11 @@ const SIDE_MM: f64 = 150.0;
 const RADIUS_MM: f64 = 50.0;
 const CLEARANCE_MM: f64 = 2.0;
 const TOLERANCE_MM: f64 = 3.0;
-/// The longest path looked for.
+/// The longest path that the search allows.
 const LENGTH_MAX_MM: f64 = 300.0;
 /// A path may be this much longer than the shortest of the exhaustive search.
 const LONGER_MAX: f64 = 1.05;
-/// Scenes have no depth: their obstacles reach this far out of the plane.
+/// The obstacles of a planar scene extend this far out of the plane.
 const FAR_MM: f64 = 1000.0;
 
 fn scenes(file: &str) -> Vec<Value> {
@@ -26,7 +26,7 @@ fn number(value: &Value, key: &str) -> f64 {
     value[key].as_f64().unwrap_or_else(|| panic!("{key} in {value}"))
 }
 
-/// The scene's x and y are y and z of the plane.
+/// The scene's x and y are the planner's y and z.
 fn obstacle(obstacle: &Value) -> Obstacle {
     let number = |key| number(obstacle, key);
     match obstacle["type"].as_str() {
@@ -42,7 +42,7 @@ fn obstacle(obstacle: &Value) -> Obstacle {
     }
 }
 
-/// Distance of (y, z) to an obstacle of the scene, by other formulas than the planner's.
+/// Distance of (y, z) to an obstacle of the scene, computed independently of the planner.
 fn distance_mm(obstacle: &Value, point: &Vector3<f64>) -> f64 {
     let number = |key| number(obstacle, key);
     match obstacle["type"].as_str() {
@@ -57,7 +57,7 @@ fn distance_mm(obstacle: &Value, point: &Vector3<f64>) -> f64 {
     }
 }
 
-/// The planner's answer to a scene as a line of the table, after its path has been checked.
+/// Checks the planner's answer to a scene, and gives it as a line of the table.
 fn line(scene: &Value) -> String {
     let obstacles = scene["obstacles"].as_array().unwrap();
     let workspace = Workspace {
@@ -106,7 +106,7 @@ fn line(scene: &Value) -> String {
     }
     assert!(clearance_mm >= CLEARANCE_MM - 1e-3, "{name}: {clearance_mm}");
     assert!((path.distance_mm(&world) - clearance_mm).abs() < 0.05, "{name}: {clearance_mm}");
-    // Three points half a millimetre apart turn by at most half a millimetre of the tightest circle.
+    // Over half a millimetre the path turns no more than the tightest circle does.
     let steps: Vec<Vector3<f64>> = points.windows(2).map(|pair| pair[1] - pair[0]).collect();
     let heading = problem.start.heading;
     assert!(steps[0].angle(&heading) <= 0.25 / RADIUS_MM + 1e-6, "{name}: the first heading");
@@ -127,7 +127,7 @@ fn the_scenes_are_solved_like_the_exhaustive_search() {
     insta::assert_snapshot!(table);
 }
 
-/// Scenes that were made by `exhaustive.py`, and searched by it.
+/// `exhaustive.py` made these scenes and searched them.
 #[test]
 fn scenes_at_random_are_solved_like_the_exhaustive_search() {
     let table: String = scenes("random.json").iter().map(line).collect();

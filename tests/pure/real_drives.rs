@@ -1,5 +1,5 @@
-//! Frames of real drives while they are brought up, as others published them: what this bench says
-//! to a drive is what was said to these, and it reads their answers as they were meant.
+//! Frames of real drives during bring-up, as others published them: the bench sends the same requests, and
+//! reads the answers correctly.
 
 use needle_bench::canopen::cia402::{Controlword, DriveState, Statusword};
 use needle_bench::canopen::nmt::{NmtCommand, NmtState, parse_heartbeat, parse_nmt};
@@ -9,8 +9,8 @@ use needle_bench::canopen::{Frame, NodeId};
 use needle_bench::units::Time;
 use std::time::Duration;
 
-/// Requests by SDO and what the drive answered.
-const ASKED: [[&str; 2]; 9] = [
+/// SDO requests and the drives' answers.
+const SDO_TRANSFERS: [[&str; 2]; 9] = [
     // A pair of servo drives for a mobile robot, vendor 0x300: "NaviCAN" motor set-up guide. They
     // repeat the data of a write in its confirmation, where CiA 301 reserves the bytes.
     ["601#4000100000000000", "581#4300100092010200"],
@@ -19,7 +19,7 @@ const ASKED: [[&str; 2]; 9] = [
     ["602#2316100158026400", "582#6016100158026400"],
     // A maxon EPOS, statusword: github.com/machinekit/machinekit/issues/589.
     ["602#4041600000000000", "582#4B41600037070000"],
-    // A drive on node 5, mode and controlwords: an example for libcanopen, of the same author.
+    // A drive on node 5, mode and controlwords: an example for libcanopen, by the same author.
     ["605#2F60600001000000", "585#6060600000000000"],
     ["605#2B40600006000000", "585#6040600000000000"],
     ["605#237A6000803E0000", "585#607A600000000000"],
@@ -33,10 +33,10 @@ fn frame(text: &str) -> Frame {
 
 #[test]
 fn sdo_requests_are_those_sent_to_real_drives_and_their_answers_are_read() {
-    for [request, answer] in ASKED.map(|pair| pair.map(frame)) {
+    for [request, answer] in SDO_TRANSFERS.map(|pair| pair.map(frame)) {
         let node = NodeId::new((request.cob_id().unwrap() & 0x7F) as u8).unwrap();
         let ClientFrame::Request(asked) = ClientFrame::decode(request.data()).unwrap() else {
-            panic!("{request}: no request");
+            panic!("{request} is not a request");
         };
         let mut client = SdoClient::new(node, Duration::from_millis(150));
         client.start(Time::ZERO, asked);
@@ -59,14 +59,14 @@ fn sdo_requests_are_those_sent_to_real_drives_and_their_answers_are_read() {
     }
 }
 
-/// The statusword comes first in these PDOs.
+/// The state in this PDO, which begins with the statusword.
 fn state(pdo: &str) -> DriveState {
     let pdo = frame(pdo);
     let statusword = Statusword(u16::from_le_bytes([pdo.data()[0], pdo.data()[1]]));
     statusword.state().unwrap_or_else(|| panic!("{pdo}: no state"))
 }
 
-/// The maxon EPOS and the drive on node 5, by PDO; the EPOS does not say that it has voltage.
+/// By PDO. The EPOS does not set bit 4, "voltage enabled".
 #[test]
 fn statuswords_of_real_drives_are_read_while_they_are_enabled() {
     let enabled = [
@@ -78,20 +78,20 @@ fn statuswords_of_real_drives_are_read_while_they_are_enabled() {
     assert_eq!(["182#4007", "182#2107", "182#2307", "182#3707"].map(state), enabled);
     let node_5 = ["185#400600000000", "185#210600000000", "185#330600000000", "185#370600000000"];
     assert_eq!(node_5.map(state), enabled);
-    // The iHSV60 and the pair of servo drives: enabled, and with a fault from the start.
+    // The iHSV60 when enabled; one of the pair of servo drives, with a fault from the start.
     assert_eq!(state("281#371000"), DriveState::OperationEnabled);
     assert_eq!(state("181#384200"), DriveState::Fault);
-    let said = [Controlword::SHUTDOWN, Controlword::SWITCH_ON, Controlword::ENABLE_OPERATION];
-    for (said, controlword) in ["202#0600", "202#0700", "202#0F00"].iter().zip(said) {
-        assert_eq!(frame(said).data(), controlword.0.to_le_bytes());
+    let ours = [Controlword::SHUTDOWN, Controlword::SWITCH_ON, Controlword::ENABLE_OPERATION];
+    for (theirs, ours) in ["202#0600", "202#0700", "202#0F00"].iter().zip(ours) {
+        assert_eq!(frame(theirs).data(), ours.0.to_le_bytes());
     }
 }
 
 #[test]
 fn boot_up_and_nmt_frames_of_real_drives_are_read() {
     let node = |id| NodeId::new(id).unwrap();
-    for (said, id) in [("703#00", 3), ("702#00", 2), ("701#00", 1)] {
-        assert_eq!(parse_heartbeat(&frame(said)), Some((node(id), NmtState::BootUp)));
+    for (boot_up, id) in [("703#00", 3), ("702#00", 2), ("701#00", 1)] {
+        assert_eq!(parse_heartbeat(&frame(boot_up)), Some((node(id), NmtState::BootUp)));
     }
     assert_eq!(parse_nmt(&frame("000#0102")), Some((NmtCommand::StartRemoteNode, Some(node(2)))));
     assert_eq!(parse_nmt(&frame("000#8200")), Some((NmtCommand::ResetCommunication, None)));

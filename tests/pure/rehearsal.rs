@@ -1,11 +1,11 @@
-//! `--rehearse`: the file of a rig, as it is, on emulated drives and an emulated tracker.
+//! `--rehearse`: the unchanged file of a rig, on emulated drives and with an emulated tracker.
 
 use crate::support::program::{Said, Scratch, needle_bench, repository};
 use crate::support::protocol;
 use std::fs;
 
-/// What a rig file calibrates: a tracker that is turned and far away, a sensor off the needle's axis,
-/// objects of the maker in the drive, a zero that is not the drive's.
+/// What an operator measures: a tracker that is turned and far away, a sensor off the needle's axis, objects of
+/// the drive's manufacturer, a zero that is not the drive's.
 const MEASURED: [&str; 9] = [
     "tracker.registration={ x_mm = 120.0, y_mm = -40.0, z_mm = 310.0, yaw_deg = 30.0, pitch_deg = -20.0, \
      roll_deg = 100.0 }",
@@ -21,7 +21,7 @@ const MEASURED: [&str; 9] = [
 
 fn rehearse(scratch: &Scratch, command: &[&str], sets: &[&str]) -> Said {
     let rig = repository("bench-config/rig-epos4.toml");
-    // With both of these a run that opened anything would fail at once.
+    // A run that opened the bus or the tracker would fail.
     let nothing =
         ["can.interface=nocan9", "tracker.mode=listen", "tracker.address=192.0.2.1:18944"];
     let sets = nothing.iter().chain(sets).flat_map(|set| ["--set", set]);
@@ -31,8 +31,8 @@ fn rehearse(scratch: &Scratch, command: &[&str], sets: &[&str]) -> Said {
 }
 
 fn manifest(scratch: &Scratch, said: &Said) -> serde_json::Value {
-    let dir = scratch.path().join(said.json()["run_dir"].as_str().unwrap());
-    serde_json::from_str(&fs::read_to_string(dir.join("manifest.json")).unwrap()).unwrap()
+    let path = said.run_dir(scratch).join("manifest.json");
+    serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap()
 }
 
 #[test]
@@ -48,7 +48,7 @@ fn the_rig_of_the_worked_example_completes_a_rehearsal_and_replays() {
     let json = said.json();
     assert_eq!((&json["rehearsal"], &json["outcome"]), (&true.into(), &"completed".into()));
     assert!(json["off_plane_rms_mm"].as_f64().unwrap() < 1.0, "{json}");
-    // The preflight is shown, and keeps nothing from moving.
+    // The preflight is shown, but its FAIL does not stop a rehearsal.
     let checks = json["preflight"].as_array().unwrap();
     let verdict = |name: &str| {
         let check = checks.iter().find(|check| check["name"] == name);
@@ -59,11 +59,11 @@ fn the_rig_of_the_worked_example_completes_a_rehearsal_and_replays() {
     assert_eq!(verdict("insertion room").as_deref(), Some("PASS"), "{json}");
     assert!(said.stderr.contains("\nFAIL  registration "), "{}", said.stderr);
     let manifest = manifest(&scratch, &said);
-    assert_eq!(manifest["rehearsal"], "nocan9", "the record says so");
+    assert_eq!(manifest["rehearsal"], "nocan9");
     assert_eq!((&manifest["bus"], &manifest["tracker"]), (&"memory".into(), &"emulated".into()));
     let replayed = needle_bench(&scratch, &["replay", json["run_dir"].as_str().unwrap()]);
     assert_eq!(replayed.stdout.lines().last(), Some("identical"), "{}", replayed.screen());
-    // The same without the word: it looks for the bus.
+    // Without --rehearse the run opens the bus.
     let said = rehearse(&scratch, &["run", "--yes", "-q"], &MEASURED);
     assert_eq!(said.status, 3, "{}", said.screen());
     assert!(said.stderr.contains("nocan9"), "{}", said.stderr);
@@ -74,17 +74,22 @@ fn a_rehearsal_uses_the_calibrations_of_the_rig() {
     let scratch = Scratch::new();
     let said = rehearse(&scratch, &["run", "--rehearse", "--json", "-q"], &MEASURED);
     assert_eq!(said.status, 0, "{}", said.screen());
-    // The file leaves the product open, the stage was never proved, the calibrations are typed, and the roll at the
-    // start is not told.
+    // The file names no product, the stage was never proved, the calibrations are typed in, and the roll at the
+    // start is unknown.
     let warned = said.stderr.lines().filter(|line| !line.starts_with(' '));
     let warned: Vec<&str> = warned.map(|line| line[..23].trim_end()).collect();
-    let drives = ["insertion drive", "rotation drive"];
-    let names =
-        [&drives[..], &["stage prove", "registration", "tip", "needle", "start roll"]].concat();
-    let names: Vec<String> = names.iter().map(|name| format!("WARN  {name}")).collect();
+    let names = [
+        "WARN  insertion drive",
+        "WARN  rotation drive",
+        "WARN  stage prove",
+        "WARN  registration",
+        "WARN  tip",
+        "WARN  needle",
+        "WARN  start roll",
+    ];
     assert_eq!(warned, names);
     let json = said.json();
-    // A tip that the registration did not bring back would be 300 mm away.
+    // Without the registration the tip would be 300 mm away.
     assert!(json["off_plane_rms_mm"].as_f64().unwrap() < 1.0, "{json}");
     for key in ["x_mm", "y_mm", "z_mm"] {
         assert!(json["final_error"][key].as_f64().unwrap().abs() < 1.0, "{json}");
@@ -107,7 +112,7 @@ fn every_operation_can_be_rehearsed() {
         let said = rehearse(&scratch, &command, &MEASURED);
         assert_eq!(said.status, 0, "{}", said.screen());
         assert!(said.stdout.contains(last), "{}", said.screen());
-        // Not even of the switch on which a homing comes to rest.
+        // A homing ends on a switch, which must give no warning.
         assert!(!said.stderr.contains("statusword bit 11"), "{}", said.screen());
     }
     let names: Vec<String> = fs::read_dir(scratch.path().join("runs"))
@@ -118,13 +123,12 @@ fn every_operation_can_be_rehearsed() {
     assert!(names.iter().all(|name| name.contains("-rehearsal")), "{names:?}");
 }
 
-/// The axis is where the file's own homing leaves it, and is homed like a real one.
 #[test]
 fn a_rehearsal_refuses_a_homing_that_does_not_suit_the_rig() {
     let scratch = Scratch::new();
     let home = ["stage", "home", "--rehearse", "--axis", "insertion", "-q"];
     for method in [1, 2, 17, 18, 24, 33, 34, 35, 37] {
-        // The switch at the withdrawn end is the positive one of a drive that counts the other way.
+        // With sign -1 the switch at the withdrawn end is the drive's positive one.
         let sign =
             format!("stage.insertion.sign={}", if [2, 18].contains(&method) { -1 } else { 1 });
         let method = format!("stage.insertion.homing.method={method}");
@@ -135,7 +139,7 @@ fn a_rehearsal_refuses_a_homing_that_does_not_suit_the_rig() {
     assert_eq!(said.status, 1, "{}", said.screen());
     let reason = said.stdout.lines().last().unwrap();
     assert!(reason.contains("0x6098"), "{reason}");
-    // Towards the deep end.
+    // With this sign method 17 homes at the deep end.
     let said = rehearse(&scratch, &["run", "--rehearse", "-q"], &["stage.insertion.sign=-1"]);
     assert_eq!(said.status, 2, "{}", said.screen());
     let said = said.stderr.split_whitespace().collect::<Vec<_>>().join(" ");
@@ -154,7 +158,7 @@ fn a_missing_calibration_file_is_refused_with_the_command_that_writes_it() {
     }
 }
 
-/// The base turns once and back; the records of the two jogs hold the sensor, and replay.
+/// The base turns once and back; both jogs record the sensor and replay.
 #[test]
 fn a_turn_of_the_base_calibrates_the_tip() {
     let scratch = Scratch::new();
@@ -174,7 +178,7 @@ fn a_turn_of_the_base_calibrates_the_tip() {
     }
     let runs = fs::read_dir(scratch.path().join("runs")).unwrap();
     let runs: Vec<_> = runs.map(|run| run.unwrap().path()).collect();
-    assert_eq!(runs.len(), 2, "there and back");
+    assert_eq!(runs.len(), 2, "not a jog there and one back");
     for run in runs {
         assert!(fs::read_to_string(run.join("tracker.ndjson")).unwrap().lines().count() > 400);
         let replayed = needle_bench(&scratch, &["replay", run.to_str().unwrap()]);
@@ -183,7 +187,7 @@ fn a_turn_of_the_base_calibrates_the_tip() {
     let said = needle_bench(&scratch, &named);
     assert_eq!(said.status, 2, "{}", said.screen());
     assert!(said.stderr.contains("turn.csv: exists"), "{}", said.stderr);
-    // A turn past a limit moves nothing and leaves no file.
+    // A turn past a limit is refused and leaves no file.
     let limits = ["--set", "stage.rotation.max_deg=300"];
     let words = [&["calibrate", "tip", "short.csv", "--run", "--rehearse"], &limits[..]].concat();
     let said = needle_bench(&scratch, &[&words[..], &["--config", &config]].concat());
@@ -194,13 +198,13 @@ fn a_turn_of_the_base_calibrates_the_tip() {
         said.stderr
     );
     assert!(!scratch.path().join("short.csv").exists());
-    // Nothing turns that nobody named.
+    // Without a stage in the configuration nothing turns.
     let said = needle_bench(&scratch, &["calibrate", "tip", "short.csv", "--run"]);
     assert_eq!(said.status, 2, "{}", said.screen());
     assert!(said.stderr.contains("no stage is named"), "{}", said.stderr);
 }
 
-/// The axis reads 0 wherever it starts, and may go back no further than its limit from there.
+/// With zero = "start" the axis reads 0 where it starts.
 #[test]
 fn a_withdrawal_is_refused_past_the_soft_limit_and_made_within_it() {
     let scratch = Scratch::new();
@@ -208,13 +212,15 @@ fn a_withdrawal_is_refused_past_the_soft_limit_and_made_within_it() {
     let withdraw = [&["stage", "--virtual", "withdraw", "--by", "13.0mm"], &start[..]].concat();
     let said = needle_bench(&scratch, &withdraw);
     assert_eq!(said.status, 1, "{}", said.screen());
-    let more = ["--set", "stage.insertion.min_mm=-14.0"];
-    let said = needle_bench(&scratch, &[&withdraw[..], &more].concat());
+    let refusal = "-13.000 mm is under the limit of -1.000 mm (stage.insertion.min_mm)";
+    assert!(said.stdout.contains(refusal), "{}", said.stdout);
+    let limit = ["--set", "stage.insertion.min_mm=-14.0"];
+    let said = needle_bench(&scratch, &[&withdraw[..], &limit].concat());
     assert_eq!(said.status, 0, "{}", said.screen());
     assert!(said.stdout.contains("from 0.000 to -13.000 mm"), "{}", said.stdout);
 }
 
-/// With a sensor on the axis there is nothing to see: the emulated one is moved off it.
+/// A sensor on the axis would not move, so the emulated one is 5 mm off it.
 #[test]
 fn handedness_can_be_proved_on_the_emulated_stage() {
     let scratch = Scratch::new();
@@ -224,8 +230,8 @@ fn handedness_can_be_proved_on_the_emulated_stage() {
     assert!(said.stderr.contains("handedness is right"), "{}", said.stderr);
 }
 
-/// From insertions to a file that the configuration names: three runs with a sensor of six degrees of
-/// freedom, whose needle is not the one that the bench believes in.
+/// The three runs have a sensor of six degrees of freedom and a needle whose curvature the configuration does
+/// not have.
 #[test]
 fn rehearsed_runs_calibrate_the_needle_and_the_file_is_used() {
     let scratch = Scratch::new();
@@ -253,27 +259,26 @@ fn rehearsed_runs_calibrate_the_needle_and_the_file_is_used() {
     let said = needle_bench(&scratch, &["run", "both.toml", "--rehearse"]);
     assert_eq!(said.status, 2);
     assert!(said.stderr.contains("is given along with needle.radius_mm"), "{}", said.stderr);
-    let json = needle_bench(&scratch, &["run", "rig.toml", "--rehearse", "--json", "-q"]).json();
-    let dir = scratch.path().join(json["run_dir"].as_str().unwrap());
-    let used = fs::read_to_string(dir.join("config.toml")).unwrap();
+    let said = needle_bench(&scratch, &["run", "rig.toml", "--rehearse", "--json", "-q"]);
+    let used = fs::read_to_string(said.run_dir(&scratch).join("config.toml")).unwrap();
     assert!(used.contains(&format!("curvature_per_mm = {curvature}")), "{used}");
     let scored = needle_bench(&scratch, &["evaluate", "--config", "rig.toml", runs[0], "--json"]);
     assert_eq!(scored.status, 0, "{}", scored.screen());
 }
 
-/// The live test follows the commands that stand on lines of their own, so all of them must.
+/// The tests find a command of docs/rig.md only at the beginning of a line.
 #[test]
 fn every_command_of_the_protocol_is_on_a_line_of_its_own() {
     let page = fs::read_to_string(repository("docs/rig.md")).unwrap();
     let is_inside =
         |line: &&str| line.contains("`needle-bench ") || line.contains(" needle-bench ");
     let inside: Vec<&str> = page.lines().filter(is_inside).collect();
-    assert_eq!(inside, [] as [&str; 0], "the protocol is tested without these");
+    assert_eq!(inside, [] as [&str; 0], "no test runs these commands");
     assert_eq!(page.matches("\nneedle-bench ").count(), protocol::commands().len());
 }
 
-/// Each command of docs/rig.md in its order, rehearsed on the worked example where that is possible. The live
-/// test follows those that need a rig.
+/// Rehearses each command of docs/rig.md that can be rehearsed on the worked example. The live test runs those
+/// that need a rig.
 #[test]
 fn every_command_of_the_protocol_is_accepted() {
     let scratch = Scratch::new();
@@ -288,12 +293,12 @@ fn every_command_of_the_protocol_is_accepted() {
                 words.push("--rehearse");
             }
             let said = needle_bench(&scratch, &words);
-            // A script's fault ends its run; that is what the page shows.
+            // The page shows a run that a scripted emergency stop ends.
             let expected = i32::from(line.contains("emergency-stop"));
             assert_eq!(said.status, expected, "{}", said.screen());
             rehearsed.push(line);
         } else {
-            // Without a rig: nothing answers, or a file of the operator is missing.
+            // These fail without a rig or the operator's files, but are not bad usage.
             if line.starts_with("tracker watch") {
                 words.extend(["--seconds", "1"]);
             }

@@ -1,9 +1,8 @@
-//! Recorded runs, run again.
+//! Replays of recorded runs.
 //!
-//! Those under `tests/recorded` hold what the bench estimated and decided when they were made. A
-//! change that alters it is seen here, by row and column; where it is meant, they are recorded anew
-//! (`NEEDLE_RECORD_ANEW=1 cargo test --test pure replay::`, after `--test live a_live_run` for the live one) and the
-//! difference in their `steps.csv` is for review.
+//! The runs under `tests/recorded` hold what the bench estimated and decided when they were recorded. These tests
+//! report a change of that by row and column. If the change is intended, record the runs again, as CONTRIBUTING.md
+//! says, and review the difference in their `steps.csv`.
 
 use crate::support::program::{Said, Scratch, needle_bench, repository};
 use crate::support::recorded;
@@ -87,27 +86,23 @@ emulator.tracker_rate_hz = 2.0"#,
     ),
 ];
 
-/// The recorded operations of the emulated stage, with what each was told.
+/// The recorded operations of the emulated stage, and their arguments.
 const OPERATIONS: [(&str, &[&str]); 2] =
     [("jog", &["jog", "--axis", "rotation", "--by", "-7.5deg"]), ("prove", &["prove"])];
 
 /// The folder that `needle-bench stage --virtual` leaves in `scratch`.
 pub(super) fn operated(scratch: &Scratch, operation: &[&str]) -> PathBuf {
-    let said =
-        needle_bench(scratch, &[&["stage", "--virtual", "--json", "-q"], operation].concat());
-    let run_dir = said.json()["run_dir"].as_str().map(|dir| scratch.path().join(dir));
-    run_dir.unwrap_or_else(|| panic!("{}", said.stderr))
+    needle_bench(scratch, &[&["stage", "--virtual", "--json", "-q"], operation].concat())
+        .run_dir(scratch)
 }
 
-/// `needle-bench run` in `scratch` with this configuration, too short to reach the plane; the folder
-/// it leaves.
+/// The folder that `needle-bench run` with this configuration leaves in `scratch`. The run may be too short to
+/// reach the plane.
 pub(super) fn run(scratch: &Scratch, config: &str) -> PathBuf {
     let short = "insertion.plane_out_of_reach = \"insert\"";
     let config = scratch.write("run.toml", &format!("{short}\n{config}"));
     let config = config.to_str().expect("UTF-8");
-    let said = needle_bench(scratch, &["run", config, "--quiet", "--json"]);
-    let run_dir = said.json()["run_dir"].as_str().map(|dir| scratch.path().join(dir));
-    run_dir.unwrap_or_else(|| panic!("{}", said.stderr))
+    needle_bench(scratch, &["run", config, "--quiet", "--json"]).run_dir(scratch)
 }
 
 fn recorded_run(name: &str) -> PathBuf {
@@ -149,12 +144,12 @@ fn every_recorded_run_replays_identically() {
     }
     assert!(
         different.is_empty(),
-        "{different}if this is meant, record them anew (CONTRIBUTING.md has the commands) and review \
+        "{different}if this is intended, record them again (CONTRIBUTING.md has the commands) and review \
          the difference in their steps.csv"
     );
 }
 
-/// A recorded run in memory, to be spoiled.
+/// A recorded run in memory, for tests to change.
 #[derive(Clone)]
 struct Run {
     manifest: Manifest,
@@ -199,7 +194,7 @@ impl Run {
         self.asked(None)
     }
 
-    /// Its first difference, as it is told.
+    /// The first difference that the replay reports.
     fn difference(&self) -> String {
         let replayed = self.replay().unwrap_or_else(|error| panic!("{error}"));
         replayed.difference.unwrap_or_default()
@@ -216,12 +211,7 @@ fn with_line(text: &str, number: usize, change: impl Fn(&str) -> String) -> Stri
     lines.map(|(line, n)| if n == number { change(line) } else { line.to_owned() } + "\n").collect()
 }
 
-/// The first line of `text`, counted from 1, that `is_it`.
-fn line_of(text: &str, is_it: impl Fn(&str) -> bool) -> usize {
-    text.lines().position(is_it).expect("is there") + 1
-}
-
-/// The last frame is refused as well, by a session that has ended with it.
+/// The bus refuses the last frame too, after the session has ended.
 #[test]
 fn a_run_whose_bus_never_comes_back_replays() {
     let scratch = Scratch::new();
@@ -248,10 +238,13 @@ fn a_replay_reports_the_first_difference() {
         values[column] = format!("{:?}", value.next_up());
         values.join(",")
     });
-    let told = changed.difference();
-    assert!(told.starts_with("steps.csv line 7, step 5, roll_est_rad: recorded "), "{told}");
+    let difference = changed.difference();
+    assert!(
+        difference.starts_with("steps.csv line 7, step 5, roll_est_rad: recorded "),
+        "{difference}"
+    );
 
-    // The truth is carried over.
+    // The replay copies the truth from the record.
     let mut other_truth = run.clone();
     let (columns, _) = run.steps.split_once('\n').unwrap();
     let column = columns.split(',').position(|name| name == "roll_true_rad").unwrap();
@@ -264,7 +257,7 @@ fn a_replay_reports_the_first_difference() {
     let csv = other_truth.replay().unwrap().steps_csv();
     assert_eq!(csv, other_truth.steps);
 
-    // A record from before the last column was added.
+    // A record made before the last column existed.
     let mut older = run.clone();
     let shorter = |row: &str| row.rsplit_once(',').unwrap().0.to_owned() + "\n";
     older.steps = run.steps.lines().map(shorter).collect();
@@ -272,11 +265,11 @@ fn a_replay_reports_the_first_difference() {
     assert_eq!(older.replay().unwrap().steps_csv(), run.steps);
 
     let mut changed = run.clone();
-    let sync = line_of(&run.can, |line| line.contains(" 080# T"));
+    let sync = run.can.lines().position(|line| line.contains(" 080# T")).expect("a SYNC") + 1;
     changed.can = with_line(&run.can, sync, |line| line.replace("080#", "081#"));
-    let told = changed.difference();
-    assert!(told.starts_with(&format!("can.log line {sync}: recorded (")), "{told}");
-    assert!(told.ends_with(" memory 080# T"), "{told}");
+    let difference = changed.difference();
+    assert!(difference.starts_with(&format!("can.log line {sync}: recorded (")), "{difference}");
+    assert!(difference.ends_with(" memory 080# T"), "{difference}");
 
     let mut changed = run.clone();
     changed.tracker =
@@ -301,8 +294,8 @@ fn a_replay_reports_the_first_difference() {
     assert!(changed.difference().ends_with("recorded 11,3.5, replayed nothing more"));
 }
 
-/// Killed at any moment, a bench leaves files that end within a line, and at about one time: one
-/// that lacks more than that is named.
+/// The files of a killed bench end within a line, at about the same time. A file that ends much earlier is a
+/// difference.
 #[test]
 fn a_cut_record_is_replayed_as_far_as_it_goes() {
     let mut run = Run::load("default");
@@ -343,8 +336,7 @@ fn a_cut_record_is_replayed_as_far_as_it_goes() {
     assert!(run.refusal().starts_with("inputs.log holds no input"), "{}", run.refusal());
 }
 
-/// Drives that a dead bus hides say nothing for the seconds that a stop may take; what the tracker
-/// says in them is recorded as it comes, so that a bench killed there loses none of it.
+/// On a dead bus the stop waits for seconds. If the bench is killed meanwhile, no sample may be lost.
 #[test]
 fn samples_are_recorded_at_once_while_a_stop_waits_for_silent_drives() {
     let scratch = Scratch::new();
@@ -360,9 +352,9 @@ fn samples_are_recorded_at_once_while_a_stop_waits_for_silent_drives() {
     };
     let heard = |inputs: &str| inputs.lines().filter(|line| line.ends_with(" sample")).count();
     let (cut, well_before) = (until(5_000_000_000), heard(&until(4_850_000_000)));
-    assert!(well_before > heard(&until(2_500_000_000)) + 50, "the stop takes seconds");
-    let left = Run { inputs: cut, ..run.clone() }.replay().expect("a replay").samples;
-    assert!(left >= well_before, "{left} of {well_before} have left the session");
+    assert!(well_before > heard(&until(2_500_000_000)) + 50, "the stop is too short for this test");
+    let recorded = Run { inputs: cut, ..run.clone() }.replay().expect("a replay").samples;
+    assert!(recorded >= well_before, "{recorded} of {well_before} samples are recorded");
 }
 
 #[test]
@@ -410,8 +402,7 @@ fn a_mixed_lossy_or_malformed_record_is_refused() {
     assert!(broken.refusal().starts_with("steps.csv begins with \"a,b\""));
 }
 
-/// What a shadow estimates is what it estimates where it steers: bit for bit, from the same
-/// measurements.
+/// A shadow estimates, bit for bit, what it would estimate if it steered.
 #[test]
 fn a_shadow_of_the_recorded_observer_gives_the_recorded_rows() {
     for name in ["default", "paper", "held"] {
@@ -422,7 +413,7 @@ fn a_shadow_of_the_recorded_observer_gives_the_recorded_rows() {
     }
 }
 
-/// The rows with the columns that were added since, which are empty in a run into the plane.
+/// `steps` with the columns that were added later, empty in each row.
 fn with_every_column(steps: &str) -> String {
     const ADDED: [&str; 9] = [
         "target_distance_mm",

@@ -1,4 +1,4 @@
-//! `needle-bench replay` as its user meets it: runs, operations, questions, refusals.
+//! The command `needle-bench replay`: runs, operations, what-if questions, refusals.
 
 use super::replay::{operated, replayed, run};
 use crate::support::program::{Said, Scratch};
@@ -61,7 +61,8 @@ fn replay_repeats_a_run_answers_what_if_and_refuses_an_edited_one() {
     assert!(refused("observer.shadows=[]").contains("name the observer by observer.kind"));
     assert!(refused("observer.knid=\"coupled\"").contains("unknown key"));
     let said = replayed(&scratch, &run_dir, &["--out", "coupled.csv"]);
-    assert_eq!(said.status, 2, "not overwritten: {}", said.stderr);
+    assert_eq!(said.status, 2, "{}", said.stderr);
+    assert!(said.stderr.contains("coupled.csv: "), "{}", said.stderr);
 
     let (steps, edited) = (run_dir.join("steps.csv"), recorded.replace(",0.0,", ",0.5,"));
     std::fs::write(&steps, edited).unwrap();
@@ -70,7 +71,7 @@ fn replay_repeats_a_run_answers_what_if_and_refuses_an_edited_one() {
     assert!(said.stderr.contains("steps.csv was edited"), "{}", said.stderr);
     std::fs::write(&steps, &recorded).unwrap();
 
-    // As a bench leaves it that is killed.
+    // A killed bench leaves the manifest open.
     let mut manifest = RunFolder::open(&run_dir).unwrap().manifest().clone();
     manifest.outcome = None;
     manifest.version = "0.0.9".to_owned();
@@ -102,11 +103,11 @@ fn a_folder_that_is_not_a_run_is_refused() {
     assert!(said.json()["error"].as_str().unwrap().contains("not a run folder"), "{}", said.stdout);
 }
 
-/// Completed, refused, and stopped by a fault on the way.
+/// Completed ones, a refused one, and one that a fault stops.
 #[test]
 fn every_operation_replays() {
     let scratch = Scratch::new();
-    let by_hand = ["--set", "emulator.insertion_start_mm=30"];
+    let deep = ["--set", "emulator.insertion_start_mm=30"];
     let faulty = [
         "--set",
         "emulator.fault=[{kind=\"drive-fault\", axis=\"rotation\", at_mm=1.0, code=0x8611}]",
@@ -117,8 +118,8 @@ fn every_operation_replays() {
         &["jog", "--axis", "insertion", "--by", "2mm"],
         &["jog", "--axis", "insertion", "--by", "311mm"],
         &[&["jog", "--axis", "insertion", "--by", "3mm"][..], &faulty].concat(),
-        &[&["withdraw"][..], &by_hand].concat(),
-        &[&["withdraw", "--by", "0.1mm"][..], &by_hand].concat(),
+        &[&["withdraw"][..], &deep].concat(),
+        &[&["withdraw", "--by", "0.1mm"][..], &deep].concat(),
         &["prove", "--handedness", "--set", "stage.rotation.jog_speed_deg_per_s=60"],
     ] {
         let run_dir = operated(&scratch, operation);
@@ -128,7 +129,7 @@ fn every_operation_replays() {
         assert_ne!(json["frames_sent"], 0, "{operation:?}");
         let manifest = RunFolder::open(&run_dir).unwrap().manifest().clone();
         assert_eq!(manifest.operation.unwrap().split('-').next(), Some(operation[0]));
-        assert_ne!(json["samples"], 0, "what the tracker sent is recorded: {operation:?}: {json}");
+        assert_ne!(json["samples"], 0, "{operation:?} recorded no sample of the tracker: {json}");
     }
 }
 

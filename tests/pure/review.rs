@@ -1,4 +1,4 @@
-//! Recorded runs as their user looks at them: one, two, a campaign; judged, edited, left open.
+//! The command `needle-bench review`: one run, two, a campaign; verdicts, edited and open records, repair.
 
 use crate::support::program::{Said, Scratch, needle_bench, refusals, repository};
 use needle_bench::archive::Manifest;
@@ -7,7 +7,7 @@ use serde_json::Value;
 use std::fs;
 use std::path::Path;
 
-/// A short run with these arguments; its folder, as `review` is told of it.
+/// The folder of a short run with these arguments, relative to `scratch`.
 fn run(scratch: &Scratch, arguments: &[&str]) -> String {
     let short = [
         "run",
@@ -24,7 +24,7 @@ fn review(scratch: &Scratch, arguments: &[&str]) -> Said {
     needle_bench(scratch, &[&["review"], arguments].concat())
 }
 
-/// Makes the record in `dir` as one whose bench was killed.
+/// Opens the record in `dir` again, as if the bench had been killed.
 fn leave_open(scratch: &Scratch, dir: &str) {
     let dir = scratch.path().join(dir);
     let folder = RunFolder::open(&dir).expect("a run folder");
@@ -33,7 +33,7 @@ fn leave_open(scratch: &Scratch, dir: &str) {
     write_manifest(&dir, &open).expect("a manifest");
 }
 
-/// The run folder `dir` under a name that has no date.
+/// Renames the run folder `dir`, so that a snapshot has no date.
 fn named(scratch: &Scratch, dir: &str) -> &'static str {
     fs::rename(scratch.path().join(dir), scratch.path().join("runs/one")).expect("renamed");
     "runs/one"
@@ -55,24 +55,24 @@ fn review_shows_a_run_on_one_screen_and_writes_one_page() {
         &said.stdout,
         &[", by J. Doe, into gelatin 10 %", note, "accepted, 0 refused", "≥ 5.95", "s inserting"],
     );
-    assert!(said.stdout.lines().count() <= 35, "more than a screen:\n{}", said.stdout);
+    assert!(said.stdout.lines().count() <= 35, "more than one screen:\n{}", said.stdout);
     assert_eq!(said.stdout.lines().last(), Some("completed"));
     let page = fs::read_to_string(scratch.path().join(&dir).join("report.html")).expect("a page");
     assert_all(
         &page,
         &["J. Doe", "&lt;script", "Distance from the plane", "Errors of the estimated angles"],
     );
-    assert_is_alone(&page);
+    assert_loads_nothing(&page);
     assert_is_well_formed(&page);
-    // The page is no part of the record, and is made again.
+    // The page is not part of the record, which stays whole.
     let json = review(&scratch, &[&dir, "--json"]).json();
     assert_eq!((&json["condition"], &json["outcome"]), (&"whole".into(), &"completed".into()));
     assert!(json["figures"]["off_plane_rms_mm"].is_f64() && json["limits"]["tip_age_s_max"] == 0.5);
     assert!(json["figures"]["estimate_rms.roll_deg"].is_f64(), "{json}");
 }
 
-/// Nothing is fetched from anywhere: no element and no style that loads.
-fn assert_is_alone(page: &str) {
+/// No element and no style of the page loads anything.
+fn assert_loads_nothing(page: &str) {
     for load in ["<script", "<link", "<img", "<iframe", "url(", "@import", " src=\"", " href=\""] {
         assert!(!page.contains(load), "{load}");
     }
@@ -94,7 +94,6 @@ fn assert_is_well_formed(page: &str) {
     assert!(open.is_empty(), "not closed: {open:?}");
 }
 
-/// The recorded jog turned the base and held the insertion.
 #[test]
 fn the_page_of_an_operation_shows_the_motion_of_both_axes() {
     let scratch = Scratch::new();
@@ -117,7 +116,7 @@ fn html_and_no_html_decide_where_the_page_goes() {
     let steps = format!("{dir}/steps.csv");
     let said = review(&scratch, &[&dir, "--html", &steps]);
     assert_all(&said.stderr, &["steps.csv: File exists"]);
-    assert_eq!(review(&scratch, &[&dir, "--no-html"]).status, 0, "it is whole as before");
+    assert_eq!(review(&scratch, &[&dir, "--no-html"]).status, 0, "steps.csv was overwritten");
     let said = review(&scratch, &[&dir, "--html", "gone/page.html"]);
     assert_eq!((said.status, said.stdout.lines().last()), (3, Some("completed")));
     assert_all(&said.stderr, &["gone/page.html: ", "--no-html"]);
@@ -182,12 +181,12 @@ fn a_campaign_lists_counted_and_excluded_runs() {
     );
     let by = review(&scratch, &["runs", "--by", "emulator.seed"]).stdout;
     assert_all(&by, &["emulator.seed = 3: 1 run", "emulator.seed = 4: 1 run"]);
-    // Named one by one they are a campaign as well.
+    // Three folders are a campaign too.
     let three = review(&scratch, &[&runs[1], &runs[2], &runs[3], "--json"]).json();
     assert_eq!((&three["counted"], three["runs"].as_array().map(Vec::len)), (&2.into(), Some(3)));
 }
 
-/// What a flag would change is not there: that is said, rather than the flag passed over.
+/// Rather than ignored.
 #[test]
 fn a_flag_that_does_not_apply_is_refused() {
     let scratch = Scratch::new();
@@ -201,7 +200,8 @@ fn a_flag_that_does_not_apply_is_refused() {
     ];
     insta::assert_snapshot!(refusals(&scratch, commands));
     assert!(!scratch.path().join("x.html").exists());
-    assert_eq!(review(&scratch, &["runs", "--no-html"]).status, 0, "there is none to leave");
+    // A campaign has no page, so --no-html is true of it.
+    assert_eq!(review(&scratch, &["runs", "--no-html"]).status, 0);
 }
 
 #[test]
@@ -216,7 +216,7 @@ fn a_run_still_being_written_is_not_offered_for_repair() {
     let campaign = review(&scratch, &["runs"]).stdout;
     assert_all(&campaign, &["going on: 1"]);
     let verdict = [&dir, "--verdict", "valid", "--reason", "x"];
-    assert_eq!(review(&scratch, &verdict).status, 3, "the bench has it in hand");
+    assert_eq!(review(&scratch, &verdict).status, 3, "a verdict on a record that is locked");
     drop(bench);
     assert_all(&review(&scratch, &[&dir]).stdout, &[": open", "--repair"]);
 }
@@ -246,8 +246,7 @@ fn copy_folder(from: &Path, to: &Path) {
     }
 }
 
-/// By its own account something is missing: that is not called whole, and its figures are those of
-/// its steps wherever they are shown.
+/// One run and a campaign show the same figures, computed from the steps.
 #[test]
 fn a_repaired_record_is_incomplete_wherever_it_is_shown() {
     let scratch = Scratch::new();
@@ -277,11 +276,10 @@ fn a_file_that_is_not_our_report_is_not_overwritten() {
     assert_eq!(fs::read_to_string(&report).expect("notes"), "<p>my notes</p>");
     fs::remove_file(&report).expect("removed");
     for _ in 0..2 {
-        assert_eq!(review(&scratch, &[&dir]).status, 0, "an earlier one of ours is made again");
+        assert_eq!(review(&scratch, &[&dir]).status, 0, "our own report is not made again");
     }
 }
 
-/// A pipe has no end, and a huge number no place on an axis.
 #[test]
 fn huge_numbers_or_a_pipe_as_steps_csv_do_not_hang_review() {
     let scratch = Scratch::new();
@@ -319,7 +317,7 @@ fn all_verdicts_are_kept_and_the_last_counts() {
     }
     let said = review(&scratch, &[&dir]);
     assert_all(&said.stdout, &["whole", "verdict     valid, it was the other run"]);
-    let folder = RunFolder::open(&scratch.path().join(&dir)).expect("sealed anew");
+    let folder = RunFolder::open(&scratch.path().join(&dir)).expect("a sealed record");
     assert_eq!(folder.manifest().verdicts.len(), 2);
 }
 
@@ -330,7 +328,7 @@ fn an_open_record_is_shown_and_closed_by_repair() {
     leave_open(&scratch, &dir);
     let steps = scratch.path().join(&dir).join("steps.csv");
     let text = fs::read_to_string(&steps).expect("steps");
-    fs::write(&steps, &text[..text.len() - 9]).expect("a cut file");
+    fs::write(&steps, &text[..text.len() - 9]).expect("a truncated file");
     let said = review(&scratch, &[&dir]);
     assert_all(&said.stdout, &[": open", "--repair", "off plane (true)", "not closed: "]);
     let said = review(&scratch, &[&dir, "--verdict", "valid", "--reason", "x"]);
@@ -344,10 +342,9 @@ fn an_open_record_is_shown_and_closed_by_repair() {
         &said.stdout,
         &[": incomplete", "closed by a repair", "off plane (true)", "stopped: the bench ended"],
     );
-    assert_eq!(review(&scratch, &[&dir, "--repair"]).status, 2);
+    assert_eq!(review(&scratch, &[&dir, "--repair"]).status, 2, "repaired twice");
 }
 
-/// `run.rrd` follows from the rest of the record.
 #[test]
 fn a_missing_run_rrd_is_made_again_by_repair() {
     let scratch = Scratch::new();
@@ -392,7 +389,7 @@ fn bad_records_and_verdicts_are_refused() {
     screens += &refusals(&scratch, &[&["review", whole]]);
     spoil("", "");
 
-    // An edited file: what there is is shown, and that it is not the record.
+    // An edited file is shown, with the warning that it was edited.
     edit(&path.join("steps.csv"));
     let said = review(&scratch, &[whole]);
     assert_eq!(said.status, 2);

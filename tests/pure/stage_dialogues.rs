@@ -1,4 +1,4 @@
-//! The dialogues with drives outside a run: a reset, a stop while a run moves them, a status.
+//! The dialogues with drives outside a run: status, reset, and a stop while a run moves the drives.
 
 use crate::support::program::{Scratch, needle_bench};
 use needle_bench::canopen::cia402::{DriveState, Mode};
@@ -14,10 +14,10 @@ use needle_bench::stage::{
 };
 use needle_bench::units::Time;
 
-/// No other program.
-struct Nobody;
+/// A dialogue that sends nothing.
+struct Idle;
 
-impl Dialogue for Nobody {
+impl Dialogue for Idle {
     fn handle_frame(&mut self, _: Time, _: &Frame) {}
     fn handle_timeout(&mut self, _: Time) {}
     fn poll_transmit(&mut self) -> Option<Frame> {
@@ -31,7 +31,7 @@ impl Dialogue for Nobody {
     }
 }
 
-/// A stage that is moved by a run's own master, while another program talks to its drives.
+/// A run's master moves the stage while another program talks to the drives.
 struct Bench {
     now: Time,
     config: StageConfig,
@@ -74,15 +74,15 @@ impl Bench {
                         self.step += 1;
                         let way = f64::from(self.step) * 0.02;
                         let set_point = SetPoint { insertion_mm: way, rotation_rad: 0.0 };
-                        // Refused once it stops.
+                        // The master refuses this once it stops.
                         let _ = self.master.command(set_point);
                     }
                     Output::Event(event) => self.events.push(event),
                 }
             }
-            let said: Vec<Frame> = std::iter::from_fn(|| other.poll_transmit()).collect();
-            self.sent.extend(&said);
-            frames.extend(said);
+            let of_other: Vec<Frame> = std::iter::from_fn(|| other.poll_transmit()).collect();
+            self.sent.extend(&of_other);
+            frames.extend(of_other);
             frames.iter().for_each(|frame| self.stage.handle_frame(self.now, frame));
             let answers: Vec<Frame> = std::iter::from_fn(|| self.stage.poll())
                 .filter_map(|output| match output {
@@ -111,7 +111,7 @@ impl Bench {
     }
 
     fn go_on_alone(&mut self, turns: u32) {
-        (0..turns).for_each(|_| self.go_on(&mut Nobody));
+        (0..turns).for_each(|_| self.go_on(&mut Idle));
     }
 
     fn talk(&mut self, other: &mut dyn Dialogue) {
@@ -119,7 +119,7 @@ impl Bench {
         while !other.is_over() {
             self.go_on(other);
             turns += 1;
-            assert!(turns < 10_000, "it does not end");
+            assert!(turns < 10_000, "the dialogue does not end");
         }
     }
 
@@ -132,8 +132,7 @@ impl Bench {
     }
 }
 
-/// The other master's set-points, which go on for as long as it does not notice, do not take the
-/// stop back.
+/// The run sends set-points until it notices the stop; they do not undo the stop.
 #[test]
 fn a_stop_from_outside_ends_a_run_that_is_moving() {
     let mut bench = Bench::moving();
@@ -147,12 +146,12 @@ fn a_stop_from_outside_ends_a_run_that_is_moving() {
     let first: Vec<String> = bench.sent.iter().take(4).map(Frame::to_string).collect();
     let quick_stop = ["601#2B40600002000000", "602#2B40600002000000"];
     assert_eq!(first[..2], ["000#8001", "000#8002"]);
-    assert_eq!(first[2..], quick_stop, "both at once");
+    assert_eq!(first[2..], quick_stop, "not both at once");
     let faults = bench.events.iter().filter(|event| matches!(event, StageEvent::Fault(_)));
-    assert_eq!(faults.count(), 1, "the run ends by its own fault");
+    assert_eq!(faults.count(), 1, "the run did not end by its own fault");
     let at_mm = bench.depth_mm();
     bench.go_on_alone(500);
-    assert_eq!(bench.depth_mm(), at_mm, "and nothing moves any more");
+    assert_eq!(bench.depth_mm(), at_mm, "it moved after the stop");
     assert!(!bench.states().contains(&DriveState::OperationEnabled));
 }
 
@@ -171,94 +170,80 @@ fn a_drive_that_does_not_answer_a_stop_is_named_and_the_other_is_stopped() {
     );
 }
 
-/// A stop that hears nothing of the rotation drive, which does not get the first frames either.
-struct Deaf {
-    quick_stop: QuickStop,
-    lost: u32,
+/// A dialogue that loses frames both ways.
+struct Lossy<D> {
+    dialogue: D,
+    is_received: Box<dyn FnMut(&Frame) -> bool>,
+    is_sent: Box<dyn FnMut(&Frame) -> bool>,
 }
 
-impl Dialogue for Deaf {
+impl<D: Dialogue> Dialogue for Lossy<D> {
     fn handle_frame(&mut self, now: Time, frame: &Frame) {
-        if frame.cob_id() != Some(0x582) {
-            self.quick_stop.handle_frame(now, frame);
+        if (self.is_received)(frame) {
+            self.dialogue.handle_frame(now, frame);
         }
     }
     fn handle_timeout(&mut self, now: Time) {
-        self.quick_stop.handle_timeout(now);
+        self.dialogue.handle_timeout(now);
     }
     fn poll_transmit(&mut self) -> Option<Frame> {
-        while let Some(frame) = self.quick_stop.poll_transmit() {
-            match frame.cob_id() {
-                Some(0x602) if self.lost > 0 => self.lost -= 1,
-                _ => return Some(frame),
-            }
-        }
-        None
+        std::iter::from_fn(|| self.dialogue.poll_transmit()).find(|frame| (self.is_sent)(frame))
     }
     fn deadline(&self) -> Time {
-        self.quick_stop.deadline()
+        self.dialogue.deadline()
     }
     fn is_over(&self) -> bool {
-        self.quick_stop.is_over()
+        self.dialogue.is_over()
     }
 }
 
-/// Whether a drive answers or not, it is told to brake and then to take its power off.
+/// No answer of the rotation drive arrives, and the first frames to it are lost too.
 #[test]
 fn a_drive_whose_answers_are_lost_is_stopped_and_loses_power() {
     for lost in [0, 1, 5] {
         let mut bench = Bench::moving();
-        let mut stop = Deaf { quick_stop: QuickStop::new(&bench.config, bench.now), lost };
+        let mut left = lost;
+        let mut stop = Lossy {
+            dialogue: QuickStop::new(&bench.config, bench.now),
+            is_received: Box::new(|frame| frame.cob_id() != Some(0x582)),
+            is_sent: Box::new(move |frame| {
+                let is_lost = frame.cob_id() == Some(0x602) && left > 0;
+                left -= u32::from(is_lost);
+                !is_lost
+            }),
+        };
         bench.talk(&mut stop);
         assert_eq!(bench.states(), [DriveState::SwitchOnDisabled; 2], "{lost} lost");
-        let said = stop.quick_stop.result(Axis::Rotation).unwrap().unwrap_err();
-        assert!(said.ends_with("; power off was not confirmed"), "{said}");
-        let told = |word: &str| {
+        let error = stop.dialogue.result(Axis::Rotation).unwrap().unwrap_err();
+        assert!(error.ends_with("; power off was not confirmed"), "{error}");
+        let sent = |word: &str| {
             let frame = format!("602#2B406000{word}000000");
             bench.sent.iter().filter(|sent| sent.to_string() == frame).count()
         };
-        assert!(told("02") >= 2 && told("00") >= 1, "{} and {}", told("02"), told("00"));
+        // Quick stop, and disable voltage.
+        assert!(sent("02") >= 2 && sent("00") >= 1, "{} and {}", sent("02"), sent("00"));
     }
 }
 
-/// A stop whose looks at the rotation drive's statusword are lost.
-struct Blind(QuickStop);
-
-impl Dialogue for Blind {
-    fn handle_frame(&mut self, now: Time, frame: &Frame) {
-        // The run that is being stopped asks the same, and hears the answer.
-        if !frame.to_string().starts_with("582#4B4160") {
-            self.0.handle_frame(now, frame);
-        }
-    }
-    fn handle_timeout(&mut self, now: Time) {
-        self.0.handle_timeout(now);
-    }
-    fn poll_transmit(&mut self) -> Option<Frame> {
-        let look = Frame::new(0x602, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]);
-        std::iter::from_fn(|| self.0.poll_transmit()).find(|frame| *frame != look)
-    }
-    fn deadline(&self) -> Time {
-        self.0.deadline()
-    }
-    fn is_over(&self) -> bool {
-        self.0.is_over()
-    }
-}
-
-/// That nobody can say whether it stands is no reason to leave it under power.
+/// A drive that may still move must not keep its power.
 #[test]
 fn a_stop_without_statuswords_takes_power_off_and_says_it_is_unconfirmed() {
     let mut bench = Bench::moving();
-    let mut quick_stop = Blind(QuickStop::new(&bench.config, bench.now));
-    bench.talk(&mut quick_stop);
-    let said = quick_stop.0.result(Axis::Rotation).unwrap().unwrap_err();
-    assert!(said.starts_with("rotation: node 2 0x6041:00: no SDO reply within 150 ms"), "{said}");
-    assert!(said.ends_with(": power off was not seen, press the emergency stop"), "{said}");
-    assert!(quick_stop.0.result(Axis::Insertion).unwrap().is_ok());
+    let statusword = Frame::new(0x602, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]);
+    let mut stop = Lossy {
+        dialogue: QuickStop::new(&bench.config, bench.now),
+        // The run reads the statusword too, and the stop would receive that answer.
+        is_received: Box::new(|frame| !frame.to_string().starts_with("582#4B4160")),
+        is_sent: Box::new(move |frame| *frame != statusword),
+    };
+    bench.talk(&mut stop);
+    let error = stop.dialogue.result(Axis::Rotation).unwrap().unwrap_err();
+    assert!(error.starts_with("rotation: node 2 0x6041:00: no SDO reply within 150 ms"), "{error}");
+    assert!(error.ends_with(": power off was not seen, press the emergency stop"), "{error}");
+    assert!(stop.dialogue.result(Axis::Insertion).unwrap().is_ok());
     assert_eq!(bench.states(), [DriveState::SwitchOnDisabled; 2]);
-    let last: Vec<String> = bench.sent.iter().rev().take(1).map(Frame::to_string).collect();
-    assert_eq!(last, ["000#8002"], "the node is told once more to leave Operational");
+    // The node has to leave Operational.
+    assert_eq!(bench.sent.last().map(Frame::to_string).as_deref(), Some("000#8002"));
 }
 
 #[test]
@@ -270,50 +255,37 @@ fn status_does_not_disturb_a_moving_run() {
     assert_eq!(status.statusword.state(), Some(DriveState::OperationEnabled));
     assert_eq!(status.mode, Some(Mode::CSP));
     assert!(status.position.is_some_and(|mm| (1.5..2.5).contains(&mm)), "{status:?}");
-    assert_eq!(status.homed, None, "it cannot say so in this mode");
-    assert!(bench.sent.iter().all(|frame| frame.data()[0] == 0x40), "it only reads");
+    assert_eq!(status.homed, None, "a drive reports this in homing mode only");
+    assert!(bench.sent.iter().all(|frame| frame.data()[0] == 0x40), "not an SDO upload");
     bench.go_on_alone(200);
     assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
 }
 
-/// A drive that lacks an object answers; one that answers nothing any more has no status.
+/// The insertion drive answers once.
 #[test]
 fn the_status_of_a_drive_that_falls_silent_is_an_error() {
-    struct Heard(StatusReader, usize);
-    impl Dialogue for Heard {
-        fn handle_frame(&mut self, now: Time, frame: &Frame) {
-            if frame.cob_id() == Some(0x581) {
-                self.1 += 1;
-            }
-            if self.1 <= 1 {
-                self.0.handle_frame(now, frame);
-            }
-        }
-        fn handle_timeout(&mut self, now: Time) {
-            self.0.handle_timeout(now);
-        }
-        fn poll_transmit(&mut self) -> Option<Frame> {
-            self.0.poll_transmit()
-        }
-        fn deadline(&self) -> Time {
-            self.0.deadline()
-        }
-        fn is_over(&self) -> bool {
-            self.0.is_over()
-        }
-    }
     let mut bench = Bench::moving();
-    let mut heard = Heard(StatusReader::new(&bench.config, bench.now), 0);
-    bench.talk(&mut heard);
-    let said = heard.0.status(Axis::Insertion).unwrap_err();
-    assert!(said.starts_with("insertion: node 1 0x1000:00: no SDO reply within 150 ms"), "{said}");
+    let mut answers = 0;
+    let mut reader = Lossy {
+        dialogue: StatusReader::new(&bench.config, bench.now),
+        is_received: Box::new(move |frame| {
+            answers += u32::from(frame.cob_id() == Some(0x581));
+            answers <= 1
+        }),
+        is_sent: Box::new(|_| true),
+    };
+    bench.talk(&mut reader);
+    let error = reader.dialogue.status(Axis::Insertion).unwrap_err();
+    assert!(
+        error.starts_with("insertion: node 1 0x1000:00: no SDO reply within 150 ms"),
+        "{error}"
+    );
 }
 
-/// Power is never taken from a drive that may need it to brake.
 #[test]
 fn a_drive_with_power_is_not_reset() {
     let mut bench = Bench::moving();
-    // Quick stop of the insertion.
+    // The insertion axis quick-stops, and may still need power to brake.
     bench.stage.handle_frame(bench.now, &Frame::new(0x601, &[0x2B, 0x40, 0x60, 0, 2, 0, 0, 0]));
     assert_eq!(bench.states()[0], DriveState::QuickStopActive);
     let mut reset = Reset::new(&bench.config, bench.now);
@@ -324,7 +296,6 @@ fn a_drive_with_power_is_not_reset() {
     }
 }
 
-/// A fault and its history are cleared, and nothing has power.
 #[test]
 fn a_reset_clears_a_fault_whose_cause_is_gone() {
     let config = Config::from_sources(&[], &[]).unwrap();
@@ -352,7 +323,7 @@ fn a_reset_clears_a_fault_whose_cause_is_gone() {
         assert_eq!(after.statusword.state(), Some(DriveState::SwitchOnDisabled));
         assert_eq!((after.error_history.len(), after.error_code), (0, None));
     }
-    // An open safety input takes the torque: the drive stays in fault.
+    // While the emergency stop is pressed, the drive stays in fault.
     stage.change_drive(
         1,
         Time::ZERO,

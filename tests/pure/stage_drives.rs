@@ -1,10 +1,7 @@
-//! The stage against two emulated drives, frames between them, in virtual time.
-
-use std::time::Duration;
+//! The stage against two emulated drives, in virtual time.
 
 use needle_bench::canopen::cia402::DriveState;
 use needle_bench::canopen::nmt::NmtState;
-
 use needle_bench::canopen::{Frame, NodeId};
 use needle_bench::config::Config;
 use needle_bench::emulator::drive::{Drive, DriveConfig};
@@ -14,6 +11,7 @@ use needle_bench::stage::{
     SetPoint, Sign, Stage, StageConfig, StageEvent,
 };
 use needle_bench::units::Time;
+use std::time::Duration;
 
 const VENDOR: u32 = 0x1ee7;
 const PRODUCT: u32 = 1;
@@ -128,7 +126,7 @@ impl Bench {
             }
             self.step();
         }
-        panic!("it never happened");
+        panic!("no such event");
     }
 
     fn feedback(&mut self) -> Feedback {
@@ -186,7 +184,7 @@ fn both_drives_follow_every_set_point_to_the_count() {
 
     bench.stage.disable(bench.now);
     assert!(bench.stopped());
-    // The bench falls silent: drives that were shut down in order do not mind.
+    // Drives that were shut down do not report that the bench is silent.
     let later = bench.now + Duration::from_secs(5);
     for drive in &mut bench.drives {
         assert_eq!(drive.nmt_state(), NmtState::PreOperational);
@@ -203,13 +201,12 @@ fn a_power_loss_of_one_drive_stops_both() {
     let mut bench = Bench::new();
     bench.drive_on(100);
     bench.drives[1].apply_fault(bench.now, &Fault::of(FaultKind::NoVoltage), true);
-    let struck_counts = bench.drives[0].position_counts_at(bench.now).round() as i64;
+    let fault_counts = bench.drives[0].position_counts_at(bench.now).round() as i64;
     let fault = bench.fault();
     assert!(fault.starts_with("rotation: emergency 0x3220 DC link undervoltage"), "{fault}");
-    assert!(bench.stopped(), "both stand");
+    assert!(bench.stopped(), "the axes do not stand");
     assert_ne!(bench.drives[0].state(), DriveState::OperationEnabled);
-    let travel_counts =
-        bench.drives[0].position_counts_at(bench.now).round() as i64 - struck_counts;
+    let travel_counts = bench.drives[0].position_counts_at(bench.now).round() as i64 - fault_counts;
     // Two cycles of 93 counts, then a quick stop at 100,000 counts/s² from 9292 counts/s.
     assert!((1..=186 + 450).contains(&travel_counts), "{travel_counts} counts");
 }
@@ -227,20 +224,20 @@ fn drives_stop_by_themselves_when_the_bench_falls_silent() {
     }
 }
 
-/// A run was killed, and the next begins at once with another drive in the configuration.
+/// A run is killed, and the next starts at once with another product code in its configuration.
 #[test]
 fn a_run_that_finds_another_type_takes_power_off_its_own_drive_alone() {
     let mut bench = Bench::new();
     bench.drive_on(50);
     let mut config = config();
     config.rotation.product_code = Some(PRODUCT + 1);
-    // Listening for another master would outlast the supervision that the drives were left with.
+    // If the stage listened first, the drives would miss the heartbeat of the killed run.
     config.listen_first = Duration::ZERO;
     bench.stage = Stage::new(config, bench.now).expect("valid");
     bench.sent.clear();
     let fault = bench.fault();
     assert!(fault.starts_with("node 2 (rotation): 0x1018:02: expected 0x00000002"), "{fault}");
-    assert!(!bench.stopped(), "nobody saw it stand");
+    assert!(!bench.stopped(), "the stage cannot see whether the rotation drive stands");
     let [insertion, rotation] = &bench.drives;
     assert_eq!(insertion.state(), DriveState::SwitchOnDisabled);
     assert_eq!(insertion.nmt_state(), NmtState::PreOperational);
@@ -250,8 +247,8 @@ fn a_run_that_finds_another_type_takes_power_off_its_own_drive_alone() {
         (Some(0x602), [command, ..]) => *command != 0x40,
         _ => false,
     });
-    assert_eq!(written, None, "only questions go to a drive that is not ours");
-    // It keeps the supervision it had.
+    assert_eq!(written, None, "more than SDO uploads to a drive of another product");
+    // That drive still stops by itself.
     let end = bench.now + Duration::from_secs(2);
     let [_, rotation] = &mut bench.drives;
     while rotation.deadline() < end {
@@ -260,7 +257,7 @@ fn a_run_that_finds_another_type_takes_power_off_its_own_drive_alone() {
     assert_ne!(rotation.state(), DriveState::OperationEnabled);
 }
 
-/// An incremental axis is not enabled before it is homed; afterwards it reads zero at home.
+/// Without homing the axes are not enabled; after it they read zero at home.
 #[test]
 fn both_axes_are_homed_by_their_drives_and_a_run_may_begin() {
     let mut bench = Bench::new();
@@ -280,7 +277,7 @@ fn both_axes_are_homed_by_their_drives_and_a_run_may_begin() {
     }
     bench.stage = Stage::new(config.clone(), bench.now).expect("valid");
     let fault = bench.fault();
-    assert!(fault.contains("home"), "{fault}");
+    assert!(fault.contains("not homed"), "{fault}");
 
     let both = PerAxis { insertion: true, rotation: true };
     bench.stage = Stage::for_homing(config.clone(), both, bench.now).expect("valid");
@@ -299,7 +296,7 @@ fn both_axes_are_homed_by_their_drives_and_a_run_may_begin() {
     let [insertion, rotation] = bench.drives.each_ref().map(counts);
     assert_eq!((insertion, rotation), (14_000, -70_000));
     bench.stage.disable(bench.now);
-    bench.stopped();
+    assert!(bench.stopped());
 
     bench.stage = Stage::new(config, bench.now).expect("valid");
     let feedback = bench.feedback();

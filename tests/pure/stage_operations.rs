@@ -1,4 +1,4 @@
-//! `needle-bench stage` as its user meets it, on the virtual stage.
+//! The command `needle-bench stage`, on the virtual stage.
 
 use crate::support::program::{Said, Scratch, needle_bench, refusals};
 
@@ -15,12 +15,12 @@ fn status_shows_identity_and_position_and_leaves_no_record() {
     assert!(lines[0].starts_with("insertion   node 1, vendor 0x000002F1"), "{}", said.stdout);
     assert!(lines[0].ends_with("at 12.500 mm (58075 counts)"), "{}", said.stdout);
     assert!(lines[1].ends_with("at 0.000 deg (0 counts)"), "{}", said.stdout);
-    assert!(!scratch.path().join("runs").exists(), "nothing happened, nothing is recorded");
+    assert!(!scratch.path().join("runs").exists(), "status left a record");
 
     let json = stage(&scratch, &["status", "--json"]).json();
     assert_eq!(json["insertion"]["state"], "switch on disabled");
     assert_eq!(json["insertion"]["position_mm"], 0.0);
-    assert_eq!(json["rotation"]["position_deg"], 0.0, "from the drive's own zero");
+    assert_eq!(json["rotation"]["position_deg"], 0.0);
     assert_eq!(json["rotation"]["node"], 2);
 }
 
@@ -38,8 +38,8 @@ fn a_jog_leaves_a_record_and_says_where_it_went() {
     assert_eq!((said.status, json["outcome"].as_str()), (0, Some("completed")));
     let moved = json["axes"][0]["to_deg"].as_f64().unwrap();
     assert!((moved + 10.0).abs() < 0.01, "{json}");
-    let dir = scratch.path().join(json["run_dir"].as_str().unwrap());
-    // The second of two within a second has a number behind its name.
+    let dir = said.run_dir(&scratch);
+    // The second of two folders within a second has a number behind its name.
     let name = dir.to_string_lossy();
     assert!(name.trim_end_matches("-2").ends_with("-virtual-jog"), "{name}");
     let manifest = std::fs::read_to_string(dir.join("manifest.json")).unwrap();
@@ -47,7 +47,7 @@ fn a_jog_leaves_a_record_and_says_where_it_went() {
     assert_eq!(manifest["outcome"], "completed");
     assert_eq!(manifest["drives"].as_array().map(Vec::len), Some(2));
     let log = std::fs::read_to_string(dir.join("can.log")).unwrap();
-    assert!(log.contains(" 080# "), "every frame is in the record");
+    assert!(log.contains(" 080# "), "no SYNC in can.log");
 }
 
 #[test]
@@ -88,7 +88,7 @@ fn a_jog_past_a_limit_is_refused_with_the_limit() {
     let scratch = Scratch::new();
     let said = stage(&scratch, &["jog", "--axis", "insertion", "--by", "311mm"]);
     assert_eq!(said.status, 1);
-    assert!(!said.stderr.contains("enabling"), "nothing was enabled: {}", said.stderr);
+    assert!(!said.stderr.contains("enabling"), "{}", said.stderr);
     assert_eq!(
         said.stdout.lines().last(),
         Some(
@@ -96,6 +96,7 @@ fn a_jog_past_a_limit_is_refused_with_the_limit() {
         )
     );
     let said = stage(&scratch, &["jog", "--axis", "insertion", "--by", "-1.5mm", "-q"]);
+    assert_eq!(said.status, 1);
     assert_eq!(
         said.stdout.lines().last(),
         Some(
@@ -136,10 +137,9 @@ fn unusable_arguments_are_bad_usage() {
         operations.iter().map(|operation| [&["stage", "--virtual"], *operation].concat()).collect();
     let commands: Vec<&[&str]> = commands.iter().map(Vec::as_slice).collect();
     insta::assert_snapshot!(refusals(&scratch, &commands));
-    assert!(!scratch.path().join("runs").exists(), "refused before a folder is made");
+    assert!(!scratch.path().join("runs").exists(), "a refusal left a run folder");
 }
 
-/// A limit set before the operation holds, whatever is set after it.
 #[test]
 fn settings_before_and_after_the_operation_both_apply() {
     let scratch = Scratch::new();
@@ -159,7 +159,7 @@ fn settings_before_and_after_the_operation_both_apply() {
         );
         assert!(said.stdout.contains("-x-jog"), "{}", said.stdout);
     }
-    // The last of two counts.
+    // The last value of a key counts.
     let twice =
         [&["--set", "name=a", "jog"][..], &jog, &["--by", "1mm", "--set", "name=b"]].concat();
     assert!(stage(&scratch, &twice).stdout.contains("-b-jog"));
@@ -218,7 +218,7 @@ fn prove_shows_that_both_drives_notice_a_silent_bench() {
         let noticed = format!("{axis}: noticed the bench's silence after ");
         assert!(said.stderr.contains(&noticed), "{}", said.stderr);
     }
-    // What the proof itself asks the drives is answered; no other master is about.
+    // The proof must not take the answers to its own requests for those to another master.
     assert!(!said.stderr.contains("answer without a question"), "{}", said.stderr);
     let last = said.stdout.lines().last().unwrap();
     assert!(
@@ -246,7 +246,7 @@ fn an_operation_without_a_named_stage_is_refused() {
             screens += &refusals(&scratch, &[&[&["stage"], operation, named].concat()]);
         }
     }
-    // The virtual stage's nodes are not those of a rig.
+    // A real interface alone does not name a stage either.
     screens += &refusals(&scratch, &[&["stage", "status", "--set", "can.interface=can0"]]);
     insta::assert_snapshot!(screens);
     assert!(!scratch.path().join("runs").exists());
@@ -265,7 +265,7 @@ fn a_stop_without_an_interface_and_nodes_is_refused() {
     insta::assert_snapshot!(refusals(&scratch, commands));
 }
 
-/// The interface and the nodes are enough to try.
+/// A stop needs only the interface and the nodes; the configuration file may be missing.
 #[test]
 fn a_stop_that_cannot_be_sent_says_so() {
     let scratch = Scratch::new();
@@ -278,7 +278,7 @@ fn a_stop_that_cannot_be_sent_says_so() {
     assert!(said.stderr.ends_with("; use the emergency stop\n"), "{}", said.stderr);
 }
 
-/// At the bound that the configuration is held to.
+/// With the least limits that the configuration check accepts; a move past them would stop the operation.
 #[test]
 fn moves_keep_to_the_acceleration_of_their_axis() {
     let scratch = Scratch::new();

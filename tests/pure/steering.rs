@@ -1,4 +1,4 @@
-//! Observer and control law alone over many seeded starts: the table of decision 7.
+//! Observer and control law alone, with many draws of the noise: the table of decision 7.
 //!
 //! `cargo test --test pure steering:: -- --nocapture` prints it.
 
@@ -12,7 +12,7 @@ use needle_bench::units::wrap_angle;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 
-const STARTS: u64 = 400;
+const SEEDS: u64 = 400;
 
 struct Insertion {
     /// True distance from the plane over the last third, RMS, mm.
@@ -23,8 +23,8 @@ struct Insertion {
     error_at_end: f64,
 }
 
-/// 300 mm, a position each mm with uniform noise of `noise_mm`, all observer poles at `rate_per_mm`.
-/// The start, x 5 mm, yaw and pitch 5°, roll 30°, is unknown to the observer but for its position.
+/// Inserts 300 mm, with a position each mm, uniform noise of `noise_mm` and all observer poles at `rate_per_mm`.
+/// The observer does not know the angles at the start (yaw and pitch 5°, roll 30°); x is 5 mm there.
 fn insert(seed: u64, noise_mm: f64, rate_per_mm: f64) -> Insertion {
     let needle = Needle::new(1.0 / 122.0).unwrap();
     let [yaw, pitch, roll] = [5.0, 5.0, 30f64].map(f64::to_radians);
@@ -83,7 +83,7 @@ fn every_noisy_insertion_settles_and_the_default_rate_is_accurate() {
     println!("rate, 1/mm | error without noise | off-plane RMS median / 95%, mm | roll RMS, deg");
     for rate in [0.05, 0.06, 0.07, 0.08, 0.10] {
         let exact = insert(0, 0.0, rate).error_at_end;
-        let noisy: Vec<Insertion> = (0..STARTS).map(|seed| insert(seed, 1.0, rate)).collect();
+        let noisy: Vec<Insertion> = (0..SEEDS).map(|seed| insert(seed, 1.0, rate)).collect();
         let of = |pick: fn(&Insertion) -> f64, q| {
             quantile(&noisy.iter().map(pick).collect::<Vec<_>>(), q).unwrap()
         };

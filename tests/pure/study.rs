@@ -1,4 +1,4 @@
-//! `needle-bench study` as its user meets it.
+//! The command `needle-bench study`.
 
 use crate::support::program::{Scratch, needle_bench, refusals};
 
@@ -43,8 +43,9 @@ fn study_json_has_its_documented_keys() {
         ("bound_ratio", &COORDINATES),
     ] {
         for part in parts {
-            let value = &json[key][part];
-            assert!(value.is_f64() || value.is_null(), "{key}.{part} in {json}");
+            let value = json[key].get(part);
+            let is_number_or_null = value.is_some_and(|value| value.is_f64() || value.is_null());
+            assert!(is_number_or_null, "{key}.{part} in {json}");
         }
     }
     assert!(json["off_plane_rms_mm"]["median"].as_f64().unwrap() > 0.0);
@@ -54,7 +55,7 @@ fn study_json_has_its_documented_keys() {
     assert!(failed.iter().all(|trial| trial["seed"].is_u64()));
 }
 
-/// What is said of the trials that failed repeats one of them.
+/// Whole sessions and trials without one differ by the rounding of the encoders.
 #[test]
 fn the_command_that_a_study_prints_repeats_a_failed_trial() {
     let scratch = Scratch::new();
@@ -81,7 +82,6 @@ fn the_command_that_a_study_prints_repeats_a_failed_trial() {
     assert!((trial_mm - run_mm).abs() < 0.5, "{trial_mm} {run_mm}");
 }
 
-/// With every position the needle comes several times as near to the plane as with one a step.
 #[test]
 fn every_position_steers_better_than_one_a_step() {
     let scratch = Scratch::new();
@@ -106,7 +106,7 @@ fn every_position_steers_better_than_one_a_step() {
     assert!(all_mm < 0.5 * one_mm, "{all_mm} {one_mm}");
 }
 
-/// The trials do not depend on how many threads make them, nor on how many trials there are.
+/// Nor on the number of trials.
 #[test]
 fn trials_do_not_depend_on_the_number_of_threads() {
     let scratch = Scratch::new();
@@ -117,8 +117,8 @@ fn trials_do_not_depend_on_the_number_of_threads() {
     assert_ne!(one, rows(&scratch, &["--trials", "6", "--seed", "2"]));
 }
 
-/// `run --seed` is the trial with that seed: through whole sessions the same (JSON may lose the last
-/// bit), and without them but for what the encoders round.
+/// A trial through a whole session is the same run (JSON may lose the last bit); one without a session differs by
+/// the rounding of the encoders.
 #[test]
 fn a_run_with_the_seed_of_a_trial_repeats_it() {
     let scratch = Scratch::new();
@@ -138,7 +138,7 @@ fn a_run_with_the_seed_of_a_trial_repeats_it() {
     }
 }
 
-/// The record of a drawn run makes the same run again: what was drawn is in it.
+/// The record has the parameters that were drawn.
 #[test]
 fn the_record_of_a_drawn_run_repeats_it() {
     let scratch = Scratch::new();
@@ -146,8 +146,7 @@ fn the_record_of_a_drawn_run_repeats_it() {
     let seed = "4503599627370497";
     let arguments = ["run", "--json", "-q", "--seed", seed, "--set", DEPTH, "--set", curvature];
     let steps = |arguments: &[&str]| {
-        let json = needle_bench(&scratch, arguments).json();
-        let dir = scratch.path().join(json["run_dir"].as_str().expect("a run folder"));
+        let dir = needle_bench(&scratch, arguments).run_dir(&scratch);
         (std::fs::read_to_string(dir.join("steps.csv")).unwrap(), dir)
     };
     let (first, dir) = steps(&arguments);
@@ -177,17 +176,17 @@ fn bad_ranges_counts_and_stages_of_a_study_are_refused() {
     insta::assert_snapshot!(refusals(&scratch, commands));
 }
 
-/// A study first records the times of one insertion. Its needle starts at the roll that is configured.
+/// The whole session that a study runs first must start at the configured roll too.
 #[test]
 fn a_known_roll_at_the_start_can_be_studied() {
     let scratch = Scratch::new();
-    let told = [
+    let known = [
         "insertion.depth_mm=100",
         "observer.start.roll_deg=137",
         "observer.invariant.start_sd.roll_deg=5",
         "study.roll_deg=[137, 137]",
     ];
-    let sets: Vec<&str> = told.iter().flat_map(|set| ["--set", set]).collect();
+    let sets: Vec<&str> = known.iter().flat_map(|set| ["--set", set]).collect();
     let said = needle_bench(&scratch, &[&["study", "--trials", "2", "--json"], &sets[..]].concat());
     assert_eq!(said.status, 0, "{}", said.stderr);
     assert_eq!(said.json()["failed"], serde_json::json!([]));

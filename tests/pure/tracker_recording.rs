@@ -1,12 +1,12 @@
-//! A recorded stream in which the tracker stalls and its last position is stamped as fresh for
-//! 59 s while the robot goes on, in place of the emulated tracker.
+//! A recorded stream in place of the emulated tracker: the tracker stalls while the robot goes on, and its last
+//! position is sent with new stamps for 59 s.
 
 use crate::support::needed::data;
 use crate::support::program::{Scratch, needle_bench};
 use serde_json::Value;
 
-/// Two positions a second, of another needle that was pushed by hand in steps of 5 mm: the model
-/// has nothing to say of it, and the tip may move fast.
+/// The recording has two positions a second of another needle, pushed by hand in steps of 5 mm. So the gate
+/// against the model is off, and the tip may move fast.
 const SETTINGS: [&str; 12] = [
     "tracker.source=csv",
     "tracker.csv.time={s=\"Timestamp sec\",ns=\"Timestamp nanosec\"}",
@@ -22,14 +22,14 @@ const SETTINGS: [&str; 12] = [
     "observer.kind=finite-difference",
 ];
 
-/// Depth at `time_s`, on the straight lines between the steps.
+/// Depth at `time_s`, interpolated between the steps.
 fn depth_mm(steps_csv: &str, time_s: f64) -> f64 {
     let row = |line: &str| {
         let mut cells = line.split(',').map(|cell| cell.parse::<f64>().ok());
         Some((cells.nth(1)??, cells.next()??))
     };
     let rows: Vec<(f64, f64)> = steps_csv.lines().skip(1).filter_map(row).collect();
-    // The last step may be followed by a position: the line is carried on.
+    // A position after the last step is extrapolated.
     let after = rows.partition_point(|(at, _)| *at <= time_s).clamp(1, rows.len() - 1);
     let ((t0, d0), (t1, d1)) = (rows[after - 1], rows[after]);
     d0 + (d1 - d0) * (time_s - t0) / (t1 - t0)
@@ -63,9 +63,10 @@ fn a_recorded_stall_of_the_tracker_holds_the_needle_within_1_mm() {
     let by_gate = manifest["gates"]["refused"].as_object().expect("counts");
     assert_eq!(by_gate.values().filter_map(Value::as_u64).sum::<u64>(), refused as u64);
     assert_eq!(manifest["gates"], json["tracker_samples"]);
-    let seen = samples.iter().rfind(|sample| sample["refused"].is_null()).expect("believed");
-    let seen_s = seen["acquisition_time_ns"].as_f64().expect("dated") * 1e-9;
-    assert!((31.0..32.5).contains(&seen_s), "it stalls after 31.5 s: {seen_s}");
+    let seen =
+        samples.iter().rfind(|sample| sample["refused"].is_null()).expect("an accepted sample");
+    let seen_s = seen["acquisition_time_ns"].as_f64().expect("a time") * 1e-9;
+    assert!((31.0..32.5).contains(&seen_s), "the stall is at 31.5 s: {seen_s}");
     let seen_mm = depth_mm(&read("steps.csv"), seen_s);
     let blind_mm = json["insertion_mm"].as_f64().expect("a depth") - seen_mm;
     println!("{blind_mm:.2} mm inserted blind; {reason}");

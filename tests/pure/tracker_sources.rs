@@ -1,44 +1,37 @@
-//! Recordings as the source of tip positions, through the command line, in virtual time.
+//! Recordings as the source of tip positions.
 
 use crate::support::needed::data;
 use crate::support::program::{Said, Scratch, needle_bench};
 use std::path::{Path, PathBuf};
 
+const RUN_30_MM: &str = "insertion={ depth_mm = 30, plane_out_of_reach = \"insert\" }";
 const REGISTRATION: &str =
     "tracker.registration={x_mm=0,y_mm=0,z_mm=0,yaw_deg=0,pitch_deg=0,roll_deg=0}";
 
-/// A run with the quickest observer: what steers does not matter here.
+/// A run with the fastest observer, because these tests do not depend on the steering.
 fn run(scratch: &Scratch, sets: &[&str]) -> Said {
     let mut arguments = vec!["run", "--json", "--set", "observer.kind=coupled"];
     sets.iter().for_each(|set| arguments.extend(["--set", set]));
     needle_bench(scratch, &arguments)
 }
 
-fn run_dir(scratch: &Scratch, said: &Said) -> PathBuf {
-    scratch.path().join(said.json()["run_dir"].as_str().expect("a run folder"))
-}
-
 fn text(dir: &Path, file: &str) -> String {
     std::fs::read_to_string(dir.join(file)).expect("text")
 }
 
-/// A run of 30 mm and what it left.
+/// The folder of a run of 30 mm.
 fn recorded(scratch: &Scratch, sets: &[&str]) -> PathBuf {
-    let said = run(
-        scratch,
-        &[&["insertion={ depth_mm = 30, plane_out_of_reach = \"insert\" }"], sets].concat(),
-    );
+    let said = run(scratch, &[&[RUN_30_MM], sets].concat());
     assert_eq!(said.status, 0, "{}", said.stderr);
-    run_dir(scratch, &said)
+    said.run_dir(scratch)
 }
 
-/// `steps.csv` as numbers, without the truth, which is the emulator's alone.
+/// `steps.csv` as numbers; an empty field is NaN.
 fn steps(dir: &Path) -> Vec<Vec<f64>> {
     let number = |field: &str| if field.is_empty() { f64::NAN } else { field.parse().unwrap() };
     text(dir, "steps.csv").lines().skip(1).map(|l| l.split(',').map(number).collect()).collect()
 }
 
-/// The record of a run, given again as the tracker, makes that run again.
 #[test]
 fn recorded_samples_as_the_tracker_repeat_the_run() {
     let scratch = Scratch::new();
@@ -54,7 +47,7 @@ fn recorded_samples_as_the_tracker_repeat_the_run() {
     }
 }
 
-/// Its own steps are a source as well, by the mapping of the defaults; their end is told.
+/// The default mapping reads a run's own `steps.csv`.
 #[test]
 fn a_recording_that_ends_stops_the_run() {
     let scratch = Scratch::new();
@@ -74,11 +67,10 @@ fn a_recording_that_ends_stops_the_run() {
     let reason = said.json()["stop_reason"].as_str().expect("a reason").to_owned();
     assert!(reason.starts_with("tracker: last tip 0.5"), "{reason}");
     assert!(reason.contains("; tracker: the recording ended after 31 samples: "), "{reason}");
-    let samples = text(&run_dir(&scratch, &said), "tracker.ndjson");
-    assert_eq!(samples.lines().count(), 31, "the emulated tracker is not heard");
+    let samples = text(&said.run_dir(&scratch), "tracker.ndjson");
+    assert_eq!(samples.lines().count(), 31, "samples of the emulated tracker are among them");
 }
 
-/// Every bad line is named; the good ones are taken.
 #[test]
 fn a_malformed_line_is_reported_and_skipped() {
     let scratch = Scratch::new();
@@ -89,23 +81,14 @@ fn a_malformed_line_is_reported_and_skipped() {
     lines.insert(200, "{\"tool\":".to_owned());
     let file = scratch.write("damaged.ndjson", &lines.join("\n"));
     let file = format!("tracker.file={}", file.display());
-    let said = run(
-        &scratch,
-        &[
-            "insertion={ depth_mm = 30, plane_out_of_reach = \"insert\" }",
-            "tracker.source=ndjson",
-            &file,
-            REGISTRATION,
-        ],
-    );
+    let said = run(&scratch, &[RUN_30_MM, "tracker.source=ndjson", &file, REGISTRATION]);
     assert_eq!(said.status, 0, "{}", said.stderr);
     for part in ["ndjson: line 101: unknown field `position_mm`", "ndjson: line 201: EOF"] {
         assert!(said.stderr.contains(part), "{}", said.stderr);
     }
-    assert_eq!(steps(&run_dir(&scratch, &said)).len(), 31);
+    assert_eq!(steps(&said.run_dir(&scratch)).len(), 31);
 }
 
-/// What cannot be a recording is refused before anything moves.
 #[test]
 fn a_wrong_file_or_mapping_is_refused_with_the_reason() {
     let scratch = Scratch::new();
@@ -129,7 +112,7 @@ fn a_wrong_file_or_mapping_is_refused_with_the_reason() {
     assert!(!scratch.path().join("runs").exists(), "a run folder was left");
 }
 
-/// `check --connect` listens to a recording as to a tracker, at its pace.
+/// `check --connect` plays the recording at its own pace.
 #[test]
 fn check_listens_to_a_recording() {
     let scratch = Scratch::new();
@@ -160,8 +143,8 @@ fn check_listens_to_a_recording() {
     assert_eq!(said.json()["tracker"]["last_position_bench_mm"][2], 5.0);
 }
 
-/// A real recording of another lab, as it is: the sender's frozen stamps, robot columns in metres
-/// among those of the tip.
+/// A real recording, unchanged: the sender's stamps are frozen, and columns of the robot in metres are among
+/// those of the tip.
 #[test]
 fn a_recording_of_another_lab_is_read_by_its_column_names() {
     let Some(path) = data("tracker-recordings/phantomA_closedloop_03.csv") else { return };
@@ -181,11 +164,12 @@ fn a_recording_of_another_lab_is_read_by_its_column_names() {
             "insertion.speed_mm_per_s=0.5",
         ],
     );
-    assert_eq!(said.status, 1, "a recording cannot be steered: {}", said.stderr);
-    let samples = text(&run_dir(&scratch, &said), "tracker.ndjson");
+    // The recorded needle does not follow the set-points, so the run stops.
+    assert_eq!(said.status, 1, "{}", said.stderr);
+    let samples = text(&said.run_dir(&scratch), "tracker.ndjson");
     let sample: serde_json::Value =
         serde_json::from_str(samples.lines().nth(1).expect("a second sample")).expect("JSON");
-    // The second row is the first with a position, half a second after the first.
+    // The second row has the first position, half a second after the first row.
     assert_eq!(sample["receive_time_ns"], 499_876_128);
     assert_eq!(sample["source_unix_ns"], 1_666_034_109_293_831_946i64);
     assert_eq!(sample["position_tracker_mm"][2], -262.991_180_419_921_9);

@@ -1,9 +1,9 @@
-//! Whole runs of which the noise is taken away, so that what else is wrong with an estimate shows.
+//! Whole runs without noise, so that other errors of an estimate show.
 
 use crate::support::program::{Scratch, needle_bench};
 use serde_json::Value;
 
-/// The run's JSON with `sets` over a run of 200 mm without noise.
+/// The JSON of a run of 200 mm without noise, with `sets` over that.
 fn noiseless(sets: &[&str]) -> Value {
     let scratch = Scratch::new();
     let mut arguments = vec![
@@ -25,8 +25,7 @@ fn rms(json: &Value, coordinate: &str) -> f64 {
     json["estimate_rms"][coordinate].as_f64().unwrap()
 }
 
-/// Wherever plane and tracker stand on the bench and whichever way the drives count, the run in
-/// the plane's frame is the same.
+/// In the plane's frame, which the poses of plane and tracker and the signs of the drives do not change.
 #[test]
 fn the_run_does_not_depend_on_frames_or_signs() {
     let elsewhere = noiseless(&[
@@ -44,8 +43,7 @@ fn the_run_does_not_depend_on_frames_or_signs() {
     assert!(rms(&elsewhere, "y_mm") < 0.01 && rms(&elsewhere, "roll_deg") < 0.1, "{elsewhere}");
 }
 
-/// A position that is late by a known latency is applied at its own depth: at 5 mm/s, 175 ms
-/// unaccounted for are 0.875 mm along the path, and accounted for are nothing.
+/// At 5 mm/s a latency of 175 ms, if the bench does not know it, is an error of 0.875 mm along the path.
 #[test]
 fn a_known_latency_causes_no_error_along_the_path() {
     let late = |stamp: &str, known_ms: &str| {
@@ -65,8 +63,7 @@ fn a_known_latency_causes_no_error_along_the_path() {
     }
 }
 
-/// The finite differences may steer; they do it badly, and never spin the needle with the law that
-/// turns it slowly.
+/// With the control law that turns the needle slowly.
 #[test]
 fn the_finite_difference_observer_can_steer_without_noise() {
     let json = noiseless(&[
@@ -78,8 +75,7 @@ fn the_finite_difference_observer_can_steer_without_noise() {
     assert!(rms(&json, "roll_deg") < 1.0, "{json}");
 }
 
-/// A step may take longer than the stage's history lasts. The session then predicts the observers in
-/// between, and the estimate is as good.
+/// A step may take longer than the stage's history lasts. The session then predicts between the steps.
 #[test]
 fn slow_insertions_are_estimated_as_well_as_fast_ones() {
     let slow =

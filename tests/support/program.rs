@@ -57,6 +57,14 @@ impl Said {
         serde_json::from_str(&self.stdout)
             .unwrap_or_else(|error| panic!("{error} in {:?}\n{}", self.stdout, self.stderr))
     }
+
+    /// The run folder that the JSON names.
+    #[track_caller]
+    pub(crate) fn run_dir(&self, scratch: &Scratch) -> PathBuf {
+        let json = self.json();
+        let dir = json["run_dir"].as_str();
+        scratch.path().join(dir.unwrap_or_else(|| panic!("no run folder: {}", self.stderr)))
+    }
 }
 
 /// `needle-bench ARGUMENTS` in `scratch`.
