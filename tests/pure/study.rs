@@ -55,7 +55,6 @@ fn study_json_has_its_documented_keys() {
     assert!(failed.iter().all(|trial| trial["seed"].is_u64()));
 }
 
-/// Whole sessions and trials without one differ by the rounding of the encoders.
 #[test]
 fn the_command_that_a_study_prints_repeats_a_failed_trial() {
     let scratch = Scratch::new();

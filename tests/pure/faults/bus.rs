@@ -1,4 +1,4 @@
-//! Faults of the bus, of the bench itself, and the operator's stop.
+//! Faults of the bus and of the bench itself, and the operator's stop.
 
 use crate::support::bench::{Bench, configured};
 use crate::support::stop::{Measured, Stop, documented, stopped};
@@ -19,7 +19,7 @@ fn foreign_and_misshapen_frames_have_no_effect() {
             bench.inject(Frame::new(cob_id, &[0; 8]));
         }
         bench.inject(extended);
-        // From the drives, but of the wrong length: position, emergency, heartbeat, SDO.
+        // Of the wrong length: the drives' TPDO1, emergency, heartbeat, SDO.
         for cob_id in [0x181, 0x182, 0x081, 0x701, 0x582] {
             bench.inject(Frame::new(cob_id, &[0; 3]));
         }
@@ -27,12 +27,12 @@ fn foreign_and_misshapen_frames_have_no_effect() {
     }
     bench.run_to_end();
     assert!(bench.completed(), "{}", bench.reason());
-    for told in ["frame from elsewhere, 16 so far", "frame of the wrong length, 16 so far"] {
-        assert!(bench.events().any(|text| text.starts_with(told)), "{told}");
+    for report in ["frame from elsewhere, 16 so far", "frame of the wrong length, 16 so far"] {
+        assert!(bench.events().any(|text| text.starts_with(report)), "no report: {report}");
     }
 }
 
-/// What is left to do after a set-point is due as soon as it may have left, and then is done.
+/// After the set-points the session is due at once, and after that tick only later.
 #[test]
 fn observers_are_updated_after_the_set_points_are_sent() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
@@ -44,7 +44,7 @@ fn observers_are_updated_after_the_set_points_are_sent() {
         bench.now = bench.now.max(due);
         bench.stage.handle_timeout(bench.now);
         bench.session.handle(bench.now, Input::Tick);
-        assert!(bench.session.deadline() > bench.now, "done");
+        assert!(bench.session.deadline() > bench.now, "still due after a tick");
         let mut made = sent(&mut bench);
         while let Some(output) = bench.stage.poll() {
             let input = match output {
@@ -56,13 +56,13 @@ fn observers_are_updated_after_the_set_points_are_sent() {
             made.extend(sent(&mut bench));
         }
         if made.contains(&0x202) {
-            assert!(bench.session.deadline() <= bench.now, "left to do");
+            assert!(bench.session.deadline() <= bench.now, "the observers were updated already");
             answered += 1;
         }
     }
 }
 
-/// Hands the drives what the session sends, and gives the identifiers.
+/// Passes the session's frames to the drives, and gives their identifiers.
 fn sent(bench: &mut Bench) -> Vec<u16> {
     let mut sent = Vec::new();
     while let Some(output) = bench.session.poll() {
@@ -97,7 +97,7 @@ fn a_stop_by_the_operator() {
     documented(&stops, "a_stop_by_the_operator", 0.0, "operator: interrupted");
 }
 
-/// From listening over standby and enabling to the insertion; these drives are brought up in no time.
+/// While listening, in standby, while enabling, and while inserting. The bring-up of these drives takes no time.
 #[test]
 fn a_stop_by_the_operator_at_any_moment() {
     let listens = Duration::from_millis(100);
@@ -107,11 +107,11 @@ fn a_stop_by_the_operator_at_any_moment() {
         session.stage.listen_first = listens;
         let mut bench = Bench::new((session, stage));
         bench.run_for(Duration::from_millis(ms));
-        let said = bench.records.iter().rev().find_map(|record| match record {
+        let last = bench.records.iter().rev().find_map(|record| match record {
             Record::Event { lane: Lane::Stage, text, .. } => Some(text.clone()),
             _ => None,
         });
-        states.push(said.unwrap_or_default());
+        states.push(last.unwrap_or_default());
         let stop = Stop::of(bench, |bench| {
             bench.hand(Input::Stop("operator: interrupted".to_owned()));
         });
@@ -131,7 +131,7 @@ fn a_stop_by_the_operator_at_any_moment() {
 fn a_bench_that_dies() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
     bench.run_to_mm(10.0);
-    let (died, struck_at) = (bench.now, bench.stage.position_true(bench.now));
+    let (died, died_at) = (bench.now, bench.stage.position_true(bench.now));
     let enabled = |bench: &Bench| {
         bench.stage.drives().iter().any(|drive| drive.state() == DriveState::OperationEnabled)
     };
@@ -144,17 +144,17 @@ fn a_bench_that_dies() {
     let end = bench.stage.position_true(bench.now);
     let measured = Measured {
         detected_ms,
-        before: ((at.0 - struck_at.0).abs(), (at.1 - struck_at.1).abs()),
+        before: ((at.0 - died_at.0).abs(), (at.1 - died_at.1).abs()),
         after: ((end.0 - at.0).abs(), (end.1 - at.1).abs()),
     };
     measured.is_documented("a_bench_that_dies", 100.0, "none: the drives stop by themselves");
 
-    // And should it come back, it finds that it was away, and moves nothing.
+    // If the bench continues after that, it moves nothing.
     let stop = Stop::of(bench, |_| ());
     assert_eq!(stop.travel(), [(0.0, 0.0); 2]);
 }
 
-/// A stop in which the bench does not see the drives any more says so, however it ends.
+/// Whether the drives still answer or not.
 #[test]
 fn a_bench_that_stalls_in_its_stop_reports_what_it_does_not_know() {
     for drives_answer in [true, false] {
@@ -167,12 +167,13 @@ fn a_bench_that_stalls_in_its_stop_reports_what_it_does_not_know() {
         }
         bench.hold_up_for(Duration::from_secs(7));
         bench.run_to_end();
-        let unknown = bench.session.stage_at_end().unknown.expect("something is not known");
-        assert!(bench.events().any(|text| text == unknown), "{drives_answer}: {unknown}");
+        let unknown = bench.session.stage_at_end().unknown.expect("an unknown state");
+        let is_reported = bench.events().any(|text| text == unknown);
+        assert!(is_reported, "drives answer: {drives_answer}; not reported: {unknown}");
     }
 }
 
-/// However long the drives bear it: what the bench knows of the tip is too old by then.
+/// However long the drives' heartbeat timeout is, after 500 ms the last tip is too old.
 #[test]
 fn the_longest_stall_is_the_shorter_of_heartbeat_and_tip_timeout() {
     for (timeout_ms, max_ms) in [(100, 100), (3000, 500)] {

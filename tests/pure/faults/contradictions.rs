@@ -1,7 +1,7 @@
-//! Streams that every gate lets pass and that are not the needle's: the run is stopped by what
-//! they contradict. The last table of the tracker in `docs/hazards.md`.
+//! Streams that pass every gate although they are wrong: the run is stopped because they contradict the insertion as
+//! a whole. The last table of the tracker in `docs/hazards.md`.
 //!
-//! With the default observer and law, whose needle is turned as it needs it.
+//! These runs use the default observer and law.
 
 use crate::support::bench::{Bench, configured_with};
 use crate::support::stop::is_row;
@@ -15,30 +15,30 @@ use needle_bench::tracker::Sample;
 use std::f64::consts::FRAC_PI_4;
 use std::time::Duration;
 
-/// The default steering over 150 mm, with `sets` over it.
+/// A run of 150 mm with the default steering and with `sets`.
 fn steered(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
     configured_with(&[&["insertion.depth_mm=150", "observer.shadows=[]"], sets].concat())
 }
 
-/// Runs to `struck_mm`, changes every sample from there on, and runs to the end. Gives the depth
-/// inserted from there to the hold or stop, mm, and the reason.
+/// Runs to `from_mm`, changes every sample after that, and runs to the end. Gives the run and the depth inserted
+/// from there to its hold or stop, mm.
 fn contradicted(
     (session, stage): (SessionConfig, VirtualStageConfig),
-    struck_mm: f64,
+    from_mm: f64,
     change: impl FnMut(&mut Sample) + 'static,
 ) -> (Bench, f64) {
     let mut bench = Bench::new((session, stage));
-    bench.run_to_mm(struck_mm);
+    bench.run_to_mm(from_mm);
     bench.change_samples(change);
     bench.run_to_end();
     assert!(!bench.completed(), "the run was not stopped");
-    let detection = bench.detection.expect("it was stopped");
-    let inserted_mm = detection.position.0 - struck_mm;
+    let detection = bench.detection.expect("a hold or a stop");
+    let inserted_mm = detection.position.0 - from_mm;
     (bench, inserted_mm)
 }
 
-/// Asserts that the stream is contradicted within `within_mm` in a run at 2 mm/s and in one at 1 mm/s, which `run`
-/// makes with its setting, and that the row of `docs/hazards.md` says the same. Gives the first.
+/// Asserts that the run is held or stopped within `within_mm` at 2 mm/s and at 1 mm/s, and that the row of
+/// `docs/hazards.md` has the measured depths. `run` takes the setting of the speed. Gives the run at 2 mm/s.
 #[track_caller]
 fn is_documented(test: &str, within_mm: f64, run: impl Fn(&str) -> (Bench, f64)) -> Bench {
     let (bench, fast_mm) = run("insertion.speed_mm_per_s=2");
@@ -73,17 +73,17 @@ fn a_rotation_of_the_wrong_sign() {
         session.stage.rotation.sign = Sign::Negative;
         contradicted((session, stage), 0.0, |_| {})
     };
-    // 42 mm at 1 mm/s, with this noise.
+    // With this noise it is 42 mm at 1 mm/s.
     is_documented("a_rotation_of_the_wrong_sign", 45.0, run);
 }
 
-/// So many starts, unless the environment names another number.
+/// `NEEDLE_STARTS`, or this number of starts.
 fn starts_or(default: u64) -> u64 {
     let starts = std::env::var("NEEDLE_STARTS").ok();
     starts.and_then(|starts| starts.parse().ok()).unwrap_or(default)
 }
 
-/// Asserts that all were found, and most of them soon; prints the figures of `docs/hazards.md`.
+/// Asserts the median and the largest of these depths; prints the figures of `docs/hazards.md`.
 fn are_found(what: &str, mut found_mm: Vec<f64>) {
     found_mm.sort_by(f64::total_cmp);
     let after_mm = |part: f64| found_mm[((found_mm.len() - 1) as f64 * part) as usize];
@@ -97,8 +97,8 @@ fn are_found(what: &str, mut found_mm: Vec<f64>) {
     assert!(median < 45.0 && most < 100.0, "{what}: {found_mm:?}");
 }
 
-/// From any start, the default noise. `NEEDLE_STARTS=300` makes the figures of `docs/hazards.md`.
-/// `NEEDLE_ROTATIONS=FILE` keeps how the base was turned, for `docs/handedness_bound.py`.
+/// With the default noise. `NEEDLE_STARTS=300` gives the figures of `docs/hazards.md`. `NEEDLE_ROTATIONS=FILE` writes
+/// the rotations of the base for `docs/handedness_bound.py`.
 #[test]
 fn wrong_handedness_is_found_from_every_start() {
     let mut rotations = String::from("start,depth_mm,rotation_rad\n");
@@ -127,8 +127,7 @@ fn wrong_handedness_is_found_from_every_start() {
     are_found("from any start", found_mm);
 }
 
-/// From the default start, with other noise each time. `NEEDLE_STARTS=100` makes the figures of
-/// `docs/hazards.md`.
+/// From the default start. `NEEDLE_STARTS=100` gives the figures of `docs/hazards.md`.
 #[test]
 fn wrong_handedness_is_found_whatever_the_noise() {
     for speed in ["1.0", "2.0"] {
@@ -153,8 +152,8 @@ fn wrong_handedness_is_found_whatever_the_noise() {
     }
 }
 
-/// A shaft that twists by 0.57°/mm, which nobody told, is no mirrored needle. Where the watch took a
-/// rigid shaft for forty times as likely as one that twists, this insertion was stopped after 64.5 mm.
+/// The shaft twists by 0.57°/mm, which the bench does not know. With a prior of forty to one for a rigid shaft, the
+/// watch stopped this insertion after 64.5 mm.
 #[test]
 fn unknown_torsion_is_not_taken_for_wrong_handedness() {
     let text = include_str!("../../../bench-config/study.toml");
@@ -180,7 +179,7 @@ fn unknown_torsion_is_not_taken_for_wrong_handedness() {
     assert_eq!(trials[0].outcome, Outcome::Completed);
 }
 
-/// A tracker of 0.1 mm that is told as such is contradicted much sooner.
+/// The noise is 0.1 mm, and the bench knows it.
 #[test]
 fn a_precise_tracker_shows_wrong_handedness_sooner() {
     let run = |speed: &str| {
@@ -196,8 +195,7 @@ fn a_precise_tracker_shows_wrong_handedness_sooner() {
     is_documented("a_precise_tracker_shows_wrong_handedness_sooner", 20.0, run);
 }
 
-/// A registration that is turned about the needle gives the path of another roll at the start: only
-/// a bench that is told the roll can see it.
+/// Such a registration looks like another roll at the start, so the bench sees it only if it knows the roll.
 #[test]
 fn a_registration_that_is_turned() {
     let turned = |sample: &mut Sample| {
@@ -212,7 +210,7 @@ fn a_registration_that_is_turned() {
     assert!(bench.reason().contains("another roll at the start"), "{}", bench.reason());
 }
 
-/// By 45°, which is far from the heading at the start that the observer is told.
+/// By 45°, far from the heading at the start that the observer assumes.
 #[test]
 fn a_registration_that_is_tilted() {
     let (sin, cos) = FRAC_PI_4.sin_cos();
@@ -225,7 +223,7 @@ fn a_registration_that_is_tilted() {
     assert!(bench.reason().contains("another heading at the start"), "{}", bench.reason());
 }
 
-/// The axis goes one and a half times as far as the bench commands.
+/// The axis moves 1.5 times as far as the bench commands.
 #[test]
 fn a_wrong_scale_of_the_stage() {
     let run = |speed: &str| {
@@ -243,7 +241,7 @@ fn a_wrong_scale_of_the_tracker() {
     is_documented("a_wrong_scale_of_the_tracker", 30.0, run);
 }
 
-/// Noise of its own on a position that stands still.
+/// Fresh noise on a position that does not change.
 #[test]
 fn a_frozen_position_with_noise() {
     let run = |speed: &str| {
@@ -252,7 +250,7 @@ fn a_frozen_position_with_noise() {
     is_documented("a_frozen_position_with_noise", 3.0, run);
 }
 
-/// Positions frozen where the first was, with the noise that `seed` draws.
+/// Replaces each position by the first one with fresh noise.
 fn frozen_with_noise(noise: WhiteNoise, seed: u64) -> impl FnMut(&mut Sample) + 'static {
     let (mut frozen, mut k) = (None, 0);
     move |sample| {
@@ -262,8 +260,7 @@ fn frozen_with_noise(noise: WhiteNoise, seed: u64) -> impl FnMut(&mut Sample) + 
     }
 }
 
-/// Where a frozen stream is tried: depths, mm, and seeds of all noise, that of the position which freezes
-/// too.
+/// Depths, mm, at which a stream freezes, and seeds of the noise before and after that.
 fn frozen_tries() -> impl Iterator<Item = (f64, u64)> {
     let seeds = 1..=starts_or(4);
     [5.0, 20.0, 60.0]
@@ -271,7 +268,7 @@ fn frozen_tries() -> impl Iterator<Item = (f64, u64)> {
         .flat_map(move |at_mm| seeds.clone().map(move |seed| (at_mm, seed)))
 }
 
-/// Asserts that all were held within `within_mm`, and prints from where to where.
+/// Asserts that all runs were held within `within_mm`, and prints the figures of `docs/hazards.md`.
 fn all_held(mut held_mm: Vec<f64>, within_mm: f64) {
     held_mm.sort_by(f64::total_cmp);
     let after_mm = |part: f64| held_mm[((held_mm.len() - 1) as f64 * part) as usize];
@@ -283,7 +280,7 @@ fn all_held(mut held_mm: Vec<f64>, within_mm: f64) {
     assert!(most <= within_mm, "{held_mm:?}");
 }
 
-/// Whatever the noise, from 5 mm on. `NEEDLE_STARTS=30` makes the figures of `docs/hazards.md`.
+/// `NEEDLE_STARTS=30` gives the figures of `docs/hazards.md`.
 #[test]
 fn a_frozen_position_is_held_whatever_the_noise() {
     for (speed, rate_hz, within_mm) in [(1.0, 40.0, 4.2), (2.0, 40.0, 4.2), (2.0, 10.0, 6.0)] {
@@ -308,8 +305,7 @@ fn a_frozen_position_is_held_whatever_the_noise() {
     }
 }
 
-/// A moment in which noise lets a frozen stream agree with the model ends a hold, where that is
-/// allowed. All holds together last no longer than one may.
+/// By chance the noise may agree with the model for a moment, which ends the hold. All holds share one timeout.
 #[test]
 fn automatic_resume_takes_a_frozen_position_no_further() {
     let inserted_mm = frozen_tries().map(|(struck_mm, seed)| {
@@ -324,9 +320,8 @@ fn automatic_resume_takes_a_frozen_position_no_further() {
     all_held(inserted_mm.collect(), 4.5);
 }
 
-/// A jump of 2.5 mm and more is held at once, and not as a silent stream is, whether the mean shows it
-/// first or single positions are refused before. `NEEDLE_STARTS=30` makes the figures of
-/// `docs/hazards.md`.
+/// A jump of 2.5 mm or more is held for itself, not as a silent stream, whether the mean of the positions or single
+/// ones show it first. `NEEDLE_STARTS=30` gives the figures of `docs/hazards.md`.
 #[test]
 fn a_jump_is_held_whatever_the_noise() {
     for (struck_mm, within_mm) in [(40.0, 1.5), (63.0, 1.0)] {
@@ -349,11 +344,11 @@ fn a_jump_is_held_whatever_the_noise() {
     }
 }
 
-/// Ten positions a second are too few to lose the track for certain: the observer may come to believe the jump.
-/// It is said all the same, but for a few draws of the noise.
+/// With ten positions a second the observer may follow the jump before the track is lost. The bench still reports
+/// the jump, except for a few draws of the noise.
 #[test]
 fn a_jump_that_a_slow_stream_hides_is_reported() {
-    let said = (1..=40).filter(|seed| {
+    let reported = (1..=40).filter(|seed| {
         let seed = format!("emulator.seed={seed}");
         let noise = "emulator.noise={ sd_mm = 0.6 }";
         let mut bench = Bench::new(steered(&[noise, &seed, "emulator.tracker_rate_hz=10"]));
@@ -368,12 +363,12 @@ fn a_jump_that_a_slow_stream_hides_is_reported() {
             _ => false,
         })
     });
-    let said = said.count();
-    println!("said in {said} of 40");
-    assert!(said >= 34, "{said} of 40");
+    let reported = reported.count();
+    println!("reported in {reported} of 40");
+    assert!(reported >= 34, "reported in {reported} of 40");
 }
 
-/// Half a millimetre to the side per mm inserted: no gate sees it.
+/// By 0.5 mm to the side per mm inserted, which no gate sees.
 #[test]
 fn a_drift_that_is_taken_for_a_heading() {
     let run = |speed: &str| {
@@ -387,7 +382,7 @@ fn a_drift_that_is_taken_for_a_heading() {
     is_documented("a_drift_that_is_taken_for_a_heading", 30.0, run);
 }
 
-/// Positions that go half as far from the first on.
+/// Halves the distance of each position from the first.
 fn at_half_speed() -> impl FnMut(&mut Sample) + 'static {
     let mut from = None;
     move |sample| {
@@ -402,8 +397,8 @@ fn a_stream_at_half_speed() {
     is_documented("a_stream_at_half_speed", 8.0, run);
 }
 
-/// The reason names the scale and not a frozen stream, but for some draws of the noise.
-/// `NEEDLE_STARTS=30` makes the figures of `docs/hazards.md`.
+/// Not as a frozen stream, except for some draws of the noise. `NEEDLE_STARTS=30` gives the figures of
+/// `docs/hazards.md`.
 #[test]
 fn a_stream_at_half_speed_is_reported_with_its_scale() {
     for speed in [1.0, 2.0] {
@@ -424,7 +419,7 @@ fn a_stream_at_half_speed_is_reported_with_its_scale() {
     }
 }
 
-/// Three millimetres to the side, at a depth at which the observer knows where the tip is.
+/// By 3 mm to the side, at a depth at which the estimate is good.
 #[test]
 fn a_jump_that_noise_hides() {
     let jump = |sample: &mut Sample| sample.position_mm.x += 3.0;
@@ -434,6 +429,6 @@ fn a_jump_that_noise_hides() {
         Record::Event { lane: Lane::Tracker, text, .. } if text.starts_with("lost, ") => Some(text),
         _ => None,
     });
-    let text = warned.expect("it is told at once");
+    let text = warned.expect("a report of the lost track");
     assert!(text.ends_with(": a jump, a drift, or too large a scale"), "{text}");
 }

@@ -1,8 +1,8 @@
-//! The same configuration and seed give the same run, to the last bit of its record.
+//! The same configuration and seed give the same record, bit for bit.
 
 use crate::support::bench::{Bench, configured};
 
-/// Every record of a run, its numbers in full.
+/// Every record of a run as text, with all digits.
 fn records(seed: u32) -> Vec<String> {
     let seed = format!("emulator.seed={seed}");
     let mut bench = Bench::new(configured(&[&seed, "insertion.depth_mm=30"]));

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 const TPDOS: [u16; 2] = [0x181, 0x182];
 
-/// Switches the supply of the power stages of these drives.
+/// Switches the supply of these drives' power stages.
 fn set_voltage(bench: &mut Bench, drives: &[usize], on: bool) {
     bench.stage.handle_timeout(bench.now);
     for drive in drives {
@@ -104,12 +104,12 @@ fn an_emergency_stop_that_is_released_moves_nothing() {
         bench.run_for(Duration::from_millis(20));
         set_voltage(bench, &[0, 1], true);
     });
-    assert!(stop.travel()[1].0 < 1e-3, "{:?}", stop.travel());
+    assert!(stop.travel()[1].0 < 1e-3, "it moved: {:?}", stop.travel());
 }
 
 #[test]
 fn a_drive_that_restarts() {
-    // As by a brown-out of its electronics: nobody says Reset Node on the bus.
+    // As after a brown-out: the drive resets without a command on the bus.
     let stops = stopped(&[], |bench| {
         bench.stage.handle_frame(bench.now, &Frame::new(0x000, &[0x81, 1]));
     });
@@ -134,7 +134,7 @@ fn a_heartbeat_lost() {
 
 #[test]
 fn an_nmt_command_of_another_master() {
-    // Enter Pre-operational, to all.
+    // Enter Pre-operational, to all nodes.
     let stops = stopped(&[], |bench| bench.inject(Frame::new(0x000, &[0x80, 0])));
     let reason = "stage: another master on the bus: an NMT command (000#8000); stop it, or give it \
                   other nodes: two masters cannot share an axis";
@@ -176,7 +176,7 @@ fn a_position_that_jumps() {
     });
     for stop in &stops {
         let deepest = stop.bench.steps().map(|step| step.insertion_meas_mm).fold(0.0, f64::max);
-        assert!(deepest < 10.2, "no step was taken at the wrong depth: {deepest}");
+        assert!(deepest < 10.2, "a step at the wrong depth: {deepest}");
     }
     let reason = stops[0].bench.reason();
     assert!(reason.ends_with("(limit 0.500); is the axis blocked, or the encoder lost?"));
@@ -199,8 +199,8 @@ fn a_depth_that_is_never_quite_reached() {
     );
 }
 
-/// The insertion drive no longer shows `bits` of its statusword: the run stops for `reason`.
-fn a_lost_flag(test: &str, bits: u16, reason: &str) {
+/// Clears `bits` in the insertion drive's statusword: the run stops for `reason`.
+fn without_bits(test: &str, bits: u16, reason: &str) {
     let stops = stopped(&[], |bench| bench.change_tpdo(move |word, counts| (word & !bits, counts)));
     documented(&stops, test, 10.0, &format!("stage: insertion: {reason}"));
 }
@@ -209,21 +209,21 @@ fn a_lost_flag(test: &str, bits: u16, reason: &str) {
 fn a_drive_that_no_longer_obeys_the_bus() {
     let reason = "the drive no longer obeys the bus (statusword 0x1037 operation enabled, bit 9 \
                   clear): it will ignore a stop; press the emergency stop";
-    a_lost_flag("a_drive_that_no_longer_obeys_the_bus", Statusword::REMOTE, reason);
+    without_bits("a_drive_that_no_longer_obeys_the_bus", Statusword::REMOTE, reason);
 }
 
 #[test]
 fn a_drive_that_reports_no_voltage() {
     let reason = "the drive has lost its supply (statusword 0x1227 operation enabled, bit 4 clear), is \
                   an emergency stop pressed, or a fuse blown?";
-    a_lost_flag("a_drive_that_reports_no_voltage", Statusword::VOLTAGE_ENABLED, reason);
+    without_bits("a_drive_that_reports_no_voltage", Statusword::VOLTAGE_ENABLED, reason);
 }
 
 #[test]
 fn a_drive_that_ignores_its_targets() {
     let reason = "the drive ignores its targets (statusword 0x0237 operation enabled, bit 12 clear), \
                   does an input or another tool hold it?";
-    a_lost_flag("a_drive_that_ignores_its_targets", Statusword::FOLLOWS_COMMAND, reason);
+    without_bits("a_drive_that_ignores_its_targets", Statusword::FOLLOWS_COMMAND, reason);
 }
 
 #[test]
@@ -237,17 +237,17 @@ fn a_warning_of_a_drive_is_reported_and_tolerated() {
     });
     bench.run_to_end();
     assert!(bench.completed(), "{}", bench.reason());
-    let told: Vec<&str> = bench.events().filter(|text| text.contains("warns")).collect();
+    let reported: Vec<&str> = bench.events().filter(|text| text.contains("warns")).collect();
     let counts = [1, 2, 4, 8].map(|count| {
         format!(
             "insertion: the drive warns (statusword 0x12B7 operation enabled, bit 7), {count} so far; \
              see its manual and its display for why"
         )
     });
-    assert_eq!(told, counts);
+    assert_eq!(reported, counts);
 }
 
-/// The insertion drive takes no controlword at the end: by RPDO, and by SDO either.
+/// The insertion drive ignores the last controlwords: those by RPDO, or those by SDO too.
 #[test]
 fn a_drive_that_keeps_its_power_at_the_end() {
     for ignores_sdo in [false, true] {
@@ -272,21 +272,22 @@ fn a_drive_that_keeps_its_power_at_the_end() {
             };
             bench.sent.iter().filter(is_of_word).count()
         };
-        // One of bring-up besides.
+        // The bring-up wrote one of them.
         let expected = if ignores_sdo { (20, 21) } else { (1, 2) };
         assert_eq!((by_sdo(0x02), by_sdo(0x00)), expected);
-        let keeps_watch = "601#2316100100000000";
-        assert_eq!(bench.sent.iter().any(|f| f.to_string() == keeps_watch), !ignores_sdo);
+        // A drive that still has power keeps its heartbeat consumer (1016).
+        let supervision_off = "601#2316100100000000";
+        assert_eq!(bench.sent.iter().any(|f| f.to_string() == supervision_off), !ignores_sdo);
         let (end_mm, _) = bench.stage.position_true(bench.now);
         assert!((end_mm - 10.0).abs() < 1e-3, "{end_mm}");
     }
 }
 
-/// A drive may stand off its target at rest, by friction or by the play of its gear: the insertion
-/// begins with the target that is held, and depth counts from where the axis was seen.
+/// At rest a drive may stand off its target, by friction or by the backlash of its gear. The insertion begins with
+/// the target that the drive holds, and depth counts from the measured position.
 #[test]
 fn a_drive_that_stands_off_its_target() {
-    // 1 mm/s are 46.46 counts in 10 ms.
+    // 1 mm/s is 46.46 counts in 10 ms.
     let cases = [302, -302, 139, -139].map(|counts| [(counts, "1", 47), (counts, "2", 93)]);
     for (offset_counts, mm_per_s, step_counts) in cases.into_iter().flatten() {
         let speed = format!("insertion.speed_mm_per_s={mm_per_s}");
@@ -315,7 +316,7 @@ fn a_drive_that_stands_off_its_target() {
     }
 }
 
-/// A real drive may hold its target a few counts short: that is near enough, after a while.
+/// By 20 counts at rest, as real drives are.
 #[test]
 fn a_depth_short_by_a_few_counts_is_accepted() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));

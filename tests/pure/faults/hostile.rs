@@ -1,4 +1,4 @@
-//! Whatever comes in and whenever: no panic, no target outside a limit, and an end.
+//! Any input at any time: no panic, no target outside a limit, and every run ends.
 
 use crate::support::bench::{Bench, configured};
 use nalgebra::Vector3;
@@ -60,7 +60,7 @@ fn attack() -> impl Strategy<Value = Attack> {
     ]
 }
 
-fn strike(bench: &mut Bench, attack: Attack) {
+fn apply(bench: &mut Bench, attack: Attack) {
     match attack {
         Attack::Frame(id, remote, data) => {
             bench.inject(Frame::from_parts(id, remote, &data).expect("in range"));
@@ -86,8 +86,7 @@ fn strike(bench: &mut Bench, attack: Attack) {
     }
 }
 
-/// Targets sent to a drive that was to follow them, in counts from the first: where the axis was
-/// enabled is zero.
+/// The targets sent to a drive with Enable Operation set, in counts from the first.
 fn targets(bench: &Bench, cob_id: u16) -> Vec<i64> {
     let target = |frame: &Frame| match frame.data() {
         [control, 0, target @ ..] if frame.cob_id() == Some(cob_id) && control & 0x08 != 0 => {
@@ -99,7 +98,7 @@ fn targets(bench: &Bench, cob_id: u16) -> Vec<i64> {
     counts.iter().map(|target| target - counts[0]).collect()
 }
 
-/// All `targets` within `min` to `max` counts, none further than `step` from the one before.
+/// All `targets` are within `min` to `max` counts, and none is further than `step` from the one before.
 fn within(targets: &[i64], [min, max]: [f64; 2], step: f64) -> Result<(), TestCaseError> {
     for &target in targets {
         prop_assert!((min.round()..=max.round()).contains(&(target as f64)), "{target} counts");
@@ -136,7 +135,7 @@ proptest! {
         let mut bench = Bench::new(configured(&sets));
         for (wait_ms, attack) in attacks {
             bench.run_for(Duration::from_millis(wait_ms));
-            strike(&mut bench, attack);
+            apply(&mut bench, attack);
         }
         bench.run_to_end();
         prop_assert!(bench.now < Time::from_secs_f64(60.0), "{}", bench.now);

@@ -1,12 +1,12 @@
-//! Limits of the accelerations at what the configuration check asks for: no run ends by them.
+//! The lowest limits of acceleration that the configuration check accepts are enough for a run.
 
-use crate::support::bench::{Bench, PAPER, configured, is_tracker};
+use crate::support::bench::{Bench, Fate, PAPER, configured, is_tracker};
 use needle_bench::config::Config;
 use needle_bench::session::{Record, State};
 use std::time::Duration;
 
-/// Runs, what their axes are commanded at most, mm/s² and deg/s², and the depth at which the tracker
-/// falls silent so that the insertion is held while it comes to its end, mm.
+/// Settings of runs, the largest accelerations that they command, mm/s² and deg/s², and the depth, mm, at which the
+/// tracker must fall silent for a hold while the insertion brakes at its end.
 const RUNS: [(&[&str], [f64; 2], f64); 7] = [
     (&[], [40.0, 8000.0], 10.9),
     (&["control.kind=nested-saturation", "observer.kind=invariant"], [40.0, 24_000.0], 10.9),
@@ -44,7 +44,7 @@ const RUNS: [(&[&str], [f64; 2], f64); 7] = [
     ),
 ];
 
-/// The accelerations allowed to the axes.
+/// The settings of these limits.
 fn limits([mm_per_s2, deg_per_s2]: [f64; 2]) -> [String; 2] {
     [
         format!("stage.insertion.acceleration_max_mm_per_s2={mm_per_s2:?}"),
@@ -52,7 +52,7 @@ fn limits([mm_per_s2, deg_per_s2]: [f64; 2]) -> [String; 2] {
     ]
 }
 
-/// Holds among steps, before the last of them and while the needle brakes at the end.
+/// With holds between steps, before the last step, and while the needle brakes at the end.
 #[test]
 fn a_run_at_its_acceleration_limits_completes() {
     for (sets, peaks, end_mm) in RUNS {
@@ -70,14 +70,14 @@ fn a_run_at_its_acceleration_limits_completes() {
             bench.run_to_mm(depth_mm);
             bench.lose(is_tracker);
             bench.run_for(Duration::from_secs(1));
-            bench.spoil(crate::support::bench::Fate::Arrives);
+            bench.spoil(Fate::Arrives);
         }
         bench.run_to_end();
         assert!(bench.completed(), "{sets:?}: {}", bench.reason());
         let is_held =
             |record: &&Record| matches!(record, Record::State { state: State::Holding, .. });
         assert!(bench.records.iter().filter(is_held).count() >= 2, "{sets:?}");
-        // Any lower is refused before anything moves.
+        // The configuration check refuses any lower limit.
         for lower in [[0.999 * peaks[0], peaks[1]], [peaks[0], 0.999 * peaks[1]]] {
             let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
             let all = PAPER.map(str::to_owned).into_iter().chain(sets).chain(self::limits(lower));

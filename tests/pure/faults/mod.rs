@@ -1,9 +1,9 @@
-//! What can go wrong in a run, one test a fault: it is detected by name and in time, both axes
-//! end in a safe state, nothing is commanded afterwards, and the record is whole.
+//! What can go wrong in a run, one test for each fault: the bench detects it in time and reports it, both axes end
+//! in a safe state, nothing is commanded afterwards, and the record is complete.
 //!
-//! `stop` checks what every fault has in common. Times and travels are of virtual time
-//! and of the true axes, at 10 ms SYNC and the default configuration; `docs/hazards.md` lists
-//! them, and each test compares its row.
+//! A test whose name is only that of a fault compares its measurements with its row in `docs/hazards.md`. `stop`
+//! checks what all faults have in common. Times are virtual; travels are those of the true axes, at 10 ms SYNC and
+//! with the default configuration.
 
 mod bus;
 mod contradictions;

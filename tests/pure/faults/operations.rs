@@ -1,10 +1,9 @@
-//! What stops a run stops `stage home`, `jog` and `withdraw`, through the command line: faults
-//! scripted in TOML, virtual time.
+//! The faults that stop a run stop `stage home`, `jog` and `withdraw` too. They are scripted in TOML.
 
 use crate::support::program::{Scratch, needle_bench};
 use serde_json::Value;
 
-/// Faults without their moment, and how the reason they lead to begins.
+/// Faults without their depth, and the beginning of the reason for the stop.
 const CAUSES: [(&str, &str); 7] = [
     (r#"kind = "emergency-stop""#, "stage: insertion: emergency 0x9000 external error"),
     (r#"kind = "silent", axis = "rotation""#, "stage: rotation: no TPDO1 for 2 SYNCs in a row"),
@@ -21,8 +20,7 @@ const CAUSES: [(&str, &str); 7] = [
     ),
 ];
 
-/// Does the operation `arguments`, on its way through the depth `at_mm` from where it began, once
-/// for each cause.
+/// Runs the operation `arguments` once for each cause, which acts at `at_mm` from the start of the operation.
 fn every_cause_stops(arguments: &[&str], at_mm: f64, sets: &[&str]) {
     for (fault, reason) in CAUSES {
         let scratch = Scratch::new();
@@ -36,14 +34,14 @@ fn every_cause_stops(arguments: &[&str], at_mm: f64, sets: &[&str]) {
         let last = said.stdout.lines().last().expect("a last line");
         assert!(last.starts_with(&format!("stopped: {reason}")), "{fault}\n{last}");
 
-        // The same once more, by the figures.
+        // The same again, with its figures.
         let json = needle_bench(&scratch, &[&all[..], &["--json", "-q"]].concat()).json();
         is_stopped(&scratch, &json, &last["stopped: ".len()..]);
     }
 }
 
-/// Both axes are out of Operation Enabled and stay where the stop left them, nothing was enabled or
-/// started after it, and the record is closed with the reason.
+/// Both axes left Operation Enabled and stood, nothing was enabled or started after the stop, and the record is
+/// closed with the reason.
 fn is_stopped(scratch: &Scratch, json: &Value, reason: &str) {
     assert_eq!((&json["outcome"], &json["stop_reason"]), (&"stopped".into(), &reason.into()));
     let emulated = &json["emulated"];
@@ -68,12 +66,12 @@ fn is_stopped(scratch: &Scratch, json: &Value, reason: &str) {
     let again = |frame: &&&str| {
         ["201#0F", "202#0F", "201#1F", "202#1F", "000#01"].iter().any(|id| frame.starts_with(id))
     };
-    assert_eq!(frames[stop..].iter().find(again), None, "after the stop");
+    assert_eq!(frames[stop..].iter().find(again), None, "enabled or started after the stop");
 }
 
 #[test]
 fn what_stops_a_run_stops_a_homing() {
-    // To a switch 20 mm off, at 2 mm/s: the depth is passed on the way out.
+    // The switch is 20 mm away.
     let sets = [
         "emulator.insertion_switches_mm={ negative = -20 }",
         "stage.insertion.homing={ method = 17, timeout_s = 60, homed_bit = 12, \

@@ -1,4 +1,4 @@
-//! The operator's commands: at each state of a run, doubled, in bursts, and at the moment of a fault.
+//! The operator's commands: in each state of a run, twice, in bursts, and at the moment of a fault.
 
 use super::stream::states;
 use crate::support::bench::{Bench, Fate, configured, is_tracker};
@@ -13,10 +13,10 @@ use std::time::Duration;
 use OperatorCommand::{Hold, Resume, Speed, Step};
 
 const SECOND: Duration = Duration::from_secs(1);
-/// Longest time in which an insertion at these speeds brakes to a standstill, and comes to rest.
+/// No insertion at these speeds takes longer to brake and come to rest.
 const BRAKING: Duration = Duration::from_millis(150);
 
-/// Furthest that the needle goes from 2 mm/s after a hold and after a stop, mm.
+/// The longest travel from 2 mm/s after a hold and after a stop, mm.
 const HOLD_MM: f64 = 0.12;
 const STOP_MM: f64 = 0.11;
 
@@ -27,7 +27,7 @@ fn bench(sets: &[&str]) -> Bench {
 fn ask(bench: &mut Bench, command: OperatorCommand) -> String {
     bench.hand(Input::Operator(command));
     let answer = bench.events().filter(|text| text.starts_with("operator: ")).last();
-    answer.expect("every command is answered").to_owned()
+    answer.expect("an answer").to_owned()
 }
 
 #[test]
@@ -67,7 +67,7 @@ fn only_the_operator_ends_a_hold_by_the_operator() {
         bench.run_for(BRAKING);
         let held_mm = commanded_mm(&bench);
         assert!(held_mm < 5.3, "{held_mm}");
-        // The tip is lost and found again; nothing of that ends the hold.
+        // Neither the loss of the tip nor its return ends the hold.
         bench.lose(is_tracker);
         bench.run_for(3 * SECOND);
         let refused = ask(&mut bench, Resume);
@@ -90,7 +90,7 @@ fn only_the_operator_ends_a_hold_by_the_operator() {
     }
 }
 
-/// Steps are exact, at rest in between, in both modes.
+/// In both modes.
 #[test]
 fn single_steps_end_at_the_depth_asked_for() {
     for mode in ["continuous", "stepwise"] {
@@ -104,7 +104,7 @@ fn single_steps_end_at_the_depth_asked_for() {
             assert_eq!(state(&bench), State::Stepping);
             bench.run_for(5 * SECOND);
             assert_eq!(state(&bench), State::HeldAfterStep);
-            // To a count of the drive.
+            // Exact to a count of the drive.
             assert!((commanded_mm(&bench) - from_mm - step_mm).abs() < 1e-3, "{mode} {step_mm}");
         }
         ask(&mut bench, Resume);
@@ -113,7 +113,7 @@ fn single_steps_end_at_the_depth_asked_for() {
     }
 }
 
-/// A tracker hold that may end by itself interrupts a step; the step does not go on by itself.
+/// With `tracker.resume = "automatic"` the tracker's hold ends by itself, but the step does not continue.
 #[test]
 fn a_step_that_the_tracker_interrupts_stays_held() {
     let mut bench = bench(&["tracker.resume=automatic"]);
@@ -134,7 +134,7 @@ fn a_step_that_the_tracker_interrupts_stays_held() {
     assert!(bench.completed(), "{}", bench.reason());
 }
 
-/// With `tracker.resume = "operator"` a hold by the tracker ends on purpose only, in its time.
+/// With `tracker.resume = "operator"`.
 #[test]
 fn a_hold_by_the_tracker_is_ended_by_the_operator_or_by_its_timeout() {
     for asks in [true, false] {
@@ -183,7 +183,7 @@ fn the_speed_changes_evenly_and_within_its_limits() {
 /// Brings a run into a state.
 type Reach = fn(&mut Bench);
 
-/// Every state that a command can meet, and how to come to it.
+/// Every state in which a command can arrive, and how a run gets there.
 const STATES: [(&str, Reach); 9] = [
     ("preparing", |_| {}),
     ("preparing, asked to hold", |bench| {
@@ -223,7 +223,7 @@ const STATES: [(&str, Reach); 9] = [
 const COMMANDS: [OperatorCommand; 5] =
     [Hold, Resume, Step { mm: 1.0 }, Step { mm: 30.0 }, Speed { mm_per_s: 1.0 }];
 
-/// What comes of each command at each state, and of the same command again.
+/// The answer to each command in each state, and to the same command again.
 #[test]
 fn each_command_at_each_state() {
     let mut table = String::new();
@@ -246,8 +246,7 @@ fn each_command_at_each_state() {
     assert_snapshot!(table);
 }
 
-/// What brings the needle to a stand, eight times in a burst: it is obeyed at each state, and the needle
-/// goes no further than from one of them.
+/// Eight holds or stops at once: the needle stands as soon as after one of them.
 #[test]
 fn a_burst_of_holds_or_stops_at_each_state_goes_no_further() {
     let stop = Input::Stop("operator: interrupted".to_owned());
@@ -262,7 +261,7 @@ fn a_burst_of_holds_or_stops_at_each_state_goes_no_further() {
             let stands_mm = bench.stage.position_true(bench.now).0;
             bench.run_for(SECOND);
             let later_mm = bench.stage.position_true(bench.now).0;
-            assert!((later_mm - stands_mm).abs() < 1e-3, "{name}, {input:?}: it moves");
+            assert!((later_mm - stands_mm).abs() < 1e-3, "{name}, {input:?}: it still moves");
             furthest_mm = furthest_mm.max(stands_mm - from_mm);
             assert!(furthest_mm < travel_max_mm, "{name}, {input:?}: {furthest_mm} mm");
         }
@@ -270,7 +269,7 @@ fn a_burst_of_holds_or_stops_at_each_state_goes_no_further() {
     }
 }
 
-/// A command just before or just after a fault changes nothing of the stop.
+/// Just before it or just after it.
 #[test]
 fn a_command_at_the_moment_of_a_fault_changes_nothing() {
     for (name, reach) in STATES.iter().filter(|(name, _)| *name != "stopping") {
@@ -316,9 +315,9 @@ fn happening() -> impl Strategy<Value = Happening> {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 
-    /// Whatever the operator asks for and whatever the tracker does: no set-point moves an insertion
-    /// that is held and has braked, or withdraws, or breaks the limits of speed and acceleration; a hold
-    /// by the operator or after a step ends on a command only; every run stops when it is asked to.
+    /// Whatever the operator and the tracker do: no set-point moves a needle that is held and has braked, or withdraws
+    /// it, or breaks a limit of speed or acceleration; only a command ends a hold by the operator or after a step; and
+    /// every run stops when the operator stops it.
     #[test]
     fn no_commands_in_any_order_move_a_held_needle_or_break_a_limit(
         resume in prop::sample::select(vec!["stop", "automatic", "operator"]),
@@ -367,7 +366,7 @@ proptest! {
                 Record::Stage(feedback) => {
                     let mm = feedback.commanded.insertion_mm;
                     let speed = (mm - last_mm) / period_s;
-                    // A count of the drive is 0.2 µm and more.
+                    // The slack is for the rounding to counts of 0.2 µm.
                     prop_assert!((-1e-9..=2.0 + 0.1).contains(&speed), "{speed} mm/s in {was}");
                     let acceleration = (speed - last_speed) / period_s;
                     prop_assert!(acceleration.abs() <= 40.0 + 11.0, "{acceleration} mm/s² in {was}");

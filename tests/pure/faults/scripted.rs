@@ -1,29 +1,29 @@
-//! The hazards of the stage through the command line: faults scripted in TOML, virtual time, 1 mm/s
-//! and 10 ms SYNC. Each strikes at two phases of the SYNC period; the worst counts.
+//! Faults of the stage, scripted in TOML, through the command line: virtual time, 1 mm/s and 10 ms SYNC. Each fault
+//! occurs at two phases of the SYNC period, and the row has the worse of the two.
 
 use crate::support::bench::PAPER;
 use crate::support::program::{Said, Scratch, needle_bench};
 use crate::support::stop::Measured;
 use serde_json::Value;
 
-/// Depths at which a fault strikes: a SYNC period moves the needle by 0.01 mm.
+/// The depths at which a fault occurs. The needle moves 0.01 mm in a SYNC period.
 const DEPTHS_MM: [f64; 2] = [4.001, 4.006];
 
-/// A run of 6 mm, by the paper's observer and law, as in the other tests here.
+/// A run of 6 mm. It also has the paper's observer and law, as the other tests of faults do.
 const SETTINGS: [&str; 2] =
     ["insertion={ depth_mm = 6, plane_out_of_reach = \"insert\" }", "insertion.speed_mm_per_s=1"];
 
-/// One run and what it left.
+/// A run and its record.
 struct Run {
     said: Said,
     json: Value,
-    /// can.log: identifier and data.
+    /// The frames in can.log: identifier and data.
     frames: Vec<(String, String)>,
-    /// Events of the run, as the operator saw them.
+    /// The events that the operator saw.
     events: String,
 }
 
-/// A run of 6 mm with `faults`, tables of TOML without their moment.
+/// A run of 6 mm with `faults` at `at_mm`, each an inline table of TOML without braces.
 fn run(faults: &[&str], at_mm: f64, sets: &[&str]) -> Run {
     let scratch = Scratch::new();
     let tables = faults.iter().map(|fault| {
@@ -52,23 +52,23 @@ fn run(faults: &[&str], at_mm: f64, sets: &[&str]) -> Run {
 }
 
 fn number(value: &Value) -> f64 {
-    value.as_f64().unwrap_or_else(|| panic!("{value} is no number"))
+    value.as_f64().unwrap_or_else(|| panic!("{value} is not a number"))
 }
 
-/// Time, s, and true position, mm and rad, of a moment of the emulated run.
+/// Time, s, and true position, mm and rad, of a moment in the JSON of an emulated run.
 fn moment(value: &Value) -> (f64, (f64, f64)) {
     let rotation_rad = number(&value["rotation_true_deg"]).to_radians();
     (number(&value["time_s"]), (number(&value["insertion_true_mm"]), rotation_rad))
 }
 
-/// What must hold of every run that a fault stopped.
+/// Asserts what must hold of every run that a fault stopped.
 fn is_stopped(run: &Run, reason: &str) {
     assert_eq!(run.said.status, 1, "{}", run.json);
     assert_eq!(run.json["stop_reason"], reason, "{}", run.events);
     for drive in run.json["emulated"]["drives"].as_array().expect("two") {
         assert_ne!(drive["state"], "operation enabled", "{}", run.json);
     }
-    // From the first quick stop on nothing is enabled, no target changes, no node is started.
+    // After the first quick stop nothing is enabled, no target changes, and no node is started.
     let Some(stop) = run.frames.iter().position(|(id, data)| id == "201" && data.starts_with("02"))
     else {
         return;
@@ -86,7 +86,7 @@ fn is_stopped(run: &Run, reason: &str) {
     assert!(!run.frames[stop..].iter().any(started), "a node was started after the stop");
 }
 
-fn way(from: (f64, f64), to: (f64, f64)) -> (f64, f64) {
+fn travel(from: (f64, f64), to: (f64, f64)) -> (f64, f64) {
     ((to.0 - from.0).abs(), (to.1 - from.1).abs())
 }
 
@@ -108,13 +108,13 @@ fn measured(run: &Run) -> Measured {
     let (_, end) = moment(&emulated["end"]);
     Measured {
         detected_ms: (detected_s - struck_s) * 1e3,
-        before: way(struck_at, detected_at),
-        after: way(detected_at, end),
+        before: travel(struck_at, detected_at),
+        after: travel(detected_at, end),
     }
 }
 
-/// Strikes with `faults` and with `sets`; the run stops for `reason` within `within_ms`, and the row
-/// of `docs/hazards.md` says so.
+/// Asserts that runs with `faults` and `sets` stop for `reason` within `within_ms`, and that the row of
+/// `docs/hazards.md` has the measured numbers.
 fn hazard(test: &str, faults: &[&str], sets: &[&str], within_ms: f64, reason: &str) -> Vec<Run> {
     let runs: Vec<Run> = DEPTHS_MM.iter().map(|at_mm| run(faults, *at_mm, sets)).collect();
     let measured = worst(runs.iter().map(|run| {
@@ -125,7 +125,7 @@ fn hazard(test: &str, faults: &[&str], sets: &[&str], within_ms: f64, reason: &s
     runs
 }
 
-/// Nothing of the bench reaches the drives any more: they see what a kill -9 leaves.
+/// No frame of the bench reaches the drives any more, as after kill -9.
 #[test]
 fn a_killed_bench() {
     let silent = r#"kind = "drop", toward = "drives""#;
@@ -142,8 +142,8 @@ fn a_killed_bench() {
             let (stopped_s, stopped_at) = moment(&drive["left_operation"]);
             Measured {
                 detected_ms: (stopped_s - struck_s) * 1e3,
-                before: way(struck_at, stopped_at),
-                after: way(stopped_at, end),
+                before: travel(struck_at, stopped_at),
+                after: travel(stopped_at, end),
             }
         }))
     }));
@@ -151,7 +151,7 @@ fn a_killed_bench() {
     measured.is_documented("a_killed_bench", 100.0, "none: the drives stop by themselves");
 }
 
-/// SYNC and set-points flow, the bench's heartbeat alone does not reach the drives.
+/// SYNC and set-points still reach the drives.
 #[test]
 fn a_heartbeat_of_the_bench_that_is_lost() {
     let lost = r#"kind = "drop", frames = "heartbeat", toward = "drives""#;
@@ -190,16 +190,15 @@ fn a_controller_that_goes_bus_off() {
     hazard("a_controller_that_goes_bus_off", &[r#"kind = "bus-off""#], &[], 0.0, "can: bus off");
 }
 
-/// It comes back after 50 ms: nothing that was queued is sent, and nothing moves again.
+/// After 50 ms. No queued frame is sent, and nothing moves again.
 #[test]
 fn a_bus_that_comes_back() {
     let fault = r#"kind = "bus-off", duration_s = 0.05"#;
     hazard("a_bus_that_comes_back", &[fault], &[], 0.0, "can: bus off");
 }
 
-/// The cable is out for 50 ms, and the interface takes frames all the same: two cycles at most wait,
-/// and leave in a burst when it is back. Which of two signs comes first is a matter of the heartbeat's
-/// phase.
+/// The cable is out for 50 ms, and the interface still takes frames: those of two cycles at most wait, and leave in a
+/// burst when the cable is back. The phase of the heartbeat decides which of two reasons comes first.
 #[test]
 fn a_bus_that_holds_frames() {
     let missing = "stage: insertion: no TPDO1 for 2 SYNCs in a row";
@@ -208,18 +207,18 @@ fn a_bus_that_holds_frames() {
         let fault = format!(r#"kind = "bus-stuck", duration_s = {duration_s}"#);
         let run = run(&[&fault], at_mm, &[]);
         let reason = run.json["stop_reason"].as_str().expect("stopped").to_owned();
-        assert!([missing, waiting].iter().any(|sign| reason.starts_with(sign)), "{reason}");
+        assert!([missing, waiting].iter().any(|known| reason.starts_with(known)), "{reason}");
         is_stopped(&run, &reason);
         measured(&run)
     };
     let worst = worst(DEPTHS_MM.iter().map(|at_mm| held(*at_mm, 0.05)));
     worst.is_documented("a_bus_that_holds_frames", 30.0, &format!("{missing}, or {waiting}"));
-    // Out for longer than the drives' heartbeat time: they stand by then, and stay so.
+    // Out for longer than the drives' heartbeat timeout: when the frames arrive, the drives stand and stay so.
     let Measured { before, after, .. } = held(DEPTHS_MM[0], 0.3);
     assert!(before.0 + after.0 < 0.03, "{before:?} {after:?}");
 }
 
-/// Where answers may be missing for longer, frames that do not leave are what stops the run.
+/// If the configuration tolerates missing TPDOs for longer.
 #[test]
 fn unconfirmed_frames_stop_the_run() {
     let fault = r#"kind = "bus-stuck", duration_s = 0.05"#;
@@ -238,7 +237,7 @@ fn unconfirmed_frames_stop_the_run() {
         let (detected_s, _) = moment(&run.json["emulated"]["stopping"]);
         let (_, end) = moment(&run.json["emulated"]["end"]);
         assert!(detected_s - struck_s <= 0.0301, "{}", run.json);
-        assert!(way(struck_at, end).0 < 0.06, "{}", run.json);
+        assert!(travel(struck_at, end).0 < 0.06, "{}", run.json);
     }
 }
 
@@ -254,7 +253,7 @@ fn a_transmit_queue_that_is_full() {
     let fault = r#"kind = "bus-full", duration_s = 0.05"#;
     for at_mm in DEPTHS_MM {
         let run = run(&[fault], at_mm, &[]);
-        // The frame that was not sent is named: set-points were sent ahead, SYNC is next.
+        // The set-points were sent ahead, so SYNC is the first frame that is refused.
         let reason = run.json["stop_reason"].as_str().expect("stopped").to_owned();
         is_stopped(&run, &reason);
         assert!(
@@ -274,7 +273,7 @@ fn an_emergency_from_a_drive() {
     hazard("an_emergency_from_a_drive", &[fault], &[], 0.0, reason);
 }
 
-/// The emergency message is lost: the statusword says it.
+/// The emergency message is lost, and the statusword shows the fault.
 #[test]
 fn a_drive_fault_without_a_message() {
     let lost = r#"kind = "drop", frames = "emergency""#;
@@ -290,7 +289,7 @@ fn a_following_error() {
     hazard("a_following_error", &[fault], &[], 0.0, reason);
 }
 
-/// The drive's own window, 0x6065, is what 30 ms do at the highest speed: 0.3 mm.
+/// The drive's own window, 0x6065, is the travel of 30 ms at the highest speed: 0.3 mm.
 #[test]
 fn a_blocked_axis() {
     let fault = r#"kind = "stall", axis = "insertion""#;
@@ -306,7 +305,7 @@ fn a_limit_switch() {
     hazard("a_limit_switch", &[fault], &[], 10.0, reason);
 }
 
-/// Where it stands, and of a drive that makes a fault of it.
+/// This drive goes into Fault at its switch, which has a place on the axis.
 #[test]
 fn a_limit_switch_of_an_epos4() {
     let reason = "stage: insertion: emergency 0xFF07 manufacturer specific (register 0x01)";
@@ -333,8 +332,7 @@ fn a_node_that_boots_in_mid_run() {
     hazard("a_node_that_boots_in_mid_run", &[fault], &[], 0.0, reason);
 }
 
-/// Pressed before the axes have power and let go a while later: that must not be what moves them,
-/// whether faults are reset at the start or not.
+/// It is pressed before power. Its release must not move the axes, whether faults are reset at the start or not.
 #[test]
 fn an_emergency_stop_let_go_while_the_axes_are_enabled() {
     for at_s in [0.02, 0.105, 0.115, 0.125, 0.135, 0.145] {
@@ -354,16 +352,16 @@ fn an_emergency_stop_let_go_while_the_axes_are_enabled() {
     }
 }
 
-/// What has no effect on motion: the run completes, and what came is counted and named.
-fn is_harmless(fault: &str, told: &str) {
+/// Asserts that a run with `fault` completes, and that the operator sees `report`.
+fn is_harmless(fault: &str, report: &str) {
     let run = run(&[fault], DEPTHS_MM[0], &[]);
     assert_eq!(run.said.status, 0, "{}", run.json);
     let (_, (insertion_mm, _)) = moment(&run.json["emulated"]["end"]);
     assert!((insertion_mm - 6.0).abs() < 1e-3, "{}", run.json);
-    assert!(run.events.contains(told), "{told}\n{}", run.events);
+    assert!(run.events.contains(report), "no {report:?} in\n{}", run.events);
 }
 
-/// What the drives would follow cannot be kept from them: the run ends at the first frame of it.
+/// The drives follow it, so the run ends at the first frame.
 #[test]
 fn another_master_s_set_point() {
     let fault = r#"kind = "foreign", frame = "201#0F0000250000""#;
@@ -390,7 +388,7 @@ fn supervision_switched_off_by_another() {
     hazard("supervision_switched_off_by_another", &[fault], &[], 0.0, reason);
 }
 
-/// It says where the axis was a moment ago, so that nothing but the two answers gives it away.
+/// The position is plausible: only the second TPDO1 after a SYNC shows the other node.
 #[test]
 fn another_node_that_sends_a_drive_s_position() {
     let fault = r#"kind = "foreign", frame = "181#371298480000", period_ms = 1"#;
@@ -403,8 +401,7 @@ fn another_node_that_sends_a_drive_s_position() {
     assert!(detected_s - struck_s <= 0.030, "{} s", detected_s - struck_s);
 }
 
-/// Between two SYNCs, under the identifiers of the insertion drive's position, of the bench's own,
-/// of another node.
+/// Under identifiers of the insertion drive, of the bench and of another node.
 #[test]
 fn a_foreign_node_on_our_identifiers() {
     let foreign = |frame: &str| format!(r#"kind = "foreign", frame = "{frame}""#);
@@ -421,7 +418,7 @@ fn a_foreign_node_on_our_identifiers() {
 fn frames_of_the_wrong_length() {
     let foreign = r#"kind = "foreign", frame = "181#3702", period_ms = 20"#;
     is_harmless(foreign, "frame of the wrong length, 1 so far");
-    // One of the drive's own lacks its position: held for one SYNC.
+    // The drive's own TPDO1 lacks its position once.
     let short = r#"kind = "resize", length = 5, frames = "pdo", axis = "rotation", count = 1"#;
     is_harmless(short, "frame of the wrong length, 1 so far");
 }
@@ -430,14 +427,13 @@ fn frames_of_the_wrong_length() {
 fn a_flood_of_foreign_frames_is_reported_and_tolerated() {
     let flood = r#"kind = "foreign", frame = "333#0011223344556677", period_ms = 0.25"#;
     is_harmless(flood, "a flood on the bus: ");
-    // Under a drive's own identifiers.
+    // Under identifiers of a drive.
     for frame in ["581#4B41600037020000", "701#05", "081#0000000000000000"] {
         let flood = format!(r#"kind = "foreign", frame = "{frame}", period_ms = 0.25"#);
         is_harmless(&flood, "a flood on the bus: ");
     }
 }
 
-/// Frames doubled, a little late or out of order cost nothing.
 #[test]
 fn duplicated_late_and_reordered_frames_are_tolerated() {
     for fault in [
@@ -451,7 +447,7 @@ fn duplicated_late_and_reordered_frames_are_tolerated() {
     }
 }
 
-/// A server that answers late by less than the time allowed.
+/// A delay under the SDO timeout is tolerated, and one over it is not.
 #[test]
 fn a_slow_sdo_server() {
     let scratch = Scratch::new();

@@ -1,13 +1,13 @@
-//! What a fault of the tracker's stream costs: when it is noticed, when the insertion is held, and
-//! how much is inserted blind. The second table of `docs/hazards.md`.
+//! Measures of a fault of the tracker's stream: when it is noticed, when the insertion is held, and how much is
+//! inserted blind. The second table of `docs/hazards.md`.
 
 use crate::support::bench::{Bench, configured};
 use crate::support::stop::{Stop, is_row};
 use needle_bench::session::{Lane, Machine as _, Record, State};
 use needle_bench::units::Time;
 
-/// Runs to 10 mm of 30 with `sets` over the defaults, strikes, and on to the end, which is a
-/// completed insertion.
+/// Runs to 10 mm of 30 with `sets`, applies `strike`, and runs to the end, which must be that of a completed
+/// insertion. Gives the run and the time of the fault.
 pub(crate) fn tolerated(sets: &[&str], strike: impl Fn(&mut Bench)) -> (Bench, Time) {
     let mut bench = Bench::new(configured(&[sets, &["insertion.depth_mm=30"]].concat()));
     bench.run_to_mm(10.0);
@@ -26,7 +26,7 @@ pub(crate) fn held(stops: &[Stop], test: &str, within_ms: f64, reason: &str) {
     held_late(stops, test, within_ms, reason, blind_mm);
 }
 
-/// As [`held`], of positions that were believed for a while: `blind_mm` was inserted meanwhile.
+/// As [`held`], for wrong positions that were accepted for a while, in which `blind_mm` was inserted.
 pub(crate) fn held_late(stops: &[Stop], test: &str, within_ms: f64, reason: &str, blind_mm: f64) {
     assert!(reason.chars().count() <= 200, "{reason}");
     for stop in stops {
@@ -42,7 +42,7 @@ pub(crate) fn held_late(stops: &[Stop], test: &str, within_ms: f64, reason: &str
     is_row(test, &row);
 }
 
-/// As [`held`], of a run that went on to its end.
+/// As [`held`], for a run that completed.
 pub(crate) fn went_on((bench, struck): &(Bench, Time), test: &str, blind_mm_max: f64) {
     let (noticed_ms, blind_mm) = (noticed_ms(bench, *struck), blind_mm(bench, Time::NEVER));
     assert!(blind_mm <= blind_mm_max, "{test}: {blind_mm} mm inserted blind");
@@ -61,12 +61,12 @@ fn noticed_ms(bench: &Bench, struck: Time) -> f64 {
         }
         _ => None,
     });
-    let first = times.filter(|time| *time >= struck).min().expect("it is noticed");
+    let first = times.filter(|time| *time >= struck).min().expect("a sign of the fault");
     first.seconds_after(struck) * 1e3
 }
 
-/// The most that was inserted, by the stage's measured depth, beyond the newest position believed
-/// that was acquired by `good_until`.
+/// The most that was inserted, by the stage's measured depth, beyond the newest accepted position that was acquired
+/// by `good_until`.
 pub(crate) fn blind_mm(bench: &Bench, good_until: Time) -> f64 {
     let stage = bench.records.iter().filter_map(|record| match record {
         Record::Stage(stage) => Some((stage.time, stage.measured.insertion_mm)),

@@ -1,4 +1,4 @@
-//! A target that is a tool of its own on the tracker's stream, and what can go wrong with it.
+//! Faults of a target that is a tool of its own on the tracker's stream.
 
 use crate::support::bench::{Bench, Fate, configured_with};
 use crate::support::stop::Stop;
@@ -26,7 +26,7 @@ fn is_target(input: &Input) -> bool {
     matches!(input, Input::Tracker(Event::Sample(sample)) if sample.tool == TARGET)
 }
 
-/// Changes every sample of the target on its way to the bench.
+/// Applies `change` to every sample of the target on its way to the bench.
 fn change(bench: &mut Bench, change: impl Fn(&mut Sample) + 'static) {
     bench.change_samples(move |sample| {
         if sample.tool == TARGET {
@@ -42,7 +42,7 @@ fn changed(what: impl Fn(&mut Sample) + Clone + 'static) -> Stop {
     Stop::of(bench, |bench| change(bench, what.clone()))
 }
 
-/// Held, and stopped once the needle stands, with this in the reason.
+/// Asserts that the run was held within 300 ms and then stopped, with `why` in its reason.
 fn is_lost(stop: &Stop, why: &str) {
     let reason = stop.bench.reason();
     assert!(reason.starts_with("tracker: the target is lost, "), "{reason}");
@@ -51,7 +51,7 @@ fn is_lost(stop: &Stop, why: &str) {
     assert!(stop.detected_after() <= Duration::from_millis(300), "{:?}", stop.detected_after());
 }
 
-/// A run that ends before power, with these in the reason.
+/// Asserts that a run ends before power, with both parts of `why` in its reason.
 fn never_begins(sets: &[&str], what: impl Fn(&mut Sample) + Clone + 'static, why: [&str; 2]) {
     let stop = Stop::of(bench(sets), |bench| change(bench, what.clone()));
     stop.never_had_power();
@@ -92,7 +92,7 @@ fn a_target_that_is_no_longer_seen() {
     assert!(stop.detected_after() <= Duration::from_millis(530));
 }
 
-/// The insertion goes on once the target is seen again, where the configuration lets it.
+/// With `tracker.resume = "automatic"` the insertion continues.
 #[test]
 fn a_target_that_is_seen_again() {
     let mut bench = bench(&["tracker.resume=\"automatic\""]);
@@ -101,7 +101,7 @@ fn a_target_that_is_seen_again() {
     bench.spoil(|input| if is_target(&input) { Fate::Lost } else { Fate::Arrives(input) });
     bench.run_to_end();
     assert!(bench.completed(), "{}", bench.reason());
-    assert!(bench.detection.is_some(), "it was held");
+    assert!(bench.detection.is_some(), "the insertion was not held");
 }
 
 #[test]
@@ -143,7 +143,7 @@ fn a_target_that_moves_where_no_path_may_end() {
     }
 }
 
-/// The needle follows the target to where that is in the end.
+/// The needle ends where the target is in the end.
 #[test]
 fn a_moving_target_is_reached() {
     let mut bench = bench(&["emulator.target_drift_mm_per_mm=[0.0, 0.05, 0.0]"]);

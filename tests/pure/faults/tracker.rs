@@ -1,4 +1,4 @@
-//! Faults of the tracker and its link that end a run: the insertion is held, then stopped.
+//! Faults of the tracker and its link that end a run: the insertion is held, then the run is stopped.
 
 use super::stream::{blind_mm, held, held_late, states};
 use crate::support::bench::{Bench, Fate, configured, is_frame, is_tracker};
@@ -10,7 +10,7 @@ use needle_bench::tracker::{AcquisitionClock, Event, Sample, StampPolicy, Validi
 use needle_bench::units::Time;
 use std::time::Duration;
 
-/// Refusals of samples in the record.
+/// Why samples were refused, by the record.
 pub(crate) fn refusals(bench: &Bench) -> Vec<String> {
     let refusals = bench.records.iter().filter_map(|record| match record {
         Record::Sample(sample) => sample.refused.as_ref().map(ToString::to_string),
@@ -19,7 +19,7 @@ pub(crate) fn refusals(bench: &Bench) -> Vec<String> {
     refusals.collect()
 }
 
-/// Two runs of the defaults in which every sample is changed from 10 mm on.
+/// Two runs with `sets` in which every sample is changed from 10 mm on.
 fn changed(sets: &[&str], change: impl Fn(&mut Sample) + Clone + 'static) -> [Stop; 2] {
     stopped(sets, |bench| bench.change_samples(change.clone()))
 }
@@ -60,7 +60,7 @@ fn messages_that_cannot_be_read() {
     assert!(reason.ends_with(why), "{reason}");
 }
 
-/// PLUS by default sends nothing for a tool out of view, and goes on with STATUS OK.
+/// By default PLUS sends no TRANSFORM for a tool out of view, but still STATUS OK.
 #[test]
 fn a_tool_out_of_view_under_a_living_connection() {
     let stops = stopped(&[], |bench| {
@@ -114,11 +114,11 @@ fn positions_that_are_not_numbers() {
         let (refused, first) = (refusals(&stop.bench).len(), stop.struck);
         assert!(refused >= 18, "{refused}");
         let later = stop.bench.steps().filter(|step| step.time > first);
-        assert!(later.into_iter().all(|step| step.tip_meas_mm.is_none()), "no NaN is a tip");
+        assert!(later.into_iter().all(|step| step.tip_meas_mm.is_none()), "a step took a NaN");
     }
-    let counted = stops[0].bench.reason();
-    held(&stops, "positions_that_are_not_numbers", 510.0, &counted);
-    assert!(counted.contains("; finite: position (NaN, "), "{counted}");
+    let reason = stops[0].bench.reason();
+    held(&stops, "positions_that_are_not_numbers", 510.0, &reason);
+    assert!(reason.contains("; finite: position (NaN, "), "{reason}");
 }
 
 #[test]
@@ -163,7 +163,7 @@ fn positions_that_come_too_late() {
     held(&stops, "positions_that_come_too_late", 510.0, &reason);
 }
 
-/// Stamps are fresh and values are not: it is the value that tells.
+/// The gate compares the values, whatever the stamps are.
 #[test]
 fn a_frozen_position_stamped_as_fresh() {
     for stamp in ["source", "receive"] {
@@ -193,12 +193,11 @@ fn a_jump_that_persists() {
         let seen = states(&stop.bench, Lane::Tracker);
         assert!(seen.contains(&"lost"), "{seen:?}");
         let later = stop.bench.steps().filter(|step| step.time > stop.struck);
-        assert!(later.into_iter().all(|step| step.tip_meas_mm.is_none()), "no step took it");
+        assert!(later.into_iter().all(|step| step.tip_meas_mm.is_none()), "a step took the jump");
     }
 }
 
-/// 8 mm/s to the side, which no needle drifts: each step is small, and the sum disagrees with the
-/// model.
+/// By 8 mm/s to the side: each position is near the one before, but the sum disagrees with the model.
 #[test]
 fn a_position_that_drifts() {
     let stops = stopped(&[], |bench| {
@@ -264,7 +263,7 @@ fn one_tip_and_then_silence_while_the_drives_are_slow() {
     );
 }
 
-/// The tip is seen 3 s after the drives are ready: they get power then, and not before.
+/// The tip is first seen 3 s after the drives are ready.
 #[test]
 fn power_comes_on_with_the_first_tip() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=2"]));
@@ -281,7 +280,7 @@ fn power_comes_on_with_the_first_tip() {
     assert!(bench.sent.iter().any(enables));
 }
 
-/// A tip that is lost before the drives are ready is waited for.
+/// The tip is lost before the drives are ready.
 #[test]
 fn a_tip_lost_before_power_is_waited_for() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=2"]));
@@ -301,7 +300,7 @@ fn a_tip_lost_before_power_is_waited_for() {
     assert!(bench.completed(), "{}", bench.reason());
 }
 
-/// The tip goes where the model says it cannot: held, long before the control law would end it.
+/// The insertion is held long before the control law would end the run.
 #[test]
 fn a_needle_nothing_like_its_model() {
     let stop = Stop::of(Bench::new(configured(&["emulator.radius_mm=10"])), |_| ());
@@ -311,7 +310,7 @@ fn a_needle_nothing_like_its_model() {
     assert!(depth_mm < 16.0, "{depth_mm}");
 }
 
-/// Positions that never agree with one another are no tip to begin with.
+/// Without positions that agree with one another there is no tip, and so no power.
 #[test]
 fn positions_that_never_agree() {
     let stop = Stop::of(Bench::new(configured(&["emulator.noise={uniform_mm=100.0}"])), |_| ());
@@ -321,7 +320,7 @@ fn positions_that_never_agree() {
     assert!(reason.contains("; step: ") && reason.contains("no tip within"), "{reason}");
 }
 
-/// Positions that are always too old to begin with: the wait for a fresh one ends all the same.
+/// Even the first position is too old.
 #[test]
 fn positions_that_are_always_too_old() {
     let (mut session, stage) = configured(&[]);

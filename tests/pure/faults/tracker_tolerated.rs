@@ -1,5 +1,4 @@
-//! Faults of the tracker's stream that cost nothing but the samples, and those that a run may go
-//! on after.
+//! Faults of the tracker's stream that cost only the samples, and holds that may end by themselves.
 
 use super::stream::{blind_mm, states, tolerated, went_on};
 use super::tracker::refusals;
@@ -21,8 +20,8 @@ fn silent_for(bench: &mut Bench, duration: Duration) {
     bench.spoil(Fate::Arrives);
 }
 
-/// The largest distance between estimate and truth at the steps, from 5 mm on.
-fn worst_estimate_mm(bench: &Bench) -> f64 {
+/// The largest innovation at the steps from 5 mm on.
+fn largest_innovation_mm(bench: &Bench) -> f64 {
     let innovations = bench.steps().skip(5).filter_map(|step| step.innovation_mm);
     innovations.map(|innovation| innovation.norm()).fold(0.0, f64::max)
 }
@@ -68,7 +67,7 @@ fn every_other_position_infinite_costs_only_those_samples() {
     assert!(bench.steps().all(finite));
 }
 
-/// Four frames of five are the one before again.
+/// Four frames of five repeat the one before.
 #[test]
 fn frames_that_are_sent_five_times() {
     let run = tolerated(&["tracker.kind=\"imaging\""], |bench| {
@@ -86,12 +85,12 @@ fn frames_that_are_sent_five_times() {
     let (repeats, states) = (counts.of(GateName::Repeat), states(&run.0, Lane::Tracker));
     assert_eq!(repeats, counts.refused());
     assert!(repeats > 300 && !states.contains(&"lost"), "{counts} {states:?}");
-    // Each value was taken at the depth where it was first sent, not where it came again.
-    assert!(worst_estimate_mm(&run.0) < 3.0, "{}", worst_estimate_mm(&run.0));
+    // Each position was used at the depth of its first frame, not at that of a repeat.
+    assert!(largest_innovation_mm(&run.0) < 3.0, "{}", largest_innovation_mm(&run.0));
     went_on(&run, "frames_that_are_sent_five_times", 0.35);
 }
 
-/// Its followers would be 10 s old, or stamped backwards, for a minute.
+/// If the bench believed it, the samples after it would be 10 s old, or their stamps would go back.
 #[test]
 fn one_stamp_10_s_ahead() {
     let run = tolerated(&["tracker.stamp=\"source\""], |bench| {
@@ -138,7 +137,7 @@ fn wrong_stamps_do_no_harm_where_stamps_are_not_used() {
     assert_eq!(bench.session.gate_counts().refused(), 0);
 }
 
-/// A server that is called again and first sends the pose it last had, a second old.
+/// After a reconnection the server first sends its last pose, which is a second old.
 #[test]
 fn a_stale_sample_after_a_reconnection() {
     let run = tolerated(&["tracker.stamp=\"source\""], |bench| {
@@ -162,7 +161,7 @@ fn learnt_at_the_start() -> u64 {
     learnt(&tolerated(&["tracker.stamp=\"source\""], |_| ()).0)
 }
 
-/// Lost while the needle is not held yet, and found again by the model.
+/// The track is found again, by the model, before the insertion is held.
 #[test]
 fn a_track_lost_for_a_moment() {
     let run = tolerated(&[], |bench| {
@@ -178,10 +177,10 @@ fn a_track_lost_for_a_moment() {
         states(&run.0, Lane::Tracker),
         ["waiting", "tracking", "coasting", "lost", "tracking"]
     );
-    let told: Vec<&str> =
+    let events: Vec<&str> =
         run.0.events().filter(|text| text.contains("lost") || text.contains("found")).collect();
-    assert!(told[0].starts_with("lost, 5 refused in a row; the last: step: "), "{told:?}");
-    assert_eq!(told[1..], ["found again: it agrees with the model"]);
+    assert!(events[0].starts_with("lost, 5 refused in a row; the last: step: "), "{events:?}");
+    assert_eq!(events[1..], ["found again: it agrees with the model"]);
     went_on(&run, "a_track_lost_for_a_moment", 0.7);
 }
 
@@ -195,9 +194,10 @@ fn automatic_resume_ends_a_hold_when_the_tip_is_seen_again() {
         states(bench, Lane::Session),
         ["preparing", "inserting", "holding", "inserting", "stopping", "completed"]
     );
-    let told: Vec<&str> = bench.events().filter(|text| text.contains("; insertion ")).collect();
-    assert!(told[0].contains("; insertion held; the link is up"), "{told:?}");
-    assert!(told[1].starts_with("the tip is seen again; insertion goes on, held for 1."));
+    let events: Vec<&str> = bench.events().filter(|text| text.contains("; insertion ")).collect();
+    assert!(events[0].contains("; insertion held; the link is up"), "{events:?}");
+    let resumed = "the tip is seen again; insertion goes on, held for 1.";
+    assert!(events[1].starts_with(resumed), "{events:?}");
     assert!(bench.steps().enumerate().all(|(n, step)| step.step as usize == n));
     went_on(&run, "automatic_resume_ends_a_hold_when_the_tip_is_seen_again", 1.0);
 }
@@ -216,7 +216,7 @@ fn automatic_resume_stops_the_run_after_the_hold_timeout() {
     assert!(blind_mm(&stop.bench, Time::NEVER) < 1.0);
 }
 
-/// A silence that is over is not why the run ends.
+/// Not a silence that is over.
 #[test]
 fn the_stop_reason_is_the_last_cause_of_the_hold() {
     let sets =
@@ -232,8 +232,8 @@ fn the_stop_reason_is_the_last_cause_of_the_hold() {
     assert!(reason.contains(ends) && !reason.contains("the link is up"), "{reason}");
 }
 
-/// Silences of 2 s, 0.2 s of the stream between them: each hold may end by itself, but all of them
-/// together have the time of one. Holds that are far from one another have their own.
+/// The silences last 2 s, with 0.2 s of the stream between them. Holds that are far from one another have a timeout
+/// each.
 #[test]
 fn holds_in_a_row_share_one_timeout() {
     let sets = |depth| ["tracker.resume=\"automatic\"", "tracker.hold_timeout_s=4", depth];
@@ -259,8 +259,7 @@ fn holds_in_a_row_share_one_timeout() {
     assert!(bench.completed(), "holds far from one another: {}", bench.reason());
 }
 
-/// A quarter of a millimetre to the side per mm inserted is a path that a needle could take: this is
-/// what the gates do not see.
+/// A needle could take this path, 0.25 mm to the side per mm inserted, so the gates do not see the drift.
 #[test]
 fn a_slow_drift_is_taken_for_the_needle() {
     let (bench, _) = tolerated(&[], |bench| {
@@ -273,7 +272,7 @@ fn a_slow_drift_is_taken_for_the_needle() {
     assert!(!states(&bench, Lane::Tracker).contains(&"lost"), "{}", bench.session.gate_counts());
 }
 
-/// A start that the observers do not know: up to 5 mm, 8° and 60° off.
+/// A random start that the observers do not know: x up to 5 mm, yaw and pitch up to 8°, roll up to 60°.
 fn start(seed: u64) -> String {
     let mut rng = Pcg64::seed_from_u64(seed);
     let [x, yaw, pitch, roll] =
@@ -281,8 +280,8 @@ fn start(seed: u64) -> String {
     format!("{{x_mm={x:.3},yaw_deg={yaw:.3},pitch_deg={pitch:.3},roll_deg={roll:.3}}}")
 }
 
-/// Trackers as they were measured, starts that the observers do not know, a shaft that twists: no
-/// more than one good position in a hundred is taken for a bad one, and none loses the track.
+/// With noise as measured of real trackers, unknown starts, and a shaft that twists. At most one good position in a
+/// hundred is refused.
 #[test]
 fn good_streams_are_never_lost() {
     let law = "control.kind=\"feedback-linearization\"";
@@ -327,8 +326,8 @@ fn good_streams_are_never_lost() {
     }
 }
 
-/// The stream goes on dated by the new offset: the tip is paired with where the stage was, and not
-/// with where it was a tenth of a second or more before.
+/// The bench learns the new offset of the clock, so each position is paired with the stage's position at its true
+/// acquisition.
 #[test]
 fn a_sender_whose_clock_is_set_back_a_little() {
     for (test, back_ms) in [
@@ -347,7 +346,8 @@ fn a_sender_whose_clock_is_set_back_a_little() {
         });
         let (bench, struck) = &run;
         let learnt = *struck + Duration::from_millis(195);
-        // The emulated tracker stamps by the bench's own clock, so the dates are known: how far they are off, ms.
+        // The errors of the acquisition times, ms. The emulated tracker stamps by the bench's clock, so the true times are
+        // known.
         let error_ms = |is_of: &dyn Fn(Time) -> bool| {
             let errors = bench.records.iter().filter_map(|record| match record {
                 Record::Sample(sample) => {
@@ -367,13 +367,13 @@ fn a_sender_whose_clock_is_set_back_a_little() {
         let before = error_ms(&|received| received <= *struck);
         let meanwhile = error_ms(&|received| received > *struck && received <= learnt);
         let after = error_ms(&|received| received > learnt);
-        println!("{test}: {} dated meanwhile, {} after", meanwhile.len(), after.len());
+        println!("{test}: {} samples meanwhile, {} after", meanwhile.len(), after.len());
         assert!(within(&before, 0.0, 0.0) && within(&after, 0.0, 0.0), "{before:?} {after:?}");
-        // A step of up to 40 ms is dated by the old offset until the new one is learnt.
+        // After a step of up to 40 ms the bench uses the old offset until it has learnt the new one.
         assert_eq!(meanwhile.is_empty(), back_ms > 40, "{meanwhile:?}");
         assert!(within(&meanwhile, -back_ms as f64, -back_ms as f64), "{meanwhile:?}");
-        let told = format!("was set back by {:.3} s", back_ms as f64 * 1e-3);
-        assert_eq!(bench.events().filter(|text| text.contains(&told)).count(), 1, "{test}");
+        let report = format!("was set back by {:.3} s", back_ms as f64 * 1e-3);
+        assert_eq!(bench.events().filter(|text| text.contains(&report)).count(), 1, "{test}");
         went_on(&run, test, 0.7);
     }
 }

@@ -1,11 +1,9 @@
-//! CANopen: whatever comes, in whatever order and whenever, the SDO machines answer, refuse or give
-//! up, nothing is kept that did not come, and a message that is understood is one that could have
-//! been sent.
+//! CANopen: for any frames in any order and at any time, SDO client and server answer, abort or time out, and keep no
+//! more data than they received. A message that is decoded encodes back to the same frame.
 
 use super::fuzz;
 use needle_bench::canopen::emcy::parse_emcy;
 use needle_bench::canopen::nmt::{heartbeat_frame, nmt_frame, parse_heartbeat, parse_nmt};
-
 use needle_bench::canopen::pdo::{MappedObject, PdoMapping};
 use needle_bench::canopen::sdo::{
     AbortCode, ObjectAccess, SdoClient, SdoReply, SdoRequest, SdoServer, SdoValue,
@@ -17,13 +15,13 @@ use std::time::Duration;
 
 const NODE: NodeId = NodeId::new(1).unwrap();
 const TIMEOUT: Duration = Duration::from_millis(150);
-/// An object that holds as many bytes as its index says.
+/// The subindex of objects that hold as many bytes as their index says.
 const STORE: u8 = 7;
 /// The most frames that an emulated drive sends after one frame or timeout.
 const DRIVE_FRAMES_MAX: usize = 16;
 
-/// A frame and the time before it, in twelve bytes, so that mutations of bytes are mutations of a
-/// sequence: of identifiers, lengths, data, times, and of what follows what.
+/// A frame and the time before it in twelve bytes, so that mutations of bytes change identifiers, lengths, data,
+/// times and the order of frames.
 pub(crate) fn written(wait_ms: u8, frame: &Frame) -> [u8; 12] {
     let mut bytes = [0; 12];
     let id = frame.cob_id().expect("a base identifier").to_be_bytes();
@@ -33,7 +31,7 @@ pub(crate) fn written(wait_ms: u8, frame: &Frame) -> [u8; 12] {
     bytes
 }
 
-/// The frames in `input`, each with the time before it. Remote and extended ones are among them.
+/// The frames in `input`, each with the time before it. They may be remote or extended.
 pub(crate) fn frames(input: &[u8]) -> impl Iterator<Item = (Duration, Frame)> {
     input.chunks_exact(12).map(|chunk| {
         let high = chunk[1];
@@ -45,7 +43,7 @@ pub(crate) fn frames(input: &[u8]) -> impl Iterator<Item = (Duration, Frame)> {
     })
 }
 
-/// Objects of every length, and what was written to them.
+/// Objects of every length, and the number of bytes written to them.
 #[derive(Default)]
 struct Store {
     written: usize,
@@ -65,8 +63,7 @@ impl ObjectAccess for Store {
     }
 }
 
-/// Transfers of each kind and many lengths; those over 4 bytes go in segments, which the bench's own
-/// client refuses.
+/// Transfers of each kind and of many lengths. Those over 4 bytes are segmented, which the bench's client refuses.
 fn requests() -> impl Iterator<Item = SdoRequest> {
     let object = |len| ObjectAddress::new(len, STORE);
     let lengths = [0, 1, 4, 5, 7, 8, 14, 15, 100, 889, 890, 2000];
@@ -76,7 +73,7 @@ fn requests() -> impl Iterator<Item = SdoRequest> {
     uploads.into_iter().chain(downloads)
 }
 
-/// Every transfer of [`requests`] as it should go: the frames of both sides, in order.
+/// The frames of both sides, in order, in an undisturbed transfer of each of [`requests`].
 fn transfers() -> Vec<Vec<u8>> {
     let converse = |request: SdoRequest| {
         let now = Time::ZERO;
@@ -128,7 +125,7 @@ fn an_sdo_client_takes_no_more_than_it_was_given_and_always_ends() {
         let mut client = SdoClient::new(NODE, TIMEOUT);
         let mut frames = frames(input);
         let mut now = Time::ZERO;
-        // One after the other: what is left of the first must not be taken for the second.
+        // Frames of the first transfer must not be taken for those of the second.
         for _ in 0..2 {
             let request = requests[mutator.below(requests.len())];
             client.start(now, request);
@@ -203,7 +200,7 @@ fn a_decoded_frame_encodes_back_to_itself() {
                 assert!(!emcy.to_string().is_empty());
             }
             if let Some((node, state)) = parse_heartbeat(&frame) {
-                // But for the reserved bit, in which node guarding has its toggle.
+                // The frame may differ in the reserved bit, the toggle bit of node guarding.
                 assert_eq!(parse_heartbeat(&heartbeat_frame(node, state)), Some((node, state)));
             }
             if let Some((command, node)) = parse_nmt(&frame) {

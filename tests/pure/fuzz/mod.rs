@@ -1,16 +1,15 @@
-//! Seeded mutations of valid input against everything that reads bytes from outside: no panic, no
-//! memory beyond what is stated, and nothing believed that is not so.
+//! Seeded mutations of valid input against everything that reads bytes from outside: no panic, bounded memory, and
+//! no wrong data accepted.
 //!
-//! A few thousand cases each by default. By hand, with the dev profile's own optimisation, an hour
-//! and another seed:
+//! Each target gets a few thousand cases by default. For an hour with another seed:
 //!
 //! ```sh
 //! NEEDLE_FUZZ_CASES=1000000000 NEEDLE_FUZZ_SEED=7 timeout 1h cargo test --test pure fuzz:: -- --test-threads=16
 //! ```
 //!
-//! With fewer threads than targets the first of them would have the hour to themselves.
+//! There must be as many threads as targets, or the last targets do not get their turn.
 //!
-//! A case that fails prints its bytes; it then becomes a test beside the code.
+//! A case that fails prints its bytes. Make a test of them beside the code.
 
 mod canopen;
 mod openigtlink;
@@ -26,7 +25,7 @@ pub(crate) struct Mutator<'a> {
     rng: Pcg64,
 }
 
-/// Numbers that lengths and counts are checked at.
+/// Edge values of lengths and counts.
 const EDGES: [u64; 8] = [0, 1, 0x7F, 0xFF, 0x7FFF_FFFF, 0xFFFF_FFFF, 1 << 63, u64::MAX];
 
 impl<'a> Mutator<'a> {
@@ -34,12 +33,12 @@ impl<'a> Mutator<'a> {
         Mutator { corpus, rng: Pcg64::seed_from_u64(seed) }
     }
 
-    /// A number under `end`, 0 where there is none.
+    /// A number under `end`, or 0 if `end` is 0.
     pub(crate) fn below(&mut self, end: usize) -> usize {
         if end == 0 { 0 } else { self.rng.random_range(0..end) }
     }
 
-    /// One of the corpus with a few mutations.
+    /// An input of the corpus with a few mutations.
     pub(crate) fn mutated(&mut self) -> Vec<u8> {
         let which = self.below(self.corpus.len());
         let mut input = self.corpus.get(which).cloned().unwrap_or_default();
@@ -60,7 +59,7 @@ impl<'a> Mutator<'a> {
                 let value: u8 = self.rng.random();
                 input.iter_mut().skip(at).take(1).for_each(|byte| *byte = value);
             }
-            // An edge over 1, 2, 4 or 8 bytes, as a length would be.
+            // An edge value in 1, 2, 4 or 8 bytes, like a length.
             2 => {
                 let edge = EDGES[self.below(EDGES.len())].to_be_bytes();
                 let width = 1 << self.below(4);
@@ -87,12 +86,11 @@ impl<'a> Mutator<'a> {
     }
 }
 
-/// Hands mutations of `corpus` to `target`, as many as `NEEDLE_FUZZ_CASES` says, in an order that
-/// `NEEDLE_FUZZ_SEED` repeats. The target may draw from the mutator, and panics where it finds
-/// something.
+/// Calls `target` with the corpus and then with `NEEDLE_FUZZ_CASES` mutations of it, which `NEEDLE_FUZZ_SEED` repeats.
+/// The target may draw from the mutator, and panics if it finds an error.
 pub(crate) fn fuzz(corpus: &[Vec<u8>], mut target: impl FnMut(&[u8], &mut Mutator<'_>)) {
     let number = |name: &str, otherwise: u64| match std::env::var(name) {
-        Ok(text) => text.parse().unwrap_or_else(|_| panic!("{name}={text} is no number")),
+        Ok(text) => text.parse().unwrap_or_else(|_| panic!("{name}={text} is not a number")),
         Err(_) => otherwise,
     };
     let cases = number("NEEDLE_FUZZ_CASES", 5000);
@@ -101,22 +99,22 @@ pub(crate) fn fuzz(corpus: &[Vec<u8>], mut target: impl FnMut(&[u8], &mut Mutato
         target(input, &mut mutator);
     }
     for _ in 0..cases {
-        let input = Told(mutator.mutated());
+        let input = PrintedOnPanic(mutator.mutated());
         target(&input.0, &mut mutator);
     }
 }
 
 /// An input that is printed when its case panics.
-struct Told(Vec<u8>);
+struct PrintedOnPanic(Vec<u8>);
 
-impl Drop for Told {
+impl Drop for PrintedOnPanic {
     fn drop(&mut self) {
         if std::thread::panicking() {
             let hex = self.0.iter().fold(String::new(), |mut hex, byte| {
                 let _ = write!(hex, "{byte:02x}");
                 hex
             });
-            eprintln!("the case that failed: {hex}");
+            eprintln!("the failed case: {hex}");
         }
     }
 }

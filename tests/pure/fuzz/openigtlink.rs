@@ -1,5 +1,5 @@
-//! The tracker's protocols: whatever arrives, cut wherever, nothing panics, nothing is kept beyond
-//! the limits, and a message that comes through is one that could have been sent.
+//! The tracker's protocols: any bytes, cut anywhere, cause no panic, and a message that is decoded encodes back to
+//! itself.
 
 use super::fuzz;
 use crate::openigtlink_vectors::decode;
@@ -52,7 +52,7 @@ fn corpus() -> Vec<Vec<u8>> {
         .collect()
 }
 
-/// The message with an extended header and these metadata.
+/// The message in version 2, with an extended header and this metadata.
 fn version_2(plain: &[u8], metadata: &[(&str, &str)]) -> Vec<u8> {
     let (header, content) = plain.split_at(HEADER_LEN);
     let (mut index, mut text) = ((metadata.len() as u16).to_be_bytes().to_vec(), Vec::new());
@@ -76,7 +76,7 @@ fn version_2(plain: &[u8], metadata: &[(&str, &str)]) -> Vec<u8> {
     message
 }
 
-/// States the size and the checksum that the bytes have, so that the inside is looked at too.
+/// Corrects size and checksum in the header, so that the decoder reads the body.
 fn repair(message: &mut [u8]) {
     let Some((header, body)) = message.split_at_mut_checked(HEADER_LEN) else { return };
     header[42..50].copy_from_slice(&(body.len() as u64).to_be_bytes());
@@ -94,13 +94,12 @@ fn a_decoded_message_encodes_back_to_itself() {
             return;
         }
         let Ok(message) = decode(&input) else { return };
-        // What is not UTF-8 in a name, or is escaped, was replaced by something longer.
+        // The decoder replaces bytes that are not UTF-8, and escapes others; both make the text longer.
         if format!("{message:?}").contains([char::REPLACEMENT_CHARACTER, '\\']) {
             return;
         }
-        // What was understood is understood again when it is sent on.
         let message = Message { metadata: Vec::new(), ..message };
-        let again = decode(&encode(&message)).expect("was read");
+        let again = decode(&encode(&message)).expect("a message");
         assert_eq!(again.body.type_name(), message.body.type_name());
         assert_eq!(encode(&again), encode(&message));
     });
@@ -141,10 +140,10 @@ fn ndjson_cut_anywhere_gives_the_same_events() {
     });
 }
 
-/// What a connection that brings `chunks` says, as text: positions may be NaN.
+/// The events of a connection that receives `chunks`, as text because a position may be NaN.
 fn events(protocol: Protocol, chunks: &[&[u8]]) -> Vec<String> {
     let mut reader = Reader::new(protocol);
-    let mut told = Vec::new();
+    let mut events = Vec::new();
     for chunk in chunks {
         reader.push(Time::ZERO, chunk);
         loop {
@@ -155,14 +154,14 @@ fn events(protocol: Protocol, chunks: &[&[u8]]) -> Vec<String> {
                         let norm = sample.orientation.map(|q| q.norm());
                         assert!(norm.is_none_or(|norm| (norm - 1.0).abs() < 1e-9), "{event:?}");
                     }
-                    told.push(format!("{event:?}"));
+                    events.push(format!("{event:?}"));
                 }
                 Err(error) => {
-                    told.push(error.to_string());
-                    return told;
+                    events.push(error.to_string());
+                    return events;
                 }
             }
         }
     }
-    told
+    events
 }

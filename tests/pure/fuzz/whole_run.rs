@@ -1,5 +1,5 @@
-//! A whole run with frames on its bus that nobody meant: it ends, and no target that the bench
-//! sends is outside a limit or a jump.
+//! A whole run with foreign frames on its bus: it ends, and the bench sends no target past a limit and none that
+//! jumps.
 
 use super::canopen::{frames, written};
 use super::fuzz;
@@ -12,10 +12,10 @@ use needle_bench::units::Time;
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
-/// A whole run costs as much as so many of the other targets' cases.
+/// A whole run takes as long as this number of cases of the other targets.
 const COST: usize = 50;
 const END_BY: Time = Time::from_nanos(60_000_000_000);
-/// Of the default configuration: counts per mm and per turn, and the speeds allowed at 10 ms SYNC.
+/// Of the default configuration: counts per mm and per turn, and the largest steps in 10 ms.
 const PER_MM: f64 = 4646.0;
 const PER_TURN: f64 = 378_830.0 / 5.0;
 const STEP_MAX_MM: f64 = 0.1;
@@ -27,7 +27,7 @@ struct Run {
     session: Session,
     stage: VirtualStage,
     tool: String,
-    /// What was on the bus, with the time, and whether the bench sent it.
+    /// The frames on the bus, each with its time and whether the bench sent it.
     bus: Vec<(Time, Frame, bool)>,
 }
 
@@ -87,7 +87,7 @@ impl Run {
         }
     }
 
-    /// Leaps from deadline to deadline until `end`, or until the run is over.
+    /// Jumps from deadline to deadline until `end`, or until the run is over.
     fn run_until(&mut self, end: Time) {
         self.settle();
         while self.now < end && self.session.outcome().is_none() {
@@ -104,7 +104,7 @@ impl Run {
         }
     }
 
-    /// Puts a frame of nobody's on the bus: drives and bench hear it.
+    /// Puts a foreign frame on the bus: drives and bench receive it.
     fn intrude(&mut self, frame: &Frame) {
         self.stage.handle_frame(self.now, frame);
         self.session.handle(self.now, Input::Frame(*frame));
@@ -132,7 +132,7 @@ impl Run {
     }
 }
 
-/// The frames of a good run, in pieces of some forty.
+/// The frames of an undisturbed run, in pieces of forty.
 fn corpus() -> Vec<Vec<u8>> {
     let mut run = Run::new();
     run.run_until(END_BY);
