@@ -238,9 +238,15 @@ fn bad_arguments_are_refused_with_the_argument() {
 #[test]
 fn an_argument_that_is_not_utf_8_is_refused() {
     use std::os::unix::ffi::OsStrExt;
-    let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
-    command.arg("rnu").arg(std::ffi::OsStr::from_bytes(b"\xff.toml"));
-    assert_eq!(command.output().unwrap().status.code(), Some(2));
+    for (words, reason) in
+        [(&["check", "--set"][..], "invalid UTF-8"), (&["rnu"], "unrecognized subcommand 'rnu'")]
+    {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+        command.args(words).arg(std::ffi::OsStr::from_bytes(b"\xff.toml"));
+        let output = command.output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{words:?}");
+        assert!(String::from_utf8_lossy(&output.stderr).contains(reason), "{words:?}");
+    }
 }
 
 /// Commands with long reasons and long lists of allowed values.

@@ -150,6 +150,7 @@ fn the_example_has_a_plan_and_a_picture() {
         assert_eq!(svg.matches("<polyline").count(), 2);
         let again = needle_bench(&scratch, &["plan", &example, "--out", &picture]);
         assert_eq!(again.status, 2, "{}", again.stderr);
+        assert!(again.stderr.contains("exists, and is not overwritten"), "{}", again.stderr);
     }
 }
 

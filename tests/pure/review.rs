@@ -299,6 +299,7 @@ fn huge_numbers_or_a_pipe_as_steps_csv_do_not_hang_review() {
     fs::write(&steps, lines.map(|line| line + "\n").collect::<String>()).expect("written");
     let said = review(&scratch, &[&dir]);
     assert_eq!(said.status, 2, "{}", said.stderr);
+    assert_all(&said.stdout, &["so this is not the record of that run any more"]);
     fs::remove_file(&steps).expect("removed");
     let made = std::process::Command::new("mkfifo").arg(&steps).status().expect("mkfifo");
     assert!(made.success());

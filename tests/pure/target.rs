@@ -177,7 +177,7 @@ fn a_curvature_so_wrong_that_no_path_is_left_ends_the_run() {
     assert!(least_distance_mm(&scratch, &said) > 1.5, "{json}");
 }
 
-/// Such a run completes all the same.
+/// Such a run still completes.
 #[test]
 fn a_missed_target_is_reported_as_missed() {
     let scratch = Scratch::new();

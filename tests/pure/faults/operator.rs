@@ -315,9 +315,9 @@ fn happening() -> impl Strategy<Value = Happening> {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 
-    /// Whatever the operator and the tracker do: no set-point moves a needle that is held and has braked, or withdraws
-    /// it, or breaks a limit of speed or acceleration; only a command ends a hold by the operator or after a step; and
-    /// every run stops when the operator stops it.
+    /// Whatever the operator and the tracker do: no set-point moves a needle that is held and has braked, or
+    /// withdraws it, or breaks a limit of speed or acceleration; only a command ends a hold by the operator or after
+    /// a step; and every run stops when the operator stops it.
     #[test]
     fn no_commands_in_any_order_move_a_held_needle_or_break_a_limit(
         resume in prop::sample::select(vec!["stop", "automatic", "operator"]),

@@ -61,7 +61,7 @@ fn never_begins(sets: &[&str], what: impl Fn(&mut Sample) + Clone + 'static, why
 
 #[test]
 fn a_target_that_jumps() {
-    is_lost(&changed(|sample| sample.position_mm.y += 5.0), "mm");
+    is_lost(&changed(|sample| sample.position_mm.y += 5.0), "innovation: ");
 }
 
 #[test]

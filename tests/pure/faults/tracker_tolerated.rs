@@ -346,8 +346,8 @@ fn a_sender_whose_clock_is_set_back_a_little() {
         });
         let (bench, struck) = &run;
         let learnt = *struck + Duration::from_millis(195);
-        // The errors of the acquisition times, ms. The emulated tracker stamps by the bench's clock, so the true times are
-        // known.
+        // The errors of the acquisition times, ms. The emulated tracker stamps by the bench's clock, so the true
+        // times are known.
         let error_ms = |is_of: &dyn Fn(Time) -> bool| {
             let errors = bench.records.iter().filter_map(|record| match record {
                 Record::Sample(sample) => {

@@ -86,8 +86,8 @@ impl<'a> Mutator<'a> {
     }
 }
 
-/// Calls `target` with the corpus and then with `NEEDLE_FUZZ_CASES` mutations of it, which `NEEDLE_FUZZ_SEED` repeats.
-/// The target may draw from the mutator, and panics if it finds an error.
+/// Calls `target` with the corpus and then with `NEEDLE_FUZZ_CASES` mutations of it, which `NEEDLE_FUZZ_SEED`
+/// repeats. The target may draw from the mutator, and panics if it finds an error.
 pub(crate) fn fuzz(corpus: &[Vec<u8>], mut target: impl FnMut(&[u8], &mut Mutator<'_>)) {
     let number = |name: &str, otherwise: u64| match std::env::var(name) {
         Ok(text) => text.parse().unwrap_or_else(|_| panic!("{name}={text} is not a number")),
