@@ -30,7 +30,7 @@ pub enum Operation {
     Home(PerAxis<bool>),
     /// Move one axis; the other is held.
     Move(Move),
-    /// Hold both axes and stop the bench's heartbeat, as if the bench had died: both drives must notice.
+    /// Hold both axes and stop the bench's heartbeat; SYNC and set-points go on. Both drives must notice.
     Prove,
     /// The check of handedness: turn the base in air, and check that a sensor off its axis turns in the same
     /// direction.

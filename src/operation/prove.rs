@@ -82,7 +82,7 @@ impl Silence {
     }
 }
 
-/// The task that stops the bench's heartbeat while both axes are held, as if the bench had died.
+/// The task that stops the bench's heartbeat while both axes are held. SYNC and set-points go on.
 #[derive(Debug)]
 pub(super) struct Prove {
     config: StageConfig,

@@ -10,6 +10,7 @@ use crate::session::{Input, Machine, Outcome, Output, Session, State};
 use crate::tracker::{Event, Sample, Validity};
 use crate::units::Time;
 use nalgebra::Vector3;
+use std::collections::BTreeMap;
 use std::f64::consts::FRAC_PI_4;
 use std::time::Duration;
 
@@ -30,6 +31,8 @@ struct Bench {
     /// `None` without a tracker.
     sensor: Option<Sensor>,
     samples: u32,
+    /// When the bench last sent on each identifier.
+    last_sent: BTreeMap<Option<u16>, Time>,
 }
 
 fn config(sets: &[&str]) -> Config {
@@ -59,6 +62,7 @@ impl Bench {
             is_deaf: false,
             sensor: None,
             samples: 0,
+            last_sent: BTreeMap::new(),
         }
     }
 
@@ -75,9 +79,9 @@ impl Bench {
             let mut quiet = true;
             while let Some(output) = self.operation.poll() {
                 quiet = false;
-                if let Output::Transmit { frame, .. } = output
-                    && !self.is_lost(&frame)
-                {
+                let Output::Transmit { frame, .. } = output else { continue };
+                self.last_sent.insert(frame.cob_id(), self.now);
+                if !self.is_lost(&frame) {
                     self.stage.handle_frame(self.now, &frame);
                 }
             }
@@ -314,6 +318,17 @@ fn an_axis_that_needs_homing_is_not_moved_before_it() {
 #[test]
 fn prove_completes_when_both_drives_miss_the_silent_bench() {
     let mut bench = Bench::new(&config(&[]), Operation::Prove);
+    while bench.operation.progress().state != State::Silent {
+        bench.step();
+    }
+    let silent_from = bench.now;
+    while bench.operation.progress().state == State::Silent {
+        bench.step();
+    }
+    let sent_after = |cob_id| bench.last_sent[&Some(cob_id)].since(silent_from);
+    assert_eq!(sent_after(0x77f), Duration::ZERO, "no heartbeat");
+    let goes_on = |cob_id: &u16| sent_after(*cob_id) > Duration::from_millis(50);
+    assert!([0x080, 0x201, 0x202].iter().all(goes_on), "SYNC and set-points");
     assert_eq!(bench.run(), Outcome::Completed);
     assert_eq!(bench.travel(), (0.0, 0.0));
 }

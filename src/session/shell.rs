@@ -160,7 +160,7 @@ impl Shell {
         self.stage.home(self.now, axis).map_err(|error| format!("stage: {error}"))
     }
 
-    /// Stops sending the bench's heartbeat, as if the bench had died.
+    /// Stops the bench's heartbeat. SYNC and set-points go on.
     pub(crate) fn fall_silent(&mut self) {
         self.is_silent = true;
         self.stage.fall_silent();

@@ -142,8 +142,8 @@ pub(super) enum Motion {
         #[command(flatten)]
         common: Common,
     },
-    /// Hold both axes and stop sending, as if the bench had died, to prove that both drives notice. Some
-    /// drives are in fault afterwards.
+    /// Hold both axes and stop the bench's heartbeat, to prove that both drives notice and stop. SYNC and
+    /// set-points go on. Some drives are in fault afterwards.
     Prove {
         /// Turn the base in air instead, by 45 degrees twice and back, and check that the tracked sensor
         /// turns the same way. The sensor must sit off the needle's axis.
