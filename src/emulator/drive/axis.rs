@@ -119,11 +119,14 @@ impl Axis {
         }
     }
 
-    /// Switched On needs torque, and Operation Enabled also the nodes that this drive supervises (0x1016).
+    /// Switched On needs torque, and Operation Enabled also the nodes that this drive supervises (0x1016). A
+    /// quick stop after which the drive switches its power off (0x605A: 1 or 2) goes on to its end.
     fn may_enter(&self, next: DriveState) -> bool {
         match next {
             DriveState::SwitchedOn => self.has_torque(),
-            DriveState::OperationEnabled => self.has_torque() && !self.partner_lost,
+            DriveState::OperationEnabled => {
+                self.has_torque() && !self.partner_lost && self.after_stop.is_none()
+            }
             _ => true,
         }
     }
@@ -133,7 +136,6 @@ impl Axis {
             DriveState::QuickStopActive => self.quick_stop(now, objects),
             DriveState::OperationEnabled => {
                 self.state = next;
-                self.after_stop = None;
                 self.demand = whole(self.motion.position_at(now));
                 self.homing = Homing::default();
             }

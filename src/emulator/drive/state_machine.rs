@@ -1,7 +1,8 @@
 //! The transitions a controlword can cause (CiA 402-2, power drive system state machine).
 //!
 //! The table leaves out the events of the drive: transitions 0 and 1 are power-on, 13 and 14 a fault,
-//! 15 the rising edge of bit 7. The end of a quick stop also causes transition 12.
+//! 15 the rising edge of bit 7. The end of a quick stop also causes transition 12. The axis allows 16 only
+//! if the drive stays in Quick Stop Active (0x605A: 5 or 6).
 
 use crate::canopen::cia402::{Controlword, DriveState};
 

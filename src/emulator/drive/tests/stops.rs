@@ -30,6 +30,20 @@ fn each_quick_stop_option_brakes_and_ends_as_605a_says() {
     }
 }
 
+/// CiA 402-2, transition 16: only with options 5 to 8 of 0x605A.
+#[test]
+fn a_quick_stop_that_ends_without_power_cannot_be_left() {
+    for option in [1, 2, 5, 6] {
+        let mut bench = moving();
+        bench.write(object::QUICK_STOP_OPTION, &[option, 0]);
+        bench.write(object::CONTROLWORD, &[0x02, 0]);
+        assert_eq!(bench.state(), DriveState::QuickStopActive);
+        bench.write(object::CONTROLWORD, &[0x0f, 0]);
+        let resumed = bench.state() == DriveState::OperationEnabled;
+        assert_eq!(resumed, option >= 5, "605A {option}");
+    }
+}
+
 #[test]
 fn halt_brakes_and_holds_while_enabled() {
     let mut bench = moving();
