@@ -230,6 +230,7 @@ impl Drive {
         let lost = [supervised.consumer.node().get(), 0, 0, 0, 0];
         self.device.raise(EmcyCode::HEARTBEAT, lost);
         self.axis.heartbeat_lost(now, &mut self.device);
+        self.send_emergencies();
         let operational = self.nmt_state() == NmtState::Operational;
         match self.device.objects.integer(communication::COMMUNICATION_ERROR_BEHAVIOUR) {
             0 if operational => self.enter(now, NmtState::PreOperational),
@@ -341,6 +342,15 @@ impl Drive {
     fn flush(&mut self, now: Time) {
         self.axis.update(now, &mut self.device);
         self.outgoing.extend(std::iter::from_fn(|| self.server.poll_transmit()));
+        self.send_emergencies();
+        if self.nmt_state() == NmtState::Operational {
+            let objects = &self.device.objects;
+            self.outgoing.extend(self.tpdos.iter_mut().filter_map(|pdo| pdo.event(now, objects)));
+        }
+    }
+
+    /// In NMT Stopped they wait until the node leaves it.
+    fn send_emergencies(&mut self) {
         if self.nmt_state() == NmtState::Stopped {
             return;
         }
@@ -349,10 +359,6 @@ impl Drive {
             if emcy_enabled {
                 self.outgoing.push_back(emcy.to_frame(self.id));
             }
-        }
-        if self.nmt_state() == NmtState::Operational {
-            let objects = &self.device.objects;
-            self.outgoing.extend(self.tpdos.iter_mut().filter_map(|pdo| pdo.event(now, objects)));
         }
     }
 }

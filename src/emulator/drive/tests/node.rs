@@ -237,6 +237,7 @@ fn error_behaviour_keeps_the_node_operational_or_stops_it() {
         assert_eq!(write(&mut node, 0x1016, 1, &[50, 0, 127, 0]), "");
         give(&mut node, 10, heartbeat_frame(MASTER, NmtState::Operational));
         node.handle_timeout(at_ms(60));
+        assert_eq!(sent(&mut node), "085#3081117F00000000", "before the node is Stopped");
         assert_eq!(node.nmt_state(), state);
     }
 }
