@@ -168,7 +168,8 @@ impl Drive {
             NmtCommand::EnterPreOperational => self.enter(now, NmtState::PreOperational),
             NmtCommand::ResetCommunication => {
                 self.enter(now, NmtState::PreOperational);
-                self.device.objects.reset(0x1000..=0x1fff);
+                // The error register is no parameter: it tells of the errors that the axis still has.
+                self.device.objects.reset(0x1002..=0x1fff);
                 self.boot(now);
             }
             NmtCommand::ResetNode => {

@@ -89,6 +89,17 @@ fn a_fault_is_reset_by_a_rising_edge_only() {
 }
 
 #[test]
+fn a_reset_of_communication_leaves_a_fault_in_the_error_register() {
+    let mut bench = Bench::enabled_at(0);
+    bench.cycle(0x0f, 1_000_000);
+    bench.nmt(NmtCommand::ResetCommunication);
+    let register = ObjectAddress::new(0x1001, 0);
+    assert_eq!((bench.state(), bench.read(register)), (DriveState::Fault, vec![0x21]));
+    bench.write(object::CONTROLWORD, &[0x80, 0]);
+    assert_eq!((bench.state(), bench.read(register)), (DriveState::SwitchOnDisabled, vec![0]));
+}
+
+#[test]
 fn a_lost_heartbeat_stops_the_axis_as_6007_says() {
     for (option, end) in [
         (0, DriveState::OperationEnabled),
