@@ -102,8 +102,8 @@ impl Entry {
     }
 
     fn parse(&self, value: SdoValue) -> Result<i64, AbortCode> {
-        let bits = 8 * value.as_bytes().len();
-        match bits.cmp(&self.data_type.bits().map_or(0, usize::from)) {
+        let own = self.data_type.bits().map_or(0, usize::from);
+        match value.size().map_or(own, |size| 8 * size).cmp(&own) {
             Ordering::Greater => Err(AbortCode::LENGTH_TOO_HIGH),
             Ordering::Less => Err(AbortCode::LENGTH_TOO_LOW),
             Ordering::Equal => self.parse_raw(value.to_u32().into()),

@@ -81,7 +81,9 @@ impl ClientFrame {
         Some(match command >> 5 {
             0 => ClientFrame::Unsupported(NO_OBJECT),
             1 if command & EXPEDITED != 0 => {
-                ClientFrame::Request(SdoRequest::Download(object, decode_value(bytes)?))
+                let is_sized = command & SIZE_INDICATED != 0;
+                let value = SdoValue { is_sized, ..decode_value(bytes)? };
+                ClientFrame::Request(SdoRequest::Download(object, value))
             }
             2 => ClientFrame::Request(SdoRequest::Upload(object)),
             3 => ClientFrame::UploadSegment(command & TOGGLE != 0),

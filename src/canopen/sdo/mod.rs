@@ -64,12 +64,14 @@ pub enum SdoError {
 pub struct SdoValue {
     bytes: [u8; 4],
     len: u8,
+    /// False for a value written without a size: as many of its four bytes count as the object has.
+    is_sized: bool,
 }
 
 impl SdoValue {
     /// The little-endian `bytes` of an object; `None` unless there are 1 to 4.
     pub fn from_bytes(bytes: &[u8]) -> Option<Self> {
-        let mut value = SdoValue { bytes: [0; 4], len: bytes.len() as u8 };
+        let mut value = SdoValue { bytes: [0; 4], len: bytes.len() as u8, is_sized: true };
         value.bytes.get_mut(..bytes.len())?.copy_from_slice(bytes);
         (!bytes.is_empty()).then_some(value)
     }
@@ -84,7 +86,7 @@ impl SdoValue {
         let fits = (-(1_i64 << (bits - 1))..1_i64 << bits).contains(&value);
         let mut bytes = (value as u32).to_le_bytes();
         bytes[usize::from(size)..].fill(0);
-        fits.then_some(SdoValue { bytes, len: size })
+        fits.then_some(SdoValue { bytes, len: size, is_sized: true })
     }
 
     /// The bytes as they go on the bus.
@@ -96,6 +98,11 @@ impl SdoValue {
     /// expedited answer need not say how many of its four bytes belong to the object (CiA 301, 7.2.4.3.6).
     pub fn at_least(self, len: u8) -> Option<u32> {
         (self.len >= len).then_some(self.to_u32())
+    }
+
+    /// How many bytes it has; `None` if it was written without a size (CiA 301, 7.2.4.3.3).
+    pub(super) fn size(self) -> Option<usize> {
+        self.is_sized.then_some(self.len.into())
     }
 
     /// As an unsigned number.
@@ -111,7 +118,7 @@ macro_rules! sdo_values {
                 let mut bytes = [0; 4];
                 let len = size_of::<$type>();
                 bytes[..len].copy_from_slice(&value.to_le_bytes());
-                SdoValue { bytes, len: len as u8 }
+                SdoValue { bytes, len: len as u8, is_sized: true }
             }
         })*
     };

@@ -70,6 +70,19 @@ fn a_node_reports_its_identity_and_keeps_it() {
     assert_eq!(write(&mut node, 0x1018, 1, &[0; 4]), "02000106");
 }
 
+/// Expedited, without a size (e = 1, s = 0): the length of the object counts (CiA 301, 7.2.4.3.3).
+#[test]
+fn a_value_written_without_a_size_has_that_of_its_object() {
+    let mut node = node();
+    assert_eq!(sdo(&mut node, [0x22, 0x29, 0x10, 1, 2, 9, 9, 9]), "585#6029100100000000");
+    assert_eq!(sdo(&mut node, [0x40, 0x29, 0x10, 1, 0, 0, 0, 0]), "585#4F29100102000000");
+    assert_eq!(sdo(&mut node, [0x22, 0x17, 0x10, 0, 0xe8, 3, 9, 9]), "585#6017100000000000");
+    assert_eq!(sdo(&mut node, [0x40, 0x17, 0x10, 0, 0, 0, 0, 0]), "585#4B171000E8030000");
+    assert_eq!(sdo(&mut node, [0x22, 0x7a, 0x60, 0, 7, 0, 0, 0]), "585#607A600000000000");
+    assert_eq!(target(&node), 7);
+    assert_eq!(write(&mut node, 0x1017, 0, &[0, 0, 0, 0]), "12000706", "with a wrong size");
+}
+
 #[test]
 fn received_data_waits_for_sync_and_samples_come_before_it() {
     let mut node = started();
