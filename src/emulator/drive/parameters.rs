@@ -1,10 +1,10 @@
 //! The rules for writing the communication objects (CiA 301, 7.5).
 
-use crate::canopen::ObjectAddress;
 use crate::canopen::object::communication::consumer_heartbeat;
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::canopen::pdo::{MappedObject, PDOS, PdoCobId, PdoDirection, PdoMapping};
 use crate::canopen::sdo::AbortCode;
+use crate::canopen::{ObjectAddress, cob};
 
 use super::pdo::{EVENT_MANUFACTURER, EVENT_PROFILE, SYNC_EVERY_MAX};
 
@@ -58,7 +58,7 @@ pub(super) fn check_write(
         // The error history can only be erased.
         (0x1003, _) => value == 0,
         // No SYNC producer, no 29-bit identifiers.
-        (0x1005, _) => (1..=0x7ff).contains(&value),
+        (0x1005, _) => (0..=0x7ff).contains(&value) && !is_restricted(value as u16),
         // The identifier is fixed; bit 31 switches the messages off.
         (0x1014, _) => (value ^ objects.integer(object)) & 0x7fff_ffff == 0,
         (0x1016, _) => return check_supervision(objects, object.subindex, value as u32),
@@ -93,7 +93,8 @@ fn may_set_pdo_parameter(objects: &ObjectDictionary, object: ObjectAddress, valu
         1 => {
             let wanted = PdoCobId(value as u32);
             let same_id = (current.0 ^ wanted.0) & 0x3fff_ffff == 0;
-            let usable = !wanted.is_valid() || wanted.cob_id().is_some_and(is_free);
+            let is_free = |cob_id| cob_id != cob::SYNC && !is_restricted(cob_id);
+            let usable = wanted.cob_id().is_some_and(|id| !wanted.is_valid() || is_free(id));
             (same_id || !current.is_valid()) && usable
         }
         2 => matches!(value as u8, 1..=SYNC_EVERY_MAX | EVENT_MANUFACTURER | EVENT_PROFILE),
@@ -102,11 +103,11 @@ fn may_set_pdo_parameter(objects: &ObjectDictionary, object: ObjectAddress, valu
     }
 }
 
-/// True for an identifier a PDO may use: one that is not restricted (CiA 301, table 39).
-fn is_free(cob_id: u16) -> bool {
-    !matches!(
+/// True for an identifier that no object may be given (CiA 301, table 39).
+fn is_restricted(cob_id: u16) -> bool {
+    matches!(
         cob_id,
-        0x000..=0x080 | 0x101..=0x180 | 0x581..=0x5ff | 0x601..=0x67f | 0x6e0..=0x6ff | 0x701..
+        0x000..=0x07f | 0x101..=0x180 | 0x581..=0x5ff | 0x601..=0x67f | 0x6e0..=0x6ff | 0x701..
     )
 }
 

@@ -182,6 +182,23 @@ fn remapping_follows_the_rules_of_cia_301() {
     assert_eq!(target(&node), 7, "objects of the axis keep their values");
 }
 
+/// CiA 301, table 39. An extended identifier (bit 29) is refused for a PDO that is off (bit 31) too.
+#[test]
+fn restricted_and_extended_identifiers_are_refused() {
+    let mut node = node();
+    for cob_id in [0x000, 0x07f, 0x101, 0x180, 0x581, 0x601, 0x67f, 0x6e0, 0x701, 0x7ff_u32] {
+        assert_eq!(write(&mut node, 0x1005, 0, &cob_id.to_le_bytes()), "30000906", "{cob_id:X}");
+    }
+    for cob_id in [0x080, 0x100, 0x181, 0x6df_u32] {
+        assert_eq!(write(&mut node, 0x1005, 0, &cob_id.to_le_bytes()), "", "{cob_id:X}");
+    }
+    for (cob_id, answer) in
+        [(0xc000_0185_u32, ""), (0xe000_0185, "30000906"), (0x6000_0185, "30000906")]
+    {
+        assert_eq!(write(&mut node, 0x1800, 1, &cob_id.to_le_bytes()), answer, "{cob_id:X}");
+    }
+}
+
 #[test]
 fn event_driven_pdos_come_on_change_and_by_timer() {
     let mut node = node();
