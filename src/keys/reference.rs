@@ -135,10 +135,10 @@ fn table_schema(keys: &'static [Key], narrowed: &[(&str, Rule)], is_whole: bool)
     if is_whole && !required.is_empty() {
         schema["required"] = json!(required);
     }
-    for key in &keys {
-        if let Some(other) = key.instead_of {
-            schema["not"] = json!({ "required": [key.name, other] });
-        }
+    let exclusive = keys.iter().filter_map(|key| Some([key.name, key.instead_of?]));
+    let exclusive: Vec<Json> = exclusive.map(|both| json!({ "required": both })).collect();
+    if !exclusive.is_empty() {
+        schema["not"] = json!({ "anyOf": exclusive });
     }
     schema
 }
@@ -192,5 +192,31 @@ fn value_schema(kind: &Kind, rule: &Rule, key: &Key) -> Json {
         (Kind::Either(_, tables), _) => {
             json!({ "anyOf": tables.map(|keys| table_schema(keys, &[], true)) })
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    crate::keys::section! {
+        /// Two pairs of keys, of each of which one may be given.
+        #[expect(unreachable_pub, reason = "a section is public")]
+        pub struct Pairs {
+            /// The first.
+            a: Option<f64>;
+            /// Its other.
+            b: Option<f64>, instead_of("a");
+            /// The second.
+            c: Option<f64>;
+            /// Its other.
+            d: Option<f64>, instead_of("c");
+        }
+    }
+
+    #[test]
+    fn every_pair_of_keys_excludes_itself() {
+        let excluded = json!({ "anyOf": [{ "required": ["b", "a"] }, { "required": ["d", "c"] }] });
+        assert_eq!(json_schema(Pairs::KEYS, "")["not"], excluded);
     }
 }
