@@ -174,6 +174,8 @@ impl AbortCode {
     pub const VALUE_TOO_LOW: Self = AbortCode(0x0609_0032);
     /// General error.
     pub const GENERAL: Self = AbortCode(0x0800_0000);
+    /// No data available.
+    pub const NO_DATA: Self = AbortCode(0x0800_0024);
 }
 
 /// A line for each code that the standard names, sorted; the descriptions are shortened.

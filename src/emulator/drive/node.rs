@@ -14,7 +14,7 @@ use crate::canopen::cia402::DriveState;
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatEvent, HeartbeatProducer};
 use crate::canopen::nmt::{NmtCommand, NmtState, heartbeat_frame, nmt_frame, parse_nmt};
-use crate::canopen::object::communication::{self, consumer_heartbeat};
+use crate::canopen::object::communication::{self, consumer_heartbeat, error_history};
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::canopen::pdo::PdoDirection;
 use crate::canopen::sdo::{AbortCode, ObjectAccess, SdoServer, SdoValue};
@@ -375,7 +375,10 @@ struct Access<'a> {
 impl ObjectAccess for Access<'_> {
     fn read(&mut self, object: ObjectAddress) -> Result<Vec<u8>, AbortCode> {
         self.axis.update(self.now, self.device);
-        self.device.objects.read(object)
+        let value = self.device.objects.read(object)?;
+        let errors = self.device.objects.integer(error_history(0));
+        let is_empty = object.index == 0x1003 && i64::from(object.subindex) > errors;
+        if is_empty { Err(AbortCode::NO_DATA) } else { Ok(value) }
     }
 
     fn write(&mut self, object: ObjectAddress, value: SdoValue) -> Result<(), AbortCode> {

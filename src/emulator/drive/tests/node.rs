@@ -134,9 +134,22 @@ fn short_pdos_and_values_out_of_limits_are_ignored() {
     give(&mut node, 10, sync_frame());
     assert_eq!(target(&node), 0);
     assert_eq!(sdo(&mut node, [0x40, 0x03, 0x10, 1, 0, 0, 0, 0]), "585#4303100110820000");
+}
+
+/// CiA 301, 7.5.2.4.
+#[test]
+fn the_error_history_has_no_data_beyond_its_errors() {
+    let mut node = started();
+    let read = |node: &mut Drive, sub| sdo(node, [0x40, 0x03, 0x10, sub, 0, 0, 0, 0]);
+    assert_eq!(read(&mut node, 0), "585#4F03100000000000");
+    assert_eq!(read(&mut node, 1), "585#8003100124000008");
+    give(&mut node, 1, Frame::new(0x205, &[7, 0]));
+    assert_eq!(read(&mut node, 1), "585#4303100110820000");
+    assert_eq!(read(&mut node, 2), "585#8003100224000008");
+    assert_eq!(read(&mut node, 9), "585#8003100911000906", "no such subindex");
     assert_eq!(write(&mut node, 0x1003, 0, &[1]), "30000906");
     assert_eq!(write(&mut node, 0x1003, 0, &[0]), "");
-    assert_eq!(sdo(&mut node, [0x40, 0x03, 0x10, 1, 0, 0, 0, 0]), "585#4303100100000000");
+    assert_eq!(read(&mut node, 1), "585#8003100124000008");
 }
 
 #[test]
