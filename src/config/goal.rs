@@ -186,16 +186,6 @@ impl GoalConfig {
         let default = if self.obstacle.is_empty() { 0.0 } else { 0.15 };
         self.curvature_margin.unwrap_or(default)
     }
-
-    /// The end of a message, if some of the curvature is left unused.
-    fn margin_hint(&self) -> String {
-        match self.curvature_margin() {
-            0.0 => String::new(),
-            margin => {
-                format!("; {margin} of the curvature is left unused, see goal.curvature_margin")
-            }
-        }
-    }
 }
 
 impl Config {
@@ -215,7 +205,6 @@ impl Config {
         let curvature_margin = self.goal.curvature_margin();
         let tool = self.target_tool(problem.target_mm)?;
         let goal = Goal::new(world, problem, reserve_mm, curvature_margin, step_expansions_max);
-        let goal = goal.map_err(|reason| reason + &self.goal.margin_hint());
         Ok(goal.map(|goal| Some(Goal { tool, ..goal })))
     }
 

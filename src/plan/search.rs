@@ -75,6 +75,8 @@ pub struct Answer {
     pub resolution: Resolution,
     /// Why there is no path.
     pub reason: Option<String>,
+    /// There is no path, but a needle that bends more may have one.
+    pub may_bend_too_little: bool,
     /// The reachable point nearest to the target, mm. With a path it is only the nearest of those that the search
     /// visited. `None` if even the start is not allowed.
     pub nearest_mm: Option<Vector3<f64>>,
@@ -114,7 +116,7 @@ pub(super) fn plan_thoroughly(field: &mut Field<'_>, problem: &Problem, route: &
         }
         if problem.to_target_mm(&end_mm) <= problem.tolerance_mm {
             let (status, path) = (Status::Plan, Some(path));
-            answer = Answer { status, path, reason: None, ..answer };
+            answer = Answer { status, path, reason: None, may_bend_too_little: false, ..answer };
         }
     }
     answer
@@ -204,6 +206,7 @@ impl Search<'_, '_> {
             expansions: 0,
             resolution: self.lattice.resolution,
             reason: self.explain_bad_start(),
+            may_bend_too_little: false,
             nearest_mm: None,
         };
         if answer.reason.is_some() {
@@ -235,7 +238,10 @@ impl Search<'_, '_> {
         if answer.status == Status::None && answer.path.is_some() {
             answer.status = Status::Plan;
         }
-        answer.reason = answer.path.is_none().then(|| self.explain_no_path(answer.status));
+        if answer.path.is_none() {
+            let (reason, may_bend_too_little) = self.explain_no_path(answer.status);
+            answer = Answer { reason: Some(reason), may_bend_too_little, ..answer };
+        }
         self.field.visited = self.lattice.visited;
         answer
     }
@@ -413,41 +419,50 @@ impl Search<'_, '_> {
         Path { start: self.problem.start, arcs }.joined()
     }
 
-    /// Why the search found no path.
-    fn explain_no_path(&self, status: Status) -> String {
+    /// Why the search found no path, and whether a needle that bends more may have one.
+    fn explain_no_path(&self, status: Status) -> (String, bool) {
         let Problem { start, target_mm, tolerance_mm, clearance_mm, length_max_mm, .. } =
             self.problem;
         let world = &self.field.world;
         let out_mm = -world.workspace.depth_mm(target_mm);
         if out_mm > *tolerance_mm {
-            return format!("the target is {out_mm:.1} mm outside goal.workspace_mm");
+            return (format!("the target is {out_mm:.1} mm outside goal.workspace_mm"), false);
         }
         let distance_mm = world.distance_mm(target_mm);
         if distance_mm < clearance_mm - tolerance_mm {
             let place = describe_distance(distance_mm);
-            return format!("the target is {place}, goal.clearance_mm is {clearance_mm}");
+            let reason = format!("the target is {place}, goal.clearance_mm is {clearance_mm}");
+            return (reason, false);
         }
         if self.route.length_mm(&start.position_mm).is_infinite() {
-            return "the obstacles close every way to the target, even for a needle that bends at will"
-                .to_owned();
+            let reason =
+                "the obstacles close every way to the target, even for a needle that bends at will";
+            return (reason.to_owned(), false);
         }
         let curvature_per_mm = self.problem.curvature_per_mm;
         let least_mm =
             start.shortest_mm(target_mm, curvature_per_mm, *tolerance_mm, self.problem.in_plane);
         if least_mm - tolerance_mm > *length_max_mm {
-            return format!(
+            let reason = format!(
                 "the target is out of reach: with nothing in the way, a needle of {:.0} mm radius takes \
                  {least_mm:.0} mm at least, allowed are {length_max_mm:.0}",
                 curvature_per_mm.recip()
             );
+            return (reason, true);
         }
         match status {
-            Status::Budget => format!(
-                "the budget of expansions was spent before a path was found: raise goal.expansions_max, \
-                 which is {}",
-                self.problem.expansions_max
-            ),
-            _ => "every tip within reach was tried, and none comes to the target".to_owned(),
+            Status::Budget => {
+                let reason = format!(
+                    "the budget of expansions was spent before a path was found: raise \
+                     goal.expansions_max, which is {}",
+                    self.problem.expansions_max
+                );
+                (reason, false)
+            }
+            _ => {
+                let reason = "every tip within reach was tried, and none comes to the target";
+                (reason.to_owned(), true)
+            }
         }
     }
 }

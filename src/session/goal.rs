@@ -5,7 +5,8 @@ use crate::control::{Bend, BendLaw, Command, ControlConfig, ControlKind};
 use crate::needle::Needle;
 use crate::observer::Estimate;
 use crate::plan::{
-    self, NoRoomyPath, Path, Problem, Replanner, RoomyPath, Step, Tip, World, plan_with_reserve,
+    self, NoRoomyPath, Path, Problem, Replanner, RoomyPath, Status, Step, Tip, World,
+    plan_with_reserve,
 };
 use nalgebra::Vector3;
 
@@ -43,9 +44,18 @@ impl Goal {
         let RoomyPath { path, .. } = roomy.map_err(|NoRoomyPath { reason, .. }| {
             let nearest = shortest.nearest_mm.filter(|_| shortest.path.is_none()).map(|at| {
                 let (at, off_mm) = (shown(&at), (at - target_mm).norm());
-                format!("; the nearest reachable point is {at}, {off_mm:.1} mm from the target")
+                let what = match shortest.status {
+                    Status::Budget => "the nearest point that was reached",
+                    _ => "the nearest reachable point",
+                };
+                format!("; {what} is {at}, {off_mm:.1} mm from the target")
             });
-            format!("goal: {reason}{}", nearest.unwrap_or_default())
+            let hint = (shortest.may_bend_too_little && curvature_margin > 0.0).then(|| {
+                format!(
+                    "; {curvature_margin} of the curvature is left unused, see goal.curvature_margin"
+                )
+            });
+            format!("goal: {reason}{}{}", nearest.unwrap_or_default(), hint.unwrap_or_default())
         })?;
         let problem = Problem { expansions_max: step_expansions_max, ..problem };
         world.workspace.start_mm = Some(problem.start.position_mm);
@@ -227,6 +237,37 @@ mod tests {
         let sets: Vec<String> = [&always, sets].concat().into_iter().map(str::to_owned).collect();
         let config = Config::from_sources(&[], &sets).unwrap();
         config.session().unwrap().goal.unwrap()
+    }
+
+    /// The hint is for a target that more curvature might reach. What a spent budget found is not all there is.
+    #[test]
+    fn a_refusal_says_what_can_help() {
+        let refusal = |sets: &[&str]| {
+            let target = ["goal.kind=\"target\"", "goal.position_mm=[0.0, 0.0, 120.0]"];
+            let ball =
+                "goal.obstacle=[{ shape=\"sphere\", centre_mm=[0.0, 1.0, 60.0], radius_mm=5.0 }]";
+            let sets = [&target, &[ball][..], sets].concat();
+            let sets: Vec<String> = sets.into_iter().map(str::to_owned).collect();
+            let config = Config::from_sources(&[], &sets).unwrap();
+            config.session().expect_err("no path").to_string()
+        };
+        let [can_help, reachable] = ["see goal.curvature_margin", "the nearest reachable point is"];
+        let said = refusal(&["goal.position_mm=[0.0, 60.0, 70.0]"]);
+        assert!(said.contains(can_help) && said.contains(reachable), "{said}");
+        let said = refusal(&["goal.position_mm=[0.0, 60.0, 70.0]", "goal.curvature_margin=0"]);
+        assert!(!said.contains(can_help), "{said}");
+        let said = refusal(&["goal.expansions_max=2"]);
+        assert!(said.contains("; the nearest point that was reached is"), "{said}");
+        assert!(!said.contains(can_help) && !said.contains(reachable), "{said}");
+        for set in [
+            "goal.position_mm=[0.0, 1.0, 62.0]",
+            "goal.position_mm=[0.0, 0.0, 200.0]",
+            "emulator.start.y_mm=90",
+            "goal.reserve_mm=40",
+        ] {
+            let said = refusal(&[set]);
+            assert!(!said.contains(can_help), "{said}");
+        }
     }
 
     /// The plan before a run does not know the measured start.
