@@ -24,6 +24,7 @@ pub(super) fn mask_reader(
 /// The image in `path`, as an obstacle.
 fn read_mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, String> {
     check_regular(path).map_err(|error| error.to_string())?;
+    check_name(path)?;
     let header = NiftiHeader::from_file(path).map_err(|error| reason(&error))?;
     // A record has one checksum for a mask, so the mask must be one file.
     if &header.magic != b"n+1\0" {
@@ -36,6 +37,11 @@ fn read_mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obsta
         }
         _ => return Err(format!("the mask has {} dimensions, allowed: 3", dim.len())),
     };
+    if let Some(count) = dim.iter().map(|count| count.cast_signed()).find(|count| *count < 0) {
+        return Err(format!(
+            "its header gives {count} voxels along an axis (dim); correct the header"
+        ));
+    }
     if !is_upright(&header) {
         return Err("its header turns or mirrors the voxels; resample it along x, y, z".to_owned());
     }
@@ -45,6 +51,15 @@ fn read_mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obsta
     let voxels = Mask::voxel_count(size, &spacing_mm)?;
     check_length(path, &header, voxels)?;
     let image = ReaderOptions::new().read_file(path).map_err(|error| reason(&error))?;
+    // `nifti` reads the voxels from here on, whatever `vox_offset` says.
+    let first_byte = HEADER_BYTES + image.extensions().bytes_on_disk();
+    if f64::from(header.vox_offset) != first_byte as f64 {
+        return Err(format!(
+            "its voxels begin at byte {} by its header (vox_offset), allowed: {first_byte}, where the header \
+             and its extensions end; load and save the image, for example with nibabel",
+            header.vox_offset
+        ));
+    }
     let image = image.into_volume();
     let mut index = vec![0; dim.len()];
     let occupied = (0..voxels).map(|voxel| {
@@ -70,14 +85,30 @@ fn read_mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obsta
     Mask::new(size, spacing_mm, &occupied, &pose.to_pose()).map(Obstacle::Mask)
 }
 
+/// The size of a NIfTI-1 header, and of the four bytes after it that say whether extensions follow.
+const HEADER_BYTES: usize = 352;
+
+/// Refuses a compressed image whose name does not say so: `nifti` goes by the name.
+fn check_name(path: &Path) -> Result<(), String> {
+    let mut start = [0; 2];
+    let is_read = File::open(path).and_then(|mut file| file.read_exact(&mut start)).is_ok();
+    match is_read && start == [0x1f, 0x8b] && !is_compressed(path) {
+        true => Err("it is compressed by gzip; give it a name that ends in .nii.gz".to_owned()),
+        false => Ok(()),
+    }
+}
+
+fn is_compressed(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == "gz")
+}
+
 /// Refuses an image with bytes after its voxels: its header may belong to another image. A compressed image is
 /// refused if its bytes are damaged.
 fn check_length(path: &Path, header: &NiftiHeader, voxels: usize) -> Result<(), String> {
     let unreadable = |error: io::Error| reason(&NiftiError::Io(error));
     let file = File::open(path).map_err(unreadable)?;
-    let is_compressed = path.extension().is_some_and(|extension| extension == "gz");
     let image: Box<dyn Read> =
-        if is_compressed { Box::new(MultiGzDecoder::new(file)) } else { Box::new(file) };
+        if is_compressed(path) { Box::new(MultiGzDecoder::new(file)) } else { Box::new(file) };
     let bits = u64::try_from(header.bitpix).unwrap_or_default() * voxels as u64;
     let expected = f64::from(header.vox_offset) as u64 + bits / 8;
     // Reads no further than needed: a compressed file may expand to any length.

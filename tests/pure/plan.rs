@@ -5,6 +5,7 @@ use flate2::Compression;
 use flate2::write::GzEncoder;
 use serde_json::Value;
 use std::io::Write;
+use std::ops::Range;
 
 /// A target straight ahead with a ball in the way.
 const BALL: &str = "\
@@ -197,6 +198,8 @@ fn a_plan_needs_a_target() {
 
 /// The offset of `xyzt_units` in a header.
 const UNITS: usize = 123;
+/// Where a header has the first byte of its voxels (`vox_offset`).
+const VOX_OFFSET: Range<usize> = 108..112;
 
 /// A NIfTI-1 image in one file: `size` voxels of `spacing_mm` with these `values`.
 fn nifti(size: [u16; 3], spacing_mm: [f32; 3], values: &[u8]) -> Vec<u8> {
@@ -210,7 +213,7 @@ fn nifti(size: [u16; 3], spacing_mm: [f32; 3], values: &[u8]) -> Vec<u8> {
     put(72, &8i16.to_le_bytes());
     let sides = [1.0, spacing_mm[0], spacing_mm[1], spacing_mm[2]];
     sides.iter().enumerate().for_each(|(i, side)| put(76 + 4 * i, &side.to_le_bytes()));
-    put(108, &352f32.to_le_bytes());
+    put(VOX_OFFSET.start, &352f32.to_le_bytes());
     // Unit: mm.
     put(UNITS, &[2]);
     put(344, b"n+1\0");
@@ -288,6 +291,13 @@ fn a_file_that_is_not_a_mask_is_refused() {
     }
     let mut pair = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
     pair[344..347].copy_from_slice(b"ni1");
+    // The voxels begin after 48 bytes of padding, or far beyond the end of the file.
+    let mut padded = nifti([2, 2, 2], [1.0; 3], &[[0; 48].as_slice(), &[1; 8]].concat());
+    padded[VOX_OFFSET].copy_from_slice(&400f32.to_le_bytes());
+    let mut beyond = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
+    beyond[VOX_OFFSET].copy_from_slice(&1e9f32.to_le_bytes());
+    let mut negative = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
+    negative[42..44].copy_from_slice(&(-2i16).to_le_bytes());
     let images = [
         b"no image".to_vec(),
         pair,
@@ -301,6 +311,10 @@ fn a_file_that_is_not_a_mask_is_refused() {
         two_sizes,
         nifti([20, 10, 10], [1.0; 3], &[1; 2500]),
         nifti([2, 2, 2], [0.001; 3], &[1; 8]),
+        padded,
+        beyond,
+        negative,
+        vec![0x1f, 0x8b, 8, 0],
         nifti([50, 50, 120], [1.0; 3], &[1; 300_000]),
     ];
     let mut screens = refusals(&scratch, &[&["check", "goal.toml"]]);
@@ -309,6 +323,20 @@ fn a_file_that_is_not_a_mask_is_refused() {
         screens += &refusals(&scratch, &[&["check", "goal.toml"]]);
     }
     insta::assert_snapshot!(screens);
+}
+
+/// As other programs write it: the voxels begin after the extension.
+#[test]
+fn a_mask_with_an_extension_is_read() {
+    let scratch = Scratch::new();
+    let mut image = nifti([20, 10, 10], [1.0; 3], &[1; 2000]);
+    image[348] = 1;
+    image[VOX_OFFSET].copy_from_slice(&368f32.to_le_bytes());
+    let extension = [16i32, 6, 0, 0].map(i32::to_le_bytes).concat();
+    image.splice(352..352, extension);
+    std::fs::write(scratch.path().join("mask.nii"), image).unwrap();
+    let (status, json) = plan(&scratch, MASK, &[]);
+    assert_eq!((status, &json["status"]), (0, &Value::from("plan")), "{json}");
 }
 
 /// With a wrong checksum, and cut before the checksum.
