@@ -13,6 +13,7 @@ use crate::emulator::fault::Fault;
 use crate::keys::{Key, expanded};
 use crate::needle::TorsionConfig;
 use crate::session::rotation_peak;
+use nalgebra::Vector3;
 
 pub(super) const ROTATION_ACCELERATION_MAX: &str = "stage.rotation.acceleration_max_deg_per_s2";
 
@@ -119,10 +120,13 @@ fn check_study(config: &Config, reader: &mut Reader) {
     }
     let study = &config.study;
     let [moves, tool] = ["study.target_move_mm", "goal.tool"];
-    let is_still = study.target_move_mm.is_some() && config.goal.tool.is_none();
-    reader.refuse_if(&[moves, tool], is_still, || {
-        format!("{moves} has no effect without {tool}: name the tool that is the target")
-    });
+    let drift = "emulator.target_drift_mm_per_mm";
+    let is_drifting = config.emulator.target_drift_mm_per_mm != Vector3::zeros();
+    for (key, is_moving) in [(moves, study.target_move_mm.is_some()), (drift, is_drifting)] {
+        reader.refuse_if(&[key, tool], is_moving && config.goal.tool.is_none(), || {
+            format!("{key} has no effect without {tool}: name the tool that is the target")
+        });
+    }
     let least_mm = match study.target_depth_mm {
         Some([low, _]) => low,
         None => config.goal.position_mm.map_or(f64::INFINITY, |target_mm| target_mm.norm()),

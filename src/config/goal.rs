@@ -5,7 +5,7 @@ use super::reader::Reader;
 use super::tracker::FILE;
 use super::{Config, ConfigError, TrackerSource};
 use crate::control::ControlKind;
-use crate::keys::{Rule, choice, not_blank, over, section, within};
+use crate::keys::{Field, Key, Rule, choice, not_blank, over, section, within};
 use crate::plan::{Obstacle, Problem, Tip, Workspace, World};
 use crate::session::{Goal, TargetTool};
 use crate::tracker::{Gate, Registration};
@@ -36,7 +36,7 @@ section! {
         /// Additional clearance of the path with which a run begins, mm. With less, the tracker's noise or a
         /// turn of the needle may leave no path.
         reserve_mm: f64 [within(0.0, 100.0)] = 0.5;
-        /// The box that the tip must not leave, without a clearance to its walls, mm.
+        /// Only with a target: the box that the tip must not leave, without a clearance to its walls, mm.
         workspace_mm: WorkspaceConfig =>
             "{ min = [-50.0, -75.0, 0.0], max = [50.0, 75.0, 150.0] }";
         /// The share of the needle's curvature that a plan leaves unused, as a reserve for what the model does
@@ -294,10 +294,14 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
         format!("{kind} is \"target\", and {position} is not given: say where it is")
     });
     let [tool, obstacle] = ["goal.tool", "goal.obstacle"];
+    // A printed configuration has the default.
+    let mut defaults = GoalConfig::KEYS.iter().filter(|key| key.name == "workspace_mm");
+    let default = defaults.next().and_then(Key::default_value);
     let given = [
         (position, goal.position_mm.is_some()),
         (tool, goal.tool.is_some()),
         (obstacle, !goal.obstacle.is_empty()),
+        (workspace, goal.workspace_mm != WorkspaceConfig::take(default.as_ref())),
         ("study.target_depth_mm", config.study.target_depth_mm.is_some()),
         ("study.obstacles", config.study.obstacles.is_some_and(|obstacles| obstacles > 0)),
     ];

@@ -158,9 +158,8 @@ fn the_example_has_a_plan_and_a_picture() {
 #[test]
 fn contradictory_goals_are_refused_with_the_key() {
     let scratch = Scratch::new();
-    let obstacle = |text: &str| {
-        format!("[goal]\nkind = \"target\"\nposition_mm = [0, 0, 100]\n[[goal.obstacle]]\n{text}\n")
-    };
+    let target = "[goal]\nkind = \"target\"\nposition_mm = [0, 0, 100]\n";
+    let obstacle = |text: &str| format!("{target}[[goal.obstacle]]\n{text}\n");
     let texts = [
         "[goal]\nkind = \"target\"\n".to_owned(),
         "[goal]\nposition_mm = [0, 0, 100]\n".to_owned(),

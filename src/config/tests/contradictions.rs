@@ -221,7 +221,14 @@ fn a_target_move_without_a_tool_or_faster_than_the_needle_is_refused() {
         set_refusal(&[moves]),
         "--set study.target_move_mm has no effect without goal.tool: name the tool that is the target"
     );
-    let target = ["goal.kind=target", "goal.tool=Target", "goal.position_mm=[0, 0, 90]", moves];
+    let drifts = "emulator.target_drift_mm_per_mm=[0, 0.02, 0]";
+    assert_eq!(
+        set_refusal(&[drifts]),
+        "--set emulator.target_drift_mm_per_mm has no effect without goal.tool: name the tool that is the \
+         target"
+    );
+    let target =
+        ["goal.kind=target", "goal.tool=Target", "goal.position_mm=[0, 0, 90]", moves, drifts];
     assert!(load("", &target).is_ok());
     let near = [&["study.target_depth_mm=[20, 90]"], &target[..]].concat();
     assert_eq!(
@@ -229,6 +236,23 @@ fn a_target_move_without_a_tool_or_faster_than_the_needle_is_refused() {
         "--set study.target_move_mm reaches 30, allowed: up to the least distance of the target from the \
          start, 20 mm; it would move faster than the needle"
     );
+}
+
+/// Only a path to a target stays in it. The default may be printed.
+#[test]
+fn a_workspace_on_the_way_into_the_plane() {
+    let narrow = "goal.workspace_mm = { min = [-50, -20, 0], max = [50, 20, 150] }";
+    assert_eq!(
+        refusal(narrow),
+        "bench.toml:1: goal.workspace_mm has no effect, since goal.kind is \"plane\": set goal.kind = \
+         \"target\""
+    );
+    let part = set_refusal(&["goal.workspace_mm.max=[50, 20, 150]"]);
+    assert!(part.contains("goal.workspace_mm has no effect"), "{part}");
+    let target = ["goal.kind=target", "goal.position_mm=[0, 0, 90]"];
+    assert!(load(narrow, &target).is_ok());
+    let printed = loaded("", &[]).to_toml().expect("TOML");
+    assert!(printed.contains("workspace_mm") && load(&printed, &[]).is_ok(), "{printed}");
 }
 
 /// Only a path to a target leads around obstacles.
