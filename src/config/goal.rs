@@ -32,7 +32,7 @@ section! {
         /// The path stays in the plane x = 0, where the control law keeps the needle.
         in_plane: bool = true;
         /// How near the path may come to an obstacle, mm.
-        clearance_mm: f64 [within(0.0, 100.0)] = 2.0;
+        clearance_mm: f64 [within(0.1, 100.0)] = 2.0;
         /// Additional clearance of the path with which a run begins, mm. With less, the tracker's noise or a
         /// turn of the needle may leave no path.
         reserve_mm: f64 [within(0.0, 100.0)] = 0.5;

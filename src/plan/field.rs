@@ -6,8 +6,9 @@ use super::obstacle::World;
 use nalgebra::Vector3;
 use std::borrow::Cow;
 
-/// The shortest step along an arc when it is tested against the obstacles, mm. Between two tests an
-/// obstacle of 1 mm radius may come nearer by 0.0012 mm.
+/// The shortest step along an arc when it is tested against the obstacles, mm. Between two tests a path may come
+/// nearer to an obstacle than a clearance of 1 mm by 0.0013 mm, and than one of 0.1 mm, the least that can be
+/// configured, by 0.0134 mm. With less than half a step it could lead through a thin obstacle.
 const TEST_STEP_MM: f64 = 0.1;
 /// An arc longer than this, mm, is first tested at a few points, at these fractions of its length.
 const FEW_POINTS_MM: f64 = 5.0;
@@ -177,5 +178,29 @@ impl<'a> Field<'a> {
             along_mm += slack_mm.max(TEST_STEP_MM);
         }
         true
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::Obstacle;
+    use crate::plan::search::tests::world;
+
+    #[test]
+    fn the_least_clearance_leaves_no_way_through_a_thin_obstacle() {
+        let tip = Tip { position_mm: Vector3::zeros(), heading: Vector3::z() };
+        let ahead = Arc { bend: Vector3::y(), curvature_per_mm: 0.0, length_mm: 40.0 };
+        let is_clear = |at_mm: f64, clearance_mm| {
+            let thin = Obstacle::Box {
+                min_mm: Vector3::new(-9.0, -9.0, at_mm),
+                max_mm: Vector3::new(9.0, 9.0, at_mm + 1e-6),
+            };
+            let world = world(vec![thin]);
+            Field::new(Cow::Borrowed(&world), clearance_mm, true).is_clear(&tip, &ahead)
+        };
+        let places = || (0..200).map(|i| 21.0 + 0.001 * f64::from(i));
+        assert!(places().all(|at_mm| !is_clear(at_mm, 0.1)));
+        assert!(places().any(|at_mm| is_clear(at_mm, 0.0)), "so 0 is not allowed");
     }
 }
