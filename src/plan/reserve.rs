@@ -30,7 +30,7 @@ pub struct NoRoomyPath {
 }
 
 /// Plans the path with which a run begins, with as much of the reserve as possible, but no less than `least_mm`.
-/// `shortest` is the answer to `problem`. Each try may spend `problem.expansions_max`.
+/// `shortest` is the answer to `problem`; without a path in it, none is looked for. Each try may spend `problem.expansions_max`.
 ///
 /// # Errors
 /// [`NoRoomyPath`].
@@ -40,13 +40,10 @@ pub fn plan_with_reserve(
     least_mm: f64,
     shortest: &Answer,
 ) -> Result<RoomyPath, NoRoomyPath> {
-    let no_path = || {
+    let Some(path) = shortest.path.clone() else {
         let reason = shortest.reason.clone().unwrap_or_default();
-        NoRoomyPath { status: shortest.status, reason }
+        return Err(NoRoomyPath { status: shortest.status, reason });
     };
-    if shortest.status == Status::None {
-        return Err(no_path());
-    }
     let parts = PARTS.map(|part| part * RESERVE_MM);
     let tries = parts.into_iter().filter(|part_mm| *part_mm > least_mm);
     let least = (least_mm > 0.0).then_some(least_mm);
@@ -59,7 +56,6 @@ pub fn plan_with_reserve(
         }
         last = answer.status;
     }
-    let path = shortest.path.clone().ok_or_else(no_path)?;
     let kept_mm = path.distance_mm(world) - problem.clearance_mm;
     match (least, last) {
         _ if kept_mm >= least_mm => Ok(RoomyPath { path, reserve_mm: least_mm }),
@@ -132,6 +128,21 @@ mod tests {
         let NoRoomyPath { reason, .. } =
             planned(clearance_mm - 0.5, 0.5, MANY).expect_err("there is no path at all");
         assert!(!reason.contains("goal.reserve_mm"), "{reason}");
+    }
+
+    /// With more distance from the obstacles the same number of expansions may find one, but `plan` has none.
+    #[test]
+    fn without_a_shortest_path_no_other_is_looked_for() {
+        let (world, problem) = (world(Vec::new()), problem([0.0, 0.0, 120.0], true));
+        let reason = Some("the budget of expansions was spent".to_owned());
+        let found = plan(&world, &problem);
+        let shortest = Answer { status: Status::Budget, path: None, reason, ..found };
+        let NoRoomyPath { status, reason } =
+            plan_with_reserve(&world, &problem, 0.5, &shortest).expect_err("no path");
+        assert_eq!(
+            (status, reason.as_str()),
+            (Status::Budget, "the budget of expansions was spent")
+        );
     }
 
     /// The first expansions find a path. Only a complete search shows that no path keeps more.

@@ -37,6 +37,7 @@ fn json_has_the_plan() {
     assert!(number("end_error_mm") < 1e-6);
     assert!((1.99..3.0).contains(&number("clearance_mm")));
     assert!(number("expansions") >= 1.0 && number("seconds") > 0.0);
+    assert!(number("run_seconds") > 0.0);
     let rows: Vec<[f64; 3]> = serde_json::from_value(json["path"].clone()).unwrap();
     assert_eq!(rows[0], [0.0, 0.0, 0.0]);
     assert!((rows[rows.len() - 1][2] - 120.0).abs() < 1e-6);
@@ -68,6 +69,8 @@ fn no_plan_is_reported_with_the_reason_and_the_nearest_point() {
     assert_eq!((status, &json["status"]), (1, &Value::from("budget")));
     assert!(json["nearest_distance_mm"].as_f64().unwrap() > 10.0, "{json}");
     let said = needle_bench(&scratch, &["plan", "goal.toml", "--set", "goal.expansions_max=2"]);
+    // A run is not allowed either, so no search for its path follows.
+    assert_eq!([&json["run_refusal"], &json["run_seconds"]], [&json["reason"], &Value::Null]);
     let raise = "raise goal.expansions_max, which is 2\nnearest";
     assert!(
         said.stdout.contains(raise) && said.stdout.contains("mm was reached"),
