@@ -82,8 +82,7 @@ pub struct Answer {
     pub nearest_mm: Option<Vector3<f64>>,
 }
 
-/// Plans the shortest path that ends at the target, or if that is not possible, within the tolerance of it. A
-/// millimetre of distance from the target counts as a millimetre of length.
+/// Plans the path to the target, or within the tolerance of it, whose length plus distance left at the end is least.
 ///
 /// The search is best-first over arcs of full curvature and straights, all of one length, in cells of position
 /// and heading that are visited once. Nodes are ordered by the length so far plus a lower bound of the
