@@ -273,6 +273,13 @@ fn a_study_draws_targets_and_obstacles() {
     let json = study(&["goal.reserve_mm=40"]);
     assert_eq!(json["refused_fraction"], 1.0, "{json}");
     assert_eq!(json["target_error_mm"]["median"], Value::Null, "{json}");
+    let all = ["study", "goal.toml", "--trials", "3", "--set", "goal.reserve_mm=40"];
+    let said = needle_bench(&scratch, &all).stdout;
+    assert!(
+        said.contains("\nrefused     100.00%: no plan at the start\n            seed "),
+        "{said}"
+    );
+    assert_eq!(said.matches("none was found that keeps goal.reserve_mm, 40").count(), 1, "{said}");
     let plane = ["study", "goal.toml", "--trials", "1", "--set", "goal.kind=plane"];
     let refused = needle_bench(&scratch, &plane);
     assert_eq!(refused.status, 2, "{}", refused.stderr);
