@@ -64,7 +64,9 @@ fn another_master_stops_a_stage_at_its_first_frame() {
 fn drives_that_another_master_sends_to_nmt_stopped_are_stopped() {
     let mut bench = Bench::ready();
     bench.drive_on(5);
-    [&mut bench.insertion, &mut bench.rotation].map(|drive| drive.nmt = NmtState::Stopped);
+    for drive in [&mut bench.insertion, &mut bench.rotation] {
+        drive.nmt = NmtState::Stopped;
+    }
     bench.receive(Frame::new(0x000, &[2, 0]));
     assert!(bench.until_fault().contains("an NMT command (000#0200)"));
     let heartbeat = Duration::from_millis(110);
