@@ -56,7 +56,7 @@ fn read_mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obsta
     if f64::from(header.vox_offset) != first_byte as f64 {
         return Err(format!(
             "its voxels begin at byte {} by its header (vox_offset), allowed: {first_byte}, where the header \
-             and its extensions end; load and save the image, for example with nibabel",
+             and its extensions end; load and save it, e.g. with nibabel",
             header.vox_offset
         ));
     }
