@@ -13,7 +13,7 @@ pub use needle::{BendFit, NeedleFit, PathNoise, PosedRow, TorsionFit};
 pub use record::{NeedleRecord, Provenance, RegistrationRecord, TipRecord};
 pub use registration::{FiducialPair, RegistrationFit};
 pub use tip::{SensorMount, TipFit, TurnSample};
-pub use tracker::{AxisNoise, Measured, NoiseFit, RestSample, TrackerFit};
+pub use tracker::{AxisNoise, DatedBy, Measured, NoiseFit, RestSample, TrackerFit};
 
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 use thiserror::Error;

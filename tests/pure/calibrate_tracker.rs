@@ -121,7 +121,7 @@ fn a_recording_of_a_frozen_stream_is_too_short() {
     );
     assert_eq!(said.status, 2, "{}", said.stdout);
     assert!(
-        said.stderr.contains("63 new positions in 31.0 s (118 repeats), at least 100"),
+        said.stderr.contains("63 new positions in 31.0 s (118 repeats, 1 invalid), at least 100"),
         "{}",
         said.stderr
     );

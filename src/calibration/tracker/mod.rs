@@ -31,8 +31,11 @@ const OUTLIER_SHARE_MAX: f64 = 0.05;
 const SD_PER_MAD: f64 = 1.4826;
 /// A position that swings has a correlation below this after half a period; noise has none.
 const SWING_CORRELATION: f64 = -0.5;
-/// A gap of more than this many intervals has dropouts.
-const DROPOUT_INTERVALS: f64 = 1.5;
+/// A delay ends within this many samples; a sample that is missing delays all those after it.
+const DELAYED_SAMPLES_MAX: usize = 12;
+/// Stamps date the positions if they span the same time as the receipts, to within the larger of these.
+const SPAN_DIFFERENCE_MAX_NS: f64 = 1e9;
+const SPAN_DIFFERENCE_SHARE_MAX: f64 = 0.01;
 
 /// One sample of a recording at rest.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -43,6 +46,16 @@ pub struct RestSample {
     pub source_unix_ns: Option<i64>,
     /// Position of the sensor, mm; `None` where the tracker itself calls it invalid.
     pub position_mm: Option<Vector3<f64>>,
+}
+
+/// The times that date the positions.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum DatedBy {
+    /// The sender's stamps.
+    Stamp,
+    /// The times of receipt.
+    Receipt,
 }
 
 /// The noise of one coordinate.
@@ -62,6 +75,8 @@ pub struct TrackerFit {
     pub positions: usize,
     /// The time that they span, s.
     pub duration_s: f64,
+    /// The times that date them.
+    pub dated_by: DatedBy,
     /// x, y and z of the tracker.
     pub axes: [AxisNoise; 3],
     /// One fit to all three axes.
@@ -72,15 +87,16 @@ pub struct TrackerFit {
     pub rate_hz: Measured,
     /// Positions left out as outliers.
     pub outliers: usize,
-    /// Positions that are missing in gaps of the stream.
+    /// Samples that are missing in gaps of the stream.
     pub dropouts: usize,
     /// Samples that the tracker called invalid.
     pub invalid: usize,
     /// Samples that repeat the position before.
     pub repeats: usize,
-    /// Standard deviation of receipt minus stamp, ms; `None` without stamps.
+    /// Standard deviation of receipt minus stamp, ms; `None` if stamps do not date the positions.
     pub latency_jitter_ms: Option<Measured>,
-    /// 99% of the samples come later than the quickest by less than this, ms; `None` without stamps.
+    /// 99% of the samples come later than the quickest by less than this, ms; `None` if stamps do not
+    /// date the positions.
     pub latency_p99_ms: Option<f64>,
 }
 
@@ -90,8 +106,8 @@ impl TrackerFit {
     /// The model of a coordinate is an offset, a drift, white noise, and a stationary process whose
     /// correlation decays as `exp(-t / time)`. The noise is the likeliest one: the likelihood comes
     /// from a Kalman filter, which takes unequal intervals as they are. Standard errors are from its
-    /// curvature. Positions are dated by their stamps where all have one and none goes back, else by their
-    /// receipt.
+    /// curvature. Positions are dated by their stamps where all have one, each is later than the one before, and
+    /// they span the same time as the receipts; else by their receipt.
     ///
     /// # Errors
     /// A recording that is too short, that moves, or that has positions no bench reaches.
@@ -102,21 +118,28 @@ impl TrackerFit {
         check_distances("position", "tracker", &positions_mm)?;
         valid.dedup_by_key(|(_, position)| *position);
         let repeats = positions_mm.len() - valid.len();
+        let invalid = samples.len() - positions_mm.len();
         let stamps: Option<Vec<i64>> =
             valid.iter().map(|(sample, _)| sample.source_unix_ns).collect();
-        let received = || valid.iter().map(|(sample, _)| sample.receive_time.as_nanos()).collect();
-        let times_ns = stamps.filter(|stamps| stamps.is_sorted()).unwrap_or_else(received);
-        let first_ns = times_ns.first().copied().unwrap_or(0);
-        let since_s = times_ns.iter().map(|ns| ns.saturating_sub(first_ns) as f64 * 1e-9);
+        let received: Vec<i64> = valid.iter().map(|(sample, _)| received_ns(sample)).collect();
+        let stamps = stamps.filter(|stamps| keep_time(stamps, &received));
+        let dated_by = if stamps.is_some() { DatedBy::Stamp } else { DatedBy::Receipt };
+        let since_s = since_first_s(&stamps.unwrap_or(received));
         let points: Vec<(f64, Vector3<f64>)> =
-            since_s.zip(valid.iter().map(|(_, position_mm)| *position_mm)).collect();
+            since_s.into_iter().zip(valid.iter().map(|(_, position_mm)| *position_mm)).collect();
         let duration_s = points.last().map_or(0.0, |(time_s, _)| *time_s);
         if points.len() < POSITIONS_MIN || duration_s < DURATION_MIN_S {
-            let repeated =
-                if repeats == 0 { String::new() } else { format!(" ({repeats} repeats)") };
+            let left_out = match (repeats, invalid) {
+                (0, 0) => String::new(),
+                (_, 0) => format!(" ({repeats} repeats)"),
+                (0, _) => format!(" ({invalid} invalid)"),
+                _ => format!(" ({repeats} repeats, {invalid} invalid)"),
+            };
+            let is_mostly_new = points.len() >= repeats + invalid;
+            let next = if is_mostly_new { "record longer" } else { "is the tool in view?" };
             return Err(CalibrationError(format!(
-                "{} new positions in {duration_s:.1} s{repeated}, at least {POSITIONS_MIN} in \
-                 {DURATION_MIN_S:.0} s are needed; record longer",
+                "{} new positions in {duration_s:.1} s{left_out}, at least {POSITIONS_MIN} in \
+                 {DURATION_MIN_S:.0} s are needed; {next}",
                 points.len()
             )));
         }
@@ -125,8 +148,7 @@ impl TrackerFit {
         // Positions that are received together have no interval between them.
         gaps_s.retain(|gap_s| *gap_s > 0.0);
         let interval_s = median(&mut gaps_s);
-        let dropouts = gaps_s.iter().filter(|gap| **gap > DROPOUT_INTERVALS * interval_s);
-        let dropouts = dropouts.map(|gap| (gap / interval_s).round() as usize - 1).sum();
+        let dropouts = dropouts(&arrivals_s(samples, dated_by), interval_s);
 
         let with_outliers = points.len();
         let points = without_outliers(points)?;
@@ -177,22 +199,79 @@ impl TrackerFit {
                  {refused_s:.1} s of {duration_s:.0} s; the sensor moved, or record longer"
             )));
         }
-        let (latency_jitter_ms, latency_p99_ms) = latency(samples).unzip();
+        let by_stamp = valid.iter().filter(|_| dated_by == DatedBy::Stamp);
+        let (latency_jitter_ms, latency_p99_ms) =
+            latency(by_stamp.map(|(sample, _)| *sample)).unzip();
         Ok(TrackerFit {
             positions: points.len(),
             duration_s,
+            dated_by,
             axes,
             together,
             drift_mm_per_min,
             rate_hz,
             outliers,
             dropouts,
-            invalid: samples.len() - positions_mm.len(),
+            invalid,
             repeats,
             latency_jitter_ms,
             latency_p99_ms,
         })
     }
+}
+
+fn received_ns(sample: &RestSample) -> i64 {
+    sample.receive_time.as_nanos()
+}
+
+/// Times since the first of them, s.
+fn since_first_s(times_ns: &[i64]) -> Vec<f64> {
+    let first_ns = times_ns.first().copied().unwrap_or(0);
+    times_ns.iter().map(|ns| ns.saturating_sub(first_ns) as f64 * 1e-9).collect()
+}
+
+/// True if `stamps` increase strictly and span the same time as the receipts. The clock of such stamps has a
+/// resolution, is in ns, and was not set.
+fn keep_time(stamps: &[i64], received: &[i64]) -> bool {
+    let span_ns = |times: &[i64]| match times {
+        [first, .., last] => last.saturating_sub(*first) as f64,
+        _ => 0.0,
+    };
+    let received_ns = span_ns(received);
+    let limit_ns = SPAN_DIFFERENCE_MAX_NS.max(SPAN_DIFFERENCE_SHARE_MAX * received_ns);
+    stamps.is_sorted_by(|a, b| a < b) && (span_ns(stamps) - received_ns).abs() <= limit_ns
+}
+
+/// When each sample came, valid or not, s: by the stamps if these date the positions and no invalid sample lacks
+/// one. Samples with the stamp of the one before are one measurement, and count once.
+fn arrivals_s(samples: &[RestSample], dated_by: DatedBy) -> Vec<f64> {
+    let stamps: Option<Vec<i64>> = samples.iter().map(|sample| sample.source_unix_ns).collect();
+    let stamps = stamps.filter(|stamps| dated_by == DatedBy::Stamp && stamps.is_sorted());
+    since_first_s(&match stamps {
+        Some(mut stamps) => {
+            stamps.dedup();
+            stamps
+        }
+        None => samples.iter().map(received_ns).collect(),
+    })
+}
+
+/// The number of samples that are missing between those that came at `times_s`, about `interval_s` apart. A sample
+/// that is delayed is late by itself; after one that is missing, all are late by an interval. So each step counts
+/// by which the least delay of the next few samples rises.
+fn dropouts(times_s: &[f64], interval_s: f64) -> usize {
+    // Delays skew the median gap, but hardly the mean of the gaps without dropouts.
+    let gaps_s = times_s.windows(2).map(|pair| pair[1] - pair[0]);
+    let is_near = |gap_s: &f64| (0.5..1.5).contains(&(gap_s / interval_s));
+    let interval_s = moments(&gaps_s.filter(is_near).collect::<Vec<_>>()).0;
+    let late = |(k, time_s): (usize, &f64)| time_s / interval_s - k as f64;
+    let late: Vec<f64> = times_s.iter().enumerate().map(late).collect();
+    let least = |k: usize| {
+        let next = late[k..].iter().take(DELAYED_SAMPLES_MAX).copied();
+        next.fold(f64::INFINITY, f64::min)
+    };
+    let rises = (1..late.len()).map(|k| (least(k) - least(k - 1)).round().max(0.0) as usize);
+    rises.sum()
 }
 
 /// The median, the upper one of an even number of values; 0 without values.
@@ -319,13 +398,12 @@ impl Detrended {
     }
 }
 
-/// Standard deviation of receipt minus stamp, and its 99th percentile above the smallest, ms; `None` unless
-/// every sample has a stamp.
-fn latency(samples: &[RestSample]) -> Option<(Measured, f64)> {
-    let offset_ns = |sample: &RestSample| {
-        Some(sample.receive_time.as_nanos().saturating_sub(sample.source_unix_ns?))
-    };
-    let offsets_ns: Vec<i64> = samples.iter().map(offset_ns).collect::<Option<_>>()?;
+/// Standard deviation of receipt minus stamp, and its 99th percentile above the smallest, ms; `None` without
+/// stamps.
+fn latency<'a>(samples: impl Iterator<Item = &'a RestSample>) -> Option<(Measured, f64)> {
+    let offset_ns =
+        |sample: &RestSample| Some(received_ns(sample).saturating_sub(sample.source_unix_ns?));
+    let offsets_ns: Vec<i64> = samples.filter_map(offset_ns).collect();
     let least_ns = *offsets_ns.iter().min()?;
     let mut delays_ms: Vec<f64> =
         offsets_ns.iter().map(|ns| ns.saturating_sub(least_ns) as f64 * 1e-6).collect();

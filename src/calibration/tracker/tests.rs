@@ -120,7 +120,7 @@ fn outliers_dropouts_and_repeats_are_counted() {
     samples.drain(700..710);
     let fit = TrackerFit::of(&samples).unwrap();
     assert_eq!((fit.outliers, fit.invalid, fit.repeats), (3, 2, 1));
-    assert_eq!(fit.dropouts, 10 + 2 + 1);
+    assert_eq!((fit.dropouts, fit.dated_by), (10, DatedBy::Stamp));
     assert!((fit.rate_hz.value - 40.0).abs() < 0.6, "{:?}", fit.rate_hz);
     let jitter = fit.latency_jitter_ms.unwrap();
     assert!((jitter.value - 1.708).abs() < 0.02 && jitter.error < 0.05, "{jitter:?}");
@@ -130,6 +130,7 @@ fn outliers_dropouts_and_repeats_are_counted() {
     let unstamped = |sample: &RestSample| RestSample { source_unix_ns: None, ..*sample };
     let fit = TrackerFit::of(&samples.iter().map(unstamped).collect::<Vec<_>>()).unwrap();
     assert_eq!((fit.latency_jitter_ms, fit.latency_p99_ms), (None, None));
+    assert_eq!((fit.dropouts, fit.dated_by), (10, DatedBy::Receipt));
     assert!((fit.rate_hz.value - 40.0).abs() < 0.6, "the rate by the times of receipt");
 }
 
@@ -141,6 +142,90 @@ fn one_stamp_ahead_costs_no_position() {
     let fit = TrackerFit::of(&samples).unwrap();
     assert_eq!((fit.positions, fit.dropouts), (1200, 0));
     assert!((fit.duration_s - 30.0).abs() < 0.1, "{fit:?}");
+}
+
+/// Stamps in whole seconds, that stand still, in µs, of a clock that is set, or that one sample lacks.
+#[test]
+fn stamps_that_do_not_keep_time_date_no_position() {
+    let in_seconds: fn(i64) -> Option<i64> = |ns| Some(ns / 1_000_000_000 * 1_000_000_000);
+    let start = 1_700_000_000_000_000_000;
+    let is_late = move |ns: i64| ns - start > 15_000_000_000;
+    let cases: [&dyn Fn(i64) -> Option<i64>; 6] = [
+        &in_seconds,
+        &|_| Some(start),
+        &|ns| Some(ns / 1000),
+        &|ns| Some(if is_late(ns) { ns + 10_000_000_000 } else { ns }),
+        &|ns| Some(if is_late(ns) { ns + 3_600_000_000_000 } else { ns }),
+        &|ns| (ns - start != 10_000_000_000).then_some(ns),
+    ];
+    let received = |sample: &RestSample| RestSample { source_unix_ns: None, ..*sample };
+    let samples = rest(HALF_COLOURED, 7, 1200, still);
+    let expected = TrackerFit::of(&samples.iter().map(received).collect::<Vec<_>>()).unwrap();
+    assert_eq!((expected.dropouts, expected.dated_by), (0, DatedBy::Receipt));
+    for (k, stamp) in cases.into_iter().enumerate() {
+        let mut samples = samples.clone();
+        for sample in &mut samples {
+            sample.source_unix_ns = sample.source_unix_ns.and_then(stamp);
+        }
+        assert_eq!(TrackerFit::of(&samples).unwrap(), expected, "case {k}");
+    }
+}
+
+/// Delays that decay exponentially move the receipts by most of an interval; with 130 samples missing, and none.
+#[test]
+fn dropouts_are_told_from_delays() {
+    for (mean_s, missing, least, most) in [
+        (0.005, 0, 0, 2),
+        (0.010, 0, 0, 4),
+        (0.0, 130, 130, 130),
+        (0.005, 130, 115, 135),
+        (0.010, 130, 85, 140),
+    ] {
+        let mut samples = rest(NEAR, 7, 2400, still);
+        let mut newest = Time::ZERO;
+        for (k, sample) in (0u64..).zip(&mut samples) {
+            // The golden ratio spreads the fractions evenly, and consecutive ones far apart.
+            let share = (0.618_033_988_75 * (k * k) as f64).fract();
+            let late_s = -mean_s * (1.0 - share).ln();
+            newest = newest.max(Time::from_secs_f64(0.025 * k as f64 + late_s));
+            (sample.receive_time, sample.source_unix_ns) = (newest, None);
+        }
+        let mut index = 0;
+        samples.retain(|_| {
+            index += 1;
+            missing == 0 || index % 18 != 9 || index / 18 >= missing
+        });
+        assert_eq!(2400 - samples.len(), missing);
+        let fit = TrackerFit::of(&samples).unwrap();
+        println!("delayed by {mean_s} s, {missing} missing: {}", fit.dropouts);
+        assert!((least..=most).contains(&fit.dropouts), "{mean_s} {missing}: {}", fit.dropouts);
+    }
+}
+
+#[test]
+fn samples_without_a_new_position_are_no_dropouts() {
+    let stamped = rest(NEAR, 7, 1200, still);
+    let received = |sample: &RestSample| RestSample { source_unix_ns: None, ..*sample };
+    let unstamped: Vec<RestSample> = stamped.iter().map(received).collect();
+    for samples in [stamped, unstamped] {
+        let (mut invalid, mut repeated, mut coarse) =
+            (samples.clone(), samples.clone(), samples.clone());
+        for k in (10..1200).step_by(20) {
+            invalid[k].position_mm = None;
+            repeated[k].position_mm = samples[k - 1].position_mm;
+        }
+        for sample in &mut coarse {
+            sample.position_mm =
+                sample.position_mm.map(|p_mm| p_mm.map(|mm| (20.0 * mm).round() / 20.0));
+        }
+        for (samples, invalid, has_repeats) in
+            [(invalid, 60, false), (repeated, 0, true), (coarse, 0, true)]
+        {
+            let fit = TrackerFit::of(&samples).unwrap();
+            assert_eq!((fit.invalid, fit.repeats > 0), (invalid, has_repeats));
+            assert_eq!(fit.dropouts, 0, "{fit:?}");
+        }
+    }
 }
 
 /// Positions are received four at a time, without stamps, so most have the same time as the one before.
@@ -189,6 +274,13 @@ fn a_recording_that_is_too_short_is_refused() {
     }
     let text = refusal(&frozen);
     assert!(text.starts_with("1 new positions in 0.0 s (399 repeats), at least 100"), "{text}");
+    assert!(text.ends_with("; is the tool in view?"), "{text}");
+    frozen[1].position_mm = None;
+    let text = refusal(&frozen);
+    assert!(text.contains("(398 repeats, 1 invalid)"), "{text}");
+    frozen.iter_mut().for_each(|sample| sample.position_mm = None);
+    let text = refusal(&frozen);
+    assert!(text.starts_with("0 new positions in 0.0 s (400 invalid), at least 100"), "{text}");
     let metres = rest(NEAR, 1, 400, |_| Vector3::x() * 1e5);
     assert!(refusal(&metres).ends_with("give positions in mm"));
     // The correlation is over a fifth of the recording.
