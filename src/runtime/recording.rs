@@ -125,8 +125,9 @@ fn make_from_text_files(
         frames: frames(open(file::CAN)?, manifest),
         events: events(open(file::EVENTS)?),
     };
-    let mut difference = None;
-    // A bench that was killed at once has recorded no inputs.
+    // A bench that was killed at once has recorded nothing.
+    let is_run = manifest.counts.is_some_and(|counts| counts.can_frames + counts.steps > 0);
+    let mut difference = is_run.then(|| format!("{} has no inputs", file::INPUTS));
     if open(file::INPUTS)?.next().is_some() {
         let recorded = Recorded { manifest, run_config, open: &open };
         let replayed = replay_to(&recorded, None, &mut |record, truth| {

@@ -21,6 +21,8 @@ pub struct Repaired {
     /// Text files that ended in the middle of a line, each with the length of that partial line in bytes.
     /// The partial line is now in a file of the same name with `.cut` appended.
     pub cuts: Vec<(String, u64)>,
+    /// Text files that are missing.
+    pub missing: Vec<&'static str>,
 }
 
 impl fmt::Display for Repaired {
@@ -31,8 +33,15 @@ impl fmt::Display for Repaired {
             "{}: {steps} steps, {can_frames} frames, {tracker_samples} samples, {events} events",
             self.stop_reason
         )?;
-        self.cuts.iter().try_for_each(|(name, bytes)| write!(f, "; {}", cut_text(name, *bytes)))
+        self.cuts.iter().try_for_each(|(name, bytes)| write!(f, "; {}", cut_text(name, *bytes)))?;
+        // The stop reason names missing steps.
+        let others = self.missing.iter().filter(|name| **name != file::STEPS);
+        others.map(missing_text).try_for_each(|text| write!(f, "; {text}"))
     }
+}
+
+fn missing_text(name: impl fmt::Display) -> String {
+    format!("{name} is missing")
 }
 
 fn cut_text(name: &str, bytes: u64) -> String {
@@ -75,21 +84,21 @@ pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
     let counts = Counts::of_lines(|name| lines.get(name).copied().unwrap_or_default());
     let last_step = match lines.contains_key(file::STEPS) {
         true => last_step(&run.text(file::STEPS)?),
-        false => format!("{} is missing", file::STEPS),
+        false => missing_text(file::STEPS),
     };
     let stop_reason = format!("the bench ended without closing its record; {last_step}");
     let mut manifest = run.manifest().clone();
     manifest.set_outcome(&Outcome::Stopped(stop_reason.clone()));
     manifest.counts = Some(counts);
     manifest.faults.extend(cuts.iter().map(|(name, bytes)| cut_text(name, *bytes)));
-    manifest.faults.extend(missing.iter().map(|name| format!("{name} is missing")));
+    manifest.faults.extend(missing.iter().map(missing_text));
     manifest.repaired_utc = Some(utc_text(SystemTime::now()));
     let names = [file::CONFIG].into_iter().chain(file::TEXT_FILES);
     for name in names.map(str::to_owned).chain(cuts.iter().map(|(name, _)| cut_name(name))) {
         manifest.files.extend(seal_of(dir, &name)?.map(|seal| (name, seal)));
     }
     folder::write_manifest(dir, &manifest)?;
-    Ok(Repaired { stop_reason, counts, cuts })
+    Ok(Repaired { stop_reason, counts, cuts, missing })
 }
 
 /// Writes the seal of `run.rrd` into the manifest of the closed record in `dir`, and the `fault`, if the file is
@@ -223,6 +232,9 @@ mod tests {
         fs::remove_file(scratch.0.join(file::STEPS)).unwrap();
         let repaired = repair(&scratch.0).unwrap();
         assert!(repaired.stop_reason.ends_with("; steps.csv is missing"), "{repaired}");
+        let others = "; tracker.ndjson is missing; inputs.log is missing; events.log is missing";
+        assert!(repaired.to_string().ends_with(others), "{repaired}");
+        assert_eq!(repaired.to_string().matches("steps.csv is missing").count(), 1, "{repaired}");
         let run = RunFolder::open(&scratch.0).unwrap();
         run.verify().unwrap();
         let missing = "steps.csv is missing".to_owned();

@@ -50,7 +50,8 @@ impl RunFolder {
     }
 
     /// Checks that the sealed files are unchanged, and that in a closed record every text file has a seal. In a
-    /// record that was never closed only the configuration is checked.
+    /// record that was never closed only the configuration is checked. `run.rrd` is not checked
+    /// ([`Self::recording_change`]): it follows from the other files, and nothing is read from it.
     ///
     /// # Errors
     /// [`TelemetryError::Record`] with every file that differs, and [`TelemetryError::File`].
@@ -58,6 +59,9 @@ impl RunFolder {
         let files = &self.manifest.files;
         let mut changes = Vec::new();
         for (name, FileSeal { bytes, sha256 }) in files {
+            if name == file::RECORDING {
+                continue;
+            }
             changes.extend(self.change(name, Some(*bytes), sha256)?);
         }
         if self.is_closed() {
@@ -77,6 +81,20 @@ impl RunFolder {
             "{changes}, so this is not the record of that run any more (restore it from a copy)"
         );
         Err(TelemetryError::record(&self.dir, reason))
+    }
+
+    /// How `run.rrd` differs from the one that the manifest lists; `None` if it does not.
+    ///
+    /// # Errors
+    /// [`TelemetryError::File`].
+    pub fn recording_change(&self) -> Result<Option<String>, TelemetryError> {
+        match self.manifest.files.get(file::RECORDING) {
+            Some(FileSeal { bytes, sha256 }) => self.change(file::RECORDING, Some(*bytes), sha256),
+            None if self.dir.join(file::RECORDING).exists() => {
+                Ok(Some(format!("{} has no seal in the manifest", file::RECORDING)))
+            }
+            None => Ok(Some(format!("{} is missing", file::RECORDING))),
+        }
     }
 
     /// How the file `name` differs from this hash and, if known, this size; `None` if it is unchanged.

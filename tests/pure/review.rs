@@ -353,14 +353,43 @@ fn a_missing_run_rrd_is_made_again_by_repair() {
     let recording = scratch.path().join(&dir).join("run.rrd");
     fs::remove_file(&recording).expect("removed");
     let said = review(&scratch, &[&dir, "--no-html"]);
-    let warning = "warning     run.rrd is missing; make it: needle-bench review ";
+    let warning = "warning     run.rrd is gone; make it: needle-bench review ";
     assert!(said.stdout.contains(warning) && said.stdout.contains(" --repair"), "{}", said.stdout);
-    let said = review(&scratch, &[&dir, "--repair"]);
+    // Nothing is read from it.
+    let said = needle_bench(&scratch, &["replay", &dir]);
     assert_eq!(said.status, 0, "{}", said.stderr);
-    assert_all(&said.stdout, &["run.rrd made"]);
-    assert!(recording.is_file());
-    let said = review(&scratch, &[&dir, "--json"]).json();
-    assert_eq!(said["condition"], "whole", "{said}");
+    let repaired = || {
+        let said = review(&scratch, &[&dir, "--repair"]);
+        assert_eq!(said.status, 0, "{}", said.stderr);
+        assert_all(&said.stdout, &["run.rrd made"]);
+        assert!(recording.is_file());
+        let said = review(&scratch, &[&dir, "--json"]).json();
+        assert_eq!(said["condition"], "whole", "{said}");
+        assert!(!said["warnings"].to_string().contains("run.rrd"), "{said}");
+    };
+    repaired();
+    fs::write(&recording, "damaged").expect("written");
+    let said = review(&scratch, &[&dir, "--no-html"]);
+    assert_all(&said.stdout, &["warning     run.rrd had ", " --repair"]);
+    assert_eq!(needle_bench(&scratch, &["replay", &dir]).status, 0);
+    repaired();
+    assert_eq!(review(&scratch, &[&dir, "--repair"]).status, 2, "there is nothing to repair");
+}
+
+/// Without the inputs nothing can be replayed.
+#[test]
+fn a_record_without_inputs_is_named() {
+    let scratch = Scratch::new();
+    let dir = run(&scratch, &[]);
+    leave_open(&scratch, &dir);
+    let inputs = scratch.path().join(&dir).join("inputs.log");
+    fs::write(&inputs, "").expect("emptied");
+    let said = review(&scratch, &[&dir, "--repair"]);
+    assert_all(&said.stderr, &["run.rrd ends before the run: inputs.log has no inputs"]);
+    leave_open(&scratch, &dir);
+    fs::remove_file(&inputs).expect("removed");
+    let said = review(&scratch, &[&dir, "--repair"]);
+    assert_all(&said.stdout, &["; inputs.log is missing"]);
 }
 
 #[test]

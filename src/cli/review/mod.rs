@@ -10,9 +10,7 @@ use crate::review::{
     Campaign, Comparison, Condition, Folder, GENERATOR, Run, html, to_json, to_text,
 };
 use crate::runtime::make_recording;
-use crate::telemetry::{
-    RunFolder, is_being_written, lock, note_recording, repair, utc_text, write_manifest,
-};
+use crate::telemetry::{RunFolder, is_being_written, lock, repair, utc_text, write_manifest};
 use crate::text::escaped;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
@@ -189,14 +187,22 @@ fn verdict_parser() -> impl TypedValueParser<Value = VerdictKind> {
     })
 }
 
-/// Closes a record that was left open, and makes its `run.rrd` if that is missing.
+/// Closes a record that was left open, and makes its `run.rrd` if that is missing or was changed.
 fn close_record(path: &Path, json: bool) -> Result<(), Failure> {
     let is_closed = RunFolder::open(path)?.is_closed() && !is_being_written(path);
-    let repaired = match is_closed && lacks_recording(path) {
-        true => note_recording(path, None).map(|()| None),
-        false => repair(path).map(Some),
-    }?;
+    let repaired = match is_closed && lacks_recording(path)? {
+        true => None,
+        false => Some(repair(path)?),
+    };
     let (_, config) = open(path)?;
+    // If it cannot be made, a changed one must not be taken for it.
+    match fs::remove_file(path.join(file::RECORDING)) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            let recording = path.join(file::RECORDING);
+            return Err(Failure::environment(format_args!("{}: {error}", recording.display())));
+        }
+        _ => {}
+    }
     let fault = make_recording(path, describe(config), &mut |made| {
         print_stderr(format_args!(
             "making {}: {:.0} s of the run done",
@@ -207,7 +213,7 @@ fn close_record(path: &Path, json: bool) -> Result<(), Failure> {
     let dir = path.display();
     if let Some(fault) = fault {
         let text = format!("{dir}: {fault}");
-        if lacks_recording(path) {
+        if lacks_recording(path)? {
             return Err(Failure::environment(text));
         }
         print_stderr(text);
@@ -222,14 +228,14 @@ fn close_record(path: &Path, json: bool) -> Result<(), Failure> {
         "stop_reason": repaired.stop_reason,
         "counts": repaired.counts,
         "cut": repaired.cuts.iter().map(cut).collect::<Vec<_>>(),
+        "missing": repaired.missing,
     });
     print_result(json, &object, || Ok(format!("{dir}: closed: {repaired}")))
 }
 
-/// True if the record in `path` has no `run.rrd`, or one that its manifest does not list.
-fn lacks_recording(path: &Path) -> bool {
-    let is_known = |run: RunFolder| run.manifest().files.contains_key(file::RECORDING);
-    !path.join(file::RECORDING).exists() || !RunFolder::open(path).is_ok_and(is_known)
+/// True if the record in `path` does not have the `run.rrd` that its manifest lists.
+fn lacks_recording(path: &Path) -> Result<bool, Failure> {
+    Ok(RunFolder::open(path)?.recording_change()?.is_some())
 }
 
 /// Adds a verdict to the manifest of a record that is closed and unchanged.

@@ -30,9 +30,9 @@ pub(super) fn run(path: &Path) -> Result<Run, Failure> {
     let events = lines(&record, file::EVENTS, parse_event, &mut unreadable);
     // A record that is not closed has no `run.rrd` yet.
     let is_closed = !matches!(folder.condition, Condition::BeingWritten | Condition::Open);
-    if is_closed && !path.join(file::RECORDING).exists() {
-        let (name, dir) = (file::RECORDING, path.display());
-        unreadable.push(format!("{name} is missing; make it: needle-bench review {dir} --repair"));
+    if let Some(change) = record.recording_change()?.filter(|_| is_closed) {
+        let dir = path.display();
+        unreadable.push(format!("{change}; make it: needle-bench review {dir} --repair"));
     }
     Ok(Run { folder, steps, samples, motion, events, unreadable })
 }
