@@ -17,6 +17,9 @@ const SETTLING_FALL_NS: i64 = 20_000_000;
 /// Learning starts again if a sample is delivered slower than the first by more than this.
 const SETTLING_RISE_NS: i64 = 1_000_000_000;
 
+/// If no offset is learnt for this long, the stamps are no clock, and the refusals say what to do.
+const LEARNING_MAX: Duration = Duration::from_secs(3);
+
 /// A stamp that trails the quickest delivery by more than this is late, or the sender's clock was set
 /// back.
 const BEHIND_MIN_NS: i64 = 10_000_000;
@@ -53,6 +56,8 @@ const LATE_SAMPLES: u32 = 10;
 pub(super) struct ClockOffset {
     known: Option<Known>,
     candidate: Settling,
+    /// The first sample, while no offset is known.
+    learning_since: Option<Time>,
     /// A stamp went back, and none since has matched the old offset.
     went_back: bool,
     /// The present run of late stamps by each of [`LATE_LIMITS`].
@@ -95,14 +100,26 @@ impl ClockOffset {
     pub(super) fn update(&mut self, receive: Time, source_ns: i64) -> Result<i64, Refusal> {
         let offset_ns = receive.as_nanos().saturating_sub(source_ns);
         let Some(known) = &mut self.known else {
-            let learnt = self.candidate.add(receive, source_ns, offset_ns, SETTLING_TIME);
-            let offset = learnt.map_err(still_learning)?;
-            return Ok(self.learn(offset, source_ns, None));
+            let since = *self.learning_since.get_or_insert(receive);
+            let back_ns = self.candidate.back_ns(source_ns);
+            return match self.candidate.add(receive, source_ns, offset_ns, SETTLING_TIME) {
+                Ok(offset) => Ok(self.learn(offset, source_ns, None)),
+                Err(samples) => {
+                    let Refusal { gate, mut why, .. } = match back_ns {
+                        Some(0) => sent_twice(source_ns),
+                        Some(back_ns @ 1..) => went_back(back_ns),
+                        _ => still_learning(samples),
+                    };
+                    if receive.since(since) >= LEARNING_MAX {
+                        why += "; no offset was learnt: set tracker.stamp = \"receive\"";
+                    }
+                    Err(Refusal { gate, effect: Effect::None, why })
+                }
+            };
         };
         let back_ns = known.last_source_ns.saturating_sub(source_ns);
         if back_ns == 0 {
-            let why = format!("sent twice (stamp {source_ns} ns)");
-            return Err(Refusal::new(GateName::Duplicate, why));
+            return Err(sent_twice(source_ns));
         }
         let known_ns = known.offset.ns();
         let behind_ns = offset_ns.saturating_sub(known_ns);
@@ -190,6 +207,10 @@ impl ClockOffset {
     }
 }
 
+fn sent_twice(source_ns: i64) -> Refusal {
+    Refusal::new(GateName::Duplicate, format!("sent twice (stamp {source_ns} ns)"))
+}
+
 fn went_back(by_ns: i64) -> Refusal {
     let why = format!("went back by {:.3} s; was the sender's clock set?", seconds(by_ns));
     Refusal::new(GateName::Stamp, why)
@@ -244,6 +265,11 @@ struct Settling {
 }
 
 impl Settling {
+    /// By how much a stamp goes back from the one before; `None` for the first.
+    fn back_ns(&self, source_ns: i64) -> Option<i64> {
+        self.since.map(|_| self.last_source_ns.saturating_sub(source_ns))
+    }
+
     /// True if a stamp continues those that the offset is being learnt from.
     fn is_continued_by(&self, source_ns: i64, offset_ns: i64) -> bool {
         let rise_ns = offset_ns.saturating_sub(self.first_ns);

@@ -28,6 +28,27 @@ fn an_offset_is_learnt_within_200_ms() {
     assert_eq!(learnt[8..], vec![Ok(-500); 4], "200 ms later");
 }
 
+/// Stamps that are stuck, that alternate, and of a clock that runs backward.
+#[test]
+fn stamps_that_are_no_clock_are_named_while_learning() {
+    let cases: [(fn(i64) -> i64, &str); 3] = [
+        (|_| 7000, "duplicate: sent twice (stamp 7000000000 ns)"),
+        (|n| 7000 - 25 * n, "stamp: went back by 0.025 s; was the sender's clock set?"),
+        (|n| 7000 + 100 * (n % 2), "stamp: went back by 0.100 s; was the sender's clock set?"),
+    ];
+    for (stamp_ms, expected) in cases {
+        let mut offset = ClockOffset::default();
+        let dated: Vec<_> =
+            (0..200).map(|n| update(&mut offset, 25 * n, stamp_ms(n)).unwrap_err()).collect();
+        assert!(dated[0].contains("is still being learnt, from 1 samples"), "{}", dated[0]);
+        assert_eq!(dated[2], expected);
+        let advice = "; no offset was learnt: set tracker.stamp = \"receive\"";
+        assert!(dated[118].strip_suffix(advice).is_none(), "{}", dated[118]);
+        assert_eq!(dated[198], format!("{expected}{advice}"));
+        assert!(dated[198].chars().count() < 200, "{}", dated[198]);
+    }
+}
+
 /// A server that kept two seconds of measurements sends them all at the connection.
 #[test]
 fn a_backlog_sent_at_connection_is_not_dated_as_fresh() {
