@@ -72,15 +72,18 @@ impl Reader {
         Ok(self.events.pop_front())
     }
 
-    /// Ends the connection.
+    /// Ends the connection. Poll for a last line without an end.
     ///
     /// # Errors
-    /// The connection ends within a message.
-    pub fn finish(&self) -> Result<(), String> {
-        match &self.decoder {
-            Decoder::OpenIgtLink(decoder) => decoder.finish().map_err(|error| error.to_string()),
+    /// The connection ends within a message of OpenIGTLink.
+    pub fn finish(&mut self) -> Result<(), String> {
+        match &mut self.decoder {
+            Decoder::OpenIgtLink(decoder) => {
+                return decoder.finish().map_err(|error| error.to_string());
+            }
             Decoder::Ndjson(decoder) => decoder.finish(),
         }
+        Ok(())
     }
 
     /// The number of whole messages so far, of every type.

@@ -187,6 +187,12 @@ impl Outlet {
         self.shared.filled.notify_one();
     }
 
+    /// Delivers what `reader` still has at the end of the connection. Returns why the end is wrong, after a colon.
+    pub(super) fn finish(&mut self, now: Time, reader: &mut Reader) -> String {
+        let finished = reader.finish().and_then(|()| self.deliver_all(now, reader));
+        finished.err().map(|error| format!(": {error}")).unwrap_or_default()
+    }
+
     /// Delivers the events in the bytes that `reader` got at `now`. An error ends the connection.
     pub(super) fn deliver_all(&mut self, now: Time, reader: &mut Reader) -> Result<(), String> {
         loop {
@@ -259,10 +265,7 @@ fn read_to_end(
     while !outlet.events.is_abandoned() {
         let len = match input.read(&mut buffer) {
             Ok(0) => {
-                return match reader.finish() {
-                    Ok(()) => "has ended".to_owned(),
-                    Err(error) => format!("has ended: {error}"),
-                };
+                return format!("has ended{}", outlet.finish(clock(), reader));
             }
             Ok(len) => len,
             Err(error) if error.kind() == ErrorKind::Interrupted => continue,
@@ -371,8 +374,8 @@ mod tests {
                 "SawTool { tool: \"N\", message_type: \"NDJSON\" }",
                 "N 1",
                 "ndjson: line 2: expected ident (column 2)",
-                "tracker: standard input has ended: ndjson: line 3: 7 bytes and no end of line; it \
-                 was cut off",
+                "ndjson: line 3: EOF while parsing an object (column 7)",
+                "tracker: standard input has ended",
             ]
         );
     }

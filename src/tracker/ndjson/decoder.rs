@@ -43,6 +43,7 @@ impl LineDecoder {
                 continue;
             }
             self.lines += 1;
+            let text = if self.lines == 1 { without_mark(text) } else { text };
             if is_too_long {
                 return Err(line_error(self.lines, format_args!("longer than {LINE_LIMIT} bytes")));
             }
@@ -52,20 +53,15 @@ impl LineDecoder {
         }
     }
 
-    /// Ends the stream.
-    ///
-    /// # Errors
-    /// The stream ends within a line.
-    pub(in crate::tracker) fn finish(&self) -> Result<(), String> {
-        let unread = self.buffer.get(self.used..).unwrap_or_default();
-        // A line that is too long was already reported.
-        if self.skipping || unread.trim_ascii().is_empty() {
-            return Ok(());
-        }
-        let length = unread.len();
-        let problem = format_args!("{length} bytes and no end of line; it was cut off");
-        Err(line_error(self.lines + 1, problem))
+    /// Ends the stream: what follows the last end of line is a line too. Poll for it.
+    pub(in crate::tracker) fn finish(&mut self) {
+        self.push(b"\n");
     }
+}
+
+/// `text` without a byte order mark.
+fn without_mark(text: &[u8]) -> &[u8] {
+    text.strip_prefix("\u{feff}".as_bytes()).unwrap_or(text)
 }
 
 #[cfg(test)]
@@ -87,7 +83,21 @@ mod tests {
         decoder.push(b"x\n{\"tool\":\"N\",\"position_tracker_mm\":[1,2,3]}\n{\"to");
         assert!(matches!(decoder.poll(), Ok(Some(_))));
         assert!(matches!(decoder.poll(), Ok(None)));
-        let unfinished = "ndjson: line 3: 4 bytes and no end of line; it was cut off";
-        assert_eq!(decoder.finish(), Err(unfinished.to_owned()));
+        decoder.finish();
+        let unfinished = "ndjson: line 3: EOF while parsing a string (column 4)";
+        assert_eq!(decoder.poll().err(), Some(unfinished.to_owned()));
+        assert!(matches!(decoder.poll(), Ok(None)));
+    }
+
+    #[test]
+    fn a_byte_order_mark_and_a_missing_last_end_of_line_cost_no_line() {
+        let mut decoder = LineDecoder::default();
+        let line = r#"{"tool":"N","position_tracker_mm":[1,2,3]}"#;
+        decoder.push(format!("\u{feff}{line}\n{line}").as_bytes());
+        assert!(matches!(decoder.poll(), Ok(Some(_))));
+        assert!(matches!(decoder.poll(), Ok(None)));
+        decoder.finish();
+        assert!(matches!(decoder.poll(), Ok(Some(_))));
+        assert!(matches!(decoder.poll(), Ok(None)));
     }
 }

@@ -63,6 +63,10 @@ pub(super) struct Line {
 impl Line {
     /// Parses `text`, which is line number `line` of a stream without its newline.
     fn parse(line: u64, text: &[u8]) -> Result<Self, String> {
+        // serde would read an array as the values of the keys in their order.
+        if text.trim_ascii_start().starts_with(b"[") {
+            return Err(line_error(line, "an array, expected a JSON object"));
+        }
         serde_json::from_slice(text).map_err(|error| {
             let message = error.to_string();
             // serde_json sees one line only, so its " at line 1 column …" would mislead.
@@ -106,6 +110,7 @@ pub fn recording(text: &str) -> Result<Vec<(Time, Event)>, String> {
     let mut newest: Option<Time> = None;
     let mut first_error = None;
     let mut events: Vec<(Option<Time>, Event)> = Vec::new();
+    let text = text.trim_start_matches('\u{feff}');
     let lines = text.lines().zip(1u64..).filter(|(line, _)| !line.trim().is_empty());
     for (text, line) in lines {
         match timed_sample(line, text, newest) {
@@ -227,6 +232,7 @@ mod tests {
         let cases = [
             ("", "EOF while parsing a value (column 0)"),
             ("1,2,3", "invalid type: integer `1`, expected a JSON object (column 1)"),
+            (r#"["N",[1,2,3],null,null,null,1]"#, "an array, expected a JSON object"),
             (r#"{"tool":"N"}"#, "missing field `position_tracker_mm` (column 12)"),
             (
                 r#"{"tool":"N","position_tracker_mm":[1,2]}"#,
@@ -312,6 +318,13 @@ mod tests {
         let given = recording(line).unwrap();
         let Event::Sample(sample) = &given[0].1 else { panic!("{given:?}") };
         assert_eq!(sample.source_unix_ns, None, "in a stream, 0 means no stamp");
+    }
+
+    #[test]
+    fn a_byte_order_mark_is_ignored() {
+        let text = "\u{feff}{\"tool\":\"N\",\"position_tracker_mm\":[1,2,3],\"receive_time_ns\":5}";
+        let events = recording(text).unwrap();
+        assert!(matches!(events[..], [(_, Event::Sample(_))]), "{events:?}");
     }
 
     #[test]

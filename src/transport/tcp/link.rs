@@ -176,11 +176,8 @@ impl<C: Fn() -> Time> LinkTask<C> {
         let now = (self.clock)();
         match read {
             Ok(0) => {
-                let name = &peer.name;
-                return Err(match peer.reader.finish() {
-                    Ok(()) => format!("tracker: {name} closed the connection"),
-                    Err(error) => format!("tracker: {name} closed the connection: {error}"),
-                });
+                let error = self.outlet.finish(now, &mut peer.reader);
+                return Err(format!("tracker: {} closed the connection{error}", peer.name));
             }
             Ok(len) => peer.reader.push(now, peer.buffer.get(..len).unwrap_or_default()),
             Err(error) => {
