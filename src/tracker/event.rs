@@ -81,7 +81,7 @@ pub struct Census {
 }
 
 impl Census {
-    /// Counts an event. A new connection starts a new census.
+    /// Counts an event. A new connection starts a new census; one that has ended still explains what came.
     pub fn note(&mut self, event: &Event) {
         match event {
             Event::Connected { peer } => *self = Census { peer: peer.clone(), ..Census::default() },
@@ -106,8 +106,7 @@ impl Census {
                     known.clone_from(message_type);
                 }
             }
-            Event::Disconnected { .. } => *self = Census::default(),
-            Event::SawTool { .. } | Event::Unreachable { .. } => {}
+            Event::SawTool { .. } | Event::Unreachable { .. } | Event::Disconnected { .. } => {}
         }
     }
 
@@ -188,6 +187,7 @@ mod tests {
             census.note(&sample("StylusToTracker"));
         }
         assert!(census.has("StylusToTracker") && !census.has("NeedleToTracker"));
+        census.note(&Event::Disconnected { reason: "standard input has ended".to_owned() });
         assert_eq!(
             census.explain_missing("NeedleToTracker"),
             "tracker: localhost:18944 sent 37 messages, none of \"NeedleToTracker\"; saw \

@@ -56,10 +56,16 @@ section! {
 }
 
 impl Gate {
-    /// True for a sample that is a measurement by itself, wherever the tracker stands: finite, a
-    /// rotation, not the exact zero, and valid by the tracker's own status.
-    pub fn is_measurement(sample: &Sample) -> bool {
-        is_finite(&sample.position_mm) && ContentChecks::ALL.check(sample).is_ok()
+    /// Checks that a sample is a measurement by itself, of whatever tool and wherever the tracker stands: its
+    /// position is finite, and its content passes the [checks](Self::checks).
+    ///
+    /// # Errors
+    /// [`Refusal`], by the first check that fails.
+    pub fn check_content(&self, sample: &Sample) -> Result<(), Refusal> {
+        if !is_finite(&sample.position_mm) {
+            return Err(Refusal::not_finite(&sample.position_mm));
+        }
+        self.checks.check(sample)
     }
 
     /// The tip's position on the bench, `p_WB` in mm, finite.
@@ -72,10 +78,7 @@ impl Gate {
             let why = format!("\"{sent}\" is not the tracked tool");
             return Err(Refusal::new(GateName::Tool, why));
         }
-        if !is_finite(&sample.position_mm) {
-            return Err(Refusal::not_finite(&sample.position_mm));
-        }
-        self.checks.check(sample)?;
+        self.check_content(sample)?;
         let p_wb_mm = self.registration.tip_mm(sample)?;
         // The registration can overflow what was finite.
         if !is_finite(&p_wb_mm) {
@@ -109,8 +112,6 @@ impl Workspace {
 }
 
 impl ContentChecks {
-    const ALL: Self = ContentChecks { rotation: true, zero: true, status: true };
-
     fn check(self, sample: &Sample) -> Result<(), Refusal> {
         let is_bad_rotation = sample.validity == Validity::NotARotation
             || sample.orientation.is_some_and(|orientation| !is_rotation(&orientation));
@@ -142,9 +143,17 @@ fn is_finite(p_mm: &Vector3<f64>) -> bool {
 }
 
 /// True if `sent` names the tool `wanted`. A name that fills the header's field may be the start
-/// of a longer one: version 1 has no room for the rest.
+/// of a longer one: version 1 has no room for the rest. If the field ends within a character, the decoder has
+/// replaced that character.
 pub fn is_same_tool(sent: &str, wanted: &str) -> bool {
-    sent == wanted || (sent.len() == DEVICE_NAME_LEN && wanted.starts_with(sent))
+    let whole = wanted.floor_char_boundary(DEVICE_NAME_LEN);
+    let is_cut = wanted.len() > DEVICE_NAME_LEN && sent.starts_with(&wanted[..whole]);
+    sent == wanted
+        || is_cut
+            && matches!(
+                (&sent[whole..], whole == DEVICE_NAME_LEN),
+                ("", true) | ("\u{fffd}", false)
+            )
 }
 
 #[cfg(test)]
@@ -162,7 +171,7 @@ mod tests {
                 min_mm: Vector3::new(-50.0, -50.0, -1.0),
                 max_mm: Vector3::new(50.0, 50.0, 200.0),
             }),
-            checks: ContentChecks::ALL,
+            checks: ContentChecks { rotation: true, zero: true, status: true },
         }
     }
 
@@ -262,5 +271,10 @@ mod tests {
         assert!(is_same_tool("NeedleTipToTrackerBa", "NeedleTipToTrackerBase"));
         assert!(!is_same_tool("NeedleTipToTracker", "NeedleTipToTrackerBase"));
         assert!(!is_same_tool("NeedleTipToTrackerBase", "NeedleTipToTrackerBa"));
+        assert!(!is_same_tool("NeedleTipToTrackerBa\u{fffd}", "NeedleTipToTrackerBase"));
+        let wanted = "AiguilleVersTraceurééé";
+        let sent = |bytes: usize| String::from_utf8_lossy(&wanted.as_bytes()[..bytes]).into_owned();
+        assert!(is_same_tool(&sent(20), wanted), "{}", sent(20));
+        assert!(!is_same_tool(&sent(19), wanted) && !is_same_tool(&sent(22), wanted));
     }
 }

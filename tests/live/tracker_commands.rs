@@ -252,6 +252,149 @@ fn commands_without_a_tracker_or_its_tool_fail_with_the_reason() {
     fails(server.tracker(&scratch, &["record", "a.csv"]), 2, "is not overwritten");
 }
 
+/// Exit status, stdout and stderr of `needle-bench tracker COMMAND…` with `input` as its tracker.
+fn piped(scratch: &Scratch, input: &str, command: &[&str]) -> (i32, String, String) {
+    let input = std::fs::File::open(scratch.write("input", input)).expect("an input");
+    let output = Command::new(env!("CARGO_BIN_EXE_needle-bench"))
+        .args([&["tracker"], command].concat())
+        .args(["--set", "tracker.source=ndjson", "--set", "tracker.address=-"])
+        .current_dir(scratch.path())
+        .stdin(input)
+        .output()
+        .expect("the program starts");
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    for line in String::from_utf8_lossy(&output.stderr).lines() {
+        assert!(line.chars().count() <= 200, "{line}");
+    }
+    (output.status.code().expect("a status"), text(&output.stdout), text(&output.stderr))
+}
+
+fn line(tool: &str, position: &str, more: &str) -> String {
+    format!("{{\"tool\":\"{tool}\",\"position_tracker_mm\":{position}{more}}}\n")
+}
+
+const NEEDLE: &str = "NeedleToTracker";
+
+/// The end of the stream is not the reason.
+#[test]
+fn a_stream_that_ended_without_the_tool_is_explained() {
+    let scratch = Scratch::new();
+    let other_key = "{\"tool\":\"NeedleToTracker\",\"position_mm\":[1,2,3]}\n".repeat(50);
+    let other_tool = line("Stylus", "[1,2,3]", "").repeat(50);
+    for (input, expected) in [
+        (&other_key, "none of \"NeedleToTracker\"; 50 refused: ndjson: line 50: unknown field"),
+        (&other_tool, "none of \"NeedleToTracker\"; saw \"Stylus\"; set tracker.tool"),
+    ] {
+        for command in [&["list"][..], &["watch"], &["record", "a.csv"], &["rest"]] {
+            if command == ["list"] && input == &other_tool {
+                continue;
+            }
+            let (status, _, said) = piped(&scratch, input, command);
+            assert_eq!(status, 3, "{command:?}: {said}");
+            assert!(said.contains("tracker: standard input sent 50 messages, "), "{said}");
+            assert!(said.contains(expected), "{command:?}: no {expected:?} in {said}");
+        }
+    }
+    // Stamps that stand still date no position, and the last refusal says what to do.
+    let stuck = |x: usize| line(NEEDLE, &format!("[{x},2,3]"), ",\"source_unix_ns\":5");
+    let by_stamp = ["watch", "--set", "tracker.stamp=source"];
+    let (status, _, said) = piped(&scratch, &(1..50).map(stuck).collect::<String>(), &by_stamp);
+    assert_eq!(status, 3, "{said}");
+    let refused =
+        "no position of \"NeedleToTracker\" was accepted; the last: duplicate: sent twice";
+    assert!(said.contains(refused), "{said}");
+}
+
+#[test]
+fn lines_that_cannot_be_read_are_counted_and_no_other_is_lost() {
+    let scratch = Scratch::new();
+    let good = |x: usize| line(NEEDLE, &format!("[{x},2,3]"), "");
+    let lines: String = (1..=100)
+        .map(|x| if x % 2 == 0 { good(x)[..30].to_owned() + "\n" } else { good(x) })
+        .collect();
+    // With a byte order mark, and without the last end of line.
+    let input = format!("\u{feff}{lines}{}", good(101).trim_end());
+    let unreadable =
+        "warning: 50 messages could not be read; the last: ndjson: line 100: EOF while";
+    for command in [&["list"][..], &["record", "a.csv"], &["record", "a.ndjson"], &["rest"]] {
+        let (_, _, said) = piped(&scratch, &input, command);
+        assert!(said.contains(unreadable), "{command:?}: {said}");
+        if command[0] == "record" {
+            assert!(said.contains("tracker: 51 samples of"), "{command:?}: {said}");
+        }
+    }
+    let recorded = std::fs::read_to_string(scratch.path().join("a.ndjson")).expect("recorded");
+    scratch.write("b.ndjson", &format!("{recorded}garbage\n"));
+    let said = needle_bench(&scratch, &["calibrate", "tracker", "b.ndjson"]);
+    let unreadable = "warning: 1 messages could not be read; the last: ndjson: line 52: ";
+    assert!(said.stderr.contains(unreadable), "{}", said.stderr);
+}
+
+/// The configured tool is listed however many there are, and as valid only what `record` takes.
+#[test]
+fn the_list_agrees_with_the_gates() {
+    let scratch = Scratch::new();
+    let others: String = (0..70).map(|n| line(&format!("A{n}"), "[1,2,3]", "")).collect();
+    let wrong = line("AA", "[\"NaN\",2,3]", "") + &line("AB", "[0,0,0]", "");
+    let input = wrong + &others + &line(NEEDLE, "[1,2,3]", "").repeat(3);
+    let (status, screen, said) = piped(&scratch, &input, &["list"]);
+    assert_eq!((status, said.as_str()), (0, ""), "{screen}");
+    for part in [
+        "1 of 1 invalid: finite: position (NaN, 2.0, 3.0) mm",
+        "1 of 1 invalid: zero: the exact zero pose",
+        "valid, tracker.tool",
+    ] {
+        assert!(screen.contains(part), "no {part:?} in {screen}");
+    }
+    assert!(!screen.contains(" Hz"), "the rate of a stream that is over at once: {screen}");
+}
+
+/// As in a run, the configuration decides what is a measurement.
+#[test]
+fn checks_that_are_switched_off_are_off_for_every_command() {
+    let scratch = Scratch::new();
+    let more = ",\"orientation_tracker_wxyz\":[0,0,0,0],\"status\":\"OK\"";
+    let input = (1..=20).map(|x| line(NEEDLE, &format!("[{x},2,3]"), more)).collect::<String>();
+    let (status, _, said) = piped(&scratch, &input, &["record", "a.csv"]);
+    assert_eq!(status, 3, "{said}");
+    let off = ["--set", "tracker.gates.rotation=false"];
+    let (status, _, said) = piped(&scratch, &input, &[&["record", "a.csv"], &off[..]].concat());
+    assert_eq!(status, 0, "{said}");
+    assert!(said.contains("tracker: 20 samples of"), "{said}");
+    let (_, screen, said) = piped(&scratch, &input, &[&["list"], &off[..]].concat());
+    assert!(screen.contains("valid, tracker.tool"), "{screen}{said}");
+    let (_, _, said) = piped(&scratch, &input, &[&["rest"], &off[..]].concat());
+    assert!(said.contains(": 20 new positions in 0.0 s, at least 100"), "{said}");
+}
+
+/// A server that closes each of its connections after one position, and goes away after three.
+#[test]
+fn connections_that_are_lost_are_told() {
+    let _machine = beside_others();
+    let scratch = Scratch::new();
+    let tracker = |command: &[&str]| {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
+        let address = format!("tracker.address=\"{}\"", listener.local_addr().expect("a port"));
+        let server = std::thread::spawn(move || {
+            for x in 0..3 {
+                let (mut peer, _) = listener.accept().expect("the bench connects");
+                peer.write_all(line(NEEDLE, &format!("[{x},2,3]"), "").as_bytes()).expect("sent");
+            }
+        });
+        let source = ["--set", "tracker.source=ndjson", "--set", &address];
+        let said = needle_bench(&scratch, &[&["tracker"], command, &source].concat());
+        server.join().expect("three connections");
+        assert_eq!(said.status, 0, "{}", said.stderr);
+        said
+    };
+    let said = tracker(&["record", "a.ndjson", "--seconds", "3"]);
+    let lost = "warning: the connection was lost 3 times; the last: 127.0.0.1:";
+    assert!(said.stderr.contains(lost), "{}", said.stderr);
+    let said = tracker(&["watch", "--seconds", "3.5"]);
+    let gone = "; not connected: cannot connect to 127.0.0.1:";
+    assert!(said.stdout.contains(gone), "{}", said.stdout);
+}
+
 #[test]
 fn a_recording_without_end_is_whole_after_ctrl_c() {
     let _machine = beside_others();

@@ -12,7 +12,7 @@ use crate::cli::stage::{load_stage, perform, sensor_off_axis};
 use crate::cli::tracker::{Listener, listen};
 use crate::cli::{Failure, finish_with};
 use crate::geometry::Pose;
-use crate::tracker::{Event, Gate, Registration};
+use crate::tracker::{Event, Registration};
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::collections::VecDeque;
@@ -137,11 +137,12 @@ fn position_at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
     let begun = listener.now();
     let limit_mm = STILL_SDS * listener.config.tracker.to_track().noise_sd_mm;
     let tip = Registration::new(Pose::identity()).with_tip(listener.config.tracker.x_sb());
+    let gate = listener.config.tracker.to_unregistered_gate();
     let mut last_second = LastSecond { begun, window: VecDeque::new() };
     let mut moved_mm = None;
     while let Some(event) = listener.next(begun + WAIT_MAX) {
         let Event::Sample(sample) = event else { continue };
-        if !Gate::is_measurement(&sample) {
+        if gate.check_content(&sample).is_err() {
             continue;
         }
         let tip_mm = tip.tip_mm(&sample).map_err(|refusal| refusal.to_string())?;
@@ -249,11 +250,12 @@ pub(super) fn record_turn(
 /// is taken at the receipt less the latency, not at the tracker's stamp: the fit needs only its direction.
 fn rows_of(turn: ReplayedRun) -> Vec<Vec<f64>> {
     let ReplayedRun { config, stage, samples, .. } = turn;
+    let gate = config.tracker.to_unregistered_gate();
     let mut rows: Vec<Vec<f64>> = Vec::new();
     for sample in samples.into_iter().map(|sample| sample.received) {
         let acquired = sample.receive_time - config.tracker.latency;
         let Some(measured) =
-            position_at(&stage, acquired).filter(|_| Gate::is_measurement(&sample))
+            position_at(&stage, acquired).filter(|_| gate.check_content(&sample).is_ok())
         else {
             continue;
         };

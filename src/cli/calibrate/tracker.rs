@@ -4,6 +4,7 @@ use super::{Output, fit_table};
 use crate::calibration::{RestSample, TrackerFit};
 use crate::cli::Failure;
 use crate::cli::arguments::{Configured, text_of};
+use crate::cli::tracker::Unreadable;
 use crate::config::TrackerSection;
 use crate::table::Table;
 use crate::text::{escaped, screen};
@@ -73,16 +74,17 @@ pub(in crate::cli) fn fit_and_write(
 }
 
 /// The part of a sample that the calibration uses.
-pub(in crate::cli) fn rest_sample(sample: &Sample) -> RestSample {
+pub(in crate::cli) fn rest_sample(gate: &Gate, sample: &Sample) -> RestSample {
     RestSample {
         receive_time: sample.receive_time,
         source_unix_ns: sample.source_unix_ns,
-        position_mm: Gate::is_measurement(sample).then_some(sample.position_mm),
+        position_mm: gate.check_content(sample).is_ok().then_some(sample.position_mm),
     }
 }
 
-/// The samples of the tool in the recording `text`.
+/// The samples of the tool in the recording `text`. Warns of lines that cannot be read.
 fn recorded(text: &str, tracker: &TrackerSection) -> Result<Vec<RestSample>, String> {
+    let text = text.trim_start_matches('\u{feff}');
     let events = match text.trim_start().starts_with('{') {
         true => ndjson::recording(text).map_err(|error| error.to_string())?,
         false => csv::recording(text, &mapping(text, &tracker.csv), &tracker.tool)
@@ -94,8 +96,13 @@ fn recorded(text: &str, tracker: &TrackerSection) -> Result<Vec<RestSample>, Str
             _ => None,
         })
     };
+    let mut unreadable = Unreadable::default();
+    events.iter().for_each(|(_, event)| unreadable.note(event));
+    unreadable.warn();
+    let gate = tracker.to_unregistered_gate();
     let of_tool = |sample: &&Sample| gate::is_same_tool(&sample.tool, &tracker.tool);
-    let found: Vec<RestSample> = samples().filter(of_tool).map(rest_sample).collect();
+    let found = samples().filter(of_tool).map(|sample| rest_sample(&gate, sample));
+    let found: Vec<RestSample> = found.collect();
     if found.is_empty() {
         let other = samples().map(|sample| sample.tool.as_str()).next().unwrap_or_default();
         return Err(format!(
@@ -108,7 +115,7 @@ fn recorded(text: &str, tracker: &TrackerSection) -> Result<Vec<RestSample>, Str
 
 /// The columns of `tracker record` if the file has them; else the configured ones.
 fn mapping(text: &str, configured: &CsvMapping) -> CsvMapping {
-    let header = Table::parse(text.lines().next().unwrap_or_default());
+    let header = Table::parse(text);
     let has = |name: &str| header.column(name).is_ok();
     if !(has(RECEIVED) && POSITION.iter().all(|name| has(name))) {
         return configured.clone();

@@ -1,12 +1,12 @@
 //! `needle-bench tracker list`: the tools of the stream.
 
-use super::listen;
+use super::{RATE_TIME_MIN_S, listen};
 use crate::cli::Failure;
 use crate::cli::arguments::{Configured, number_in};
 use crate::cli::output::{print_stderr, print_stdout};
 use crate::text::{clipped, table};
 use crate::tracker::gate::is_same_tool;
-use crate::tracker::{Event, Sample, Validity};
+use crate::tracker::{Event, Gate, Sample, Validity};
 use crate::units::Time;
 use clap::Args;
 use serde_json::{Value, json};
@@ -43,20 +43,24 @@ struct Tool {
 }
 
 impl Tool {
-    fn take(&mut self, sample: &Sample) {
+    /// Counts a sample, which is valid by the checks of `gate`.
+    fn take(&mut self, gate: &Gate, sample: &Sample) {
         self.samples += 1;
-        match &sample.validity {
-            Validity::Valid => self.valid += 1,
-            invalid => self.status = Some(invalid.clone()),
+        match (gate.check_content(sample), &sample.validity) {
+            (Ok(()), _) => self.valid += 1,
+            (Err(refusal), Validity::Valid) => {
+                self.status = Some(Validity::Invalid(refusal.to_string()));
+            }
+            (Err(_), invalid) => self.status = Some(invalid.clone()),
         }
         let now = sample.receive_time;
         self.received = Some((self.received.map_or(now, |(first, _)| first), now));
     }
 
-    /// Samples a second; `None` for fewer than two.
+    /// Samples a second; `None` if they came in too short a time.
     fn rate_hz(&self) -> Option<f64> {
         let seconds = self.received.map(|(first, last)| last.seconds_after(first))?;
-        (seconds > 0.0).then(|| (self.samples - 1) as f64 / seconds)
+        (seconds >= RATE_TIME_MIN_S).then(|| (self.samples - 1) as f64 / seconds)
     }
 
     fn row(&self, name: &str, is_configured: bool) -> Vec<String> {
@@ -95,6 +99,9 @@ impl Tool {
 pub(super) fn list(arguments: &ListArguments) -> Result<(), Failure> {
     let mut listener = listen(&arguments.configured, true)?;
     let until = listener.now() + Duration::from_secs_f64(arguments.seconds);
+    let configured = listener.config.tracker.tool.clone();
+    let is_configured = |name: &String| is_same_tool(name, &configured);
+    let gate = listener.config.tracker.to_unregistered_gate();
     let mut tools: BTreeMap<String, Tool> = BTreeMap::new();
     while let Some(event) = listener.next(until) {
         let name = match &event {
@@ -102,12 +109,12 @@ pub(super) fn list(arguments: &ListArguments) -> Result<(), Failure> {
             Event::SawTool { tool, .. } => tool,
             _ => continue,
         };
-        if tools.len() >= TOOLS_MAX && !tools.contains_key(name) {
+        if tools.len() >= TOOLS_MAX && !tools.contains_key(name) && !is_configured(name) {
             continue;
         }
         let tool = tools.entry(name.clone()).or_default();
         match event {
-            Event::Sample(sample) => tool.take(&sample),
+            Event::Sample(sample) => tool.take(&gate, &sample),
             Event::SawTool { message_type, .. } => tool.message_type = Some(message_type),
             _ => {}
         }
@@ -115,8 +122,7 @@ pub(super) fn list(arguments: &ListArguments) -> Result<(), Failure> {
     if tools.is_empty() {
         return Err(listener.no_samples());
     }
-    let configured = &listener.config.tracker.tool;
-    let is_configured = |name: &String| is_same_tool(name, configured);
+    listener.warn_of_losses();
     if arguments.json {
         let tools: Vec<Value> =
             tools.iter().map(|(name, tool)| tool.json(name, is_configured(name))).collect();

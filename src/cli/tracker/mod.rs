@@ -14,7 +14,8 @@ use super::output::print_stderr;
 use super::{Failure, io_runtime};
 use crate::config::{Config, TrackerMode, TrackerSection, TrackerSource};
 use crate::runtime::{Clock, Interrupt};
-use crate::tracker::{Census, Event, Sample, StreamReplay, csv, ndjson};
+use crate::text::clipped;
+use crate::tracker::{Census, Event, Sample, Sieve, StreamReplay, csv, ndjson};
 use crate::transport::link::{Link, LinkSettings};
 use crate::units::Time;
 use std::path::Path;
@@ -102,6 +103,12 @@ pub(super) fn source_label(config: &Config) -> String {
 /// Interval at which a listener checks for Ctrl-C.
 const SIGNAL_POLL: Duration = Duration::from_millis(100);
 
+/// Over less than this, a rate is not given: a short recording is over at once.
+const RATE_TIME_MIN_S: f64 = 0.1;
+/// A message shows at most this many characters of the reason for a lost connection, and of an unreadable message.
+const REASON_MAX: usize = 100;
+const ERROR_MAX: usize = 140;
+
 /// The configuration if none is named: only the tracker is opened, never the stage.
 const ANY_STAGE: (&str, &str) =
     ("no configuration", "can.interface = \"vcan0\"\ntracker.source = \"openigtlink\"\n");
@@ -114,8 +121,13 @@ pub(super) struct Listener {
     link: Link,
     interrupt: Interrupt,
     census: Census,
-    /// Why there is no connection, or what was wrong with the last message.
+    /// Why there is no connection; `None` while there is one.
     trouble: Option<String>,
+    /// Connections that ended, also since the last [`Self::connection_trouble`], and why the last one did.
+    ended: u64,
+    ended_lately: u64,
+    last_end: String,
+    unreadable: Unreadable,
     has_ended: bool,
     // The last field, so dropped last: the link uses it.
     runtime: Runtime,
@@ -150,6 +162,10 @@ impl Listener {
             interrupt,
             census: Census::default(),
             trouble: None,
+            ended: 0,
+            ended_lately: 0,
+            last_end: String::new(),
+            unreadable: Unreadable::default(),
             has_ended: false,
             runtime,
         })
@@ -174,11 +190,15 @@ impl Listener {
 
     fn note(&mut self, event: &Event) {
         self.census.note(event);
+        self.unreadable.note(event);
         match event {
-            Event::Unreachable { reason } | Event::Disconnected { reason } => {
+            Event::Unreachable { reason } => self.trouble = Some(reason.clone()),
+            Event::Disconnected { reason } => {
                 self.trouble = Some(reason.clone());
+                self.ended += 1;
+                self.ended_lately += 1;
+                self.last_end.clone_from(reason);
             }
-            Event::Malformed(error) => self.trouble = Some(error.clone()),
             Event::Connected { .. } => self.trouble = None,
             _ => {}
         }
@@ -223,26 +243,89 @@ impl Listener {
         if !has_sample {
             return Err(self.no_samples());
         }
+        self.warn_of_losses();
+        Ok(())
+    }
+
+    /// Warns of samples, messages and connections that were lost.
+    fn warn_of_losses(&self) {
         match self.link.dropped() {
             0 => {}
             lost => print_stderr(format_args!(
                 "warning: {lost} samples were lost: they came faster than they were read"
             )),
         }
-        Ok(())
+        self.unreadable.warn();
+        // A pipe and a recording end once, and that is no loss.
+        match self.ended.saturating_sub(u64::from(self.has_ended)) {
+            0 => {}
+            lost => print_stderr(format_args!(
+                "warning: the connection was lost {lost} times; the last: {}",
+                short_reason(&self.last_end)
+            )),
+        }
+    }
+
+    /// What is wrong with the connection now, or was since the last call, to be appended to a line.
+    fn connection_trouble(&mut self) -> String {
+        let lost = std::mem::take(&mut self.ended_lately);
+        match &self.trouble {
+            _ if self.has_ended => String::new(),
+            Some(trouble) => format!("; not connected: {}", short_reason(trouble)),
+            None if lost == 0 => String::new(),
+            None => format!("; connection lost {lost} times: {}", short_reason(&self.last_end)),
+        }
     }
 
     /// Why no sample of the tool came, and what came instead.
     pub(super) fn explain_missing(&mut self) -> String {
         self.link.passed_over().iter().for_each(|event| self.census.note(event));
+        let tool = &self.config.tracker.tool;
         match &self.trouble {
-            Some(trouble) if self.census.messages() == 0 => trouble.clone(),
-            _ => self.census.explain_missing(&self.config.tracker.tool),
+            // The tool or its name is not to blame.
+            Some(trouble) if self.census.messages() == 0 || self.census.has(tool) => {
+                trouble.clone()
+            }
+            _ => self.census.explain_missing(tool),
         }
     }
 
     /// The failure of a command that received no sample of the tool.
     pub(super) fn no_samples(&mut self) -> Failure {
         Failure::environment(self.explain_missing())
+    }
+}
+
+/// `reason` as part of a longer message.
+fn short_reason(reason: &str) -> String {
+    clipped(reason.strip_prefix("tracker: ").unwrap_or(reason), REASON_MAX).into_owned()
+}
+
+/// Counts messages that could not be read.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Unreadable {
+    count: u64,
+    last: String,
+}
+
+impl Unreadable {
+    pub(super) fn note(&mut self, event: &Event) {
+        if let Event::Malformed(error) = event {
+            self.count += 1;
+            self.last.clone_from(error);
+        }
+    }
+
+    /// Warns if there are any.
+    pub(super) fn warn(&self) {
+        let Unreadable { count, last } = self;
+        // A link passes on only some of a flood.
+        let at_least = if *count < u64::from(Sieve::NOTICES_MAX) { "" } else { "at least " };
+        if *count > 0 {
+            print_stderr(format_args!(
+                "warning: {at_least}{count} messages could not be read; the last: {}",
+                clipped(last, ERROR_MAX)
+            ));
+        }
     }
 }

@@ -7,7 +7,7 @@ use crate::cli::arguments::{Configured, number_in};
 use crate::cli::calibrate::tracker::{POSITION, QUATERNION, RECEIVED, STAMP};
 use crate::cli::output::{print_stderr, refuse_existing};
 use crate::session::SampleRecord;
-use crate::tracker::{Gate, Sample};
+use crate::tracker::Sample;
 use crate::units::Time;
 use clap::Args;
 use std::ffi::OsStr;
@@ -43,28 +43,25 @@ fn recording_path(text: &str) -> Result<PathBuf, String> {
 /// A recording in progress.
 struct Recording {
     out: BufWriter<File>,
-    /// The number of columns of a CSV file, with or without an orientation; `None` for NDJSON.
-    columns: Option<usize>,
+    is_csv: bool,
     flushed: Time,
 }
 
 impl Recording {
-    /// A new file that begins with `first`.
-    fn create(path: &Path, is_csv: bool, first: &Sample) -> io::Result<Self> {
+    /// A new file, begun at `now`.
+    fn create(path: &Path, is_csv: bool, now: Time) -> io::Result<Self> {
         let mut out = BufWriter::new(File::create_new(path)?);
-        let names = [&[RECEIVED, STAMP], &POSITION[..], &QUATERNION].concat();
-        let missing = if first.orientation.is_some() { 0 } else { QUATERNION.len() };
-        let columns = is_csv.then_some(names.len() - missing);
-        if let Some(columns) = columns {
-            writeln!(out, "{}", names[..columns].join(","))?;
+        if is_csv {
+            let names = [&[RECEIVED, STAMP], &POSITION[..], &QUATERNION].concat();
+            writeln!(out, "{}", names.join(","))?;
         }
-        Ok(Recording { out, columns, flushed: first.receive_time })
+        Ok(Recording { out, is_csv, flushed: now })
     }
 
     fn take(&mut self, sample: &Sample) -> io::Result<()> {
-        let line = match self.columns {
-            None => tracker_line(&SampleRecord::received(sample.clone()))?,
-            Some(columns) => {
+        let line = match self.is_csv {
+            false => tracker_line(&SampleRecord::received(sample.clone()))?,
+            true => {
                 let stamp = sample.source_unix_ns.unwrap_or(0);
                 let times = [sample.receive_time.as_nanos(), stamp].map(|ns| ns.to_string());
                 let position = sample.position_mm.iter().map(f64::to_string);
@@ -74,7 +71,7 @@ impl Recording {
                     None => Default::default(),
                 };
                 let cells = times.into_iter().chain(position).chain(quaternion);
-                cells.take(columns).collect::<Vec<_>>().join(",")
+                cells.collect::<Vec<_>>().join(",")
             }
         };
         writeln!(self.out, "{line}")?;
@@ -91,6 +88,7 @@ pub(super) fn record(arguments: &RecordArguments) -> Result<(), Failure> {
     let is_csv = path.extension().is_some_and(|ending| ending == "csv");
     refuse_existing(Some(path))?;
     let mut listener = listen(&arguments.configured, false)?;
+    let gate = listener.config.tracker.to_unregistered_gate();
     let (mut recording, mut written, mut invalid) = (None, 0u64, 0u64);
     let failed = |error: io::Error, written: u64| {
         Failure::environment(format_args!(
@@ -99,14 +97,14 @@ pub(super) fn record(arguments: &RecordArguments) -> Result<(), Failure> {
         ))
     };
     listener.for_each_sample(arguments.seconds, |sample| {
-        let is_valid = Gate::is_measurement(sample);
+        let is_valid = gate.check_content(sample).is_ok();
         invalid += u64::from(!is_valid);
         if is_csv && !is_valid {
             return Ok(());
         }
         let taken = match &mut recording {
             Some(recording) => Recording::take(recording, sample),
-            None => Recording::create(path, is_csv, sample)
+            None => Recording::create(path, is_csv, sample.receive_time)
                 .and_then(|new| recording.insert(new).take(sample)),
         };
         taken.map_err(|error| failed(error, written))?;
@@ -145,13 +143,14 @@ mod tests {
     fn an_orientation_that_was_not_sent_is_not_recorded() {
         let path = std::env::temp_dir().join(format!("needle-record-{}.csv", std::process::id()));
         let turned = sample("");
-        let mut recording = Recording::create(&path, true, &turned).unwrap();
+        let without = Sample { orientation: None, ..turned.clone() };
+        let mut recording = Recording::create(&path, true, turned.receive_time).unwrap();
+        recording.take(&without).unwrap();
         recording.take(&turned).unwrap();
-        recording.take(&Sample { orientation: None, ..turned }).unwrap();
         recording.out.flush().unwrap();
         let text = std::fs::read_to_string(&path).unwrap();
         std::fs::remove_file(&path).unwrap();
         let rows: Vec<&str> = text.lines().skip(1).collect();
-        assert_eq!(rows, ["5,0,1,2,3,1,0,0,0", "5,0,1,2,3,,,,"]);
+        assert_eq!(rows, ["5,0,1,2,3,,,,", "5,0,1,2,3,1,0,0,0"]);
     }
 }

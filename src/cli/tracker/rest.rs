@@ -27,9 +27,10 @@ pub(super) fn rest(arguments: &RestArguments) -> Result<(), Failure> {
         "tracker: hold \"{}\" still for {} s",
         listener.config.tracker.tool, arguments.seconds
     ));
+    let gate = listener.config.tracker.to_unregistered_gate();
     let mut samples = Vec::new();
     listener.for_each_sample(Some(arguments.seconds), |sample| {
-        samples.push(rest_sample(sample));
+        samples.push(rest_sample(&gate, sample));
         Ok(())
     })?;
     fit_and_write(&samples, &source, None, &arguments.output)

@@ -1,6 +1,6 @@
 //! `needle-bench tracker watch`: one line a second on the configured tool.
 
-use super::{Listener, listen};
+use super::{Listener, RATE_TIME_MIN_S, listen};
 use crate::cli::Failure;
 use crate::cli::arguments::{Configured, number_in};
 use crate::cli::output::{has_no_reader, print_stdout};
@@ -13,8 +13,6 @@ use std::io;
 use std::time::Duration;
 
 const LINE_PERIOD: Duration = Duration::from_secs(1);
-/// Over less than this, a rate is not given.
-const LEAST_SECONDS: f64 = 0.1;
 
 #[derive(Debug, Args)]
 pub(in crate::cli) struct WatchArguments {
@@ -39,6 +37,8 @@ struct Watch {
     repeats: u32,
     /// Why the newest sample or message was refused, since the last line.
     refusal: Option<String>,
+    /// Why the last sample that was refused was refused.
+    last_refusal: Option<Refusal>,
     /// Messages that could not be read.
     malformed: u64,
     /// Accepted positions since the last line.
@@ -59,6 +59,7 @@ impl Watch {
             last: None,
             repeats: 0,
             refusal: None,
+            last_refusal: None,
             malformed: 0,
             positions: 0,
         }
@@ -91,17 +92,24 @@ impl Watch {
                 self.last = Some(position);
                 self.positions += 1;
             }
-            Err(refusal) => self.refusal = Some(refusal.to_string()),
+            Err(refusal) => {
+                self.refusal = Some(refusal.to_string());
+                self.last_refusal = Some(refusal);
+            }
         }
     }
 
     /// The line at `now` for the last `seconds`.
     fn line(&mut self, now: Time, seconds: f64, listener: &mut Listener) -> String {
-        self.position_line(now, seconds).unwrap_or_else(|| {
-            let refusal = self.refusal.take().map(|refusal| format!("tracker: {refusal}"));
-            let why = refusal.unwrap_or_else(|| listener.explain_missing());
-            format!("{:7.1} s  {why}", now.as_secs_f64())
-        })
+        let connection = listener.connection_trouble();
+        if let Some(line) = self.position_line(now, seconds) {
+            return line + &connection;
+        }
+        let why = match self.refusal.take() {
+            Some(refusal) => format!("tracker: {refusal}{connection}"),
+            None => listener.explain_missing(),
+        };
+        format!("{:7.1} s  {why}", now.as_secs_f64())
     }
 
     /// The same, if there was a position.
@@ -109,8 +117,7 @@ impl Watch {
         let (time, p_mm) = self.last?;
         let at = now.as_secs_f64();
         let positions = std::mem::take(&mut self.positions);
-        // A short recording is over at once: that is no rate.
-        let rate = match seconds < LEAST_SECONDS {
+        let rate = match seconds < RATE_TIME_MIN_S {
             true => format!("{positions} positions"),
             false => format!("{:.1} Hz", positions as f64 / seconds),
         };
@@ -151,7 +158,14 @@ pub(super) fn watch(arguments: &WatchArguments) -> Result<(), Failure> {
     if has_no_reader(&io::stdout()) {
         return Ok(());
     }
-    watch.last.map(|_| ()).ok_or_else(|| listener.no_samples())
+    match (watch.last, watch.last_refusal) {
+        (Some(_), _) => Ok(()),
+        (None, Some(refusal)) => Err(Failure::environment(format_args!(
+            "tracker: no position of \"{}\" was accepted; the last: {refusal}",
+            listener.config.tracker.tool
+        ))),
+        (None, None) => Err(listener.no_samples()),
+    }
 }
 
 #[cfg(test)]
