@@ -290,7 +290,7 @@ impl Stage {
         }
     }
 
-    /// Sends no more heartbeats, like a bench that has died: drives that monitor them stop by themselves and
+    /// Sends no more heartbeats, while SYNC and set-points go on: drives that monitor them stop by themselves and
     /// send emergency messages. From here on the stage reports no fault, and does not stop the axes by itself.
     pub fn fall_silent(&mut self) {
         self.faulted = true;

@@ -7,6 +7,7 @@ use needle_bench::emulator::WhiteNoise;
 use needle_bench::tracker::openigtlink::{Body, IgtlStamp, Message};
 use needle_bench::transport::tcp::TransformServer;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::TcpListener;
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};

@@ -327,7 +327,7 @@ impl TestDrive {
             0x6061 => self.objects[&at(0x6060, 0)],
             0x6064 => self.counts.into(),
             // "No data available": the error history is empty (CiA 301, 7.5.2.4).
-            0x1003 => *self.objects.get(&object).ok_or((object, AbortCode(0x0800_0024)))?,
+            0x1003 => *self.objects.get(&object).ok_or((object, AbortCode::NO_DATA))?,
             _ => *self.objects.get(&object).ok_or((object, AbortCode::NO_SUCH_OBJECT))?,
         };
         Ok(ServerFrame::Reply(object, SdoReply::Uploaded(value)))
