@@ -178,6 +178,8 @@ pub(super) struct Insertion {
 }
 
 impl Insertions {
+    /// The record of a rehearsal, on emulated drives with an emulated tracker.
+    pub(super) is_rehearsal: bool,
     /// Reads the configuration, with the key `extra_key` over it, and the insertions. Refuses an insertion that is
     /// named twice.
     pub(super) fn read(
@@ -190,15 +192,15 @@ impl Insertions {
         let config = config.load(Some(RECORDINGS_TOML))?;
         let mut insertions: Vec<Insertion> = Vec::new();
         for &path in &files {
-            let (text, recording) = read_insertion(path)?;
-            if let Some(first) = insertions.iter().find(|other| other.recording.is_same(&recording))
-            {
+            let insertion = read_insertion(path)?;
+            let is_same = |other: &&Insertion| other.recording.is_same(&insertion.recording);
+            if let Some(first) = insertions.iter().find(is_same) {
                 let first = first.path.display();
                 let error =
                     format!("the same recording as {first}: it would count twice, give each once");
                 return Err(Failure::bad_input(path, error));
             }
-            insertions.push(Insertion { path: path.to_owned(), text, recording });
+            insertions.push(insertion);
         }
         if let (None, Some(run)) = (configuration, files.iter().find(|path| path.is_dir())) {
             print_stderr(format_args!(
@@ -235,12 +237,18 @@ impl Insertions {
     }
 }
 
-/// Reads the insertion in `path`, a CSV file or a run folder; returns also the text that it was read from.
-fn read_insertion(path: &Path) -> Result<(String, Recording), Failure> {
+/// Reads the insertion in `path`, a CSV file or a run folder.
+fn read_insertion(path: &Path) -> Result<Insertion, Failure> {
+    let insertion = |text, recording, is_rehearsal| Insertion {
+        path: path.to_owned(),
+        text,
+        recording,
+        is_rehearsal,
+    };
     if !path.is_dir() {
         let text = text_of(path)?;
         let recording = Recording::parse(&text).map_err(|error| Failure::bad_input(path, error))?;
-        return Ok((text, recording));
+        return Ok(insertion(text, recording, false));
     }
     let ReplayedRun { folder, config, stage, samples } = replay_run(path)?;
     let registration = config.tracker.to_registration()?;
@@ -252,7 +260,8 @@ fn read_insertion(path: &Path) -> Result<(String, Recording), Failure> {
         let why = "no position was accepted while the needle was inserted";
         return Err(Failure::bad_input(path, why));
     }
-    Ok((folder.text(file::TRACKER)?, Recording { rows }))
+    let is_rehearsal = folder.manifest().rehearsal.is_some();
+    Ok(insertion(folder.text(file::TRACKER)?, Recording { rows }, is_rehearsal))
 }
 
 /// Rows of the tip on the bench and of the stage at that time. `samples` are lines, acquisition times and samples;

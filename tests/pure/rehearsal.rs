@@ -171,6 +171,7 @@ fn a_turn_of_the_base_calibrates_the_tip() {
     let said = needle_bench(&scratch, &named);
     assert_eq!(said.status, 0, "{}", said.screen());
     let json = said.json();
+    assert_eq!(json["rehearsal"], true);
     for (found, truth) in
         json["tracker"]["tip_offset_mm"].as_array().unwrap().iter().zip([4.0, -3.0, 7.5])
     {
@@ -184,6 +185,8 @@ fn a_turn_of_the_base_calibrates_the_tip() {
         let replayed = needle_bench(&scratch, &["replay", run.to_str().unwrap()]);
         assert_eq!(replayed.stdout.lines().last(), Some("identical"), "{}", replayed.screen());
     }
+    assert!(!scratch.path().join("turn.csv").exists(), "its sensor is emulated");
+    scratch.write("turn.csv", "of the rig");
     let said = needle_bench(&scratch, &named);
     assert_eq!(said.status, 2, "{}", said.screen());
     assert!(said.stderr.contains("turn.csv: exists"), "{}", said.stderr);
@@ -230,18 +233,46 @@ fn handedness_can_be_proved_on_the_emulated_stage() {
     assert!(said.stderr.contains("handedness is right"), "{}", said.stderr);
 }
 
+/// An emulated needle must not become the calibration of the rig.
+#[test]
+fn a_rehearsal_calibrates_nothing() {
+    let scratch = Scratch::new();
+    let rig = repository("bench-config/rig-epos4.toml");
+    let tip = ["calibrate", "tip", "turn.csv", &rig, "--run", "--rehearse"];
+    let said = needle_bench(&scratch, &[&tip[..], &["--out", "tip.toml"]].concat());
+    assert_eq!(said.status, 2, "{}", said.screen());
+    assert!(said.stderr.contains("--rehearse writes no calibration"), "{}", said.stderr);
+    assert_eq!(fs::read_dir(scratch.path()).unwrap().count(), 0, "nothing turned");
+
+    let said = needle_bench(&scratch, &[&tip[..], &["--set", MEASURED[1]]].concat());
+    assert_eq!((said.status, said.stdout.as_str()), (0, ""), "{}", said.screen());
+    assert!(said.stderr.contains("rehearsal   emulated drives and tracker"), "{}", said.stderr);
+    assert!(!scratch.path().join("turn.csv").exists());
+
+    let short = ["insertion.depth_mm=10"];
+    let said = rehearse(&scratch, &["run", "--rehearse", "--json", "-q"], &short);
+    let run = said.json()["run_dir"].as_str().unwrap().to_owned();
+    let said = needle_bench(&scratch, &["calibrate", "needle", &run]);
+    assert_eq!((said.status, said.stdout.as_str()), (2, ""), "{}", said.screen());
+    assert!(said.stderr.contains(&format!("{run}: a rehearsal")), "{}", said.stderr);
+}
+
 /// The three runs have a sensor of six degrees of freedom and a needle whose curvature the configuration does
 /// not have.
 #[test]
 fn rehearsed_runs_calibrate_the_needle_and_the_file_is_used() {
     let scratch = Scratch::new();
+    let rig = fs::read_to_string(repository("bench-config/rig-epos4.toml")).unwrap();
     let needle = ["emulator.curvature_per_mm=0.0095", "emulator.noise={ sd_mm = 0.05 }"];
     let sensor = "tracker.tip_offset_mm=[0.5, 0.0, 0.0]";
     let mut runs = Vec::new();
     for start in ["1.0", "-0.5", "0.4"] {
         let start = format!("emulator.start.x_mm={start}");
-        let sets = [&needle[..], &[sensor, &start, "tracker.gates.noise_sd_mm=0.1"]].concat();
-        let said = rehearse(&scratch, &["run", "--rehearse", "--json", "-q"], &sets);
+        let depth = "insertion.depth_mm=50";
+        let sets =
+            [&needle[..], &[sensor, &start, depth, "tracker.gates.noise_sd_mm=0.1"]].concat();
+        let sets: Vec<&str> = sets.into_iter().flat_map(|set| ["--set", set]).collect();
+        let said = needle_bench(&scratch, &[&["run", "--json", "-q"], &sets[..]].concat());
         assert_eq!(said.status, 0, "{}", said.screen());
         runs.push(said.json()["run_dir"].as_str().unwrap().to_owned());
     }
@@ -251,7 +282,6 @@ fn rehearsed_runs_calibrate_the_needle_and_the_file_is_used() {
     assert_eq!(found.status, 0, "{}", found.screen());
     let curvature = found.json()["needle"]["curvature_per_mm"].as_f64().unwrap();
     assert!((curvature - 0.0095).abs() < 5e-4, "{curvature}");
-    let rig = fs::read_to_string(repository("bench-config/rig-epos4.toml")).unwrap();
     let both = rig.replace("[needle]\n", "[needle]\nneedle_file = \"needle.toml\"\n");
     scratch.write("both.toml", &both);
     let named = both.lines().filter(|line| !line.starts_with("radius_mm")).collect::<Vec<_>>();

@@ -106,7 +106,8 @@ pub(super) struct TipArguments {
     /// back.
     #[arg(long)]
     run: bool,
-    /// With --run: rehearse it on emulated drives and an emulated tracker, in virtual time.
+    /// With --run: rehearse it on emulated drives and an emulated tracker, in virtual time. FILE is not written,
+    /// and --out is refused: the result is not that of the rig.
     #[arg(long, requires = "run")]
     rehearse: bool,
     /// Distance of the tip ahead of the sensor along the needle, mm.
@@ -160,6 +161,15 @@ impl Output {
         self.write_toml(summary, &format!("{header}{toml}"), json)
     }
 
+    /// Shows the result of a rehearsal. There is no TOML: it would pass for a calibration of the rig.
+    fn show_rehearsal(&self, (summary, more): (&str, Shown), json: &Value) -> Result<(), Failure> {
+        print_stderr(screen(summary, json, more).map_err(Failure::environment)?);
+        print_stderr(
+            "rehearsal   emulated drives and tracker: no calibration of the rig, nothing is written",
+        );
+        if self.json { print_stdout(json) } else { Ok(()) }
+    }
+
     /// As [`write`](Self::write), with the whole `toml`.
     fn write_toml(
         &self,
@@ -207,6 +217,10 @@ fn angles_json(rotation: &Rotation3<f64>) -> Value {
 fn needle(insertions: &Insertions, output: &Output) -> Result<(), Failure> {
     output.refuse_existing()?;
     let (config, insertions) = insertions.read(None)?;
+    if let Some(Insertion { path, .. }) = insertions.iter().find(|run| run.is_rehearsal) {
+        let why = "a rehearsal, whose needle is emulated: calibrate from runs on the rig";
+        return Err(Failure::bad_input(path, why));
+    }
     let posed_rows = insertions.iter().map(posed_rows).collect::<Result<Vec<_>, _>>()?;
     let fit = NeedleFit::of(&posed_rows, &config.path_noise()).map_err(Failure::configuration)?;
     let mut file = insertions[0].path.display().to_string();
@@ -314,14 +328,17 @@ fn registration(arguments: &RegistrationArguments) -> Result<(), Failure> {
 /// The tip's offset and tilt on the sensor, from the sensor's circle while the base turns.
 fn tip(arguments: &TipArguments) -> Result<(), Failure> {
     let path = &arguments.file;
-    arguments.output.refuse_existing()?;
-    let mut rms_max_mm = RMS_MAX_MM;
-    if arguments.run {
-        let noise_sd_mm = record_turn(path, &arguments.configured, arguments.rehearse)?;
-        rms_max_mm = rms_max_mm.max(2.0 * noise_sd_mm);
+    if arguments.rehearse && arguments.output.out.is_some() {
+        return Err(Failure::configuration(
+            "--rehearse writes no calibration, since its needle and tracker are emulated: leave --out out",
+        ));
     }
-    let rms_max_mm = arguments.rms_max_mm.unwrap_or(rms_max_mm);
-    let text = text_of(path)?;
+    arguments.output.refuse_existing()?;
+    let (text, noise_sd_mm) = match arguments.run {
+        true => record_turn(path, &arguments.configured, arguments.rehearse)?,
+        false => (text_of(path)?, 0.0),
+    };
+    let rms_max_mm = arguments.rms_max_mm.unwrap_or(RMS_MAX_MM.max(2.0 * noise_sd_mm));
     let samples = TurnSample::parse(&text).map_err(|error| Failure::bad_input(path, error))?;
     let fit = TipFit::of(&samples, rms_max_mm).map_err(|error| Failure::bad_input(path, error))?;
     let is_oriented = samples.iter().all(|sample| sample.orientation_meas.is_some());
@@ -344,12 +361,16 @@ fn tip(arguments: &TipArguments) -> Result<(), Failure> {
         "centre_sd_mm": fit.centre_sd_mm,
         "axis_sd_deg": fit.axis_sd_rad.to_degrees(),
         "has_mount": fit.mount.is_some(),
+        "rehearsal": arguments.rehearse,
     });
     let header = format!("{TIP_HEADER}{}\n", if fit.mount.is_some() { "" } else { NO_MOUNT });
     let more = context! {
         rms_max_mm,
         tilt_deg => fit.mount.map(|mount| mount.axis.z.clamp(-1.0, 1.0).acos().to_degrees()),
     };
-    let overlay = json!({ "tracker": tracker });
-    arguments.output.write((include_str!("tip.txt"), more), &header, &overlay, &json)
+    let summary = (include_str!("tip.txt"), more);
+    if arguments.rehearse {
+        return arguments.output.show_rehearsal(summary, &json);
+    }
+    arguments.output.write(summary, &header, &json!({ "tracker": tracker }), &json)
 }

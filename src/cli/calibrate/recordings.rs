@@ -216,12 +216,13 @@ const TURNS: [&str; 2] = ["360deg", "-360deg"];
 const ROWS_APART_DEG: f64 = 0.5;
 
 /// Turns the base of the stage that `configured` names and writes the sensor's positions into the new
-/// file `path`; returns their configured noise, mm. Writes nothing after a turn that did not complete.
+/// file `path`; returns the text of the file and the configured noise of the positions, mm. Writes nothing after a
+/// turn that did not complete, and nothing in a rehearsal, whose sensor is emulated.
 pub(super) fn record_turn(
     path: &Path,
     configured: &Configured,
     rehearse: bool,
-) -> Result<f64, Failure> {
+) -> Result<(String, f64), Failure> {
     refuse_existing(Some(path))?;
     let configured = configured.clone().rehearsed(rehearse);
     let (config, _) = load_stage(configured, rehearse, sensor_off_axis)?;
@@ -242,8 +243,10 @@ pub(super) fn record_turn(
         let row: Vec<String> = row.iter().take(cells).map(f64::to_string).collect();
         text += &format!("{}\n", row.join(","));
     }
-    write_new(path, &text)?;
-    Ok(config.tracker.to_track().noise_sd_mm)
+    if !rehearse {
+        write_new(path, &text)?;
+    }
+    Ok((text, config.tracker.to_track().noise_sd_mm))
 }
 
 /// Rows of the base's rotation, the sensor's position and, if the tracker gives it, its orientation. The rotation
