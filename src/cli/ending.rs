@@ -103,13 +103,33 @@ pub(super) fn after_insertion(
     if config.is_emulated() {
         return report.outcome.stop_reason().map(|_| next_review(report));
     }
-    let inserted_mm = report.figures.report().insertion_mm;
+    let depth_mm = depth_mm(config, report);
     let next = match (required(config, &report.stage_at_end), possible_withdrawal(config, report)) {
         (Some(required), _) => next_stage(required.operation(), path, report),
+        (None, Err(_)) if depth_mm.is_none() => next_stage("status", path, report),
         (None, Err(_)) => next_review(report),
         (None, Ok(withdrawal)) => next_stage("withdraw", path, report) + &withdrawal.options(),
     };
-    Some(format!("needle      {inserted_mm:.1} mm in; {}\n{next}", drives(&report.stage_at_end)))
+    let needle = needle_at(config, depth_mm);
+    Some(format!("needle      {needle}; {}\n{next}", drives(&report.stage_at_end)))
+}
+
+/// Where the insertion axis stands after an insertion, mm. `None` if the drives have not reported it, or if it is less
+/// than the run has inserted from the lower limit on, as of a drive that has restarted and counts anew.
+fn depth_mm(config: &Config, report: &RunReport) -> Option<f64> {
+    let depth_mm = report.stage_at_end.position?.insertion_mm;
+    let least_mm = config.stage.insertion.limits.min + report.figures.report().insertion_mm;
+    (depth_mm >= least_mm - config.insertion.arrival_mm).then_some(depth_mm)
+}
+
+/// Where the needle is. An axis without a configured zero knows only its travel in the run.
+fn needle_at(config: &Config, depth_mm: Option<f64>) -> String {
+    match (depth_mm, config.stage.insertion.zero) {
+        (None, _) => "its depth is not known".to_owned(),
+        (Some(mm), None) => format!("{mm:.1} mm in from where the run began"),
+        (Some(mm), Some(_)) if mm <= config.insertion.arrival_mm => format!("out, at {mm:.2} mm"),
+        (Some(mm), Some(_)) => format!("{mm:.1} mm in"),
+    }
 }
 
 /// The lines after an operation that was stopped or left a drive in Fault: where the axes are, and the next
@@ -211,7 +231,7 @@ pub(super) struct Withdrawal {
 }
 
 impl Withdrawal {
-    /// The withdrawal from a depth of `inserted_mm`.
+    /// The withdrawal from where the axis reads `inserted_mm`.
     fn from_depth(config: &Config, inserted_mm: f64) -> Self {
         let insertion = &config.stage.insertion;
         if insertion.zero.is_some() {
@@ -266,12 +286,14 @@ pub(super) fn possible_withdrawal(
     config: &Config,
     report: &RunReport,
 ) -> Result<Withdrawal, String> {
-    let inserted_mm = report.figures.report().insertion_mm;
-    if inserted_mm <= config.insertion.arrival_mm {
-        return Err(format!("the needle is out, at {inserted_mm:.2} mm"));
+    let Some(depth_mm) = depth_mm(config, report) else {
+        return Err("the needle's depth is not known; look at the stage".to_owned());
+    };
+    if depth_mm <= config.insertion.arrival_mm {
+        return Err(format!("the needle is {}", needle_at(config, Some(depth_mm))));
     }
     match required(config, &report.stage_at_end) {
-        None => Ok(Withdrawal::from_depth(config, inserted_mm)),
+        None => Ok(Withdrawal::from_depth(config, depth_mm)),
         Some(Required::Reset) => Err("a drive is in fault: find why, then stage reset".to_owned()),
         Some(Required::Status) => {
             Err("the drives are not known to stand; look at the stage".to_owned())
@@ -345,17 +367,20 @@ mod tests {
         Configured::new(Some(Path::new("bench-config/vcan.toml")), sets).load(None).unwrap()
     }
 
-    fn stopped(insertion_mm: f64, stage_at_end: StageAtEnd) -> RunReport {
+    fn stopped(stage_at_end: StageAtEnd) -> RunReport {
         let stopped = Outcome::Stopped("operator: interrupted".to_owned());
-        let mut report = RunReport { stage_at_end, ..report(stopped, &[]) };
-        report.figures.take_scored(insertion_mm, None, None);
-        report
+        RunReport { stage_at_end, ..report(stopped, &[]) }
     }
 
     /// Both drives had power and stand at 5 mm and 90 degrees.
     fn stood() -> StageAtEnd {
+        at(5.0)
+    }
+
+    /// As [`stood`], at `insertion_mm`.
+    fn at(insertion_mm: f64) -> StageAtEnd {
         let off = DriveReport { state: Some(DriveState::SwitchOnDisabled), error: None };
-        let position = SetPoint { insertion_mm: 5.0, rotation_rad: 90_f64.to_radians() };
+        let position = SetPoint { insertion_mm, rotation_rad: 90_f64.to_radians() };
         let drives = PerAxis::from_fn(|_| off);
         StageAtEnd { had_power: true, unknown: None, drives, position: Some(position) }
     }
@@ -372,26 +397,62 @@ mod tests {
     fn a_needle_is_withdrawn_after_a_stop_as_after_a_completed_run() {
         let real = config(&[]);
         assert_eq!(
-            possible_withdrawal(&real, &stopped(5.0, stood())),
+            possible_withdrawal(&real, &stopped(stood())),
             Ok(Withdrawal::from_depth(&real, 5.0))
         );
-        let out = possible_withdrawal(&real, &stopped(0.01, stood()));
-        assert_eq!(out.unwrap_err(), "the needle is out, at 0.01 mm");
-        let text = after_insertion(&real, Some(Path::new(RIG)), &stopped(5.0, stood())).unwrap();
+        let not_moved = possible_withdrawal(&real, &stopped(at(0.01))).unwrap_err();
+        assert_eq!(not_moved, "the needle is 0.0 mm in from where the run began");
+        let text = after_insertion(&real, Some(Path::new(RIG)), &stopped(stood())).unwrap();
         assert!(
             text.starts_with(
-                "needle      5.0 mm in; both axes stand, power is off\n\
+                "needle      5.0 mm in from where the run began; both axes stand, power is off\n\
                  next        needle-bench stage withdraw rig.toml --by 5.0mm"
             ),
             "{text}"
         );
     }
 
+    /// The run may begin with the needle in, and may move it no further.
+    #[test]
+    fn the_depth_after_a_run_is_that_of_the_axis_not_the_travel_of_the_run() {
+        let real = config(&["stage.insertion.zero=0"]);
+        let said = |stage| {
+            let report = stopped(stage);
+            let lines = after_insertion(&real, Some(Path::new(RIG)), &report).unwrap();
+            (lines, possible_withdrawal(&real, &report).map(|withdrawal| withdrawal.to_string()))
+        };
+        let (lines, withdrawal) = said(StageAtEnd { had_power: false, ..at(10.0) });
+        let expected = "needle      10.0 mm in; no power was given\n\
+                        next        needle-bench stage withdraw rig.toml";
+        assert_eq!((&lines[..], withdrawal), (expected, Ok("to depth 0".to_owned())));
+        let (lines, withdrawal) = said(at(0.01));
+        assert!(lines.starts_with("needle      out, at 0.01 mm; "), "{lines}");
+        assert_eq!(withdrawal.unwrap_err(), "the needle is out, at 0.01 mm");
+        let (lines, withdrawal) = said(StageAtEnd::default());
+        let expected = "needle      its depth is not known; no power was given\n\
+                        next        needle-bench stage status rig.toml";
+        assert_eq!(lines, expected);
+        assert_eq!(withdrawal.unwrap_err(), "the needle's depth is not known; look at the stage");
+    }
+
+    /// A drive without power loses its position: after a restart it may report 0 with the needle in.
+    #[test]
+    fn a_position_of_less_than_was_inserted_is_no_depth() {
+        let real = config(&["stage.insertion.zero=0"]);
+        let mut restarted = stopped(at(0.0));
+        restarted.figures.take_scored(15.0, None, None);
+        let lines = after_insertion(&real, Some(Path::new(RIG)), &restarted).unwrap();
+        assert!(lines.starts_with("needle      its depth is not known; "), "{lines}");
+        assert!(lines.ends_with("stage status rig.toml"), "{lines}");
+        let why = possible_withdrawal(&real, &restarted).unwrap_err();
+        assert_eq!(why, "the needle's depth is not known; look at the stage");
+    }
+
     #[test]
     fn drives_that_may_move_call_for_stage_status_first() {
         let real = config(&[]);
         let unknown = Some("the axes were not seen to stand");
-        let stopped = stopped(5.0, StageAtEnd { unknown, ..in_fault() });
+        let stopped = stopped(StageAtEnd { unknown, ..in_fault() });
         let why = possible_withdrawal(&real, &stopped).unwrap_err();
         assert_eq!(why, "the drives are not known to stand; look at the stage");
         let path = Some(Path::new(RIG));
@@ -407,11 +468,11 @@ mod tests {
     #[test]
     fn a_drive_in_fault_is_named_and_reset_first() {
         let real = config(&[]);
-        let stopped = stopped(5.0, in_fault());
+        let stopped = stopped(in_fault());
         assert_eq!(
             after_insertion(&real, Some(Path::new(RIG)), &stopped).unwrap(),
-            "needle      5.0 mm in; both axes stand, power is off; rotation is in fault (0x8130 \
-             heartbeat or life guard lost)\n\
+            "needle      5.0 mm in from where the run began; both axes stand, power is off; rotation \
+             is in fault (0x8130 heartbeat or life guard lost)\n\
              next        needle-bench stage reset rig.toml"
         );
         let why = possible_withdrawal(&real, &stopped).unwrap_err();
@@ -429,23 +490,23 @@ mod tests {
         let real = config(&[]);
         let text = |report: &RunReport| after_operation(&real, Some(Path::new(RIG)), None, report);
         assert_eq!(
-            text(&stopped(5.0, stood())).unwrap(),
+            text(&stopped(stood())).unwrap(),
             "stage       insertion at 5.000 mm, rotation at 90.000 deg; both axes stand, power is \
              off\nnext        needle-bench stage status rig.toml"
         );
         assert_eq!(
-            text(&stopped(0.0, StageAtEnd::default())).unwrap(),
+            text(&stopped(StageAtEnd::default())).unwrap(),
             "stage       not known where the axes stand; no power was given\n\
              next        needle-bench stage status rig.toml"
         );
-        let withdrawal = stopped(5.0, stood());
+        let withdrawal = stopped(stood());
         let rest =
             after_operation(&real, Some(Path::new(RIG)), Some(" --by 5.0mm"), &withdrawal).unwrap();
         assert!(
             rest.ends_with("\nnext        needle-bench stage withdraw rig.toml --by 5.0mm"),
             "{rest}"
         );
-        let done = RunReport { outcome: Outcome::Completed, ..stopped(5.0, stood()) };
+        let done = RunReport { outcome: Outcome::Completed, ..stopped(stood()) };
         assert_eq!(text(&done), None);
         let proved = RunReport { stage_at_end: in_fault(), ..done };
         let next = "\nnext        needle-bench stage reset rig.toml";
@@ -459,7 +520,7 @@ mod tests {
             let sets = sets.iter().map(|set| (*set).to_owned()).collect();
             let config = Configured::new(None, sets).load(None).unwrap();
             let withdrawal = Withdrawal::from_depth(&config, 12.96);
-            let allowed = withdrawal.configuration(config, &stopped(12.96, stood()));
+            let allowed = withdrawal.configuration(config, &stopped(stood()));
             assert_eq!(allowed.emulator.insertion_start_mm, 5.0, "where the stage stands");
             assert!(allowed.stage.insertion.limits.min <= -13.0 || withdrawal.by_mm.is_none());
             withdrawal.options()

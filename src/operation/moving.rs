@@ -183,12 +183,17 @@ impl Task for MoveOneAxis {
             StageEvent::Located(at) => self.plan_from(shell, *at).map(drop),
             StageEvent::Feedback(feedback) => {
                 shell.record(Record::Stage(*feedback));
-                if let Some(moved) = self.moves.last_mut() {
-                    moved.to = feedback.measured.along(moved.axis);
-                }
                 if shell.is_running() { self.advance(shell, feedback) } else { Ok(()) }
             }
             _ => Ok(()),
+        }
+    }
+
+    /// A stop from outside ends the feedback while the axis still brakes, so the end of the move is where the axis
+    /// was measured last.
+    fn end(&mut self, shell: &mut Shell) {
+        if let (Some(moved), Some(position)) = (self.moves.last_mut(), shell.position()) {
+            moved.to = position.along(moved.axis);
         }
     }
 

@@ -250,6 +250,19 @@ fn an_operator_a_bus_fault_and_a_drive_fault_stop_an_operation() {
     assert!(reason.starts_with("stage: rotation: emergency 0x3220"), "{reason}");
 }
 
+/// `needle-bench stop` takes the nodes out of Operational, so the axis brakes without feedback.
+#[test]
+fn the_end_of_a_move_that_is_stopped_from_outside_is_where_the_axis_stands() {
+    let mut bench = Bench::new(&config(&[]), Operation::Move(by(Axis::Insertion, 10.0)));
+    bench.run_until_moved(3.0);
+    let preoperational = Frame::new(0, &[0x80, 0]);
+    bench.stage.handle_frame(bench.now, &preoperational);
+    let reason = bench.reason();
+    assert!(reason.contains("no TPDO1 for 2 SYNCs in a row"), "{reason}");
+    let [moved] = bench.operation.moves() else { panic!("one move") };
+    assert!((moved.to - bench.travel().0).abs() < 1e-3, "{moved:?}, {}", bench.travel().0);
+}
+
 #[test]
 fn an_axis_that_does_not_reach_its_goal_is_an_error() {
     let feedback = |time_s: f64| crate::stage::Feedback {

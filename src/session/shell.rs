@@ -299,13 +299,18 @@ impl Shell {
             || Axis::BOTH.into_iter().any(|axis| reports[axis].says_power())
     }
 
+    /// Where the axes were last measured; `None` before both drives have reported it.
+    pub(crate) fn position(&self) -> Option<SetPoint> {
+        self.stage.position()
+    }
+
     /// The state in which the run leaves the stage.
     pub(super) fn stage_at_end(&self) -> StageAtEnd {
         StageAtEnd {
             had_power: self.had_power(),
             unknown: self.unconfirmed,
             drives: self.stage.drive_reports(),
-            position: self.stage.position(),
+            position: self.position(),
         }
     }
 

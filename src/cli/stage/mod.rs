@@ -199,19 +199,19 @@ impl Motion {
         given.flatten().collect()
     }
 
-    /// The options of the `stage withdraw` that finishes this withdrawal after it went as far as `done`. `None` if
-    /// nothing remains, if the limit `min_mm` would refuse the remainder, and for another motion.
+    /// The options of the `stage withdraw` that finishes this withdrawal after it went as far as `done`. `None` if it
+    /// has not begun, since it may have been refused, if nothing remains, if the limit `min_mm` would refuse the
+    /// remainder, and for another motion.
     fn remaining(&self, done: &[AxisMove], min_mm: f64) -> Option<String> {
         let Motion::Withdraw { by, .. } = self else { return None };
+        let (from_mm, to_mm) = done.iter().find_map(|done| Some((done.from?, done.to)))?;
         let Some(by_mm) = by.and_then(|by| by.along(Axis::Insertion).ok()) else {
             return Some(String::new());
         };
-        let moved = done.iter().find_map(|done| Some((done.from?, done.to)));
-        let (from_mm, to_mm) = moved.unwrap_or_default();
         // Rounded down to a tenth: rounded up, the remainder might pass the limit.
         let remaining_mm = (10.0 * (by_mm - (from_mm - to_mm)) + 1e-6).floor() / 10.0;
-        let is_allowed = moved.is_none() || from_mm - by_mm >= min_mm;
-        (remaining_mm >= 0.05 && is_allowed).then(|| format!(" --by {remaining_mm:.1}mm"))
+        (remaining_mm >= 0.05 && from_mm - by_mm >= min_mm)
+            .then(|| format!(" --by {remaining_mm:.1}mm"))
     }
 
     /// The configuration key that an emulated stage also needs for this motion to have an effect.
@@ -487,5 +487,12 @@ mod tests {
         assert_eq!(rest("withdraw", 24.5).as_deref(), Some(""), "to depth 0");
         assert_eq!(rest("withdraw --by 32mm", 30.0), None, "was refused");
         assert_eq!(rest("jog --axis insertion --by=-20mm", 24.5), None);
+        for line in ["withdraw", "withdraw --by 20mm"] {
+            assert_eq!(
+                Motion::of(line).unwrap().remaining(&[], -1.0),
+                None,
+                "{line} has not begun"
+            );
+        }
     }
 }
