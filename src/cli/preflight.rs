@@ -78,7 +78,7 @@ impl Preflight {
                 vec![Check::unlimited("tracker", "emulated: not listened to")]
             }
             Ok(None) => {
-                let next = "watch it on its own: needle-bench tracker watch";
+                let next = "watch it on its own: needle-bench tracker watch CONFIG";
                 let check = Check::unlimited("tracker", "standard input: not listened to");
                 vec![check.with(Verdict::Warn, next)]
             }
@@ -132,7 +132,7 @@ pub(super) fn before_run(config: &Config, yes: bool, as_json: bool) -> Result<Ve
     if !yes && !std::io::stdin().is_terminal() {
         return Err(Failure::configuration(
             "a run on hardware asks before it moves, and there is no terminal: read `needle-bench check \
-             --connect`, then give --yes",
+             CONFIG --connect`, then give --yes",
         ));
     }
     // From here on Ctrl-C means no, during the checks as at the question; it does not kill the program.

@@ -324,7 +324,7 @@ fn an_axis_that_needs_homing_is_not_moved_before_it() {
     let mut bench = Bench::new(&config, Operation::Move(by(Axis::Insertion, 2.0)));
     let reason = bench.reason();
     assert!(reason.starts_with("stage: node 1 (insertion): not homed"), "{reason}");
-    assert!(reason.ends_with("home it first: needle-bench stage home"), "{reason}");
+    assert!(reason.ends_with("home it first: needle-bench stage home CONFIG"), "{reason}");
     assert_eq!(bench.travel(), (0.0, 0.0));
 }
 

@@ -121,7 +121,7 @@ pub fn start_roll(config: &Config) -> Option<Check> {
 /// Judges the `last` completed `stage prove` on this bus: its age, and the keys of stage and bus that changed
 /// since.
 pub fn proof(config: &Config, last: Option<&Earlier>, now_unix_us: i64) -> Check {
-    let next = "needle-bench stage prove, without a needle";
+    let next = "needle-bench stage prove CONFIG, without a needle";
     let days_max = config.calibration.max_age_days;
     let limit = format!("this configuration, up to {days_max:.0} days");
     let Some(Earlier { started_utc, changed, proof }) = last else {

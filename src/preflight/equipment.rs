@@ -109,8 +109,9 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
 
 /// Checks the drive of `axis` by the status that it reports.
 pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) -> Vec<Check> {
-    const POWERED: &str = "it has power: is another program moving it? Stop it: needle-bench stop";
-    const HISTORY: &str = "needle-bench stage reset clears it once it is understood";
+    const POWERED: &str =
+        "it has power: is another program moving it? Stop it: needle-bench stop CONFIG";
+    const HISTORY: &str = "needle-bench stage reset CONFIG clears it once it is understood";
     let name = format!("{axis} drive");
     let status = match status {
         Ok(status) => status,
@@ -144,7 +145,7 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
     let limit = format!("vendor {vendor}, product {product}; no fault, no power");
     let write = format!("write vendor_id and product_code into [stage.{axis}]");
     let other = format!("not the drive of [stage.{axis}]: is node right?");
-    let reset = "find the cause, then needle-bench stage reset";
+    let reset = "find the cause, then needle-bench stage reset CONFIG";
     let mut checks = vec![
         Check::new(&name, format!("node {node}, {identity}; {statusword}"), limit)
             .unless(is_named, Warn, write)
@@ -163,7 +164,7 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
             Some(false) => "not homed",
             None => "reported in homing mode only, where the run asks for it",
         };
-        let next = format!("needle-bench stage home --axis {axis}");
+        let next = format!("needle-bench stage home CONFIG --axis {axis}");
         let homing = Check::new(format!("{axis} homing"), found, "homed");
         checks.push(homing.unless(status.homed != Some(false), Fail, next));
     }
@@ -218,9 +219,10 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     let noise_max_mm = NOISE_MAX * config.tracker.to_track().noise_sd_mm;
     let found = noise_mm.map_or_else(|| "not measured".to_owned(), |mm| format!("{mm:.3} mm"));
     let limit = format!("up to {noise_max_mm:.3}, {NOISE_MAX} times tracker.gates.noise_sd_mm");
-    let longer =
-        format!("listen for at least {POSITIONS_MIN} positions: check --connect --listen 10");
-    let measure = "measure it: needle-bench tracker rest";
+    let longer = format!(
+        "listen for at least {POSITIONS_MIN} positions: check CONFIG --connect --listen 10"
+    );
+    let measure = "measure it: needle-bench tracker rest CONFIG";
     let noise = Check::new("tracker noise at rest", found, limit)
         .unless(noise_mm.is_some(), Warn, longer)
         .unless(is_within(noise_mm, noise_max_mm), Warn, measure);

@@ -140,7 +140,7 @@ impl Script {
         let history = history.map_or("empty".to_owned(), |error| format!("{error:#010X}"));
         Err(format!(
             "drive found in fault (statusword {statusword}, 0x603F {error_code}, 0x1003:01 {history}); \
-             clear its cause, then: needle-bench stage reset"
+             clear its cause, then: needle-bench stage reset CONFIG"
         ))
     }
 
@@ -274,7 +274,7 @@ impl Script {
             return Ok(());
         }
         Err(format!(
-            "not homed (statusword {statusword}, bit {} clear), home it first: needle-bench stage home",
+            "not homed (statusword {statusword}, bit {} clear), home it first: needle-bench stage home CONFIG",
             homing.homed_bit
         ))
     }

@@ -151,7 +151,9 @@ impl Reset {
 async fn reset(sdo: Sdo) -> Result<Statusword, String> {
     let (node, word) = (sdo.node(), sdo.statusword().await?);
     if may_have_power(word.state()) {
-        return Err(format!("node {node} has power ({word}): stop it first, needle-bench stop"));
+        return Err(format!(
+            "node {node} has power ({word}): stop it first, needle-bench stop CONFIG"
+        ));
     }
     // A rising edge of bit 7 resets the fault.
     for word in

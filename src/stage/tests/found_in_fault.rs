@@ -12,7 +12,7 @@ fn a_drive_found_in_fault_is_named_or_reset_as_configured() {
         fault,
         "node 2 (rotation): drive found in fault (statusword 0x0218 fault, \
          0x603F 0x7320 position sensor, 0x1003:01 0x00007320); \
-         clear its cause, then: needle-bench stage reset"
+         clear its cause, then: needle-bench stage reset CONFIG"
     );
     let config = resetting_config();
     let mut bench = Bench::new(config);

@@ -158,7 +158,7 @@ fn an_axis_that_needs_homing_is_not_enabled_without_it() {
     assert_eq!(
         bench.until_fault(),
         "node 1 (insertion): not homed (statusword 0x0650 switch on disabled, bit 12 clear), home \
-         it first: needle-bench stage home"
+         it first: needle-bench stage home CONFIG"
     );
     bench.until_stopped();
 
