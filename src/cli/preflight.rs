@@ -1,5 +1,5 @@
-//! Inspects what the preflight judges: the bus, the drives, the tracker, earlier runs and the disk. Nothing is
-//! written and nothing moves.
+//! Inspects what the preflight judges: the bus, the drives, the tracker, earlier runs and the disk. Nothing moves,
+//! and nothing is written but an empty file in the record's folder, which is removed at once.
 
 use super::output::{print_stderr, print_stdout};
 use super::records::earlier_run;
@@ -14,7 +14,7 @@ use crate::preflight::{
 };
 use crate::runtime::Interrupt;
 use crate::stage::{Axis, AxisStatus};
-use crate::telemetry::free_mb;
+use crate::telemetry::{free_mb, try_to_write};
 use nix::errno::Errno;
 use nix::net::if_::if_nametoindex;
 use nix::poll::{PollFd, PollFlags, poll};
@@ -93,7 +93,8 @@ impl Preflight {
         checks.extend(start_roll(rig));
         checks.extend(report.as_ref().and_then(|report| plane(config, report)));
         let dir = Path::new(&config.record.dir);
-        let free_mb = free_mb(dir).map_err(|error| format!("{}: {error}", dir.display()));
+        let free_mb = try_to_write(dir).and_then(|()| free_mb(dir));
+        let free_mb = free_mb.map_err(|error| format!("{}: {error}", dir.display()));
         checks.push(disk(config, free_mb));
         if !rig.is_emulated() {
             let is_insertion = |run: &Manifest| run.operation.is_none();

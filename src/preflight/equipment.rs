@@ -291,7 +291,8 @@ pub fn plane(config: &Config, report: &TrackerReport) -> Option<Check> {
     })
 }
 
-/// Checks the free space in `record.dir`, MB; `None` if the system does not report it.
+/// Checks the free space in `record.dir`, MB; `None` if the system does not report it, and an error if nothing can
+/// be written there.
 pub fn disk(config: &Config, free_mb: Result<Option<u64>, String>) -> Check {
     let free_mb_min = config.record.free_mb_min;
     let next = "make room, or set record.dir to another disk";

@@ -168,8 +168,22 @@ pub(super) fn check_not_full(dir: &Path) -> Result<(), TelemetryError> {
 /// # Errors
 /// The system's error.
 pub fn free_mb(dir: &Path) -> io::Result<Option<u64>> {
-    let there = dir.ancestors().find(|dir| dir.is_dir()).unwrap_or(Path::new("."));
-    Ok(free_bytes(there)?.map(|bytes| bytes / 1_000_000))
+    Ok(free_bytes(existing(dir))?.map(|bytes| bytes / 1_000_000))
+}
+
+/// Creates a file in `dir`, or in the folder that `dir` would be created in, and removes it.
+///
+/// # Errors
+/// The system's error: nothing can be written there.
+pub fn try_to_write(dir: &Path) -> io::Result<()> {
+    let path = existing(dir).join(format!(".needle-bench-{}", std::process::id()));
+    File::create_new(&path)?;
+    fs::remove_file(&path)
+}
+
+/// `dir`, or the nearest folder above it that exists.
+fn existing(dir: &Path) -> &Path {
+    dir.ancestors().find(|dir| dir.is_dir()).unwrap_or(Path::new("."))
 }
 
 /// Free bytes for this user on the file system of `path`; `None` if it does not report them, like some network
@@ -253,6 +267,16 @@ mod tests {
         fs::write(&file, "").unwrap();
         let error = create(&file, 0, "x").unwrap_err().to_string();
         assert!(error.contains(file.to_str().unwrap()), "{error}");
+    }
+
+    #[test]
+    fn a_folder_that_cannot_be_written_is_found_without_a_trace() {
+        let scratch = Scratch::new("writable");
+        try_to_write(&scratch.0).unwrap();
+        try_to_write(&scratch.0.join("runs/today")).unwrap();
+        assert_eq!(fs::read_dir(&scratch.0).unwrap().count(), 0);
+        // No user can create a file there, not even root.
+        assert!(try_to_write(Path::new("/proc/runs")).is_err());
     }
 
     #[test]

@@ -29,7 +29,7 @@ mod vitals;
 mod worker;
 
 pub use error::TelemetryError;
-pub use folder::{check_room, free_mb, is_being_written, lock, write_manifest};
+pub use folder::{check_room, free_mb, is_being_written, lock, try_to_write, write_manifest};
 pub use recorder::{Finished, Recorder};
 pub use recording::Recording;
 pub use repair::{Repaired, note_recording, repair};
