@@ -129,10 +129,13 @@ pub(super) fn replay_run(path: &Path) -> Result<ReplayedRun, Failure> {
     let recorded =
         Recorded { manifest: folder.manifest(), run_config, open: &|name| folder.lines(name) };
     let (mut stage, mut samples) = (Vec::new(), Vec::new());
-    let replayed = replay_to(&recorded, None, &mut |record, _| match record {
-        Record::Stage(feedback) => stage.push((feedback.time, feedback.measured)),
-        Record::Sample(sample) => samples.push(sample),
-        _ => {}
+    let replayed = replay_to(&recorded, None, &mut |record, _| {
+        match record {
+            Record::Stage(feedback) => stage.push((feedback.time, feedback.measured)),
+            Record::Sample(sample) => samples.push(sample),
+            _ => {}
+        }
+        Ok(())
     });
     match replayed.map_err(|error| Failure::bad_input(path, error))?.difference {
         Some(difference) => {
@@ -175,11 +178,11 @@ pub(super) struct Insertion {
     /// The text that it was read from.
     pub(super) text: String,
     pub(super) recording: Recording,
+    /// The record of a rehearsal, on emulated drives with an emulated tracker.
+    pub(super) is_rehearsal: bool,
 }
 
 impl Insertions {
-    /// The record of a rehearsal, on emulated drives with an emulated tracker.
-    pub(super) is_rehearsal: bool,
     /// Reads the configuration, with the key `extra_key` over it, and the insertions. Refuses an insertion that is
     /// named twice.
     pub(super) fn read(

@@ -95,7 +95,7 @@ pub fn replay(
     what_if: Option<ObserverConfig>,
 ) -> Result<Replayed, String> {
     match recorded.manifest.dropped.unwrap_or_default().text_files {
-        0 => replay_to(recorded, what_if, &mut |_, _| {}),
+        0 => replay_to(recorded, what_if, &mut |_, _| Ok(())),
         dropped => Err(format!(
             "{dropped} records were dropped while this run was recorded (manifest.json, \
              dropped.text_files): so inputs of the session may be missing, and no replay can be \
@@ -104,14 +104,14 @@ pub fn replay(
     }
 }
 
-/// Takes a record of the replayed session; that of a step comes with the recorded truth.
-type TakeRecord<'a> = &'a mut dyn FnMut(Record, Option<Truth>);
+/// Takes a record of the replayed session; that of a step comes with the recorded truth. An error ends the replay.
+type TakeRecord<'a> = &'a mut dyn FnMut(Record, Option<Truth>) -> Result<(), String>;
 
 /// Like [`replay`], but accepts dropped records, and passes every record of the session to `take`, up to the
 /// first difference. After a dropped record the replay equals the run only up to there.
 ///
 /// # Errors
-/// The session refuses its configuration, or the files do not belong together.
+/// The session refuses its configuration, the files do not belong together, or `take` fails.
 pub fn replay_to(
     recorded: &Recorded<'_>,
     what_if: Option<ObserverConfig>,
@@ -204,10 +204,10 @@ impl Replay<'_> {
             Record::Step(step) => self.step(step.as_ref().clone())?,
             _ => None,
         };
-        if self.comparison.difference.is_none() {
-            (self.take)(record, truth);
+        match self.comparison.difference {
+            None => (self.take)(record, truth),
+            Some(_) => Ok(()),
         }
-        Ok(())
     }
 
     /// Compares `step` and adds its row and figures; returns the recorded truth at it.

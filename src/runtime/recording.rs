@@ -135,6 +135,8 @@ fn make_from_text_files(
                 log.text_until(time);
                 log.take(time, Entry { record, truth });
             }
+            // After a failed write the rest of the replay would take its time for nothing.
+            log.failed.as_ref().map_or(Ok(()), |error| Err(error.to_string()))
         });
         difference = match replayed {
             Ok(replayed) => replayed.difference,
@@ -174,7 +176,7 @@ impl Log<'_> {
         loop {
             let events_first = self.events.next_time() <= self.frames.next_time();
             let earlier = if events_first { &mut self.events } else { &mut self.frames };
-            if earlier.next_time() > time {
+            if earlier.next_time() > time || self.failed.is_some() {
                 return;
             }
             let Some((time, record)) = earlier.take_next() else { return };

@@ -9,7 +9,7 @@ use crate::support::recorded;
 use needle_bench::archive::{Lines, Manifest, file};
 use needle_bench::config::{Config, Source};
 use needle_bench::operation::RunConfig;
-use needle_bench::replay::{Recorded, Replayed, replay};
+use needle_bench::replay::{Recorded, Replayed, replay, replay_to};
 use needle_bench::session::{ObserverConfig, SessionConfig};
 use needle_bench::telemetry::RunFolder;
 use std::io::Cursor;
@@ -177,6 +177,13 @@ impl Run {
     }
 
     fn asked(&self, what_if: Option<ObserverConfig>) -> Result<Replayed, String> {
+        self.with(|recorded| replay(recorded, what_if))
+    }
+
+    fn with(
+        &self,
+        replay: impl FnOnce(&Recorded<'_>) -> Result<Replayed, String>,
+    ) -> Result<Replayed, String> {
         let open = |name: &str| {
             let text = match name {
                 file::INPUTS => &self.inputs,
@@ -187,7 +194,7 @@ impl Run {
             Ok(Lines::new(Cursor::new(text.clone())))
         };
         let run_config = RunConfig::from(self.session.clone());
-        replay(&Recorded { manifest: &self.manifest, run_config, open: &open }, what_if)
+        replay(&Recorded { manifest: &self.manifest, run_config, open: &open })
     }
 
     fn replay(&self) -> Result<Replayed, String> {
@@ -221,6 +228,18 @@ fn a_run_whose_bus_never_comes_back_replays() {
         let said = replayed(&scratch, &run, &[]);
         assert_eq!(said.status, 0, "{kind}: {} {}", said.stdout, said.stderr);
     }
+}
+
+/// As where the disk is full: nothing more would be kept of a replay that goes on.
+#[test]
+fn a_replay_whose_records_cannot_be_taken_ends() {
+    let mut taken = 0;
+    let mut take = |_, _| {
+        taken += 1;
+        if taken < 3 { Ok(()) } else { Err("no space left".to_owned()) }
+    };
+    let ended = Run::load("default").with(|recorded| replay_to(recorded, None, &mut take));
+    assert_eq!((ended.expect_err("it ends"), taken), ("no space left".to_owned(), 3));
 }
 
 #[test]
