@@ -237,6 +237,13 @@ fn without_its_configuration_a_run_is_shown_without_limits() {
         &json["warnings"].to_string(),
         &["config.toml is missing", "the limits are unknown"],
     );
+    assert_all(&json["error"].to_string(), &[&dir, "config.toml is gone"]);
+    let other = run(&scratch, &[]);
+    let compared = review(&scratch, &[&other, &dir, "--json"]);
+    assert_eq!(compared.status, 2);
+    assert_eq!(compared.json()["error"], json["error"]);
+    let whole = review(&scratch, &[&other, "--json"]);
+    assert_eq!((whole.status, whole.json().get("error")), (0, None));
 }
 
 fn copy_folder(from: &Path, to: &Path) {
@@ -273,6 +280,9 @@ fn a_file_that_is_not_our_report_is_not_overwritten() {
     let said = review(&scratch, &[&dir]);
     assert_eq!((said.status, said.stdout.lines().last()), (3, Some("completed")));
     assert_all(&said.stderr, &["report.html: exists and is not a report of this program"]);
+    let json = review(&scratch, &[&dir, "--json"]).json();
+    assert_all(&json["error"].to_string(), &["exists and is not a report of this program"]);
+    assert_eq!((&json["report"], &json["outcome"]), (&Value::Null, &"completed".into()));
     assert_eq!(fs::read_to_string(&report).expect("notes"), "<p>my notes</p>");
     fs::remove_file(&report).expect("removed");
     for _ in 0..2 {

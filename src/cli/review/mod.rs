@@ -4,7 +4,7 @@ mod read;
 
 use super::output::{print_result, print_stderr};
 use super::records::{RUNS, describe, newest_first, open};
-use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure, finish_with};
+use super::{Failure, finish_with};
 use crate::archive::{Verdict, VerdictKind, file};
 use crate::review::{
     Campaign, Comparison, Condition, Folder, GENERATOR, Run, html, to_json, to_text,
@@ -14,7 +14,8 @@ use crate::telemetry::{RunFolder, is_being_written, lock, repair, utc_text, writ
 use crate::text::escaped;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
-use serde_json::json;
+use minijinja::Error as TemplateError;
+use serde_json::{Value, json};
 use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
@@ -93,8 +94,8 @@ pub(super) fn review(arguments: &Arguments) -> Result<(), Failure> {
         [a, b] => {
             let (a, b) = (read::run(a)?, read::run(b)?);
             let comparison = Comparison::of(&a, &b);
-            print_result(arguments.json, &comparison.to_json(), || comparison.to_text())?;
-            check_unchanged(&[&a, &b])
+            let edited = edited(&a).or_else(|| edited(&b));
+            print_with(edited, arguments.json, comparison.to_json(), || comparison.to_text())
         }
         paths => {
             let lines = paths.iter().map(|path| read::campaign_lines(path));
@@ -123,19 +124,29 @@ fn review_one(path: &Path, arguments: &Arguments) -> Result<(), Failure> {
         let hint = "--html FILE writes it to a new file, --no-html leaves it out";
         written.map(|()| path.to_string()).map_err(|error| format!("{path}: {error}; {hint}"))
     });
-    let report = page_written.as_ref().and_then(|written| written.as_deref().ok());
+    let (report, failure) = match page_written.transpose() {
+        Err(error) => (None, Some(Failure::environment(error))),
+        Ok(report) if arguments.open => (report, open_viewer(path).err()),
+        Ok(report) => (report, None),
+    };
     let mut object = to_json(&run);
     object["report"] = json!(report);
-    print_result(arguments.json, &object, || to_text(&run, report))?;
-    match page_written {
-        // The summary is printed; the error follows it.
-        Some(Err(error)) => {
-            print_stderr(format_args!("error: {error}"));
-            finish_with(ENVIRONMENT_FAILED)
-        }
-        _ if arguments.open => open_viewer(path).and_then(|()| check_unchanged(&[&run])),
-        _ => check_unchanged(&[&run]),
-    }
+    let failure = failure.or_else(|| edited(&run));
+    print_with(failure, arguments.json, object, || to_text(&run, report.as_deref()))
+}
+
+/// Prints the result of a review; a `failure` is in its object, follows its text, and gives the exit status.
+fn print_with(
+    failure: Option<Failure>,
+    json: bool,
+    mut object: Value,
+    text: impl FnOnce() -> Result<String, TemplateError>,
+) -> Result<(), Failure> {
+    let Some(failure) = failure else { return print_result(json, &object, text) };
+    object["error"] = json!(failure.to_string());
+    print_result(json, &object, text)?;
+    print_stderr(format_args!("error: {failure}"));
+    finish_with(failure.status)
 }
 
 /// Starts the viewer with the recording of the run in `path`, without waiting for it to end.
@@ -173,10 +184,10 @@ fn write_report(path: &Path, page: &str) -> io::Result<()> {
     })
 }
 
-/// The exit status of a review: an edited record is bad input, since it is not what the run recorded.
-fn check_unchanged(runs: &[&Run]) -> Result<(), Failure> {
-    let is_edited = |run: &&Run| matches!(run.folder.condition, Condition::Changed(_));
-    finish_with(if runs.iter().any(is_edited) { BAD_CONFIGURATION } else { 0 })
+/// The failure of the review of an edited record: it is bad input, since it is not what the run recorded.
+fn edited(Run { folder, .. }: &Run) -> Option<Failure> {
+    let Condition::Changed(what) = &folder.condition else { return None };
+    Some(Failure::bad_input(folder.dir.as_ref(), what))
 }
 
 /// A parser of a verdict's name, for clap.
