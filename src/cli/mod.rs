@@ -151,8 +151,7 @@ impl From<TelemetryError> for Failure {
         use TelemetryError::{File, NotARun, Record};
         match &error {
             NotARun { .. } => Failure::configuration(format_args!(
-                "{error}; name a run's own folder (in record.dir: <UTC>-<name>), or one with such \
-                 folders in it"
+                "{error}; name a run's own folder (in record.dir: <UTC>-<name>)"
             )),
             File { source, .. } if source.kind() == ErrorKind::NotFound => {
                 Failure::configuration(error)

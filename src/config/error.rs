@@ -1,5 +1,6 @@
 //! The errors of a configuration, one line for each, and hints for unknown keys.
 
+use std::collections::BTreeSet;
 use std::fmt;
 
 use super::value::Origin;
@@ -68,7 +69,7 @@ const SIMILARITY_MIN: f64 = 0.55;
 /// Length of a list of keys, characters.
 const LISTED_MAX: usize = 110;
 
-/// A hint for the unknown `key`: the nearest of the known `keys`, or those of its section.
+/// A hint for the unknown `key`: the nearest of the known `keys`, or the keys and sections of its section.
 pub fn nearest_key<'a>(key: &str, keys: impl Iterator<Item = &'a str> + Clone) -> String {
     let rated = keys.clone().map(|known| (similarity(key, known), known));
     if let Some((similarity, known)) = rated.max_by(|a, b| a.0.total_cmp(&b.0))
@@ -77,8 +78,12 @@ pub fn nearest_key<'a>(key: &str, keys: impl Iterator<Item = &'a str> + Clone) -
         return format!("did you mean \"{known}\"?");
     }
     let (section, _) = split(key);
-    let siblings: Vec<&str> =
-        keys.map(split).filter(|(of, _)| *of == section).map(|(_, name)| name).collect();
+    let below = |known: &'a str| match section {
+        "" => Some(known),
+        _ => known.strip_prefix(section)?.strip_prefix('.'),
+    };
+    let names = keys.filter_map(below).map(|path| path.split('.').next().unwrap_or(path));
+    let siblings: Vec<&str> = names.collect::<BTreeSet<_>>().into_iter().collect();
     match (siblings.is_empty(), section) {
         (true, _) => "no known key is like it".to_owned(),
         (false, "") => format!("known are {}", listed(&siblings)),

@@ -197,6 +197,7 @@ fn a_flag_that_does_not_apply_is_refused() {
         &["review", "runs", "--html", "x.html"],
         &["review", dir, "--repair", "--html", "x.html"],
         &["review", "runs", "--by", "needle.radius"],
+        &["review", "runs", "--by", "nosuch"],
     ];
     insta::assert_snapshot!(refusals(&scratch, commands));
     assert!(!scratch.path().join("x.html").exists());
