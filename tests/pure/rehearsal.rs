@@ -2,6 +2,8 @@
 
 use crate::support::program::{Said, Scratch, needle_bench, repository};
 use crate::support::protocol;
+use needle_bench::archive::Manifest;
+use needle_bench::telemetry::{RunFolder, write_manifest};
 use std::fs;
 
 /// What an operator measures: a tracker that is turned and far away, a sensor off the needle's axis, objects of
@@ -262,19 +264,20 @@ fn a_rehearsal_calibrates_nothing() {
 #[test]
 fn rehearsed_runs_calibrate_the_needle_and_the_file_is_used() {
     let scratch = Scratch::new();
-    let rig = fs::read_to_string(repository("bench-config/rig-epos4.toml")).unwrap();
     let needle = ["emulator.curvature_per_mm=0.0095", "emulator.noise={ sd_mm = 0.05 }"];
     let sensor = "tracker.tip_offset_mm=[0.5, 0.0, 0.0]";
     let mut runs = Vec::new();
     for start in ["1.0", "-0.5", "0.4"] {
         let start = format!("emulator.start.x_mm={start}");
-        let depth = "insertion.depth_mm=50";
-        let sets =
-            [&needle[..], &[sensor, &start, depth, "tracker.gates.noise_sd_mm=0.1"]].concat();
-        let sets: Vec<&str> = sets.into_iter().flat_map(|set| ["--set", set]).collect();
-        let said = needle_bench(&scratch, &[&["run", "--json", "-q"], &sets[..]].concat());
+        let sets = [&needle[..], &[sensor, &start, "tracker.gates.noise_sd_mm=0.1"]].concat();
+        let said = rehearse(&scratch, &["run", "--rehearse", "--json", "-q"], &sets);
         assert_eq!(said.status, 0, "{}", said.screen());
-        runs.push(said.json()["run_dir"].as_str().unwrap().to_owned());
+        let run = said.json()["run_dir"].as_str().unwrap().to_owned();
+        // As the record of a run on the rig: that of a rehearsal is refused.
+        let dir = scratch.path().join(&run);
+        let manifest = RunFolder::open(&dir).unwrap().manifest().clone();
+        write_manifest(&dir, &Manifest { rehearsal: None, ..manifest }).unwrap();
+        runs.push(run);
     }
     let runs: Vec<&str> = runs.iter().map(String::as_str).collect();
     let out = ["--json", "--out", "needle.toml"];
@@ -282,6 +285,7 @@ fn rehearsed_runs_calibrate_the_needle_and_the_file_is_used() {
     assert_eq!(found.status, 0, "{}", found.screen());
     let curvature = found.json()["needle"]["curvature_per_mm"].as_f64().unwrap();
     assert!((curvature - 0.0095).abs() < 5e-4, "{curvature}");
+    let rig = fs::read_to_string(repository("bench-config/rig-epos4.toml")).unwrap();
     let both = rig.replace("[needle]\n", "[needle]\nneedle_file = \"needle.toml\"\n");
     scratch.write("both.toml", &both);
     let named = both.lines().filter(|line| !line.starts_with("radius_mm")).collect::<Vec<_>>();
