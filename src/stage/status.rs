@@ -68,7 +68,7 @@ impl StatusReader {
         let status = self.outcome(axis).unwrap_or_else(interrupted);
         match (status, nmt_state) {
             (Err(_), Some(NmtState::Stopped)) => Err(format!(
-                "{axis}: the node is in NMT stopped, where it answers no SDO; needle-bench stage stop \
+                "{axis}: the node is in NMT stopped, where it answers no SDO; needle-bench stop CONFIG \
                  leads it to Pre-operational"
             )),
             (status, nmt_state) => Ok(AxisStatus { nmt_state, ..status? }),
