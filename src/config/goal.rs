@@ -31,8 +31,8 @@ section! {
         tolerance_mm: f64 [over(0.0, 100.0)] = 1.0;
         /// The path stays in the plane x = 0, where the control law keeps the needle.
         in_plane: bool = true;
-        /// How near the path may come to an obstacle, mm.
-        clearance_mm: f64 [within(0.1, 100.0)] = 2.0;
+        /// How near the path may come to an obstacle, mm. With obstacles at least 0.1.
+        clearance_mm: f64 [within(0.0, 100.0)] = 2.0;
         /// Additional clearance of the path with which a run begins, mm. With less, the tracker's noise or a
         /// turn of the needle may leave no path.
         reserve_mm: f64 [within(0.0, 100.0)] = 0.5;
@@ -285,6 +285,9 @@ impl Config {
     }
 }
 
+/// A path is tested at points this far apart, mm, so with half of it a path could lead through a thin obstacle.
+const CLEARANCE_MIN_MM: f64 = 0.1;
+
 /// Reports contradictions in `[goal]`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
     let goal = &config.goal;
@@ -310,6 +313,14 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
             format!("{key} has no effect, since {kind} is \"plane\": set {kind} = \"target\"")
         });
     }
+    let (clearance, clearance_mm) = ("goal.clearance_mm", goal.clearance_mm);
+    let is_too_near = !goal.obstacle.is_empty() && clearance_mm < CLEARANCE_MIN_MM;
+    reader.refuse_if(&[clearance, obstacle], is_too_near, || {
+        format!(
+            "{clearance} is {clearance_mm}, allowed with obstacles: at least {CLEARANCE_MIN_MM}; with less \
+             a path may lead through a thin obstacle"
+        )
+    });
     let is_tip = goal.tool.as_ref() == Some(&config.tracker.tool);
     reader.refuse_if(&[tool, "tracker.tool"], is_tip, || {
         format!("{tool} is tracker.tool, the needle's tip: name the target's own tool")

@@ -30,7 +30,8 @@ pub struct NoRoomyPath {
 }
 
 /// Plans the path with which a run begins, with as much of the reserve as possible, but no less than `least_mm`.
-/// `shortest` is the answer to `problem`; without a path in it, none is looked for. Each try may spend `problem.expansions_max`.
+/// `shortest` is the answer to `problem`; without a path in it, none is looked for. Each try may spend
+/// `problem.expansions_max`.
 ///
 /// # Errors
 /// [`NoRoomyPath`].

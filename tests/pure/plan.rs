@@ -163,6 +163,7 @@ fn contradictory_goals_are_refused_with_the_key() {
     let scratch = Scratch::new();
     let target = "[goal]\nkind = \"target\"\nposition_mm = [0, 0, 100]\n";
     let obstacle = |text: &str| format!("{target}[[goal.obstacle]]\n{text}\n");
+    let ball = "shape = \"sphere\"\ncentre_mm = [0, 20, 50]\nradius_mm = 5";
     let texts = [
         "[goal]\nkind = \"target\"\n".to_owned(),
         "[goal]\nposition_mm = [0, 0, 100]\n".to_owned(),
@@ -170,7 +171,7 @@ fn contradictory_goals_are_refused_with_the_key() {
         "[goal]\nkind = \"target\"\nposition_mm = [3, 0, 100]\n".to_owned(),
         "[goal]\nkind = \"target\"\nposition_mm = [0, 0, 160]\n".to_owned(),
         "[goal]\nkind = \"target\"\nposition_mm = [0, 0, 100]\nexpansions_max = 0\n".to_owned(),
-        format!("{target}clearance_mm = 0\n"),
+        format!("{target}clearance_mm = 0.09\n[[goal.obstacle]]\n{ball}\n"),
         format!("{target}workspace_mm = {{ min = [0, 0, 0], max = [1, 0, 1] }}\n"),
         format!("{target}workspace_mm = {{ min = [1, 0, 0], max = [2, 1, 1] }}\n"),
         obstacle("shape = \"ball\""),
