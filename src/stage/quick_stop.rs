@@ -99,22 +99,28 @@ impl AxisStop {
     /// Waits until the axis has left Operation Enabled and stands; returns its position, counts. `command` is
     /// given again whenever the axis was not seen to obey it.
     async fn come_to_stand(&mut self, command: Option<Controlword>) -> Result<i32, String> {
-        let node = self.sdo.node();
         let mut obeys = false;
         loop {
-            if let Some(word) = command.filter(|_| !obeys) {
-                self.command(word).await?;
+            let mut trouble = None;
+            // Another master may enable a drive again after the command.
+            if command.is_some() || !obeys {
+                if let Some(word) = command.filter(|_| !obeys) {
+                    self.command(word).await?;
+                }
+                trouble = self.disobedience().await;
+                obeys = trouble.is_none();
             }
-            let word = self.statusword().await;
-            obeys =
-                word.as_ref().is_ok_and(|word| word.state() != Some(DriveState::OperationEnabled));
-            let trouble = match word {
-                Err(error) => error,
-                Ok(word) if !obeys => format!("node {node} stays in operation enabled ({word})"),
-                Ok(_) => match self.read_position().await {
+            let trouble = match trouble {
+                Some(trouble) => trouble,
+                None => match self.read_position().await {
                     Err(error) => error,
                     Ok(counts) if self.standstill.stands() => return Ok(counts),
-                    Ok(counts) => format!("node {node} was not seen to stand, at {counts} counts"),
+                    Ok(counts) => {
+                        format!(
+                            "node {} was not seen to stand, at {counts} counts",
+                            self.sdo.node()
+                        )
+                    }
                 },
             };
             self.wait_to_read_again(trouble).await?;
@@ -123,6 +129,17 @@ impl AxisStop {
                 // Another master may have started the node again. In Stopped a node answers no SDO.
                 self.sdo.leave_operational();
             }
+        }
+    }
+
+    /// Why the axis is not known to have left Operation Enabled; `None` if it has.
+    async fn disobedience(&mut self) -> Option<String> {
+        match self.statusword().await {
+            Err(error) => Some(error),
+            Ok(word) if word.state() == Some(DriveState::OperationEnabled) => {
+                Some(format!("node {} stays in operation enabled ({word})", self.sdo.node()))
+            }
+            Ok(_) => None,
         }
     }
 

@@ -436,7 +436,7 @@ fn a_run_on_hardware_without_a_terminal_needs_yes_and_a_preflight_that_passes() 
     let said = needle_bench(&scratch, &[&["run", &rig][..], &sets].concat());
     assert_eq!((said.status, said.stdout.as_str()), (2, ""));
     assert!(
-        said.stderr.ends_with("`needle-bench check --connect`, then give --yes\n"),
+        said.stderr.ends_with("`needle-bench check CONFIG --connect`, then give --yes\n"),
         "{}",
         said.stderr
     );
