@@ -31,7 +31,8 @@ fn an_offset_is_learnt_within_200_ms() {
 /// Stamps that are stuck, that alternate, and of a clock that runs backward.
 #[test]
 fn stamps_that_are_no_clock_are_named_while_learning() {
-    let cases: [(fn(i64) -> i64, &str); 3] = [
+    type StampMs = fn(i64) -> i64;
+    let cases: [(StampMs, &str); 3] = [
         (|_| 7000, "duplicate: sent twice (stamp 7000000000 ns)"),
         (|n| 7000 - 25 * n, "stamp: went back by 0.025 s; was the sender's clock set?"),
         (|n| 7000 + 100 * (n % 2), "stamp: went back by 0.100 s; was the sender's clock set?"),
