@@ -127,7 +127,7 @@ impl Table {
     /// Some of the columns or rows without the others, a field that is not a finite number, or a quaternion that
     /// cannot be normalised.
     pub fn rotations(&self) -> Result<Vec<Option<Rotation3<f64>>>, TableError> {
-        if !QUATERNION.iter().any(|name| self.column(name).is_ok()) {
+        if !self.header.iter().any(|name| QUATERNION.contains(&name)) {
             return Ok(vec![None; self.rows.len()]);
         }
         let columns = self.columns_of(QUATERNION)?;
@@ -243,6 +243,8 @@ mod tests {
         assert_eq!(rotations("a\n1\n"), Ok(vec![None]));
         assert_eq!(rotations("qw,qx,qy,qz\n2,0,0,0\n"), Ok(vec![Some(Rotation3::identity())]));
         assert_eq!(rotations("qw,qx,qy,qz\n,,,\n"), Ok(vec![None]));
+        let twice = format!("{0},{0}\n1,0,0,0,1,0,0,0\n", QUATERNION.join(","));
+        assert_eq!(rotations(&twice).unwrap_err(), "line 1: column \"qw\" twice");
         assert!(rotations("qw,qx\n").unwrap_err().contains("no column \"qy\""));
         let message = rotations("qw,qx,qy,qz\n1,0,0,0\n,,,\n").unwrap_err();
         let expected = "line 3: no orientation (qw,qx,qy,qz), but other rows have one";

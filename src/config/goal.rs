@@ -298,8 +298,8 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     });
     let [tool, obstacle] = ["goal.tool", "goal.obstacle"];
     // A printed configuration has the default.
-    let mut defaults = GoalConfig::KEYS.iter().filter(|key| key.name == "workspace_mm");
-    let default = defaults.next().and_then(Key::default_value);
+    let default = GoalConfig::KEYS.iter().find(|key| key.name == "workspace_mm");
+    let default = default.and_then(Key::default_value);
     let given = [
         (position, goal.position_mm.is_some()),
         (tool, goal.tool.is_some()),

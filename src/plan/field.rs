@@ -7,8 +7,8 @@ use nalgebra::Vector3;
 use std::borrow::Cow;
 
 /// The shortest step along an arc when it is tested against the obstacles, mm. Between two tests a path may come
-/// nearer to an obstacle than a clearance of 1 mm by 0.0013 mm, and than one of 0.1 mm, the least that can be
-/// configured, by 0.0134 mm. With less than half a step it could lead through a thin obstacle.
+/// nearer to an obstacle than a clearance of 1 mm by 0.0013 mm, and than one of 0.1 mm, the least that is
+/// allowed with obstacles, by 0.0134 mm. With less than half a step it could lead through a thin obstacle.
 const TEST_STEP_MM: f64 = 0.1;
 /// An arc longer than this, mm, is first tested at a few points, at these fractions of its length.
 const FEW_POINTS_MM: f64 = 5.0;

@@ -268,7 +268,7 @@ impl<T> ScriptRunner<T> {
         self.outcome.as_ref()
     }
 
-    /// What the script talks by.
+    /// The script's access to its drive.
     pub(super) fn sdo(&self) -> &Sdo {
         &self.sdo
     }

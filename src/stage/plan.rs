@@ -128,13 +128,17 @@ impl Script {
         }
         let mut fault = FoundFault { statusword, error_code: None };
         self.note(|state| state.found_in_fault = Some(fault));
-        // A drive refuses to read an error history that is empty.
-        let error_code = self.sdo.read_optional(drive::ERROR_CODE).await?;
+        // A fault is reset only if its code can be read, unless the drive has no codes.
+        let error_code = match self.config.power.fault_reset_on_start {
+            true => self.read(optional(drive::ERROR_CODE)).await?,
+            false => self.sdo.read_optional(drive::ERROR_CODE).await?,
+        };
         fault.error_code = error_code.map(|code| EmcyCode(code.to_u32() as u16));
         self.note(|state| state.found_in_fault = Some(fault));
         if self.config.power.fault_reset_on_start {
             return Ok(());
         }
+        // A drive refuses to read an error history that is empty.
         let history = self.sdo.read_optional(error_history(1)).await?.map(SdoValue::to_u32);
         let error_code = fault.error_code.map_or("absent".to_owned(), |code| code.to_string());
         let history = history.map_or("empty".to_owned(), |error| format!("{error:#010X}"));

@@ -2,8 +2,8 @@
 //!
 //! Both nodes leave Operational first, so that no master's PDO can cancel the stop. Then both drives are
 //! commanded to quick stop by SDO. Their identities are not checked: any node with these numbers must stop. At
-//! the end power is taken off, whatever a drive reports, and even if it reports nothing. A command that is not
-//! obeyed is repeated, and so is one whose effect cannot be read.
+//! the end power is taken off, whatever a drive reports, and even if it reports nothing. A command is repeated if
+//! the drive does not obey it, and if its effect cannot be read.
 //!
 //! [`QuickStop::watch`] reads the same objects and writes nothing: it shows whether drives stop by themselves. It
 //! only leads a node out of NMT Stopped, where it could not be read.

@@ -177,7 +177,7 @@ pub fn free_mb(dir: &Path) -> io::Result<Option<u64>> {
 /// The system's error: nothing can be written there.
 pub fn try_to_write(dir: &Path) -> io::Result<()> {
     let path = existing(dir).join(format!(".needle-bench-{}", std::process::id()));
-    File::create_new(&path)?;
+    File::create(&path)?;
     fs::remove_file(&path)
 }
 

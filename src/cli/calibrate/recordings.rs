@@ -223,7 +223,8 @@ pub(super) fn record_turn(
     configured: &Configured,
     rehearse: bool,
 ) -> Result<(String, f64), Failure> {
-    refuse_existing(Some(path))?;
+    // A rehearsal does not write it.
+    refuse_existing(Some(path).filter(|_| !rehearse))?;
     let configured = configured.clone().rehearsed(rehearse);
     let (config, _) = load_stage(configured, rehearse, sensor_off_axis)?;
     let (mut rows, mut has_orientation) = (Vec::new(), true);

@@ -24,7 +24,6 @@ pub(in crate::cli) struct WatchArguments {
 }
 
 /// The tool's samples, each judged by itself as in a run.
-#[derive(Clone)]
 struct Watch {
     gate: Gate,
     /// The frame of the positions.
@@ -195,6 +194,19 @@ pub(super) mod tests {
         assert!(why.contains("to the bit, 3 in a row"), "{why}");
     }
 
+    /// A recording is over at once.
+    #[test]
+    fn a_rate_is_given_only_over_enough_time() {
+        let tracker = Config::from_sources(&[], &[]).unwrap().tracker;
+        for (seconds, rate) in [(1.0, "  1.0 Hz  age"), (1e-4, "  1 positions  age")] {
+            let mut watch = Watch::new(&tracker);
+            watch.gate = tracker.to_unregistered_gate();
+            watch.take(&Event::Sample(sample(&tracker.tool)));
+            let line = watch.position_line(Time::from_nanos(5), seconds).expect("a position");
+            assert!(line.contains(rate), "{line}");
+        }
+    }
+
     #[test]
     fn a_message_that_cannot_be_read_is_shown_beside_a_position() {
         let tracker = Config::from_sources(&[], &[]).unwrap().tracker;
@@ -202,11 +214,7 @@ pub(super) mod tests {
         watch.gate = tracker.to_unregistered_gate();
         watch.take(&Event::Sample(sample(&tracker.tool)));
         watch.take(&Event::Malformed("line 2: garbage".to_owned()));
-        let mut at_once = watch.clone();
-        let line = at_once.position_line(Time::from_nanos(5), 1e-4).expect("a position was seen");
-        assert!(line.contains("  1 positions  age"), "{line}");
         let line = watch.position_line(Time::from_nanos(5), 1.0).expect("a position was seen");
-        assert!(line.contains("  1.0 Hz  age"), "{line}");
         let end =
             "1 accepted, 0 refused, 1 not readable; a message cannot be read: line 2: garbage";
         assert!(line.ends_with(end), "{line}");

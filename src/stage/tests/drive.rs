@@ -32,6 +32,8 @@ pub(super) struct TestDrive {
     pub(super) off: bool,
     /// This many requests about this object get no answer.
     pub(super) mute: Option<(ObjectAddress, u32)>,
+    /// Reads of this object are refused.
+    pub(super) refused: Option<(ObjectAddress, AbortCode)>,
     /// Whether an object was written while the motor had power.
     pub(super) configured_under_power: bool,
     /// Number of next TPDOs that are lost.
@@ -138,6 +140,7 @@ impl TestDrive {
             out: Vec::new(),
             off: false,
             mute: None,
+            refused: None,
             configured_under_power: false,
             tpdos_lost: 0,
             forgets: None,
@@ -322,6 +325,9 @@ impl TestDrive {
     }
 
     fn read(&self, object: ObjectAddress) -> Result<ServerFrame, (ObjectAddress, AbortCode)> {
+        if let Some(refused) = self.refused.filter(|(refused, _)| *refused == object) {
+            return Err(refused);
+        }
         let value = match object.index {
             0x6041 => self.statusword().0.into(),
             0x6061 => self.objects[&at(0x6060, 0)],

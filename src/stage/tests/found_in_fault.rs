@@ -4,6 +4,7 @@ use super::bring_up::fault_of;
 use super::*;
 use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::DriveState;
+use crate::canopen::sdo::AbortCode;
 
 #[test]
 fn a_drive_found_in_fault_is_named_or_reset_as_configured() {
@@ -129,4 +130,21 @@ fn a_fault_without_a_history_is_named() {
     bench.insertion.objects.remove(&ObjectAddress::new(0x1003, 1));
     let said = bench.until_fault();
     assert!(said.contains("drive found in fault") && said.contains("0x1003:01 empty"), "{said}");
+}
+
+/// Only a fault whose code is known may be reset without the operator.
+#[test]
+fn a_fault_whose_code_cannot_be_read_is_named_and_not_reset() {
+    let refused = Some((ObjectAddress::new(0x603f, 0), AbortCode::GENERAL));
+    for (config, expected) in [
+        (config(), "0x603F absent"),
+        (resetting_config(), "0x603F:00: reading was refused with SDO abort"),
+    ] {
+        let mut bench = Bench::new(config);
+        bench.insertion.state = DriveState::Fault;
+        bench.insertion.refused = refused;
+        let fault = bench.until_fault();
+        assert!(fault.contains(expected), "{fault}");
+        assert_eq!(bench.insertion.resets, 0);
+    }
 }

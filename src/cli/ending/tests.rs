@@ -1,0 +1,226 @@
+//! Tests of the last lines of a run.
+
+use super::*;
+use crate::archive::{Counts, Dropped};
+use crate::canopen::emcy::EmcyCode;
+use crate::cli::arguments::Configured;
+use crate::runtime::Holds;
+use crate::stage::{PerAxis, SetPoint};
+use crate::study::RunFigures;
+use crate::tracker::GateCounts;
+use crate::units::Time;
+use std::path::PathBuf;
+
+fn report(outcome: Outcome, faults: &[&str]) -> RunReport {
+    let run_dir = PathBuf::from("runs/a");
+    let finished = Finished {
+        run_dir: run_dir.clone(),
+        counts: Counts::default(),
+        dropped: Dropped::default(),
+        faults: faults.iter().map(|fault| (*fault).to_owned()).collect(),
+    };
+    RunReport {
+        outcome,
+        figures: RunFigures::default(),
+        stage_at_end: StageAtEnd::default(),
+        holds: Holds::default(),
+        gates: GateCounts::default(),
+        end: Time::ZERO,
+        timing: None,
+        run_dir,
+        record: Ok(finished),
+        emulated: None,
+    }
+}
+
+#[test]
+fn a_record_left_open_is_named_with_what_closes_it() {
+    let mut report = report(Outcome::Completed, &[]);
+    let source = std::io::ErrorKind::NotFound.into();
+    report.record = Err(TelemetryError::File { path: "runs/a/manifest.json".into(), source });
+    let text = ending(&Config::from_sources(&[], &[]).unwrap(), &report);
+    let lines: Vec<&str> = text.lines().collect();
+    assert!(lines[0].starts_with("record      runs/a, left open: "), "{text}");
+    assert!(lines[0].ends_with("; close it: needle-bench review runs/a --repair"), "{text}");
+    assert_eq!(lines[1], "completed");
+}
+
+/// With `record.on_failure = "stop"` a run without a complete record does not succeed.
+#[test]
+fn a_completed_run_without_its_record_is_a_failure() {
+    let mut config = Configured::default().load(None).unwrap();
+    let lost = ["recording: the disk took nothing for 5.0 s"];
+    assert_eq!(status(&config, &report(Outcome::Completed, &[])), 0);
+    assert_eq!(status(&config, &report(Outcome::Completed, &lost)), 3);
+    assert_eq!(status(&config, &report(Outcome::Stopped("tracker".to_owned()), &lost)), 1);
+    config.record.on_failure = OnFailure::GoOn;
+    assert_eq!(status(&config, &report(Outcome::Completed, &lost)), 0);
+}
+
+const RIG: &str = "rig.toml";
+
+fn config(sets: &[&str]) -> Config {
+    let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+    Configured::new(Some(Path::new("bench-config/vcan.toml")), sets).load(None).unwrap()
+}
+
+fn stopped(stage_at_end: StageAtEnd) -> RunReport {
+    let stopped = Outcome::Stopped("operator: interrupted".to_owned());
+    RunReport { stage_at_end, ..report(stopped, &[]) }
+}
+
+/// Both drives had power and stand at 5 mm and 90 degrees.
+fn stood() -> StageAtEnd {
+    at(5.0)
+}
+
+/// As [`stood`], at `insertion_mm`.
+fn at(insertion_mm: f64) -> StageAtEnd {
+    let off = DriveReport { state: Some(DriveState::SwitchOnDisabled), error: None };
+    let position = SetPoint { insertion_mm, rotation_rad: 90_f64.to_radians() };
+    let drives = PerAxis::from_fn(|_| off);
+    StageAtEnd { had_power: true, unknown: None, drives, position: Some(position) }
+}
+
+/// Like [`stood`], with the rotation drive in Fault.
+fn in_fault() -> StageAtEnd {
+    let mut stage = stood();
+    stage.drives.rotation =
+        DriveReport { state: Some(DriveState::Fault), error: Some(EmcyCode::HEARTBEAT) };
+    stage
+}
+
+#[test]
+fn a_needle_is_withdrawn_after_a_stop_as_after_a_completed_run() {
+    let real = config(&[]);
+    assert_eq!(
+        possible_withdrawal(&real, &stopped(stood())),
+        Ok(Withdrawal::from_depth(&real, 5.0))
+    );
+    let not_moved = possible_withdrawal(&real, &stopped(at(0.01))).unwrap_err();
+    assert_eq!(not_moved, "the needle is 0.0 mm in from where the run began");
+    let text = after_insertion(&real, Some(Path::new(RIG)), &stopped(stood())).unwrap();
+    assert!(
+        text.starts_with(
+            "needle      5.0 mm in from where the run began; both axes stand, power is off\n\
+             next        needle-bench stage withdraw rig.toml --by 5.0mm"
+        ),
+        "{text}"
+    );
+}
+
+/// The run may begin with the needle in, and may move it no further.
+#[test]
+fn the_depth_after_a_run_is_that_of_the_axis_not_the_travel_of_the_run() {
+    let real = config(&["stage.insertion.zero=0"]);
+    let said = |stage| {
+        let report = stopped(stage);
+        let lines = after_insertion(&real, Some(Path::new(RIG)), &report).unwrap();
+        (lines, possible_withdrawal(&real, &report).map(|withdrawal| withdrawal.to_string()))
+    };
+    let (lines, withdrawal) = said(StageAtEnd { had_power: false, ..at(10.0) });
+    let expected = "needle      10.0 mm in; no power was given\n\
+                    next        needle-bench stage withdraw rig.toml";
+    assert_eq!((&lines[..], withdrawal), (expected, Ok("to depth 0".to_owned())));
+    let (lines, withdrawal) = said(at(0.01));
+    assert!(lines.starts_with("needle      out, at 0.01 mm; "), "{lines}");
+    assert_eq!(withdrawal.unwrap_err(), "the needle is out, at 0.01 mm");
+    let (lines, withdrawal) = said(StageAtEnd::default());
+    let expected = "needle      its depth is not known; no power was given\n\
+                    next        needle-bench stage status rig.toml";
+    assert_eq!(lines, expected);
+    assert_eq!(withdrawal.unwrap_err(), "the needle's depth is not known; look at the stage");
+}
+
+/// A drive without power loses its position: after a restart it may report 0 with the needle in.
+#[test]
+fn a_position_of_less_than_was_inserted_is_no_depth() {
+    let real = config(&["stage.insertion.zero=0"]);
+    let mut restarted = stopped(at(0.0));
+    restarted.figures.take_scored(15.0, None, None);
+    let lines = after_insertion(&real, Some(Path::new(RIG)), &restarted).unwrap();
+    assert!(lines.starts_with("needle      its depth is not known; "), "{lines}");
+    assert!(lines.ends_with("stage status rig.toml"), "{lines}");
+    let why = possible_withdrawal(&real, &restarted).unwrap_err();
+    assert_eq!(why, "the needle's depth is not known; look at the stage");
+}
+
+#[test]
+fn drives_that_may_move_call_for_stage_status_first() {
+    let real = config(&[]);
+    let unknown = Some("the axes were not seen to stand");
+    let stopped = stopped(StageAtEnd { unknown, ..in_fault() });
+    let why = possible_withdrawal(&real, &stopped).unwrap_err();
+    assert_eq!(why, "the drives are not known to stand; look at the stage");
+    let path = Some(Path::new(RIG));
+    for text in [
+        after_insertion(&real, path, &stopped).unwrap(),
+        after_operation(&real, path, Some(""), &stopped).unwrap(),
+    ] {
+        assert!(text.contains("; the axes were not seen to stand; rotation is in"), "{text}");
+        assert!(text.ends_with("\nnext        needle-bench stage status rig.toml"), "{text}");
+    }
+}
+
+#[test]
+fn a_drive_in_fault_is_named_and_reset_first() {
+    let real = config(&[]);
+    let stopped = stopped(in_fault());
+    assert_eq!(
+        after_insertion(&real, Some(Path::new(RIG)), &stopped).unwrap(),
+        "needle      5.0 mm in from where the run began; both axes stand, power is off; rotation \
+         is in fault (0x8130 heartbeat or life guard lost)\n\
+         next        needle-bench stage reset rig.toml"
+    );
+    let why = possible_withdrawal(&real, &stopped).unwrap_err();
+    assert_eq!(why, "a drive is in fault: find why, then stage reset");
+    let resets = config(&["stage.fault_reset_on_start=true"]);
+    let text = after_insertion(&resets, Some(Path::new(RIG)), &stopped).unwrap();
+    assert!(text.contains("\nnext        needle-bench stage withdraw rig.toml --by 5"), "{text}");
+}
+
+#[test]
+fn an_operation_says_where_it_left_the_axes() {
+    let real = config(&[]);
+    let text = |report: &RunReport| after_operation(&real, Some(Path::new(RIG)), None, report);
+    assert_eq!(
+        text(&stopped(stood())).unwrap(),
+        "stage       insertion at 5.000 mm, rotation at 90.000 deg; both axes stand, power is \
+         off\nnext        needle-bench stage status rig.toml"
+    );
+    assert_eq!(
+        text(&stopped(StageAtEnd::default())).unwrap(),
+        "stage       not known where the axes stand; no power was given\n\
+         next        needle-bench stage status rig.toml"
+    );
+    let withdrawal = stopped(stood());
+    let rest =
+        after_operation(&real, Some(Path::new(RIG)), Some(" --by 5.0mm"), &withdrawal).unwrap();
+    assert!(
+        rest.ends_with("\nnext        needle-bench stage withdraw rig.toml --by 5.0mm"),
+        "{rest}"
+    );
+    let done = RunReport { outcome: Outcome::Completed, ..stopped(stood()) };
+    assert_eq!(text(&done), None);
+    let proved = RunReport { stage_at_end: in_fault(), ..done };
+    let next = "\nnext        needle-bench stage reset rig.toml";
+    assert!(text(&proved).unwrap().ends_with(next));
+}
+
+/// The limits of an axis that reads 0 at its start may not let it go back as far as the needle went in.
+#[test]
+fn the_suggested_withdrawal_is_within_the_limits() {
+    let options = |sets: &[&str]| {
+        let sets = sets.iter().map(|set| (*set).to_owned()).collect();
+        let config = Configured::new(None, sets).load(None).unwrap();
+        let withdrawal = Withdrawal::from_depth(&config, 12.96);
+        let allowed = withdrawal.configuration(config, &stopped(stood()));
+        assert_eq!(allowed.emulator.insertion_start_mm, 5.0, "where the stage stands");
+        assert!(allowed.stage.insertion.limits.min <= -13.0 || withdrawal.by_mm.is_none());
+        withdrawal.options()
+    };
+    assert_eq!(options(&[]), "");
+    let start = "stage.insertion.zero=\"start\"";
+    assert_eq!(options(&[start]), " --by 13.0mm --set stage.insertion.min_mm=-14.0");
+    assert_eq!(options(&[start, "stage.insertion.min_mm=-20"]), " --by 13.0mm");
+}
