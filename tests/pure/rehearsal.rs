@@ -190,6 +190,11 @@ fn a_turn_of_the_base_calibrates_the_tip() {
     assert!(!scratch.path().join("turn.csv").exists(), "its sensor is emulated");
     scratch.write("turn.csv", "of the rig");
     let said = needle_bench(&scratch, &named);
+    assert_eq!(said.status, 0, "{}", said.screen());
+    assert_eq!(fs::read_to_string(scratch.path().join("turn.csv")).unwrap(), "of the rig");
+    // On the rig the turn would overwrite it.
+    let rig: Vec<&str> = named.iter().copied().filter(|word| *word != "--rehearse").collect();
+    let said = needle_bench(&scratch, &rig);
     assert_eq!(said.status, 2, "{}", said.screen());
     assert!(said.stderr.contains("turn.csv: exists"), "{}", said.stderr);
     // A turn past a limit is refused and leaves no file.
