@@ -23,5 +23,5 @@ pub use obstacle::{Obstacle, Workspace, World};
 pub use path::Path;
 pub use reach::{Reach, reach_around};
 pub use replanner::{Replanner, Steer, Step, StopReason, TipEstimate};
-pub use reserve::{NoRoomyPath, RoomyPath, plan_with_reserve};
+pub use reserve::{RoomyPath, plan_with_reserve};
 pub use search::{Answer, Problem, Status, plan};

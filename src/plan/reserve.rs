@@ -20,30 +20,20 @@ pub struct RoomyPath {
     pub reserve_mm: f64,
 }
 
-/// Why a run has no path to begin with.
-#[derive(Debug, Clone, PartialEq)]
-pub struct NoRoomyPath {
-    /// [`Status::Budget`] if more expansions may find one, else [`Status::None`].
-    pub status: Status,
-    /// The reason in words.
-    pub reason: String,
-}
-
 /// Plans the path with which a run begins, with as much of the reserve as possible, but no less than `least_mm`.
 /// `shortest` is the answer to `problem`; without a path in it, none is looked for. Each try may spend
 /// `problem.expansions_max`.
 ///
 /// # Errors
-/// [`NoRoomyPath`].
+/// Why a run has no path to begin with, in words.
 pub fn plan_with_reserve(
     world: &World,
     problem: &Problem,
     least_mm: f64,
     shortest: &Answer,
-) -> Result<RoomyPath, NoRoomyPath> {
+) -> Result<RoomyPath, String> {
     let Some(path) = shortest.path.clone() else {
-        let reason = shortest.reason.clone().unwrap_or_default();
-        return Err(NoRoomyPath { status: shortest.status, reason });
+        return Err(shortest.reason.clone().unwrap_or_default());
     };
     let parts = PARTS.map(|part| part * RESERVE_MM);
     let tries = parts.into_iter().filter(|part_mm| *part_mm > least_mm);
@@ -61,21 +51,15 @@ pub fn plan_with_reserve(
     match (least, last) {
         _ if kept_mm >= least_mm => Ok(RoomyPath { path, reserve_mm: least_mm }),
         (None, _) => Ok(RoomyPath { path, reserve_mm: 0.0 }),
-        (Some(_), Status::Budget) => {
-            let reason = format!(
-                "there is a path, but the budget of expansions was spent before one was found that keeps \
-                 goal.reserve_mm, {least_mm}: raise goal.expansions_max, which is {}",
-                problem.expansions_max
-            );
-            Err(NoRoomyPath { status: Status::Budget, reason })
-        }
-        (Some(_), _) => {
-            let reason = format!(
-                "there is a path, but none was found that keeps goal.reserve_mm, {least_mm}, beside \
-                 goal.clearance_mm: the needle may lose it on the way; to try it, set goal.reserve_mm = 0"
-            );
-            Err(NoRoomyPath { status: Status::None, reason })
-        }
+        (Some(_), Status::Budget) => Err(format!(
+            "there is a path, but the budget of expansions was spent before one was found that keeps \
+             goal.reserve_mm, {least_mm}: raise goal.expansions_max, which is {}",
+            problem.expansions_max
+        )),
+        (Some(_), _) => Err(format!(
+            "there is a path, but none was found that keeps goal.reserve_mm, {least_mm}, beside \
+             goal.clearance_mm: the needle may lose it on the way; to try it, set goal.reserve_mm = 0"
+        )),
     }
 }
 
@@ -92,7 +76,7 @@ mod tests {
         gap_mm: f64,
         least_mm: f64,
         expansions_max: u32,
-    ) -> Result<(f64, RoomyPath), NoRoomyPath> {
+    ) -> Result<(f64, RoomyPath), String> {
         let ball = |side: f64| {
             let centre_mm = Vector3::new(0.0, side * (36.0 + gap_mm), 60.0);
             Obstacle::Sphere { centre_mm, radius_mm: 36.0 }
@@ -122,12 +106,9 @@ mod tests {
         let clearance_mm = problem([0.0, 0.0, 120.0], true).clearance_mm;
         let (distance_mm, roomy) = planned(clearance_mm + 0.6, 0.5, MANY).expect("it keeps more");
         assert!(distance_mm >= clearance_mm + 0.5 - 1e-3 && roomy.reserve_mm == 0.5);
-        let NoRoomyPath { status, reason } =
-            planned(clearance_mm + 0.4, 0.5, MANY).expect_err("it keeps less");
-        assert_eq!(status, Status::None);
+        let reason = planned(clearance_mm + 0.4, 0.5, MANY).expect_err("it keeps less");
         assert!(reason.contains("none was found that keeps goal.reserve_mm, 0.5,"), "{reason}");
-        let NoRoomyPath { reason, .. } =
-            planned(clearance_mm - 0.5, 0.5, MANY).expect_err("there is no path at all");
+        let reason = planned(clearance_mm - 0.5, 0.5, MANY).expect_err("there is no path at all");
         assert!(!reason.contains("goal.reserve_mm"), "{reason}");
     }
 
@@ -138,21 +119,15 @@ mod tests {
         let reason = Some("the budget of expansions was spent".to_owned());
         let found = plan(&world, &problem);
         let shortest = Answer { status: Status::Budget, path: None, reason, ..found };
-        let NoRoomyPath { status, reason } =
-            plan_with_reserve(&world, &problem, 0.5, &shortest).expect_err("no path");
-        assert_eq!(
-            (status, reason.as_str()),
-            (Status::Budget, "the budget of expansions was spent")
-        );
+        let refusal = plan_with_reserve(&world, &problem, 0.5, &shortest).expect_err("no path");
+        assert_eq!(Some(refusal), shortest.reason);
     }
 
     /// The first expansions find a path. Only a complete search shows that no path keeps more.
     #[test]
     fn a_spent_budget_is_not_reported_as_no_path() {
         let clearance_mm = problem([0.0, 0.0, 120.0], true).clearance_mm;
-        let NoRoomyPath { status, reason } =
-            planned(clearance_mm + 0.4, 0.5, 10).expect_err("it keeps less");
-        assert_eq!(status, Status::Budget);
+        let reason = planned(clearance_mm + 0.4, 0.5, 10).expect_err("it keeps less");
         let spent = "the budget of expansions was spent before one was found that keeps";
         assert!(reason.contains(spent) && !reason.contains("none was"), "{reason}");
         assert!(reason.contains("goal.expansions_max, which is 10"), "{reason}");

@@ -5,8 +5,7 @@ use crate::control::{Bend, BendLaw, Command, ControlConfig, ControlKind};
 use crate::needle::Needle;
 use crate::observer::Estimate;
 use crate::plan::{
-    self, NoRoomyPath, Path, Problem, Replanner, RoomyPath, Status, Step, Tip, World,
-    plan_with_reserve,
+    self, Path, Problem, Replanner, RoomyPath, Status, Step, Tip, World, plan_with_reserve,
 };
 use nalgebra::Vector3;
 
@@ -41,7 +40,7 @@ impl Goal {
     ) -> Result<Self, String> {
         let (shortest, target_mm) = (plan::plan(&world, &problem), problem.target_mm);
         let roomy = plan_with_reserve(&world, &problem, reserve_mm, &shortest);
-        let RoomyPath { path, .. } = roomy.map_err(|NoRoomyPath { reason, .. }| {
+        let RoomyPath { path, .. } = roomy.map_err(|reason| {
             let nearest = shortest.nearest_mm.filter(|_| shortest.path.is_none()).map(|at| {
                 let (at, off_mm) = (shown(&at), (at - target_mm).norm());
                 let what = match shortest.status {

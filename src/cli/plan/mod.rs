@@ -37,19 +37,15 @@ pub(super) fn plan(arguments: &Arguments) -> Result<(), Failure> {
     let (config, _) = arguments.configured.load_with_warnings()?;
     let (world, problem) = config.to_plan(&mask_reader(arguments.configured.path()))?;
     let begun = Instant::now();
-    let mut answer = solve(&world, &problem);
+    let answer = solve(&world, &problem);
     let seconds = begun.elapsed().as_secs_f64();
     let run_path = plan_with_reserve(&world, &problem, config.goal.reserve_mm, &answer);
     let run_seconds = begun.elapsed().as_secs_f64() - seconds;
-    // A run refuses a path without the reserve, so such a path is no plan.
-    if let (Some(_), Err(refusal)) = (&answer.path, &run_path) {
-        (answer.status, answer.reason) = (refusal.status, Some(refusal.reason.clone()));
-    }
     let mut object = to_json(&world, &problem, &answer, seconds);
     let with_obstacles = run_path.as_ref().ok().filter(|_| !world.obstacles.is_empty());
     object["run_reserve_mm"] = json!(with_obstacles.map(|run_path| run_path.reserve_mm));
     object["run_seconds"] = json!(answer.path.as_ref().map(|_| run_seconds));
-    object["run_refusal"] = json!(run_path.err().map(|refusal| refusal.reason));
+    object["run_refusal"] = json!(run_path.err());
     object["curvature_margin"] = json!(config.goal.curvature_margin());
     if let Some(path) = &arguments.out {
         write_new(path, &picture(&world, &problem, &answer)?)?;
