@@ -135,9 +135,8 @@ impl Checks<'_> {
         reader.refuse_if(&[&zero, &high, "stage.hardware"], has_moving_limits, || {
             let unit = self.which.unit();
             format!(
-                "{zero} is \"start\": its limits of {min} to {max} {unit} would count anew from each start; \
-                 give the counts at 0 {unit} (stage status), and {reference} = \"homing\" if power-off \
-                 loses them"
+                "{zero} is \"start\": limits of {min} to {max} {unit} would count anew from each start; give \
+                 the counts at 0 {unit} (stage status), or home the axis ({reference})"
             )
         });
     }

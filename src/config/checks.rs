@@ -90,8 +90,8 @@ fn check_rotation(config: &Config, reader: &mut Reader) {
     let peak = rotation_peak(per_mm, speed, config.can.bus.sync_period());
     reader.refuse_if(&[key, speed_key, sync_key, max_key], peak > max, || {
         format!(
-            "{key} is {per_mm}: reversed from one SYNC to the next at {speed} mm/s, that is {peak:.0} \
-             deg/s², over {max_key} = {max}; turn or insert more slowly, or raise the limit"
+            "{key} is {per_mm}: reversed at {speed} mm/s, that is {peak:.0} deg/s², over \
+             {max_key} = {max}; turn or insert more slowly"
         )
     });
 }

@@ -48,19 +48,20 @@ pub fn plan_with_reserve(
         last = answer.status;
     }
     let kept_mm = path.distance_mm(world) - problem.clearance_mm;
-    match (least, last) {
-        _ if kept_mm >= least_mm => Ok(RoomyPath { path, reserve_mm: least_mm }),
-        (None, _) => Ok(RoomyPath { path, reserve_mm: 0.0 }),
-        (Some(_), Status::Budget) => Err(format!(
+    if least_mm == 0.0 || kept_mm >= least_mm {
+        return Ok(RoomyPath { path, reserve_mm: least_mm });
+    }
+    Err(match last {
+        Status::Budget => format!(
             "there is a path, but the budget of expansions was spent before one was found that keeps \
              goal.reserve_mm, {least_mm}: raise goal.expansions_max, which is {}",
             problem.expansions_max
-        )),
-        (Some(_), _) => Err(format!(
+        ),
+        _ => format!(
             "there is a path, but none was found that keeps goal.reserve_mm, {least_mm}, beside \
              goal.clearance_mm: the needle may lose it on the way; to try it, set goal.reserve_mm = 0"
-        )),
-    }
+        ),
+    })
 }
 
 #[cfg(test)]

@@ -254,7 +254,8 @@ mod tests {
         let error = gate.admit(&sample(1.0, 2.0, 3.0)).expect_err("no orientation");
         assert_eq!(
             error.to_string(),
-            "registration: a tip offset of 8.00 mm needs an orientation; send TRANSFORM"
+            "registration: a tip offset of 8.00 mm needs the sensor's orientation, which the tracker did not \
+             send (OpenIGTLink has it in TRANSFORM)"
         );
         assert_eq!(error.gate, GateName::Registration);
     }

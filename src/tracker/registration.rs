@@ -43,7 +43,8 @@ impl Registration {
             None => {
                 let offset_mm = p_sb_mm.norm();
                 let why = format!(
-                    "a tip offset of {offset_mm:.2} mm needs an orientation; send TRANSFORM"
+                    "a tip offset of {offset_mm:.2} mm needs the sensor's orientation, which the tracker did not \
+                     send (OpenIGTLink has it in TRANSFORM)"
                 );
                 return Err(Refusal::new(GateName::Registration, why));
             }

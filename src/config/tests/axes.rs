@@ -16,10 +16,9 @@ fn a_homing_reference_without_a_zero_in_counts_is_refused() {
 #[test]
 fn limits_of_a_real_axis_without_a_fixed_zero_are_refused() {
     let absolute = "stage.rotation.reference=absolute";
-    let error =
-        load(RIG, &[absolute, "stage.rotation.zero=start"]).expect_err("refused").to_string();
-    let expected = "--set stage.rotation.zero is \"start\": its limits of -720 to 720 deg would count anew \
-                    from each start";
+    let error = refused(RIG, &[absolute, "stage.rotation.zero=start"]);
+    let expected = "--set stage.rotation.zero is \"start\": limits of -720 to 720 deg would count anew from \
+                    each start";
     assert!(error.starts_with(expected), "{error}");
     loaded(RIG, &[absolute, "stage.rotation.zero=-1234"]);
     loaded(RIG, &[absolute, "stage.rotation.zero=start", "stage.rotation.wraps=true"]);
@@ -98,10 +97,10 @@ fn accelerations_over_the_axis_limits_are_refused() {
     );
     let about = |max: f64| format!("stage.rotation.acceleration_max_deg_per_s2 = {max:?}\n");
     assert_eq!(
-        load(&about(3600.0), &[]).expect_err("refused").to_string(),
-        "bench.toml:1: control.nested_saturation.rotation_max_deg_per_mm is 60: reversed from one \
-         SYNC to the next at 2 mm/s, that is 24000 deg/s², over stage.rotation.acceleration_max_deg_per_s2 = \
-         3600; turn or insert more slowly, or raise the limit"
+        refusal(&about(3600.0)),
+        "bench.toml:1: control.nested_saturation.rotation_max_deg_per_mm is 60: reversed at 2 mm/s, \
+         that is 24000 deg/s², over stage.rotation.acceleration_max_deg_per_s2 = 3600; turn or insert more \
+         slowly"
     );
     let jog = about(24_000.0) + "stage.rotation.jog_acceleration_deg_per_s2 = 22000\n";
     assert_eq!(
