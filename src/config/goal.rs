@@ -296,7 +296,8 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     reader.refuse_if(&[position, kind], is_target && goal.position_mm.is_none(), || {
         format!("{kind} is \"target\", and {position} is not given: say where it is")
     });
-    let [tool, obstacle] = ["goal.tool", "goal.obstacle"];
+    let [tool, obstacle, drawn] = ["goal.tool", "goal.obstacle", "study.obstacles"];
+    let is_drawn = config.study.obstacles.is_some_and(|obstacles| obstacles > 0);
     // A printed configuration has the default.
     let default = GoalConfig::KEYS.iter().find(|key| key.name == "workspace_mm");
     let default = default.and_then(Key::default_value);
@@ -306,7 +307,7 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
         (obstacle, !goal.obstacle.is_empty()),
         (workspace, goal.workspace_mm != WorkspaceConfig::take(default.as_ref())),
         ("study.target_depth_mm", config.study.target_depth_mm.is_some()),
-        ("study.obstacles", config.study.obstacles.is_some_and(|obstacles| obstacles > 0)),
+        (drawn, is_drawn),
     ];
     for (key, is_given) in given {
         reader.refuse_if(&[key, kind], !is_target && is_given, || {
@@ -314,8 +315,8 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
         });
     }
     let (clearance, clearance_mm) = ("goal.clearance_mm", goal.clearance_mm);
-    let is_too_near = !goal.obstacle.is_empty() && clearance_mm < CLEARANCE_MIN_MM;
-    reader.refuse_if(&[clearance, obstacle], is_too_near, || {
+    let is_too_near = (is_drawn || !goal.obstacle.is_empty()) && clearance_mm < CLEARANCE_MIN_MM;
+    reader.refuse_if(&[clearance, obstacle, drawn], is_too_near, || {
         format!(
             "{clearance} is {clearance_mm}, allowed with obstacles: at least {CLEARANCE_MIN_MM}; with less \
              a path may lead through a thin obstacle"

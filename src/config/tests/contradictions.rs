@@ -270,3 +270,15 @@ fn obstacles_on_the_way_into_the_plane_are_refused() {
         assert!(error.contains(" has no effect, since goal.kind is \"plane\""), "{error}");
     }
 }
+
+/// Obstacles that a study draws may be as thin as those of the configuration.
+#[test]
+fn a_clearance_of_0_is_refused_with_drawn_obstacles() {
+    let target = ["goal.kind=target", "goal.position_mm=[0.0, 0.0, 100.0]", "goal.clearance_mm=0"];
+    loaded("", &target);
+    let error = set_refusal(&[&target[..], &["study.obstacles=1"]].concat());
+    assert!(
+        error.contains("goal.clearance_mm is 0, allowed with obstacles: at least 0.1"),
+        "{error}"
+    );
+}
