@@ -6,7 +6,6 @@ use flate2::CrcReader;
 use flate2::read::MultiGzDecoder;
 use nalgebra::Vector3;
 use nifti::{NiftiError, NiftiHeader, NiftiObject, RandomAccessNiftiVolume, ReaderOptions};
-use std::fmt::Display;
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
@@ -141,8 +140,11 @@ pub(super) fn file_crc32(path: &Path) -> io::Result<u32> {
 
 /// Why an image cannot be read.
 fn reason(error: &NiftiError) -> String {
-    let error: &dyn Display = if let NiftiError::Io(error) = error { error } else { error };
-    format!("no NIfTI image can be read: {error}")
+    match error {
+        NiftiError::Io(error) if error.kind() == io::ErrorKind::NotFound => error.to_string(),
+        NiftiError::Io(error) => format!("no NIfTI image can be read: {error}"),
+        error => format!("no NIfTI image can be read: {error}"),
+    }
 }
 
 /// The largest part of a voxel's side that may point along another axis.

@@ -149,8 +149,8 @@ impl TargetTracking {
             true => Ok((self.clock.acquisition_time(sample)?, position_mm)),
             false => {
                 let why = format!(
-                    "the target is {} mm from goal.position_mm (limit {limit_mm:.1}); another frame, \
-                     or tool?",
+                    "the target is {} mm from goal.position_mm (limit {limit_mm:.1}, goal.tool_range_mm); \
+                     another frame, or tool?",
                     short(off_mm)
                 );
                 Err(Refusal::new(GateName::Workspace, why))

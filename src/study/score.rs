@@ -35,7 +35,7 @@ pub struct TrialResult {
 /// The result of a trial with a target.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TargetScore {
-    /// There was no plan at the start.
+    /// There was no path with which a run may begin.
     pub is_refused: bool,
     /// True distance of the tip from the target at the end, mm; `None` if the trial was stopped.
     pub error_mm: Option<f64>,

@@ -91,7 +91,9 @@ fn a_run_reaches_its_target_and_replays() {
         assert_eq!(replayed.status, 0, "{}", replayed.stdout);
         assert_eq!(needle_bench(&scratch, &["review", dir]).status, 0);
         let page = std::fs::read_to_string(scratch.path().join(dir).join("report.html")).unwrap();
-        assert!(page.contains("Predicted error at the target"), "{in_plane}");
+        for chart in ["Predicted error at the target", "Way to the target"] {
+            assert!(page.contains(chart), "{in_plane}: no {chart}");
+        }
     }
 }
 
@@ -276,7 +278,9 @@ fn a_study_draws_targets_and_obstacles() {
     let all = ["study", "goal.toml", "--trials", "3", "--set", "goal.reserve_mm=40"];
     let said = needle_bench(&scratch, &all).stdout;
     assert!(
-        said.contains("\nrefused     100.00%: no plan at the start\n            seed "),
+        said.contains(
+            "\nrefused     100.00%: no path with which a run may begin\n            seed "
+        ),
         "{said}"
     );
     assert_eq!(said.matches("none was found that keeps goal.reserve_mm, 40").count(), 1, "{said}");

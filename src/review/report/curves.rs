@@ -33,6 +33,7 @@ pub(super) fn curves(run: &Run, limits: &Limits) -> Vec<Chart> {
         turning_of_base(run),
         rotation_of_base(run),
         target_error(run, limits),
+        path_left(run),
         insertion(run, limits),
         tip_age(run, limits),
         blind_depth(run, limits),
@@ -86,6 +87,17 @@ fn target_error(run: &Run, limits: &Limits) -> Chart {
     ];
     layers.extend(limits.get("target_error_mm").map(|mm| Layer::level("goal.tolerance_mm", *mm)));
     Chart::new("Predicted error at the target", DEPTH, "error (mm)", layers)
+}
+
+/// How far the target is, and how long the way there.
+fn path_left(run: &Run) -> Chart {
+    let depth = depth(run);
+    let of = |name| points(&depth, &column(run, name));
+    let layers = vec![
+        line("planned path", COMMANDED, of("path_left_mm")),
+        line("estimated distance", ESTIMATE, of("target_distance_mm")),
+    ];
+    Chart::new("Way to the target", DEPTH, "length (mm)", layers)
 }
 
 /// Errors of the estimate over depth. The large errors at the start do not widen the y axis.

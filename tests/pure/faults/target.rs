@@ -72,7 +72,7 @@ fn a_target_position_that_is_not_finite() {
 #[test]
 fn a_target_stream_that_changes_its_frame() {
     let turned = |sample: &mut Sample| sample.position_mm.swap_rows(0, 2);
-    is_lost(&changed(turned), "mm from goal.position_mm (limit 10.0)");
+    is_lost(&changed(turned), "mm from goal.position_mm (limit 10.0, goal.tool_range_mm)");
 }
 
 #[test]
@@ -117,7 +117,7 @@ fn a_target_that_is_never_seen() {
 
 #[test]
 fn a_target_that_is_seen_where_no_path_leads() {
-    let frame = ["no target within 5.0 s", "mm from goal.position_mm (limit 10.0); another frame"];
+    let frame = ["no target within 5.0 s", "(limit 10.0, goal.tool_range_mm); another frame"];
     never_begins(&[], |sample| sample.position_mm.swap_rows(0, 2), frame);
     let far = ["goal.tool_range_mm=100"];
     let behind = ["no path to the target", "outside goal.workspace_mm"];
