@@ -140,11 +140,14 @@ pub(super) fn file_crc32(path: &Path) -> io::Result<u32> {
 
 /// Why an image cannot be read.
 fn reason(error: &NiftiError) -> String {
-    match error {
-        NiftiError::Io(error) if error.kind() == io::ErrorKind::NotFound => error.to_string(),
-        NiftiError::Io(error) => format!("no NIfTI image can be read: {error}"),
-        error => format!("no NIfTI image can be read: {error}"),
-    }
+    let why = match error {
+        NiftiError::Io(error) if error.kind() == io::ErrorKind::NotFound => {
+            return error.to_string();
+        }
+        NiftiError::Io(error) => error.to_string(),
+        error => error.to_string(),
+    };
+    format!("no NIfTI image can be read: {why}")
 }
 
 /// The largest part of a voxel's side that may point along another axis.

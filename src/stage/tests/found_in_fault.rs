@@ -135,14 +135,16 @@ fn a_fault_without_a_history_is_named() {
 /// Only a fault whose code is known may be reset without the operator.
 #[test]
 fn a_fault_whose_code_cannot_be_read_is_named_and_not_reset() {
-    let refused = Some((ObjectAddress::new(0x603f, 0), AbortCode::GENERAL));
-    for (config, expected) in [
-        (config(), "0x603F absent"),
-        (resetting_config(), "0x603F:00: reading was refused with SDO abort"),
+    let object = ObjectAddress::new(0x603f, 0);
+    let (refused, mute) = (Some((object, AbortCode::GENERAL)), Some((object, u32::MAX)));
+    for (config, refused, mute, expected) in [
+        (config(), refused, None, "0x603F absent"),
+        (resetting_config(), refused, None, "0x603F:00: reading was refused with SDO abort"),
+        (resetting_config(), None, mute, "0x603F:00: no SDO reply within 150 ms (attempt 3 of 3)"),
     ] {
         let mut bench = Bench::new(config);
         bench.insertion.state = DriveState::Fault;
-        bench.insertion.refused = refused;
+        (bench.insertion.refused, bench.insertion.mute) = (refused, mute);
         let fault = bench.until_fault();
         assert!(fault.contains(expected), "{fault}");
         assert_eq!(bench.insertion.resets, 0);
