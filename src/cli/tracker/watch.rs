@@ -116,9 +116,10 @@ impl Watch {
         let (time, p_mm) = self.last?;
         let at = now.as_secs_f64();
         let positions = std::mem::take(&mut self.positions);
-        let rate = match seconds < RATE_TIME_MIN_S {
-            true => format!("{positions} positions"),
-            false => format!("{:.1} Hz", positions as f64 / seconds),
+        let rate = match positions {
+            1 if seconds < RATE_TIME_MIN_S => "1 position".to_owned(),
+            _ if seconds < RATE_TIME_MIN_S => format!("{positions} positions"),
+            _ => format!("{:.1} Hz", positions as f64 / seconds),
         };
         let refusal = self.refusal.take().map(|refusal| format!("; {refusal}")).unwrap_or_default();
         let malformed = match self.malformed {
@@ -198,7 +199,7 @@ pub(super) mod tests {
     #[test]
     fn a_rate_is_given_only_over_enough_time() {
         let tracker = Config::from_sources(&[], &[]).unwrap().tracker;
-        for (seconds, rate) in [(1.0, "  1.0 Hz  age"), (1e-4, "  1 positions  age")] {
+        for (seconds, rate) in [(1.0, "  1.0 Hz  age"), (1e-4, "  1 position  age")] {
             let mut watch = Watch::new(&tracker);
             watch.gate = tracker.to_unregistered_gate();
             watch.take(&Event::Sample(sample(&tracker.tool)));
