@@ -74,7 +74,7 @@ fn run_on(
     let own = [
         "insertion={ depth_mm = 3, plane_out_of_reach = \"insert\" }",
         "insertion.speed_mm_per_s=1",
-        // An emulated machine may be held up for longer than a second.
+        // A busy host may hold up the relay, which is Python.
         "tracker.hold_after_s=2",
         "can.heartbeat_timeout_ms=2000",
         &bus,
@@ -193,7 +193,7 @@ pub(crate) fn a_drive_that_ignores_every_command_to_power_off_is_reported(buses:
         );
         let (late_max_s, least) = match buses {
             Buses::Udp => (0.2, 15),
-            Buses::Vcan => (3.0, 10),
+            Buses::Vcan => (3.0, 5),
         };
         assert!((least..=20).contains(&times_s.len()), "{times_s:?}");
         let late_s = times_s[0] - shutdown_s - after_s;

@@ -107,9 +107,6 @@ fn a_run_steers_by_positions_that_pyigtl_relays_and_candump_agrees_with_its_reco
         &tracker,
         "tracker.stamp=\"source\"",
         "insertion={ depth_mm = 20, plane_out_of_reach = \"insert\" }",
-        // The relay is slow: Python in an emulated machine on a busy host.
-        "tracker.hold_after_s=2",
-        "tracker.hold_after_mm=11",
     ];
     let bench = scratch.bench(&["--json"], &settings).end();
     let on_the_wire = candump.end();
@@ -143,7 +140,7 @@ fn a_run_steers_by_positions_that_pyigtl_relays_and_candump_agrees_with_its_reco
     let (wire_sent, wire_received): (Vec<&str>, Vec<&str>) =
         on_the_wire.iter().map(String::as_str).partition(by_the_bench);
     println!("{} frames sent, {} received", sent.len(), received.len());
-    assert!(sent.len() > 1000 && received.len() > 1000);
+    assert!(sent.len() > 500 && received.len() > 500);
     assert!(wire_sent == sent, "{}", difference(&wire_sent, &sent));
     // The drives sent before the bench listened, and send on after its end.
     let all_heard = wire_received.windows(received.len()).any(|window| window == received);
