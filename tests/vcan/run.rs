@@ -55,7 +55,14 @@ fn an_insertion_of_150_mm_completes_with_a_complete_record() {
     let truth_csv = scratch.path("truth.csv");
     let stage = stage(&["--truth", truth_csv.to_str().unwrap()]);
     // The default observer takes long in an emulated machine.
-    let steered = ["observer.kind=\"invariant\"", "control.kind=\"nested-saturation\""];
+    let steered = [
+        "observer.kind=\"invariant\"",
+        "control.kind=\"nested-saturation\"",
+        // An emulated machine may take seconds for the first steps of this observer.
+        "can.heartbeat_timeout_ms=5000",
+        "tracker.hold_after_s=5",
+        "tracker.hold_after_mm=30",
+    ];
     let bench = scratch.bench(&["--json"], &steered).end();
     bench.assert_status(0);
     assert_the_drives_stand(&[]);
@@ -275,7 +282,8 @@ fn a_stop_from_another_process_ends_a_run_on_the_bus() {
     witness.wait_until_inserted(2.0);
     let mut stop = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
     stop.current_dir(env!("CARGO_MANIFEST_DIR"));
-    let stop = Program::start(stop.args(["stop", "--config", "bench-config/vcan.toml"])).end();
+    stop.args(["stop", "--config", "bench-config/vcan.toml"]);
+    let stop = Program::start(stop.args(["--set", "can.sdo_timeout_ms=1000"])).end();
     stop.assert_status(0);
     let bench = bench.end();
     bench.assert_status(1);
