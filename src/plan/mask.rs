@@ -158,9 +158,12 @@ fn lowest_mm2(line_mm2: &[f64], spacing_mm: f64) -> Vec<f64> {
         }
         envelope.push((voxel, begin_mm));
     }
+    let mut lowest_here = 0;
     let lowest = |voxel: usize| {
-        let begun = envelope.partition_point(|(_, begin_mm)| *begin_mm < position_mm(voxel));
-        let (at, _) = envelope[begun.saturating_sub(1)];
+        while envelope.get(lowest_here + 1).is_some_and(|(_, begin)| *begin < position_mm(voxel)) {
+            lowest_here += 1;
+        }
+        let (at, _) = envelope[lowest_here];
         line_mm2[at] + (position_mm(voxel) - position_mm(at)).powi(2)
     };
     (0..line_mm2.len()).map(lowest).collect()
