@@ -7,8 +7,7 @@
 # ~/.cache/needle-bench), then: shell scripts, formatting, licences where cargo-deny is there, the tests
 # on real SocketCAN, in a virtual machine where this kernel has no vcan, and all other tests. Clippy,
 # documentation and the tests in virtual time run beside those two, when the processors have nothing else to
-# do. Stops at the first failure, of a test in real time at its second. With CI=true a test that lacks something
-# fails.
+# do. Stops at the first failure. With CI=true a test that lacks something fails.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PATH=$PATH:$HOME/.cargo/bin
@@ -146,32 +145,13 @@ lint() {
     RUSTDOCFLAGS='-D warnings' cargo doc --no-deps
 }
 
-# Tests in real time. A host that runs no thread for a second, because others keep it busy, fails one now and then; so
-# up to five that failed are run once more. A fault in the code fails again.
-test_in_real_time() { # name of the tests, arguments for them...
-    local tests=$1 log failed
-    shift
-    log=$(mktemp)
-    if cargo test --test "$tests" -- "$@" 2>&1 | tee "$log"; then
-        rm "$log"
-        return
-    fi
-    mapfile -t failed < <(sed -n '/^failures:$/,$ s/^    \([a-z0-9_]\+::[a-z0-9_:]\+\)$/\1/p' "$log" | sort -u)
-    rm "$log"
-    [ ${#failed[@]} -gt 0 ] && [ ${#failed[@]} -le 5 ] || return 1
-    echo "==> once more, ${#failed[@]} that failed: ${failed[*]}"
-    cargo test --test "$tests" -- "$@" --exact "${failed[@]}"
-}
-
 test_on_vcan() {
     local host runner
     host=$(rustc -vV | sed -n 's/^host: //p')
     runner=CARGO_TARGET_$(tr a-z- A-Z_ <<<"$host")_RUNNER
     # In a machine, a processor for each side of the bus.
-    (
-        export "$runner=$PWD/vcan/run.sh" VCAN_CPUS=2 VCAN_TIMEOUT_S=1800
-        test_in_real_time vcan
-    )
+    env "$runner=$PWD/vcan/run.sh" VCAN_CPUS=2 VCAN_TIMEOUT_S=1800 \
+        cargo test --test vcan
 }
 
 # What needs time but is in no hurry, since tests in real time mostly wait: it runs only where nothing else
@@ -205,7 +185,7 @@ test_on_host() {
     room_kb=$(df -k --output=avail /dev/shm 2>/dev/null | tail -n 1) || room_kb=0
     [ "$room_kb" -lt 2000000 ] || folder=/dev/shm
     cargo test --lib --bins
-    TMPDIR=$folder test_in_real_time live --test-threads=6
+    TMPDIR=$folder cargo test --test live -- --test-threads=6
 }
 
 stage 'system packages' install_packages

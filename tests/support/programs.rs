@@ -17,23 +17,6 @@ use serde_json::Value;
 pub(crate) const LONG: Duration = Duration::from_secs(60);
 const POLL: Duration = Duration::from_millis(10);
 
-/// More settings of runs over SocketCAN, perhaps in an emulated machine: on a slow host it cannot keep 10 ms, and runs
-/// no thread for more than half a second.
-const ON_VCAN: [&str; 7] = [
-    "can.sync_ms=40",
-    "can.heartbeat_ms=100",
-    "can.heartbeat_timeout_ms=2000",
-    "can.missed_feedback_max=50",
-    "can.sdo_timeout_ms=1000",
-    "tracker.hold_after_s=2",
-    "tracker.hold_after_mm=11",
-];
-
-/// Whether `vcan/run.sh` runs the tests, with vcan0 and vcan1.
-pub(crate) fn is_on_vcan() -> bool {
-    std::env::var("NEEDLE_VCAN").as_deref() == Ok("1")
-}
-
 /// Held by one test alone, or by those that share the machine.
 static MACHINE: RwLock<()> = RwLock::new(());
 
@@ -262,8 +245,7 @@ impl Scratch {
         let given = self.settings();
         // At this speed the default `hold_after_mm` is reached in 0.1 s, and an emulated machine may stall longer.
         let fast = ["insertion.speed_mm_per_s=5", "tracker.hold_after_mm=3"];
-        let on_vcan = if is_on_vcan() { &ON_VCAN[..] } else { &[] };
-        let given = given.iter().map(String::as_str).chain(fast).chain(on_vcan.iter().copied());
+        let given = given.iter().map(String::as_str).chain(fast);
         for setting in given.chain(settings.iter().copied()) {
             command.args(["--set", setting]);
         }

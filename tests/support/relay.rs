@@ -24,6 +24,12 @@ impl Buses {
     }
 }
 
+/// In an emulated machine on a slow host the relay passes on answers of the drives after more than 300 ms, and a SYNC
+/// every 10 ms is too much for it. A statusword comes up to 30 ms later so; the bounds on what follows stay as they
+/// are at 10 ms. The same runs over UDP have the limits of the others.
+const PATIENCE_ON_VCAN: [&str; 3] =
+    ["can.sync_ms=40", "can.missed_feedback_max=50", "can.sdo_timeout_ms=1000"];
+
 /// A run through the relay.
 struct Relayed {
     buses: Buses,
@@ -74,12 +80,17 @@ fn run_on(
     let own = [
         "insertion={ depth_mm = 3, plane_out_of_reach = \"insert\" }",
         "insertion.speed_mm_per_s=1",
-        // A busy host may hold up the relay, which is Python.
+        // An emulated machine may be held up for longer than a second.
         "tracker.hold_after_s=2",
         "can.heartbeat_timeout_ms=2000",
         &bus,
     ];
-    let bench = scratch.bench(&["--json"], &stage.settings(&[&own[..], settings].concat())).end();
+    let patience = match buses {
+        Buses::Udp => &[][..],
+        Buses::Vcan => &PATIENCE_ON_VCAN[..],
+    };
+    let settings = [&own[..], patience, settings].concat();
+    let bench = scratch.bench(&["--json"], &stage.settings(&settings)).end();
     relay.signal("INT");
     let relay = relay.end();
     relay.assert_status(0);
@@ -193,7 +204,7 @@ pub(crate) fn a_drive_that_ignores_every_command_to_power_off_is_reported(buses:
         );
         let (late_max_s, least) = match buses {
             Buses::Udp => (0.2, 15),
-            Buses::Vcan => (3.0, 5),
+            Buses::Vcan => (3.0, 10),
         };
         assert!((least..=20).contains(&times_s.len()), "{times_s:?}");
         let late_s = times_s[0] - shutdown_s - after_s;

@@ -44,7 +44,13 @@ fn a_run_completes_under_a_flood_of_cangen() {
         let cangen = Program::start(Command::new("cangen").args(flood));
         let scratch = Scratch::new("flooded");
         let listen = format!("can.listen=\"{listen}\"");
-        let settings = ["insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }", &listen];
+        let settings = [
+            "insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }",
+            // An emulated machine under this flood holds the bench up for more than half a second.
+            "tracker.hold_after_s=2",
+            "can.heartbeat_timeout_ms=2000",
+            &listen,
+        ];
         let bench = scratch.bench(&["--json"], &settings).end();
         cangen.signal("INT");
         cangen.end();
@@ -107,6 +113,9 @@ fn a_run_steers_by_positions_that_pyigtl_relays_and_candump_agrees_with_its_reco
         &tracker,
         "tracker.stamp=\"source\"",
         "insertion={ depth_mm = 20, plane_out_of_reach = \"insert\" }",
+        // The relay is slow: Python in an emulated machine on a busy host.
+        "tracker.hold_after_s=2",
+        "tracker.hold_after_mm=11",
     ];
     let bench = scratch.bench(&["--json"], &settings).end();
     let on_the_wire = candump.end();
@@ -140,7 +149,7 @@ fn a_run_steers_by_positions_that_pyigtl_relays_and_candump_agrees_with_its_reco
     let (wire_sent, wire_received): (Vec<&str>, Vec<&str>) =
         on_the_wire.iter().map(String::as_str).partition(by_the_bench);
     println!("{} frames sent, {} received", sent.len(), received.len());
-    assert!(sent.len() > 500 && received.len() > 500);
+    assert!(sent.len() > 1000 && received.len() > 1000);
     assert!(wire_sent == sent, "{}", difference(&wire_sent, &sent));
     // The drives sent before the bench listened, and send on after its end.
     let all_heard = wire_received.windows(received.len()).any(|window| window == received);

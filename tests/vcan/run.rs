@@ -58,10 +58,9 @@ fn an_insertion_of_150_mm_completes_with_a_complete_record() {
     let steered = [
         "observer.kind=\"invariant\"",
         "control.kind=\"nested-saturation\"",
-        // An emulated machine may take seconds for the first steps of this observer.
-        "can.heartbeat_timeout_ms=5000",
+        // Its first steps have held the bench up for 2.2 s.
         "tracker.hold_after_s=5",
-        "tracker.hold_after_mm=30",
+        "can.heartbeat_timeout_ms=5000",
     ];
     let bench = scratch.bench(&["--json"], &steered).end();
     bench.assert_status(0);
@@ -91,7 +90,7 @@ fn an_insertion_of_150_mm_completes_with_a_complete_record() {
     let frames = can_log(&run_dir);
     assert_eq!(manifest["counts"]["can_frames"], frames.len());
     let sync_count = frames.iter().filter(|frame| **frame == ("T".into(), "080#".into())).count();
-    assert!(sync_count > 600, "{sync_count} SYNCs in 30 s at 40 ms; a slow machine skips some");
+    assert!(sync_count > 2500, "{sync_count} SYNCs in 30 s at 10 ms; a slow machine skips some");
     let samples = ndjson(&run_dir.join("tracker.ndjson"));
     assert_eq!(manifest["counts"]["tracker_samples"], samples.len());
     assert!(samples.len() > 1000, "{} samples in 30 s at 40 Hz", samples.len());
@@ -149,7 +148,7 @@ fn a_realtime_run_has_priority_80_or_names_the_missing_permission() {
     println!("{timing}");
     assert_eq!(timing["realtime"]["priority"], 80);
     assert!(timing["realtime"]["cpu"].is_u64(), "{timing}");
-    assert!(timing["syncs"].as_u64().unwrap() > 20, "{timing}");
+    assert!(timing["syncs"].as_u64().unwrap() > 50, "{timing}");
 }
 
 #[test]
@@ -188,8 +187,8 @@ fn drives_stop_by_themselves_when_the_bench_is_killed() {
     witness.wait_for_emergency();
     let missed = witness.heartbeat_at.elapsed();
     println!("the drives reported the missing heartbeat after {missed:?}");
-    let bounds = Duration::from_millis(1000)..Duration::from_millis(5000);
-    assert!(bounds.contains(&missed), "{missed:?} with a timeout of 2 s");
+    let bounds = Duration::from_millis(500)..Duration::from_millis(3000);
+    assert!(bounds.contains(&missed), "{missed:?} with a timeout of 1 s");
     let [insertion, _] = assert_the_drives_stand(&[]);
     let stands_at_mm = insertion.position_counts as f64 / COUNTS_PER_MM;
     // The following error depends on the machine's load, but no drive passes its last set-point.
@@ -201,7 +200,7 @@ fn drives_stop_by_themselves_when_the_bench_is_killed() {
     assert_eq!(programs::manifest(&run_dir)["outcome"], Value::Null);
     let (steps, frames) = (programs::csv(&run_dir.join("steps.csv")), can_log(&run_dir));
     assert!(steps.len() >= 2, "{} steps", steps.len());
-    assert!(frames.len() > 200, "{} frames", frames.len());
+    assert!(frames.len() > 500, "{} frames", frames.len());
     assert!(ndjson(&run_dir.join("tracker.ndjson")).len() > 20);
 }
 
