@@ -75,7 +75,7 @@ const CHANGES: [Change; 11] = [
     // the following error grows, and the needle moves on without tip positions.
     (
         "sync_ms = 10 ",
-        "sync_ms = 10\nsdo_timeout_ms = 1000\nmissed_feedback_max = 100\nheartbeat_timeout_ms = 1500 ",
+        "sync_ms = 10\nsdo_timeout_ms = 1000\nmissed_feedback_max = 100\nheartbeat_timeout_ms = 3000 ",
     ),
     ("following_error_mm = 0.5", "following_error_mm = 3.0"),
     ("following_error_deg = 2.0", "following_error_deg = 90.0\njog_speed_deg_per_s = 60.0"),
