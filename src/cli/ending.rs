@@ -9,7 +9,6 @@ use crate::runtime::RunReport;
 use crate::session::{Outcome, StageAtEnd};
 use crate::stage::{Axis, DriveReport};
 use crate::study::{OFF_PLANE_LIMIT_MM, PlanStatus};
-use crate::telemetry::{Finished, TelemetryError};
 use crate::text::fixed;
 use std::fmt;
 use std::fs;
@@ -19,22 +18,12 @@ use std::path::Path;
 /// that.
 pub(super) fn status(config: &Config, report: &RunReport) -> u8 {
     let must_be_whole = config.record.on_failure == OnFailure::Stop;
-    match (&report.outcome, &report.record) {
-        (_, Err(_)) => ENVIRONMENT_FAILED,
-        (Outcome::Stopped(_), Ok(_)) => STOPPED,
+    match &report.record {
+        Err(_) => ENVIRONMENT_FAILED,
+        Ok(_) if report.outcome != Outcome::Completed => STOPPED,
         // The record failed while it was being closed, when nothing was left to stop.
-        (Outcome::Completed, Ok(record)) if must_be_whole && !record.faults.is_empty() => {
-            ENVIRONMENT_FAILED
-        }
-        (Outcome::Completed, Ok(_)) => 0,
-    }
-}
-
-/// Why the record is not whole; `None` if it is.
-pub(super) fn record_error(record: &Result<Finished, TelemetryError>) -> Option<String> {
-    match record {
-        Ok(finished) => finished.faults.first().cloned(),
-        Err(error) => Some(error.to_string()),
+        Ok(record) if must_be_whole && !record.faults.is_empty() => ENVIRONMENT_FAILED,
+        Ok(_) => 0,
     }
 }
 
@@ -105,7 +94,7 @@ pub(super) fn after_insertion(
     }
     let depth_mm = depth_mm(config, report);
     let next = match (required(config, &report.stage_at_end), possible_withdrawal(config, report)) {
-        (Some(required), _) => next_stage(required.operation(), path, report),
+        (Some(operation), _) => next_stage(operation, path, report),
         (None, Err(_)) if depth_mm.is_none() => next_stage("status", path, report),
         (None, Err(_)) => next_review(report),
         (None, Ok(withdrawal)) => next_stage("withdraw", path, report) + &withdrawal.options(),
@@ -156,9 +145,8 @@ pub(super) fn after_operation(
         None => "not known where the axes stand".to_owned(),
     };
     let next = match (required, remaining) {
-        (Some(required), _) => next_stage(required.operation(), path, report),
         (None, Some(remaining)) => next_stage("withdraw", path, report) + remaining,
-        (None, None) => next_stage("status", path, report),
+        _ => next_stage(required.unwrap_or("status"), path, report),
     };
     Some(format!("stage       {positions}; {}\n{next}", drives(&report.stage_at_end)))
 }
@@ -174,30 +162,14 @@ fn next_stage(operation: &str, path: Option<&Path>, report: &RunReport) -> Strin
     format!("next        needle-bench stage {operation} {}", path.display())
 }
 
-/// An operation of the stage that is required before any other.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Required {
-    /// The drives are not known to stand without power.
-    Status,
-    /// A drive is in Fault, and a run would not reset it.
-    Reset,
-}
-
-impl Required {
-    fn operation(self) -> &'static str {
-        match self {
-            Required::Status => "status",
-            Required::Reset => "reset",
-        }
-    }
-}
-
-fn required(config: &Config, stage: &StageAtEnd) -> Option<Required> {
+/// The operation of the stage that is required before any other: `status` if the drives are not known to stand
+/// without power, `reset` if a drive is in Fault and a run would not reset it.
+fn required(config: &Config, stage: &StageAtEnd) -> Option<&'static str> {
     if stage.unknown.is_some() {
-        return Some(Required::Status);
+        return Some("status");
     }
     let is_any_in_fault = Axis::BOTH.into_iter().any(|axis| is_in_fault(&stage.drives[axis]));
-    (is_any_in_fault && !config.stage.power.fault_reset_on_start).then_some(Required::Reset)
+    (is_any_in_fault && !config.stage.power.fault_reset_on_start).then_some("reset")
 }
 
 fn is_in_fault(drive: &DriveReport) -> bool {
@@ -292,12 +264,13 @@ pub(super) fn possible_withdrawal(
     if depth_mm <= config.insertion.arrival_mm {
         return Err(format!("the needle is {}", needle_at(config, Some(depth_mm))));
     }
-    match required(config, &report.stage_at_end) {
+    let stage = &report.stage_at_end;
+    match required(config, stage) {
         None => Ok(Withdrawal::from_depth(config, depth_mm)),
-        Some(Required::Reset) => Err("a drive is in fault: find why, then stage reset".to_owned()),
-        Some(Required::Status) => {
+        Some(_) if stage.unknown.is_some() => {
             Err("the drives are not known to stand; look at the stage".to_owned())
         }
+        Some(_) => Err("a drive is in fault: find why, then stage reset".to_owned()),
     }
 }
 

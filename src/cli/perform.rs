@@ -2,7 +2,7 @@
 
 use super::arguments::{About, RealTimeArguments};
 use super::console::Console;
-use super::ending::{possible_withdrawal, record_error};
+use super::ending::possible_withdrawal;
 use super::mask::mask_reader;
 use super::operator::Terminal;
 use super::output::print_stderr;
@@ -112,9 +112,9 @@ impl Job<'_> {
         interrupt: &Interrupt,
     ) -> Result<Performed, Failure> {
         let run = || self.run(operator, runtime, interrupt);
-        let (mut report, done) = self.options.realtime.run_isolated(run)?;
-        complete_record(&mut report, describe(self.config.clone()), operator);
-        Ok(Performed { report, done, wants_withdrawal: false })
+        let mut performed = self.options.realtime.run_isolated(run)?;
+        complete_record(&mut performed.report, describe(self.config.clone()), operator);
+        Ok(performed)
     }
 
     fn run(
@@ -122,29 +122,36 @@ impl Job<'_> {
         operator: &mut dyn Operator,
         runtime: &Runtime,
         interrupt: &Interrupt,
-    ) -> Result<(RunReport, Vec<AxisMove>), Failure> {
+    ) -> Result<Performed, Failure> {
         let config = self.config;
         let stops_on_record_failure = config.record.on_failure == OnFailure::Stop;
         let begin = |now| self.run_config.clone().begin(now).map_err(Failure::configuration);
+        let performed = |report, done: &[AxisMove]| Performed {
+            report,
+            done: done.to_vec(),
+            wants_withdrawal: false,
+        };
         let Options { realtime, live, paced, .. } = self.options;
         live.map_or(Ok(()), check_live_address)?;
         if config.is_emulated() {
             realtime.refuse_if_given("a run with can.interface = \"memory\" is in virtual time")?;
             let stage = VirtualStage::new(config.virtual_stage()?, Time::ZERO);
-            let (tool, target) = (config.tracker.tool.clone(), config.goal.tool.clone());
-            let emulated = TipSource::Emulated { tool, target };
             let tips = match self.receives_tracker() {
-                true => Some(
-                    load_replay(&config.tracker, Time::ZERO)?.map_or(emulated, TipSource::Recorded),
-                ),
                 false => None,
+                true => Some(match load_replay(&config.tracker, Time::ZERO)? {
+                    Some(replay) => TipSource::Recorded(replay),
+                    None => TipSource::Emulated {
+                        tool: config.tracker.tool.clone(),
+                        target: config.goal.tool.clone(),
+                    },
+                }),
             };
             let (recorder, _) = self.start_recording(SystemTime::now(), Backpressure::Block)?;
             let sink = Sink::new(recorder, stops_on_record_failure, operator, interrupt);
             let mut session = begin(Time::ZERO)?;
             let pace = paced.then(Pace::begin);
             let report = run_virtual(&mut session, stage, tips, pace, sink);
-            return Ok((report, session.moves().to_vec()));
+            return Ok(performed(report, session.moves()));
         }
         realtime.check_permission()?;
         let mut bus = open_stage_bus(config)?;
@@ -158,7 +165,7 @@ impl Job<'_> {
         let (bus, tips) = (bus.as_mut(), tracker.as_mut());
         let report = run_live(&mut session, bus, tips, clock, realtime, sink);
         drop(tracker);
-        Ok((report, session.moves().to_vec()))
+        Ok(performed(report, session.moves()))
     }
 
     fn needs_tracker(&self) -> bool {
@@ -222,11 +229,12 @@ impl Job<'_> {
         let Job { config, motion, options: Options { about, .. }, .. } = self;
         let calibration = config.calibration_toml().map_err(Failure::environment)?;
         let rehearsal = config.emulator.rehearse.then(|| config.can.interface.to_string());
-        let parts = [motion.map(Motion::name), rehearsal.as_ref().map(|_| "rehearsal")];
-        let name = parts
-            .into_iter()
-            .flatten()
-            .fold(config.name.clone(), |name, part| format!("{name}-{part}"));
+        let parts = [
+            Some(&*config.name),
+            motion.map(Motion::name),
+            rehearsal.as_ref().map(|_| "rehearsal"),
+        ];
+        let name = parts.into_iter().flatten().collect::<Vec<_>>().join("-");
         Ok(Manifest {
             operation: motion.map(|motion| motion.name().to_owned()),
             arguments: motion.map(Motion::arguments).unwrap_or_default(),
@@ -326,7 +334,10 @@ pub(super) fn end_json(report: &RunReport) -> Value {
         "stop_reason": report.outcome.stop_reason(),
         "duration_s": report.end.as_secs_f64(),
         "run_dir": report.run_dir.display().to_string(),
-        "record_error": record_error(&report.record),
+        "record_error": match &report.record {
+            Ok(finished) => finished.faults.first().cloned(),
+            Err(error) => Some(error.to_string()),
+        },
         "emulated": report.emulated.as_ref().map(emulated_json),
     })
 }

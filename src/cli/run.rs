@@ -6,7 +6,7 @@ use super::ending::{
     after_insertion, ending, plan_status, plane_missed_by_mm, possible_withdrawal, status,
 };
 use super::mask::{file_crc32, mask_reader};
-use super::output::{merged, print_result, print_stderr};
+use super::output::{merged, print_result};
 use super::perform::{Job, LIVE_ADDRESS, Options, Performed, end_json};
 use super::preflight::{before_rehearsal, before_run};
 use super::{Failure, finish_with, stage};
@@ -107,8 +107,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<(), Failure> {
     if wants_withdrawal && let Ok(withdrawal) = possible_withdrawal(&config, &report) {
         let config = withdrawal.configuration(config, &report);
         let command = format!("withdraw{}", withdrawal.by_option());
-        let (report, summary) = stage::perform(&config, &command, withdrawal_options)?;
-        print_stderr(summary);
+        let report = stage::perform(&config, &command, withdrawal_options)?;
         worst = worst.max(status(&config, &report));
     }
     finish_with(worst)

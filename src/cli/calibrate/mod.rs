@@ -25,30 +25,6 @@ use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::time::SystemTime;
 
-/// The comment above the result of a needle's calibration.
-const NEEDLE_HEADER: &str = "\
-# A needle on its sensor, by `needle-bench calibrate needle`. In the rig's configuration, under
-# [needle]: needle_file = \"FILE\"
-# [needle.fit] says how sure the values are: standard errors, from how the insertions differ.
-
-";
-const REGISTRATION_HEADER: &str = "\
-# Pose of the tracker frame in the bench frame, by `needle-bench calibrate registration`. In the
-# rig's configuration, under [tracker]: registration_file = \"FILE\"
-# sd_mm: standard deviation of each coordinate of a tip on the planned path that the error of this
-# pose causes.
-
-";
-const TIP_HEADER: &str = "\
-# The tip in the sensor's frame, by `needle-bench calibrate tip`. In the rig's configuration, under
-# [tracker]: tip_file = \"FILE\"
-";
-/// Added to [`TIP_HEADER`] if the fit has no [`mount`](TipFit::mount).
-const NO_MOUNT: &str = "\
-# The tracker sends no orientation that turns with the needle: the sensor's distance from the
-# needle's axis cannot be subtracted, and is left in the positions.
-";
-
 /// Student's t for a two-sided 95% interval, by the number of insertions from 3 on: standard errors from so few
 /// are themselves uncertain.
 const STUDENT_T_95: [f64; 8] = [4.3, 3.2, 2.8, 2.6, 2.4, 2.4, 2.3, 2.3];
@@ -148,47 +124,32 @@ impl Output {
         refuse_existing(self.out.as_deref())
     }
 
-    /// Writes the result: the operator's `summary`, a template for the values of `json` and `more`;
-    /// `overlay` as TOML below the comment `header` for the configuration; `json` for programs.
+    /// Writes the result: `json` for programs, and two templates for the values of `json` and `more`: the
+    /// operator's `summary`, and `toml` for the configuration. There is no TOML of a rehearsal: it would pass for
+    /// a calibration of the rig.
     fn write(
         &self,
-        summary: (&str, Shown),
-        header: &str,
-        overlay: &Value,
         json: &Value,
+        more: Shown,
+        summary: &str,
+        toml: Option<&str>,
     ) -> Result<(), Failure> {
-        let toml = toml::to_string(overlay).map_err(Failure::environment)?;
-        self.write_toml(summary, &format!("{header}{toml}"), json)
-    }
-
-    /// Shows the result of a rehearsal. There is no TOML: it would pass for a calibration of the rig.
-    fn show_rehearsal(&self, (summary, more): (&str, Shown), json: &Value) -> Result<(), Failure> {
-        print_stderr(screen(summary, json, more).map_err(Failure::environment)?);
-        print_stderr(
-            "rehearsal   emulated drives and tracker: no calibration of the rig, nothing is written",
-        );
+        let show = |template| screen(template, json, more.clone()).map_err(Failure::environment);
+        print_stderr(show(summary)?);
+        match (toml, &self.out) {
+            (Some(toml), Some(path)) => write_new(path, &(show(toml)? + "\n"))?,
+            (Some(toml), None) if !self.json => print_stdout(show(toml)?)?,
+            (Some(_), None) => {}
+            (None, _) => print_stderr(
+                "rehearsal   emulated drives and tracker: no calibration of the rig, nothing is written",
+            ),
+        }
         if self.json { print_stdout(json) } else { Ok(()) }
     }
+}
 
-    /// As [`write`](Self::write), with the whole `toml`.
-    fn write_toml(
-        &self,
-        (summary, more): (&str, Shown),
-        toml: &str,
-        json: &Value,
-    ) -> Result<(), Failure> {
-        print_stderr(screen(summary, json, more).map_err(Failure::environment)?);
-        if let Some(path) = &self.out {
-            write_new(path, toml)?;
-        }
-        if self.json {
-            print_stdout(json)
-        } else if self.out.is_none() {
-            print_stdout(toml.trim_end())
-        } else {
-            Ok(())
-        }
-    }
+fn to_toml(overlay: &Value) -> Result<String, Failure> {
+    toml::to_string(overlay).map_err(Failure::environment)
 }
 
 /// The `fit` table: source file, SHA-256 of its `text`, version and date, with the fields of `found`. `text` is
@@ -250,12 +211,9 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<(), Failure> {
         },
     });
     let student_t = STUDENT_T_95.get(fit.insertions - 3).unwrap_or(&STUDENT_T_95_MANY);
-    output.write(
-        (include_str!("needle.txt"), context! { student_t }),
-        NEEDLE_HEADER,
-        &overlay,
-        &overlay,
-    )
+    let more = context! { student_t, overlay => to_toml(&overlay)? };
+    let toml = Some(include_str!("needle.toml"));
+    output.write(&overlay, more, include_str!("needle.txt"), toml)
 }
 
 /// The rows of an insertion; every row must have an orientation.
@@ -320,9 +278,13 @@ fn registration(arguments: &RegistrationArguments) -> Result<(), Failure> {
         "localisation_error_mm": fit.localisation_error_mm(),
     });
     let overlay = json!({ "tracker": { "registration": registration } });
-    let more = context! { rms_max_mm => arguments.rms_max_mm, remarks => fit.remarks() };
-    let summary = (include_str!("registration.txt"), more);
-    arguments.output.write(summary, REGISTRATION_HEADER, &overlay, &json)
+    let more = context! {
+        rms_max_mm => arguments.rms_max_mm,
+        remarks => fit.remarks(),
+        overlay => to_toml(&overlay)?,
+    };
+    let toml = Some(include_str!("registration.toml"));
+    arguments.output.write(&json, more, include_str!("registration.txt"), toml)
 }
 
 /// The tip's offset and tilt on the sensor, from the sensor's circle while the base turns.
@@ -363,14 +325,11 @@ fn tip(arguments: &TipArguments) -> Result<(), Failure> {
         "has_mount": fit.mount.is_some(),
         "rehearsal": arguments.rehearse,
     });
-    let header = format!("{TIP_HEADER}{}\n", if fit.mount.is_some() { "" } else { NO_MOUNT });
     let more = context! {
         rms_max_mm,
         tilt_deg => fit.mount.map(|mount| mount.axis.z.clamp(-1.0, 1.0).acos().to_degrees()),
+        overlay => to_toml(&json!({ "tracker": tracker }))?,
     };
-    let summary = (include_str!("tip.txt"), more);
-    if arguments.rehearse {
-        return arguments.output.show_rehearsal(summary, &json);
-    }
-    arguments.output.write(summary, &header, &json!({ "tracker": tracker }), &json)
+    let toml = (!arguments.rehearse).then_some(include_str!("tip.toml"));
+    arguments.output.write(&json, more, include_str!("tip.txt"), toml)
 }

@@ -49,8 +49,8 @@ pub(super) fn collect_fiducials(path: &Path, configured: &Configured) -> Result<
     let mut file = OpenOptions::new().append(true).open(path).map_err(failed)?;
     let lines = read_lines();
     let mut text = HEADER.to_owned();
-    let mut number = 1_usize;
     loop {
+        let number = text.lines().count();
         print_stderr(format_args!(
             "point {number}: touch it, hold still, and type its bench coordinates as x y z in mm; an \
              empty line ends, `undo` removes the last point"
@@ -60,8 +60,7 @@ pub(super) fn collect_fiducials(path: &Path, configured: &Configured) -> Result<
             break;
         }
         if line.trim() == "undo" {
-            number = number.saturating_sub(1).max(1);
-            text = text.split_inclusive('\n').take(number).collect();
+            text = text.split_inclusive('\n').take((number - 1).max(1)).collect();
             // The file is in append mode: the next point follows the rows that remain.
             file.set_len(text.len() as u64).map_err(failed)?;
             continue;
@@ -82,11 +81,10 @@ pub(super) fn collect_fiducials(path: &Path, configured: &Configured) -> Result<
                     "taken: {x:.2}, {y:.2}, {z:.2} mm; {}",
                     residuals(&text)
                 ));
-                number += 1;
             }
         }
     }
-    if number > 1 {
+    if text != HEADER {
         return Ok(());
     }
     std::fs::remove_file(path).map_err(failed)?;
@@ -206,10 +204,9 @@ fn residuals(text: &str) -> String {
     }
 }
 
-const COLUMNS: &str = "rotation_rad,x_mm,y_mm,z_mm";
-const ORIENTATION: &str = ",qw,qx,qy,qz";
-/// Cells of a row with an orientation.
-const CELLS: usize = 8;
+const COLUMNS: [&str; 8] = ["rotation_rad", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"];
+/// Cells of a row without an orientation.
+const CELLS_MIN: usize = 4;
 /// A whole turn, and back: no cable stays wound up, and a lag in one direction is a lead in the other.
 const TURNS: [&str; 2] = ["360deg", "-360deg"];
 /// Smallest rotation between two rows of a turn: a base at rest gives one row.
@@ -227,22 +224,19 @@ pub(super) fn record_turn(
     refuse_existing(Some(path).filter(|_| !rehearse))?;
     let configured = configured.clone().rehearsed(rehearse);
     let (config, _) = load_stage(configured, rehearse, sensor_off_axis)?;
-    let (mut rows, mut has_orientation) = (Vec::new(), true);
+    let mut rows = Vec::new();
     for by in TURNS {
         let line = format!("jog --axis rotation --by {by}");
-        let (report, summary) = perform(&config, &line, Options::default())?;
-        print_stderr(summary);
+        let report = perform(&config, &line, Options::default())?;
         finish_with(status(&config, &report))?;
-        for row in rows_of(replay_run(&report.run_dir)?) {
-            has_orientation &= row.len() == CELLS;
-            rows.push(row);
-        }
+        rows.extend(rows_of(replay_run(&report.run_dir)?));
     }
-    let cells = if has_orientation { CELLS } else { 4 };
-    let mut text = format!("{COLUMNS}{}\n", if has_orientation { ORIENTATION } else { "" });
+    let has_orientation = rows.iter().all(|row| row.len() == COLUMNS.len());
+    let cells = if has_orientation { COLUMNS.len() } else { CELLS_MIN };
+    let mut text = COLUMNS[..cells].join(",") + "\n";
     for row in rows {
         let row: Vec<String> = row.iter().take(cells).map(f64::to_string).collect();
-        text += &format!("{}\n", row.join(","));
+        text += &(row.join(",") + "\n");
     }
     if !rehearse {
         write_new(path, &text)?;

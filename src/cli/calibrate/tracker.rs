@@ -1,15 +1,17 @@
-//! `needle-bench calibrate tracker`: noise, drift and rate of the tracker from a recording at rest.
+//! `needle-bench calibrate tracker`: noise, drift and rate of the tracker from a recording at rest; and
+//! `needle-bench tracker rest`, which measures them at once.
 
 use super::{Output, fit_table};
 use crate::calibration::{RestSample, TrackerFit};
 use crate::cli::Failure;
-use crate::cli::arguments::{Configured, text_of};
-use crate::cli::tracker::Unreadable;
+use crate::cli::arguments::{Configured, number_in, text_of};
+use crate::cli::output::print_stderr;
+use crate::cli::tracker::{Unreadable, listen, source_label};
 use crate::config::TrackerSection;
 use crate::table::Table;
-use crate::text::{escaped, screen};
-use crate::tracker::{CsvMapping, Event, Gate, Sample, TimeColumns, csv, gate, ndjson};
-use crate::units::Time;
+use crate::text::escaped;
+use crate::tracker::gate::is_same_tool;
+use crate::tracker::{CsvMapping, Event, Gate, Sample, TimeColumns, csv, ndjson};
 use clap::Args;
 use minijinja::context;
 use serde_json::json;
@@ -45,15 +47,43 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<(), Failure> {
     fit_and_write(&samples, &path.display().to_string(), Some(&text), &arguments.output)
 }
 
+#[derive(Debug, Args)]
+pub(in crate::cli) struct RestArguments {
+    #[command(flatten)]
+    configured: Configured,
+    /// How long the tool rests, s; Ctrl-C ends it sooner.
+    #[arg(long, value_name = "SECONDS", default_value_t = 60.0, value_parser = number_in(5.0..=3600.0, "seconds"))]
+    seconds: f64,
+    #[command(flatten)]
+    output: Output,
+}
+
+pub(in crate::cli) fn rest(arguments: &RestArguments) -> Result<(), Failure> {
+    arguments.output.refuse_existing()?;
+    let mut listener = listen(&arguments.configured, false)?;
+    let source = source_label(&listener.config);
+    print_stderr(format_args!(
+        "tracker: hold \"{}\" still for {} s",
+        listener.config.tracker.tool, arguments.seconds
+    ));
+    let gate = listener.config.tracker.to_unregistered_gate();
+    let mut samples = Vec::new();
+    listener.for_each_sample(Some(arguments.seconds), |sample| {
+        samples.push(rest_sample(&gate, sample));
+        Ok(())
+    })?;
+    fit_and_write(&samples, &source, None, &arguments.output)
+}
+
 /// Fits the `samples` of `source` and writes the result. `text` is the content of `source` if it is a file.
-pub(in crate::cli) fn fit_and_write(
+fn fit_and_write(
     samples: &[RestSample],
     source: &str,
     text: Option<&str>,
     output: &Output,
 ) -> Result<(), Failure> {
-    let fit =
-        TrackerFit::of(samples).map_err(|error| Failure::bad_input(source.as_ref(), error))?;
+    let bad_input = |error| Failure::bad_input(source.as_ref(), error);
+    let fit = TrackerFit::of(samples).map_err(bad_input)?;
     let found = serde_json::to_value(&fit).map_err(Failure::environment)?;
     let all = &fit.together;
     let json = json!({
@@ -69,12 +99,11 @@ pub(in crate::cli) fn fit_and_write(
         "fit": fit_table(source, text, &found),
     });
     let more = context! { source => escaped(source) };
-    let toml = screen(include_str!("noise.toml"), &json, more).map_err(Failure::environment)?;
-    output.write_toml((include_str!("tracker.txt"), context! {}), &format!("{toml}\n"), &json)
+    output.write(&json, more, include_str!("tracker.txt"), Some(include_str!("noise.toml")))
 }
 
 /// The part of a sample that the calibration uses.
-pub(in crate::cli) fn rest_sample(gate: &Gate, sample: &Sample) -> RestSample {
+fn rest_sample(gate: &Gate, sample: &Sample) -> RestSample {
     RestSample {
         receive_time: sample.receive_time,
         source_unix_ns: sample.source_unix_ns,
@@ -90,21 +119,19 @@ fn recorded(text: &str, tracker: &TrackerSection) -> Result<Vec<RestSample>, Str
         false => csv::recording(text, &mapping(text, &tracker.csv), &tracker.tool)
             .map_err(|error| format!("{error}; see [tracker.csv]"))?,
     };
-    let samples = || {
-        events.iter().filter_map(|(_, event): &(Time, Event)| match event {
-            Event::Sample(sample) => Some(sample),
-            _ => None,
-        })
-    };
-    let mut unreadable = Unreadable::default();
-    events.iter().for_each(|(_, event)| unreadable.note(event));
+    let (mut samples, mut unreadable) = (Vec::new(), Unreadable::default());
+    for (_, event) in &events {
+        unreadable.note(event);
+        if let Event::Sample(sample) = event {
+            samples.push(sample);
+        }
+    }
     unreadable.warn();
     let gate = tracker.to_unregistered_gate();
-    let of_tool = |sample: &&Sample| gate::is_same_tool(&sample.tool, &tracker.tool);
-    let found = samples().filter(of_tool).map(|sample| rest_sample(&gate, sample));
-    let found: Vec<RestSample> = found.collect();
+    let of_tool = samples.iter().filter(|sample| is_same_tool(&sample.tool, &tracker.tool));
+    let found: Vec<RestSample> = of_tool.map(|sample| rest_sample(&gate, sample)).collect();
     if found.is_empty() {
-        let other = samples().map(|sample| sample.tool.as_str()).next().unwrap_or_default();
+        let other = samples.first().map_or("", |sample| &sample.tool);
         return Err(format!(
             "no sample of \"{}\", but of \"{other}\"; give --set 'tracker.tool=\"{other}\"'",
             tracker.tool

@@ -7,6 +7,7 @@ use crate::cli::arguments::Configured;
 use crate::runtime::Holds;
 use crate::stage::{PerAxis, SetPoint};
 use crate::study::RunFigures;
+use crate::telemetry::{Finished, TelemetryError};
 use crate::tracker::GateCounts;
 use crate::units::Time;
 use std::path::PathBuf;

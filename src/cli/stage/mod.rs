@@ -240,15 +240,24 @@ impl Motion {
                 }
                 homing => homing,
             },
-            Motion::Jog { axis, by, to, speed, .. } => {
-                let goal = jog_goal(&stage, *axis, *by, *to)?;
-                Operation::Move(with_speed(jog_move(config, *axis, goal), *speed, &stage)?)
-            }
-            Motion::Withdraw { by, speed, .. } => {
-                Operation::Move(with_speed(withdrawal_move(config, &stage, *by)?, *speed, &stage)?)
-            }
+            Motion::Jog { axis, by, to, speed, .. } => jog_goal(&stage, *axis, *by, *to)
+                .and_then(|goal| with_speed(jog_move(config, *axis, goal), *speed, &stage))
+                .map_err(Failure::configuration)?,
+            Motion::Withdraw { by, speed, .. } => withdrawal_move(config, &stage, *by)
+                .and_then(|withdrawal| with_speed(withdrawal, *speed, &stage))
+                .map_err(Failure::configuration)?,
             Motion::Prove { handedness: false, .. } => Operation::Prove,
-            Motion::Prove { handedness: true, .. } => handedness_check(config)?,
+            Motion::Prove { handedness: true, .. } => {
+                let gate = config.tracker.to_gate()?;
+                // The sensor's own position: the tip is on the axis.
+                let registration = Registration::new(*gate.registration.x_wt());
+                let turn = Goal::By(HANDEDNESS_TURN_DEG.to_radians());
+                Operation::Answer(Box::new(AnswerSettings {
+                    gate: Gate { registration, workspace: None, ..gate },
+                    axis: config.plane.to_pose().rotation * Vector3::z(),
+                    turn: jog_move(config, Axis::Rotation, turn),
+                }))
+            }
         };
         Ok(OperationConfig { stage, operation })
     }
@@ -367,54 +376,40 @@ pub(super) fn sensor_off_axis(config: &Config) -> Option<String> {
         .then(|| format!("emulator.sensor.x_mm={SENSOR_OFF_AXIS_MM}"))
 }
 
-fn handedness_check(config: &Config) -> Result<Operation, Failure> {
-    let gate = config.tracker.to_gate()?;
-    // The sensor's own position: the tip is on the axis.
-    let registration = Registration::new(*gate.registration.x_wt());
-    Ok(Operation::Answer(Box::new(AnswerSettings {
-        gate: Gate { registration, workspace: None, ..gate },
-        axis: config.plane.to_pose().rotation * Vector3::z(),
-        turn: jog_move(config, Axis::Rotation, Goal::By(HANDEDNESS_TURN_DEG.to_radians())),
-    })))
-}
-
 /// The goal of a jog.
 fn jog_goal(
     stage: &StageConfig,
     axis: Axis,
     by: Option<Distance>,
     to: Option<Distance>,
-) -> Result<Goal, Failure> {
+) -> Result<Goal, String> {
     match (by, to) {
-        (Some(by), _) => by
-            .nonzero_along(axis, stage.axis(axis).ratio)
-            .map(Goal::By)
-            .map_err(Failure::configuration),
-        (None, Some(_)) if stage.axis(axis).zero.is_none() => {
-            Err(Failure::configuration(format_args!(
-                "--to: stage.{axis}.zero is \"start\": positions count from where each command begins, \
+        (Some(by), _) => by.nonzero_along(axis, stage.axis(axis).ratio).map(Goal::By),
+        (None, Some(to)) if stage.axis(axis).zero.is_some() => to.along(axis).map(Goal::To),
+        (None, Some(_)) => Err(format!(
+            "--to: stage.{axis}.zero is \"start\": positions count from where each command begins, \
              so --to would mean --by; give --by, or set stage.{axis}.zero in counts of the drive"
-            )))
-        }
-        (None, Some(to)) => to.along(axis).map(Goal::To).map_err(Failure::configuration),
-        (None, None) => Err(Failure::configuration("give --by or --to")),
+        )),
+        (None, None) => Err("give --by or --to".to_owned()),
     }
 }
 
 /// `jog` at `speed`, if one is given.
-fn with_speed(jog: Move, speed: Option<Distance>, stage: &StageConfig) -> Result<Move, Failure> {
-    let Some(asked) = speed else { return Ok(jog) };
-    let speed = asked.along(jog.axis).map_err(Failure::configuration)?;
+fn with_speed(
+    jog: Move,
+    speed: Option<Distance>,
+    stage: &StageConfig,
+) -> Result<Operation, String> {
+    let Some(asked) = speed else { return Ok(Operation::Move(jog)) };
+    let speed = asked.along(jog.axis)?;
     let max = stage.axis(jog.axis).limits.speed_max;
     if speed > 0.0 && speed <= max {
-        return Ok(Move { speed, ..jog });
+        return Ok(Operation::Move(Move { speed, ..jog }));
     }
     let (max, unit) = jog.axis.in_unit(max);
     // Undo the rounding of the conversion to radians and back.
     let max = (max * 1e9).round() / 1e9;
-    Err(Failure::configuration(format_args!(
-        "--speed is {asked}/s, allowed: over 0, up to {max}{unit}/s"
-    )))
+    Err(format!("--speed is {asked}/s, allowed: over 0, up to {max}{unit}/s"))
 }
 
 /// A move of `axis` at its jog speed.
@@ -436,23 +431,24 @@ fn withdrawal_move(
     config: &Config,
     stage: &StageConfig,
     by: Option<Distance>,
-) -> Result<Move, Failure> {
+) -> Result<Move, String> {
     let insertion = &config.stage.insertion;
     let along = |by: Distance| by.nonzero_along(Axis::Insertion, stage.insertion.ratio);
-    let goal = match by.map(along).transpose().map_err(Failure::configuration)? {
+    let goal = match by.map(along).transpose()? {
         Some(mm) if mm > 0.0 => Goal::By(-mm),
         Some(mm) => {
             let by = mm.abs();
-            return Err(Failure::configuration(format!(
+            return Err(format!(
                 "withdraw pulls back: --by {mm}mm is not over 0; give the distance alone, --by {by}mm"
-            )));
+            ));
         }
         None if insertion.zero.is_some() => Goal::BackTo(0.0),
         None => {
-            return Err(Failure::configuration(
+            return Err(
                 "stage.insertion.zero is \"start\": the bench does not know the depth where the \
-                 needle went in; say how far to withdraw, --by 20mm",
-            ));
+                        needle went in; say how far to withdraw, --by 20mm"
+                    .to_owned(),
+            );
         }
     };
     let speed = insertion.withdraw_speed.unwrap_or(insertion.jog_speed);

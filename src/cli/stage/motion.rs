@@ -3,7 +3,7 @@
 use super::{Arguments, Motion};
 use crate::archive::{file, proof};
 use crate::cli::ending::{after_operation, ending, status};
-use crate::cli::output::{merged, print_stdout, print_wrapped};
+use crate::cli::output::{merged, print_result, print_stderr};
 use crate::cli::perform::{Job, Options, Performed, end_json};
 use crate::cli::{Failure, finish_with};
 use crate::config::Config;
@@ -26,26 +26,23 @@ pub(super) fn operate(
         ..Options::default()
     };
     let Performed { report, done, .. } = job(config, motion, options)?.perform()?;
-    match arguments.json {
-        true => print_stdout(to_json(motion.name(), &done, &report))?,
-        false => {
-            print_wrapped(summary(config, path, motion, &done, &report))?;
-            proof_of(&report).map_or(Ok(()), print_wrapped)?;
-        }
-    }
+    let proof = proof_of(&report);
+    let object = to_json(motion.name(), &done, &proof, &report);
+    let text = [summary(config, path, motion, &done, &report)].into_iter().chain(proof);
+    print_result(arguments.json, &object, || Ok(text.collect::<Vec<_>>().join("\n")))?;
     finish_with(status(config, &report))
 }
 
-/// Runs the motion that `line` describes as on the command line of `stage`; returns the report and the summary.
+/// Runs the motion that `line` describes as on the command line of `stage`, and prints its summary on stderr.
 pub(in crate::cli) fn perform(
     config: &Config,
     line: &str,
     options: Options,
-) -> Result<(RunReport, String), Failure> {
+) -> Result<RunReport, Failure> {
     let motion = Motion::of(line).map_err(Failure::configuration)?;
     let Performed { report, done, .. } = job(config, &motion, options)?.perform()?;
-    let summary = summary(config, None, &motion, &done, &report);
-    Ok((report, summary))
+    print_stderr(summary(config, None, &motion, &done, &report));
+    Ok(report)
 }
 
 fn job<'a>(config: &'a Config, motion: &'a Motion, options: Options) -> Result<Job<'a>, Failure> {
@@ -53,7 +50,7 @@ fn job<'a>(config: &'a Config, motion: &'a Motion, options: Options) -> Result<J
     Ok(Job { config, run_config, motion: Some(motion), options })
 }
 
-fn to_json(name: &str, done: &[AxisMove], report: &RunReport) -> Value {
+fn to_json(name: &str, done: &[AxisMove], proof: &Option<String>, report: &RunReport) -> Value {
     let axis = |done: &AxisMove| {
         let (to, unit) = done.axis.in_unit(done.to);
         let from = done.from.map(|from| done.axis.in_unit(from).0);
@@ -65,7 +62,7 @@ fn to_json(name: &str, done: &[AxisMove], report: &RunReport) -> Value {
     let object = json!({
         "operation": name,
         "axes": done.iter().map(axis).collect::<Vec<_>>(),
-        "proof": proof_of(report),
+        "proof": proof,
     });
     merged(object, &end_json(report))
 }
@@ -93,7 +90,6 @@ fn summary(
     };
     let remaining = motion.remaining(done, config.stage.insertion.limits.min);
     let next = after_operation(config, path, remaining.as_deref(), report);
-    let lines: Vec<String> =
-        done.iter().map(line).chain(next).chain([ending(config, report)]).collect();
-    lines.join("\n")
+    let lines = done.iter().map(line).chain(next).chain([ending(config, report)]);
+    lines.collect::<Vec<_>>().join("\n")
 }

@@ -120,7 +120,7 @@ pub(super) fn list(arguments: &ListArguments) -> Result<(), Failure> {
         }
     }
     if tools.is_empty() {
-        return Err(listener.no_samples());
+        return Err(Failure::environment(listener.explain_missing()));
     }
     listener.warn_of_losses();
     if arguments.json {

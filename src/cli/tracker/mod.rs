@@ -1,15 +1,15 @@
 //! The source of tip positions that the configuration names; and `needle-bench tracker`, which listens to it
 //! without a run.
 
-mod commands;
 mod list;
 mod record;
-mod rest;
 mod watch;
 
-pub(super) use self::commands::{TrackerCommand, tracker};
-
+use self::list::{ListArguments, list};
+use self::record::{RecordArguments, record};
+use self::watch::{WatchArguments, watch};
 use super::arguments::{Configured, text_of};
+use super::calibrate::tracker::{RestArguments, rest};
 use super::output::print_stderr;
 use super::{Failure, io_runtime};
 use crate::config::{Config, TrackerMode, TrackerSection, TrackerSource};
@@ -18,10 +18,32 @@ use crate::text::clipped;
 use crate::tracker::{Census, Event, Sample, Sieve, StreamReplay, csv, ndjson};
 use crate::transport::link::{Link, LinkSettings};
 use crate::units::Time;
+use clap::Subcommand;
 use std::path::Path;
 use std::time::{Duration, UNIX_EPOCH};
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
+
+#[derive(Debug, Subcommand)]
+pub(super) enum TrackerCommand {
+    /// The tools that the tracker sends, with types and rates.
+    List(ListArguments),
+    /// One line a second: position, rate, age, refusals; until Ctrl-C.
+    Watch(WatchArguments),
+    /// Write the tool's positions to a file; until Ctrl-C.
+    Record(RecordArguments),
+    /// Measure the tracker's noise while the tool is at rest, as `calibrate tracker` does.
+    Rest(RestArguments),
+}
+
+pub(super) fn tracker(command: &TrackerCommand) -> Result<(), Failure> {
+    match command {
+        TrackerCommand::List(arguments) => list(arguments),
+        TrackerCommand::Watch(arguments) => watch(arguments),
+        TrackerCommand::Record(arguments) => record(arguments),
+        TrackerCommand::Rest(arguments) => rest(arguments),
+    }
+}
 
 /// Opens the stream of the tracker's tool and, if the target is tracked, of the target's, in real time.
 pub(super) fn open_tracker(
@@ -241,7 +263,7 @@ impl Listener {
             take(&sample)?;
         }
         if !has_sample {
-            return Err(self.no_samples());
+            return Err(Failure::environment(self.explain_missing()));
         }
         self.warn_of_losses();
         Ok(())
@@ -288,11 +310,6 @@ impl Listener {
             }
             _ => self.census.explain_missing(tool),
         }
-    }
-
-    /// The failure of a command that received no sample of the tool.
-    pub(super) fn no_samples(&mut self) -> Failure {
-        Failure::environment(self.explain_missing())
     }
 }
 

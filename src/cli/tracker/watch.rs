@@ -164,7 +164,7 @@ pub(super) fn watch(arguments: &WatchArguments) -> Result<(), Failure> {
             "tracker: no position of \"{}\" was accepted; the last: {refusal}",
             listener.config.tracker.tool
         ))),
-        (None, None) => Err(listener.no_samples()),
+        (None, None) => Err(Failure::environment(listener.explain_missing())),
     }
 }
 
