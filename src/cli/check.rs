@@ -46,7 +46,12 @@ pub(super) fn check(arguments: &Arguments) -> Result<(), Failure> {
         return print_stdout(text.trim_end());
     }
     let (config, warnings) = arguments.configured.load_with_warnings()?;
-    check_goal(&config, arguments)?;
+    let goal = config.to_goal(&mask_reader(arguments.configured.path()))?;
+    goal.map_err(Failure::configuration)?;
+    // Without a registration the tracker can still be checked; the checks say that it is missing.
+    if !arguments.connect || config.tracker.registration.is_some() {
+        config.session_without_goal()?;
+    }
     if arguments.print {
         return print_stdout(config.to_toml().map_err(Failure::environment)?.trim_end());
     }
@@ -91,16 +96,4 @@ pub(super) fn check(arguments: &Arguments) -> Result<(), Failure> {
         (1, true) => BAD_CONFIGURATION,
         _ => ENVIRONMENT_FAILED,
     })
-}
-
-/// Checks the configuration of a run, and plans its path to the target, with the masks.
-fn check_goal(config: &Config, arguments: &Arguments) -> Result<(), Failure> {
-    let goal = config.to_goal(&mask_reader(arguments.configured.path()))?;
-    goal.map_err(Failure::configuration)?;
-    // Without a registration the tracker can still be checked; the checks say that it is missing.
-    if arguments.connect && config.tracker.registration.is_none() {
-        return Ok(());
-    }
-    config.session_without_goal()?;
-    Ok(())
 }

@@ -159,19 +159,18 @@ fn why_refused(
     is_interrupted: impl Fn() -> bool,
     ask: impl FnOnce() -> bool,
 ) -> Option<(String, u8)> {
-    let interrupted = || Some(("operator: interrupted".to_owned(), STOPPED));
-    if is_interrupted() {
-        return interrupted();
-    }
+    let stopped = |reason: &str| Some((reason.to_owned(), STOPPED));
     let failed = failed(checks).count();
-    if failed > 0 {
+    if is_interrupted() {
+        stopped("operator: interrupted")
+    } else if failed > 0 {
         let reason = format!("preflight: {failed} of {} checks failed", checks.len());
-        return Some((reason, ENVIRONMENT_FAILED));
+        Some((reason, ENVIRONMENT_FAILED))
+    } else if ask() {
+        None
+    } else {
+        stopped(if is_interrupted() { "operator: interrupted" } else { "not confirmed" })
     }
-    if ask() {
-        return None;
-    }
-    if is_interrupted() { interrupted() } else { Some(("not confirmed".to_owned(), STOPPED)) }
 }
 
 /// Shows the checks of `rig` before its rehearsal `config`. A rehearsal moves nothing, so it runs even if

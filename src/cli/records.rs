@@ -242,16 +242,10 @@ impl Insertions {
 
 /// Reads the insertion in `path`, a CSV file or a run folder.
 fn read_insertion(path: &Path) -> Result<Insertion, Failure> {
-    let insertion = |text, recording, is_rehearsal| Insertion {
-        path: path.to_owned(),
-        text,
-        recording,
-        is_rehearsal,
-    };
     if !path.is_dir() {
         let text = text_of(path)?;
         let recording = Recording::parse(&text).map_err(|error| Failure::bad_input(path, error))?;
-        return Ok(insertion(text, recording, false));
+        return Ok(Insertion { path: path.to_owned(), text, recording, is_rehearsal: false });
     }
     let ReplayedRun { folder, config, stage, samples } = replay_run(path)?;
     let registration = config.tracker.to_registration()?;
@@ -263,8 +257,12 @@ fn read_insertion(path: &Path) -> Result<Insertion, Failure> {
         let why = "no position was accepted while the needle was inserted";
         return Err(Failure::bad_input(path, why));
     }
-    let is_rehearsal = folder.manifest().rehearsal.is_some();
-    Ok(insertion(folder.text(file::TRACKER)?, Recording { rows }, is_rehearsal))
+    Ok(Insertion {
+        path: path.to_owned(),
+        text: folder.text(file::TRACKER)?,
+        recording: Recording { rows },
+        is_rehearsal: folder.manifest().rehearsal.is_some(),
+    })
 }
 
 /// Rows of the tip on the bench and of the stage at that time. `samples` are lines, acquisition times and samples;

@@ -69,7 +69,9 @@ pub(super) fn study(arguments: &Arguments) -> Result<(), Failure> {
     let seeds: Vec<u64> =
         (0..u64::from(arguments.trials)).map(|trial| trial_seed(arguments.seed, trial)).collect();
 
-    let bar = progress_bar(seeds.len());
+    let style = ProgressStyle::with_template("{bar:40.cyan/blue} {pos} of {len} trials  {eta}");
+    let style = style.unwrap_or_else(|_| ProgressStyle::default_bar());
+    let bar = ProgressBar::new(seeds.len() as u64).with_style(style);
     let threads = arguments.threads.map_or(0, usize::from);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let begun = Instant::now();
@@ -119,12 +121,6 @@ struct Report<'a> {
     #[serde(flatten)]
     summary: &'a StudySummary,
     insertion_mm_per_second: f64,
-}
-
-fn progress_bar(trials: usize) -> ProgressBar {
-    let style = ProgressStyle::with_template("{bar:40.cyan/blue} {pos} of {len} trials  {eta}");
-    let style = style.unwrap_or_else(|_| ProgressStyle::default_bar());
-    ProgressBar::new(trials as u64).with_style(style)
 }
 
 /// Writes a CSV row for each trial; a cell for which the trial has no number is empty.

@@ -92,8 +92,7 @@ struct Shared {
 
 impl Shared {
     fn new(setup: Setup, interrupt: Interrupt) -> Self {
-        let screen = Mutex::new(Screen::new(setup));
-        Shared { screen, interrupt, ..Shared::default() }
+        Shared { screen: Mutex::new(Screen::new(setup)), interrupt, ..Shared::default() }
     }
 }
 
@@ -135,24 +134,17 @@ impl Console {
         let (mut command_sender, commands) = RingBuffer::new(COMMANDS);
         let (drawing, drawn) = sync_channel::<()>(0);
         let (keys_shared, draw_shared) = (Arc::clone(&shared), Arc::clone(&shared));
-        let spawn = |name: &str, serve: Box<dyn FnOnce() + Send>| {
-            thread::Builder::new().name(name.to_owned()).spawn(serve).map_err(|error| {
-                give_terminal_back();
-                Failure::environment(error)
-            })
-        };
-        spawn(
-            "console-draw",
-            Box::new(move || {
-                draw(terminal, &draw_shared);
-                give_terminal_back();
-                drop(drawing);
-            }),
-        )?;
-        spawn(
-            "console-keys",
-            Box::new(move || serve_keys(keys, &keys_shared, &mut queue, &mut command_sender)),
-        )?;
+        let thread = |name: &str| thread::Builder::new().name(name.to_owned());
+        let drawer = thread("console-draw").spawn(move || {
+            draw(terminal, &draw_shared);
+            give_terminal_back();
+            drop(drawing);
+        });
+        let served = drawer.and_then(|_| {
+            let serve = move || serve_keys(keys, &keys_shared, &mut queue, &mut command_sender);
+            thread("console-keys").spawn(serve)
+        });
+        served.inspect_err(|_| give_terminal_back())?;
         Ok(Console { shared, messages, commands, drawn })
     }
 

@@ -68,15 +68,11 @@ pub(super) fn review(arguments: &Arguments) -> Result<(), Failure> {
             paths => paths.len() > 2,
         };
     let is_one_run = !changes_record && !is_campaign && paths.len() == 1;
+    let one_run = "the review of one run: name one run folder";
     for (flag, is_given, applies, to) in [
         ("--by", arguments.by.is_some(), is_campaign, "a campaign: name a folder of runs"),
-        (
-            "--html",
-            arguments.html.is_some(),
-            is_one_run,
-            "the review of one run: name one run folder",
-        ),
-        ("--open", arguments.open, is_one_run, "the review of one run: name one run folder"),
+        ("--html", arguments.html.is_some(), is_one_run, one_run),
+        ("--open", arguments.open, is_one_run, one_run),
     ] {
         if is_given && !applies {
             return Err(Failure::configuration(format_args!("{flag} applies only to {to}")));
@@ -207,10 +203,10 @@ fn close_record(path: &Path, json: bool) -> Result<(), Failure> {
     };
     let (_, config) = open(path)?;
     // If it cannot be made, a changed one must not be taken for it.
-    match fs::remove_file(path.join(file::RECORDING)) {
+    let recording = path.join(file::RECORDING);
+    match fs::remove_file(&recording) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
-            let recording = path.join(file::RECORDING);
-            return Err(Failure::environment(format_args!("{}: {error}", recording.display())));
+            return Err(Failure::io(&recording, error));
         }
         _ => {}
     }
