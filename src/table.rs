@@ -34,7 +34,8 @@ pub struct Row {
 #[derive(Debug, Clone)]
 pub struct Column {
     index: usize,
-    name: String,
+    /// Its name in the header.
+    pub name: String,
 }
 
 impl Table {
@@ -137,31 +138,24 @@ impl Table {
         }
         let rotation = |row: &Row| {
             if is_empty(row) {
-                let line = row.line;
                 return Err(TableError(format!(
-                    "line {line}: no orientation (qw,qx,qy,qz), but other rows have one"
+                    "line {}: no orientation (qw,qx,qy,qz), but other rows have one",
+                    row.line
                 )));
             }
             let [w, x, y, z] = row.finite_numbers(&columns)?;
             let quaternion = Quaternion::new(w, x, y, z);
             let norm = quaternion.norm();
             if !(norm.is_finite() && norm > 1e-6) {
-                let line = row.line;
                 return Err(TableError(format!(
-                    "line {line}: qw,qx,qy,qz have the norm {norm}: no orientation"
+                    "line {}: qw,qx,qy,qz have the norm {norm}: no orientation",
+                    row.line
                 )));
             }
             Ok(Some(UnitQuaternion::new_normalize(quaternion).to_rotation_matrix()))
         };
         self.check_row_lengths()?;
         self.rows.iter().map(rotation).collect()
-    }
-}
-
-impl Column {
-    /// The column's name.
-    pub fn name(&self) -> &str {
-        &self.name
     }
 }
 
@@ -182,14 +176,10 @@ impl Row {
     fn finite_numbers<const N: usize>(&self, columns: &[Column]) -> Result<[f64; N], TableError> {
         let mut numbers = [0.0; N];
         for (number, column) in numbers.iter_mut().zip(columns) {
-            *number = self.finite(column)?;
+            let finite = self.number(column).ok().filter(|number| number.is_finite());
+            *number = finite.ok_or_else(|| self.error(column, "finite number"))?;
         }
         Ok(numbers)
-    }
-
-    fn finite(&self, column: &Column) -> Result<f64, TableError> {
-        let number = self.number(column).ok().filter(|number| number.is_finite());
-        number.ok_or_else(|| self.error(column, "finite number"))
     }
 
     /// The error for a field in `column` that does not hold what was `expected`.

@@ -24,7 +24,7 @@ impl StepsTable {
                 "" => Ok(None),
                 _ => row.number(&column).map(Some),
             });
-            Ok((column.name().to_owned(), numbers.collect::<Result<_, _>>()?))
+            Ok((column.name.clone(), numbers.collect::<Result<_, _>>()?))
         });
         Ok(StepsTable { rows: table.rows().len(), columns: columns.collect::<Result<_, _>>()? })
     }
