@@ -1,7 +1,7 @@
 //! Arguments that several commands share, and the configuration that they name.
 
-use super::Failure;
 use super::output::print_stderr;
+use super::{Failure, Result};
 use crate::config::{Config, SEED_MAX, Source};
 use crate::runtime::{RealTime, enter_real_time};
 use clap::Args;
@@ -47,12 +47,12 @@ impl Configured {
     }
 
     /// Loads the configuration. If no file is named, loads the built-in `fallback` (name, text) or the defaults.
-    pub(super) fn load(&self, fallback: Option<(&str, &str)>) -> Result<Config, Failure> {
+    pub(super) fn load(&self, fallback: Option<(&str, &str)>) -> Result<Config> {
         self.read(fallback).map(|(config, _)| config)
     }
 
     /// Loads the configuration and its warnings, and prints the warnings.
-    pub(super) fn load_with_warnings(&self) -> Result<(Config, Vec<String>), Failure> {
+    pub(super) fn load_with_warnings(&self) -> Result<(Config, Vec<String>)> {
         let (config, warnings) = self.read(None)?;
         for warning in &warnings {
             print_stderr(format_args!("warning: {warning}"));
@@ -60,7 +60,7 @@ impl Configured {
         Ok((config, warnings))
     }
 
-    fn read(&self, fallback: Option<(&str, &str)>) -> Result<(Config, Vec<String>), Failure> {
+    fn read(&self, fallback: Option<(&str, &str)>) -> Result<(Config, Vec<String>)> {
         let source = match self.path() {
             Some(path) => Some((path.display().to_string(), text_of(path)?)),
             None => fallback.map(|(name, text)| (name.to_owned(), text.to_owned())),
@@ -73,7 +73,7 @@ impl Configured {
 }
 
 /// The text of a file that the arguments name.
-pub(super) fn text_of(path: &Path) -> Result<String, Failure> {
+pub(super) fn text_of(path: &Path) -> Result<String> {
     read_text(path).map_err(|error| Failure::bad_input(path, error))
 }
 
@@ -124,7 +124,7 @@ pub(super) struct RealTimeArguments {
 
 impl RealTimeArguments {
     /// Refuses `--realtime`, if it was given, for the reason `why`.
-    pub(super) fn refuse_if_given(self, why: &str) -> Result<(), Failure> {
+    pub(super) fn refuse_if_given(self, why: &str) -> Result<()> {
         match self.realtime {
             false => Ok(()),
             true => Err(Failure::configuration(format_args!("--realtime: {why}"))),
@@ -133,7 +133,7 @@ impl RealTimeArguments {
 
     /// Checks that this process may take real-time priority. Tries it on a thread that then ends: threads created
     /// later must not inherit the priority.
-    pub(super) fn check_permission(self) -> Result<(), Failure> {
+    pub(super) fn check_permission(self) -> Result<()> {
         let tried = thread::spawn(move || self.enter()).join();
         tried.map_err(|_| Failure::environment("--realtime: the trial ended in a panic"))?.map(drop)
     }
@@ -150,7 +150,7 @@ impl RealTimeArguments {
 
     /// Gives this thread, the SYNC thread, its real-time priority if asked. Call it after all other
     /// threads have started.
-    pub(super) fn enter(self) -> Result<Option<RealTime>, Failure> {
+    pub(super) fn enter(self) -> Result<Option<RealTime>> {
         let entered = self.realtime.then(|| enter_real_time(self.cpu)).transpose();
         entered.map_err(Failure::environment)
     }

@@ -3,9 +3,9 @@
 use super::arguments::{Configured, number_in};
 use super::mask::mask_reader;
 use super::output::{print_stderr, print_stdout, print_wrapped};
-use super::preflight::Preflight;
+use super::preflight::{Preflight, troubles};
 use super::stage::drive_json;
-use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure, finish_with};
+use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure, Result, finish_with};
 use crate::config::Config;
 use crate::preflight::to_text;
 use clap::Args;
@@ -37,7 +37,7 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-pub(super) fn check(arguments: &Arguments) -> Result<(), Failure> {
+pub(super) fn check(arguments: &Arguments) -> Result<()> {
     if arguments.reference || arguments.schema {
         let text = match arguments.schema {
             true => format!("{:#}", Config::json_schema()),
@@ -68,7 +68,7 @@ pub(super) fn check(arguments: &Arguments) -> Result<(), Failure> {
         };
     }
     let preflight = Preflight::inspect(&config, &config, Duration::from_secs_f64(arguments.listen));
-    let troubles = preflight.troubles();
+    let troubles = troubles(&preflight.checks);
     if !troubles.is_empty() {
         print_stderr(format_args!("error: {}", troubles.join("\n       ")));
         report["error"] = json!(troubles.join("; "));

@@ -1,8 +1,8 @@
 //! `needle-bench evaluate`: runs the observers over recorded insertions and scores them.
 
-use super::Failure;
 use super::output::{merged, print_result, print_stderr};
 use super::records::{Insertion, Insertions};
+use super::{Failure, Result};
 use crate::session::ObserverConfig;
 use crate::study::{Evaluation, Recording, RecordingScore, evaluate as evaluate_observer};
 use crate::text::screen;
@@ -22,12 +22,12 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-pub(super) fn evaluate(arguments: &Arguments) -> Result<(), Failure> {
+pub(super) fn evaluate(arguments: &Arguments) -> Result<()> {
     let observer = arguments.observer.as_ref().map(|kind| format!("observer.kind={kind:?}"));
     let (config, insertions) = arguments.insertions.read(observer)?;
     let (needle, torsion) = (config.believed_needle()?, config.believed_torsion()?);
     let scoring = config.scoring()?;
-    let score_observer = |observer: &ObserverConfig, recording: &Recording| {
+    let score_once = |observer: &ObserverConfig, recording: &Recording| {
         let mut observer = observer.build(needle, torsion).map_err(|error| error.to_string())?;
         evaluate_observer(observer.as_mut(), recording, &scoring)
     };
@@ -43,10 +43,14 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<(), Failure> {
     for observer in config.observers() {
         let (mut scores, mut files) = (Vec::new(), Vec::new());
         for Insertion { path, recording, .. } in &insertions {
-            let score = score_with_and_without_roll(&observer, |observer| {
-                score_observer(observer, recording)
+            let scored = score_once(&observer, recording).and_then(|score| {
+                // Also the roll error of the same observer without the roll at the start, if it is told the roll.
+                let roll_unknown = observer.with_roll_unknown();
+                let without_roll = roll_unknown.map(|other| score_once(&other, recording));
+                let roll_unknown_rms_deg = without_roll.transpose()?.and_then(|it| it.roll_rms_deg);
+                Ok(RecordingScore { roll_unknown_rms_deg, ..score })
             });
-            let score = score.map_err(|error| Failure::bad_input(path, error))?;
+            let score = scored.map_err(|error| Failure::bad_input(path, error))?;
             files.push(merged(json!({ "file": path.display().to_string() }), &json!(score)));
             scores.push(score);
         }
@@ -59,15 +63,4 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<(), Failure> {
     let object = merged(first, &json!({ "observers": observers }));
     let text = || screen(include_str!("evaluate.txt"), &object, context! {});
     print_result(arguments.json, &object, text)
-}
-
-/// Scores `observer`, and adds the roll error of the same observer if it does not know the roll at the start.
-fn score_with_and_without_roll(
-    observer: &ObserverConfig,
-    score: impl Fn(&ObserverConfig) -> Result<RecordingScore, String>,
-) -> Result<RecordingScore, String> {
-    let with_roll = score(observer)?;
-    let without_roll = observer.with_roll_unknown().as_ref().map(&score).transpose()?;
-    let roll_unknown_rms_deg = without_roll.and_then(|score| score.roll_rms_deg);
-    Ok(RecordingScore { roll_unknown_rms_deg, ..with_roll })
 }

@@ -1,7 +1,7 @@
 //! `needle-bench generate`: completions and man pages, from the command line as it is declared.
 
 use super::output::print_stdout;
-use super::{Failure, command_line};
+use super::{Failure, Result, command_line};
 use clap::Subcommand;
 use clap_complete::Shell;
 use std::path::PathBuf;
@@ -21,7 +21,7 @@ pub(super) enum Artifact {
     },
 }
 
-pub(super) fn generate(artifact: &Artifact) -> Result<(), Failure> {
+pub(super) fn generate(artifact: &Artifact) -> Result<()> {
     let shell = match artifact {
         Artifact::Bash => Shell::Bash,
         Artifact::Zsh => Shell::Zsh,

@@ -112,6 +112,9 @@ impl Failure {
     }
 }
 
+/// The result of a command, or of a part of one.
+type Result<T, E = Failure> = std::result::Result<T, E>;
+
 /// The message; empty if it was printed already.
 impl Display for Failure {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
@@ -120,7 +123,7 @@ impl Display for Failure {
 }
 
 /// The end of a command that has printed its result: a failure unless `status` is 0.
-fn finish_with(status: u8) -> Result<(), Failure> {
+fn finish_with(status: u8) -> Result<()> {
     match status {
         0 => Ok(()),
         _ => Err(Failure { message: None, status }),
@@ -212,7 +215,7 @@ pub fn bench() -> ExitCode {
 }
 
 impl Command {
-    fn execute(&self) -> Result<(), Failure> {
+    fn execute(&self) -> Result<()> {
         match self {
             Command::Run(arguments) => run::run(arguments),
             Command::Plan(arguments) => plan::plan(arguments),
@@ -267,7 +270,7 @@ pub fn virtual_stage() -> ExitCode {
 
 /// The exit status. A failure that is not printed yet is reported on stderr, and in the object `json` on
 /// stdout.
-fn exit(result: Result<(), Failure>, json: Option<Value>) -> ExitCode {
+fn exit(result: Result<()>, json: Option<Value>) -> ExitCode {
     let Err(Failure { message, status }) = result else { return ExitCode::SUCCESS };
     if let Some(message) = message {
         print_stderr(format_args!("error: {message}"));

@@ -1,6 +1,6 @@
 //! Output to stdout, stderr and new files; either stream may be closed or broken.
 
-use super::Failure;
+use super::{Failure, Result};
 use crate::text::{is_unprintable, wrapped};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use serde::Serialize;
@@ -13,7 +13,7 @@ use std::path::Path;
 
 /// Writes `text`, made [`plain`], and a line end to stdout. A closed pipe (`run --json | true`) is no
 /// failure: the reader has read all that it wanted.
-pub(super) fn print_stdout(text: impl Display) -> Result<(), Failure> {
+pub(super) fn print_stdout(text: impl Display) -> Result<()> {
     let mut stdout = io::stdout().lock();
     match writeln!(stdout, "{}", plain(text, "\n\t")).and_then(|()| stdout.flush()) {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {
@@ -36,7 +36,7 @@ pub(super) fn print_result(
     json: bool,
     object: &impl Serialize,
     text: impl FnOnce() -> Result<String, minijinja::Error>,
-) -> Result<(), Failure> {
+) -> Result<()> {
     match json {
         true => print_stdout(serde_json::to_value(object).map_err(Failure::environment)?),
         false => print_wrapped(text().map_err(Failure::environment)?),
@@ -52,12 +52,12 @@ pub(super) fn merged(mut object: Value, more: &Value) -> Value {
 }
 
 /// Writes text for an operator to stdout, its long lines broken.
-pub(super) fn print_wrapped(text: impl Display) -> Result<(), Failure> {
+pub(super) fn print_wrapped(text: impl Display) -> Result<()> {
     print_stdout(wrapped(&text.to_string()))
 }
 
 /// Writes a new file. A file that exists is not overwritten.
-pub(super) fn write_new(path: &Path, text: &str) -> Result<(), Failure> {
+pub(super) fn write_new(path: &Path, text: &str) -> Result<()> {
     let written = File::create_new(path).and_then(|mut file| file.write_all(text.as_bytes()));
     written.map_err(|error| match error.kind() {
         ErrorKind::AlreadyExists => already_exists(path),
@@ -66,7 +66,7 @@ pub(super) fn write_new(path: &Path, text: &str) -> Result<(), Failure> {
 }
 
 /// Refuses to write a file that exists, before there is anything to write.
-pub(super) fn refuse_existing(path: Option<&Path>) -> Result<(), Failure> {
+pub(super) fn refuse_existing(path: Option<&Path>) -> Result<()> {
     path.filter(|path| path.exists()).map_or(Ok(()), |path| Err(already_exists(path)))
 }
 

@@ -9,7 +9,7 @@ use super::output::print_stderr;
 use super::records::describe;
 use super::stage::Motion;
 use super::tracker::{load_replay, open_tracker, source_label};
-use super::{Failure, io_runtime};
+use super::{Failure, Result, io_runtime};
 use crate::archive::{Manifest, RunOutcome, sha256_hex};
 use crate::config::{
     CanInterface, Config, ConfigError, GoalKind, Listen, OnFailure, TrackerSource,
@@ -80,12 +80,18 @@ impl Options {
 impl Job<'_> {
     /// Runs the session to its end. Everything that can be refused is refused before the run folder is
     /// made and before anything moves.
-    pub(super) fn perform(self) -> Result<Performed, Failure> {
+    pub(super) fn perform(self) -> Result<Performed> {
         let runtime = io_runtime()?;
         let interrupt = Interrupt::listen()?;
+        let run_and_complete = |operator: &mut (dyn Operator + Send)| {
+            let run = || self.run(operator, &runtime, &interrupt);
+            let mut performed = self.options.realtime.run_isolated(run)?;
+            complete_record(&mut performed.report, describe(self.config.clone()), operator);
+            Ok(performed)
+        };
         let performed = if self.options.console {
             let mut console = Console::open(self.config, interrupt.clone())?;
-            let performed = self.run_and_complete(&mut console, &runtime, &interrupt);
+            let performed: Result<Performed> = run_and_complete(&mut console);
             let withdrawal = performed.as_ref().ok().map(|performed| {
                 let possible = possible_withdrawal(self.config, &performed.report);
                 possible.map(|withdrawal| withdrawal.to_string())
@@ -95,7 +101,7 @@ impl Job<'_> {
         } else {
             let quiet = self.options.quiet;
             let mut terminal = Terminal::new(quiet, self.motion.is_none() && !quiet);
-            let performed = self.run_and_complete(&mut terminal, &runtime, &interrupt);
+            let performed = run_and_complete(&mut terminal);
             terminal.finish();
             performed
         };
@@ -104,36 +110,19 @@ impl Job<'_> {
         performed
     }
 
-    /// Runs the session and completes its record.
-    fn run_and_complete(
-        &self,
-        operator: &mut (dyn Operator + Send),
-        runtime: &Runtime,
-        interrupt: &Interrupt,
-    ) -> Result<Performed, Failure> {
-        let run = || self.run(operator, runtime, interrupt);
-        let mut performed = self.options.realtime.run_isolated(run)?;
-        complete_record(&mut performed.report, describe(self.config.clone()), operator);
-        Ok(performed)
-    }
-
     fn run(
         &self,
         operator: &mut dyn Operator,
         runtime: &Runtime,
         interrupt: &Interrupt,
-    ) -> Result<Performed, Failure> {
+    ) -> Result<Performed> {
         let config = self.config;
         let stops_on_record_failure = config.record.on_failure == OnFailure::Stop;
         let begin = |now| self.run_config.clone().begin(now).map_err(Failure::configuration);
-        let performed = |report, done: &[AxisMove]| Performed {
-            report,
-            done: done.to_vec(),
-            wants_withdrawal: false,
-        };
         let Options { realtime, live, paced, .. } = self.options;
         live.map_or(Ok(()), check_live_address)?;
-        if config.is_emulated() {
+        let mut session;
+        let report = if config.is_emulated() {
             realtime.refuse_if_given("a run with can.interface = \"memory\" is in virtual time")?;
             let stage = VirtualStage::new(config.virtual_stage()?, Time::ZERO);
             let tips = match self.receives_tracker() {
@@ -148,24 +137,21 @@ impl Job<'_> {
             };
             let (recorder, _) = self.start_recording(SystemTime::now(), Backpressure::Block)?;
             let sink = Sink::new(recorder, stops_on_record_failure, operator, interrupt);
-            let mut session = begin(Time::ZERO)?;
-            let pace = paced.then(Pace::begin);
-            let report = run_virtual(&mut session, stage, tips, pace, sink);
-            return Ok(performed(report, session.moves()));
-        }
-        realtime.check_permission()?;
-        let mut bus = open_stage_bus(config)?;
-        let clock = Clock::start();
-        let mut tracker = self.open_tracker(runtime, clock)?;
-        let (recorder, realtime) =
-            self.start_recording(clock.origin_utc(), Backpressure::DropAndCount)?;
-        let sink = Sink::new(recorder, stops_on_record_failure, operator, interrupt);
-        // Last: the session's deadlines start to run here.
-        let mut session = begin(clock.now())?;
-        let (bus, tips) = (bus.as_mut(), tracker.as_mut());
-        let report = run_live(&mut session, bus, tips, clock, realtime, sink);
-        drop(tracker);
-        Ok(performed(report, session.moves()))
+            session = begin(Time::ZERO)?;
+            run_virtual(&mut session, stage, tips, paced.then(Pace::begin), sink)
+        } else {
+            realtime.check_permission()?;
+            let mut bus = open_stage_bus(config)?;
+            let clock = Clock::start();
+            let mut tracker = self.open_tracker(runtime, clock)?;
+            let (recorder, realtime) =
+                self.start_recording(clock.origin_utc(), Backpressure::DropAndCount)?;
+            let sink = Sink::new(recorder, stops_on_record_failure, operator, interrupt);
+            // Last: the session's deadlines start to run here.
+            session = begin(clock.now())?;
+            run_live(&mut session, bus.as_mut(), tracker.as_mut(), clock, realtime, sink)
+        };
+        Ok(Performed { report, done: session.moves().to_vec(), wants_withdrawal: false })
     }
 
     fn needs_tracker(&self) -> bool {
@@ -182,13 +168,16 @@ impl Job<'_> {
         self.needs_tracker() || (tracker.file.is_none() && !tracker.is_standard_input())
     }
 
-    /// The stream of the tracker's tool, if the session receives one.
-    fn open_tracker(&self, runtime: &Runtime, clock: Clock) -> Result<Option<Link>, Failure> {
+    /// The stream of the tracker's tool and, if the target is tracked, of the target's, if the session receives
+    /// one.
+    fn open_tracker(&self, runtime: &Runtime, clock: Clock) -> Result<Option<Link>> {
         let is_emulated = self.config.tip_source() == TrackerSource::Emulated;
         if !self.receives_tracker() || (is_emulated && !self.needs_tracker()) {
             return Ok(None);
         }
-        match open_tracker(self.config, runtime, clock) {
+        let tools = [Some(&self.config.tracker.tool), self.config.goal.tool.as_ref()];
+        let tools = tools.into_iter().flatten().cloned().collect();
+        match open_tracker(self.config, tools, runtime, clock) {
             Err(failure) if !self.needs_tracker() => {
                 print_stderr(format_args!("warning: {failure}; the tracker is not recorded"));
                 Ok(None)
@@ -203,7 +192,7 @@ impl Job<'_> {
         &self,
         started_utc: SystemTime,
         backpressure: Backpressure,
-    ) -> Result<(Recorder, Option<RealTime>), Failure> {
+    ) -> Result<(Recorder, Option<RealTime>)> {
         let dir = Path::new(&self.config.record.dir);
         let manifest = self.manifest(started_utc)?;
         if dir.is_file() {
@@ -225,7 +214,7 @@ impl Job<'_> {
         }
     }
 
-    fn manifest(&self, started_utc: SystemTime) -> Result<Manifest, Failure> {
+    fn manifest(&self, started_utc: SystemTime) -> Result<Manifest> {
         let Job { config, motion, options: Options { about, .. }, .. } = self;
         let calibration = config.calibration_toml().map_err(Failure::environment)?;
         let rehearsal = config.emulator.rehearse.then(|| config.can.interface.to_string());
@@ -253,7 +242,7 @@ impl Job<'_> {
     }
 
     /// Serves the run to viewers if an address is given, and prints the command that shows it.
-    fn serve(&self, recorder: &mut Recorder) -> Result<(), Failure> {
+    fn serve(&self, recorder: &mut Recorder) -> Result<()> {
         let Some(address) = self.options.live else { return Ok(()) };
         recorder.serve(address, scene(self.config)?).map_err(Failure::environment)?;
         print_stderr(format_args!("live        rerun rerun+http://{address}/proxy"));
@@ -281,7 +270,7 @@ pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
 
 /// Opens the bus of `config`. The bench receives only what `can.listen` selects, and each frame that it sends must
 /// be confirmed on the bus.
-pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure> {
+pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>> {
     let CanInterface::Socket(name) = config.bus() else { return open_bus(config.bus()) };
     if !config.stage.hardware && has_device(name) {
         return Err(Failure::configuration(format_args!(
@@ -302,7 +291,7 @@ pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure
 }
 
 /// Opens the bus that `interface` names.
-pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Failure> {
+pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>> {
     match interface {
         CanInterface::Socket(name) => Ok(Box::new(SocketCan::open(name)?)),
         CanInterface::Udp(group) => Ok(Box::new(UdpBus::join(*group)?)),
@@ -314,7 +303,7 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
 }
 
 /// Checks that viewers can be served at `address`, before the run folder is created.
-fn check_live_address(address: SocketAddr) -> Result<(), Failure> {
+fn check_live_address(address: SocketAddr) -> Result<()> {
     if address.port() == 0 {
         return Err(Failure::configuration(format_args!(
             "--live: {address}: viewers must know the port; name one, as in --live={LIVE_ADDRESS}"

@@ -5,7 +5,7 @@ use super::output::{print_stderr, print_stdout};
 use super::records::earlier_run;
 use super::stage::read_status;
 use super::tracker::Listener;
-use super::{ENVIRONMENT_FAILED, Failure, STOPPED};
+use super::{ENVIRONMENT_FAILED, Failure, Result, STOPPED};
 use crate::archive::{Manifest, RunOutcome};
 use crate::config::{CanInterface, Config, TrackerSource};
 use crate::preflight::{
@@ -105,20 +105,15 @@ impl Preflight {
         }
         Preflight { checks, drives, tracker: report }
     }
-
-    /// What the failed checks found and what to do next, a line each.
-    pub(super) fn troubles(&self) -> Vec<String> {
-        failed(&self.checks)
-            .map(|Check { name, found, next_step, .. }| {
-                let next = next_step.as_deref().unwrap_or_default();
-                format!("{name}: {found}; {next}")
-            })
-            .collect()
-    }
 }
 
-fn failed(checks: &[Check]) -> impl Iterator<Item = &Check> {
-    checks.iter().filter(|check| check.verdict == Verdict::Fail)
+/// What the failed checks found and what to do next, a line each.
+pub(super) fn troubles(checks: &[Check]) -> Vec<String> {
+    let failed = checks.iter().filter(|check| check.verdict == Verdict::Fail);
+    let line = |Check { name, found, next_step, .. }: &Check| {
+        format!("{name}: {found}; {}", next_step.as_deref().unwrap_or_default())
+    };
+    failed.map(line).collect()
 }
 
 /// Shows the checks before a run on hardware, and asks the operator. Returns the checks; there are none on the
@@ -126,7 +121,7 @@ fn failed(checks: &[Check]) -> impl Iterator<Item = &Check> {
 ///
 /// # Errors
 /// The run is refused: by a failed check, by the operator, or because there is no terminal to ask at.
-pub(super) fn before_run(config: &Config, yes: bool, as_json: bool) -> Result<Vec<Check>, Failure> {
+pub(super) fn before_run(config: &Config, yes: bool, as_json: bool) -> Result<Vec<Check>> {
     if !config.stage.hardware || config.is_emulated() {
         return Ok(Vec::new());
     }
@@ -160,7 +155,7 @@ fn why_refused(
     ask: impl FnOnce() -> bool,
 ) -> Option<(String, u8)> {
     let stopped = |reason: &str| Some((reason.to_owned(), STOPPED));
-    let failed = failed(checks).count();
+    let failed = troubles(checks).len();
     if is_interrupted() {
         stopped("operator: interrupted")
     } else if failed > 0 {
@@ -237,7 +232,7 @@ fn bus_facts(config: &Config) -> Result<Option<BusFacts>, String> {
 }
 
 /// Listens to the tracker; `None` if it cannot be listened to without a run.
-fn listen_to_tracker(config: &Config, listen: Duration) -> Result<Option<TrackerReport>, Failure> {
+fn listen_to_tracker(config: &Config, listen: Duration) -> Result<Option<TrackerReport>> {
     if config.tip_source() == TrackerSource::Emulated || config.tracker.is_standard_input() {
         return Ok(None);
     }

@@ -1,11 +1,11 @@
 //! Recorded runs: their folders, their plans, and the insertions in them.
 
-use super::Failure;
 use super::arguments::{Configured, text_of};
 use super::mask::mask_reader;
 use super::output::print_stderr;
 use super::perform::scene;
-use super::stage;
+use super::stage::Motion;
+use super::{Failure, Result};
 use crate::archive::{Manifest, file, proof};
 use crate::config::{CanInterface, Config, Source};
 use crate::operation::RunConfig;
@@ -84,7 +84,7 @@ pub(super) fn earlier_run(
 }
 
 /// Opens the record of a run in the folder `path`, and its configuration. Refuses a record that was changed.
-pub(super) fn open(path: &Path) -> Result<(RunFolder, Config), Failure> {
+pub(super) fn open(path: &Path) -> Result<(RunFolder, Config)> {
     let folder = RunFolder::open(path)?;
     folder.verify()?;
     let text = folder.text(file::CONFIG)?;
@@ -102,14 +102,20 @@ pub(super) fn describe(config: Config) -> Describe {
 }
 
 /// What the run of `manifest` was to do, from its configuration and arguments.
-pub(super) fn recorded_run_config(
-    manifest: &Manifest,
-    config: &Config,
-) -> Result<RunConfig, Failure> {
-    Ok(match stage::recorded_operation(manifest, config)? {
-        Some(operation) => RunConfig::from(operation),
-        None => RunConfig::from(config.session_reading(&mask_reader(None))?),
-    })
+pub(super) fn recorded_run_config(manifest: &Manifest, config: &Config) -> Result<RunConfig> {
+    let Some(name) = &manifest.operation else {
+        return Ok(config.session_reading(&mask_reader(None))?.into());
+    };
+    // The record says `prove-handedness` for `prove --handedness`.
+    let command = name.split('-').next().unwrap_or_default();
+    let motion = Motion::of(&format!("{command} {}", manifest.arguments.join(" ")));
+    let motion = motion.map_err(|_| {
+        Failure::configuration(format_args!(
+            "the record does not say what `stage {name}` was to do; replay it with the bench that \
+             recorded it"
+        ))
+    })?;
+    Ok(motion.plan(config)?.into())
 }
 
 /// The stage and the tracker in a recorded run.
@@ -123,7 +129,7 @@ pub(super) struct ReplayedRun {
 }
 
 /// Replays the run in the folder `path`.
-pub(super) fn replay_run(path: &Path) -> Result<ReplayedRun, Failure> {
+pub(super) fn replay_run(path: &Path) -> Result<ReplayedRun> {
     let (folder, config) = open(path)?;
     let run_config = recorded_run_config(folder.manifest(), &config)?;
     let recorded =
@@ -185,10 +191,7 @@ pub(super) struct Insertion {
 impl Insertions {
     /// Reads the configuration, with the key `extra_key` over it, and the insertions. Refuses an insertion that is
     /// named twice.
-    pub(super) fn read(
-        &self,
-        extra_key: Option<String>,
-    ) -> Result<(Config, Vec<Insertion>), Failure> {
+    pub(super) fn read(&self, extra_key: Option<String>) -> Result<(Config, Vec<Insertion>)> {
         let (configuration, files) = self.split_files()?;
         let set = self.set.iter().cloned().chain(extra_key).collect();
         let config = Configured::new(configuration, set);
@@ -221,7 +224,7 @@ impl Insertions {
     }
 
     /// The configuration, named by `--config` or as the TOML file among the files; and the other files.
-    fn split_files(&self) -> Result<(Option<&Path>, Vec<&Path>), Failure> {
+    fn split_files(&self) -> Result<(Option<&Path>, Vec<&Path>)> {
         let is_toml = |file: &&Path| file.extension().is_some_and(|ending| ending == "toml");
         let (mut configurations, files): (Vec<_>, Vec<_>) =
             self.files.iter().map(PathBuf::as_path).partition(is_toml);
@@ -241,7 +244,7 @@ impl Insertions {
 }
 
 /// Reads the insertion in `path`, a CSV file or a run folder.
-fn read_insertion(path: &Path) -> Result<Insertion, Failure> {
+fn read_insertion(path: &Path) -> Result<Insertion> {
     if !path.is_dir() {
         let text = text_of(path)?;
         let recording = Recording::parse(&text).map_err(|error| Failure::bad_input(path, error))?;

@@ -2,7 +2,7 @@
 
 use super::output::{print_result, refuse_existing, write_new};
 use super::records::{open, recorded_run_config};
-use super::{Failure, STOPPED, finish_with};
+use super::{Failure, Result, STOPPED, finish_with};
 use crate::archive::file;
 use crate::config::{Config, Source};
 use crate::operation::RunConfig;
@@ -32,7 +32,7 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
+pub(super) fn replay(arguments: &Arguments) -> Result<()> {
     refuse_existing(arguments.out.as_deref())?;
     let (folder, config) = open(&arguments.run)?;
     let what_if = what_if(&folder.text(file::CONFIG)?, &arguments.set)?;
@@ -50,10 +50,6 @@ pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
     if let Some(path) = &arguments.out {
         write_new(path, &replayed.steps_csv())?;
     }
-    let mut observers = vec![("recorded", observer, &replayed.figures)];
-    let what_if_observer = what_if.map(|observer| observer.name());
-    observers
-        .extend(replayed.what_if.as_ref().map(|figures| ("what_if", what_if_observer, figures)));
     let mut object = json!({
         "run_dir": arguments.run.display().to_string(),
         "recorded_by": { "version": folder.manifest().version, "git": folder.manifest().git },
@@ -78,7 +74,12 @@ pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
         "what_if": null,
     });
     let mut rows = Vec::new();
-    for (title, observer, FigureReport { estimate_rms, final_error, .. }) in observers {
+    let what_if_observer = what_if.map(|observer| observer.name());
+    for (title, observer, figures) in [
+        ("recorded", observer, Some(&replayed.figures)),
+        ("what_if", what_if_observer, replayed.what_if.as_ref()),
+    ] {
+        let Some(FigureReport { estimate_rms, final_error, .. }) = figures else { continue };
         object[title] = json!({
             "observer": observer,
             "estimate_rms": estimate_rms,
@@ -97,7 +98,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<(), Failure> {
 }
 
 /// The observer that the keys `sets` describe over the configuration `text`; `None` without any key.
-fn what_if(text: &str, sets: &[String]) -> Result<Option<ObserverConfig>, Failure> {
+fn what_if(text: &str, sets: &[String]) -> Result<Option<ObserverConfig>> {
     if sets.is_empty() {
         return Ok(None);
     }

@@ -9,7 +9,7 @@ use super::mask::{file_crc32, mask_reader};
 use super::output::{merged, print_result};
 use super::perform::{Job, LIVE_ADDRESS, Options, Performed, end_json};
 use super::preflight::{before_rehearsal, before_run};
-use super::{Failure, finish_with, stage};
+use super::{Failure, Result, finish_with, stage};
 use crate::config::Config;
 use crate::preflight::Check;
 use crate::runtime::{RunReport, gates_to_json};
@@ -60,7 +60,7 @@ pub(super) struct Arguments {
     quiet: bool,
 }
 
-pub(super) fn run(arguments: &Arguments) -> Result<(), Failure> {
+pub(super) fn run(arguments: &Arguments) -> Result<()> {
     if arguments.console {
         // Refused before anything is checked.
         Console::open_keys()?;

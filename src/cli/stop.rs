@@ -4,7 +4,7 @@ use super::arguments::Configured;
 use super::output::{print_stderr, print_stdout};
 use super::perform::open_bus;
 use super::records::last_run_on_a_bus;
-use super::{ENVIRONMENT_FAILED, Failure, finish_with};
+use super::{ENVIRONMENT_FAILED, Failure, Result, finish_with};
 use crate::canopen::Frame;
 use crate::config::{Source, StopConfig};
 use crate::runtime::{BusTrouble, Clock, talk_despite_errors};
@@ -31,7 +31,7 @@ pub(super) struct Arguments {
 
 /// Stops both axes. Errors of the configuration other than the bus and the nodes are reported after
 /// the stop.
-pub(super) fn stop(configured: &Configured, as_json: bool) -> Result<(), Failure> {
+pub(super) fn stop(configured: &Configured, as_json: bool) -> Result<()> {
     let settings = settings(configured)?;
     let mut bus = open_bus(&settings.interface).map_err(|failure| {
         Failure::environment(format_args!("nothing was stopped: {failure}; use the emergency stop"))
@@ -53,7 +53,7 @@ pub(super) fn stop(configured: &Configured, as_json: bool) -> Result<(), Failure
     status
 }
 
-fn settings(configured: &Configured) -> Result<StopConfig, Failure> {
+fn settings(configured: &Configured) -> Result<StopConfig> {
     let (mut problems, mut source) = (Vec::new(), None);
     if let Some(path) = configured.path() {
         let name = path.display().to_string();
@@ -76,15 +76,14 @@ fn settings(configured: &Configured) -> Result<StopConfig, Failure> {
 }
 
 /// Reports which stops were confirmed, which were not, and which frames were not sent.
-fn report(quick_stop: &QuickStop, trouble: &BusTrouble, as_json: bool) -> Result<(), Failure> {
+fn report(quick_stop: &QuickStop, trouble: &BusTrouble, as_json: bool) -> Result<()> {
     let mut object = json!({});
     let (mut errors, mut confirmed) = (Vec::new(), Vec::new());
     for axis in Axis::BOTH {
         let counts =
             quick_stop.result(axis).and_then(|result| result.map_err(|e| errors.push(e)).ok());
-        if let (Some(counts), false) = (counts, as_json) {
-            confirmed.push(format!("{axis:<11} stands without power, at {counts} counts"));
-        }
+        let line = |counts| format!("{axis:<11} stands without power, at {counts} counts");
+        confirmed.extend(counts.map(line));
         let is_standing = counts.is_some();
         object[axis.to_string()] = json!({ "stands": is_standing, "position_counts": counts });
     }
@@ -103,17 +102,13 @@ fn report(quick_stop: &QuickStop, trouble: &BusTrouble, as_json: bool) -> Result
     }
     let is_confirmed = errors.is_empty();
     if !is_confirmed {
+        object["error"] = json!(errors.join("; "));
         print_stderr("an axis whose stop was not confirmed may still move: use the emergency stop");
     }
     // Stdout comes last: if it blocks, everything on stderr was written already.
-    for line in confirmed {
-        print_stdout(line)?;
-    }
-    if as_json {
-        if !is_confirmed {
-            object["error"] = json!(errors.join("; "));
-        }
-        print_stdout(object)?;
+    match as_json {
+        true => print_stdout(object)?,
+        false => confirmed.iter().try_for_each(print_stdout)?,
     }
     finish_with(if is_confirmed { 0 } else { ENVIRONMENT_FAILED })
 }

@@ -1,9 +1,9 @@
 //! `needle-bench study`: Monte Carlo trials of emulated insertions.
 
-use super::Failure;
 use super::arguments::{Configured, parse_seed};
 use super::mask::mask_reader;
 use super::output::{print_result, refuse_existing, shell_word, write_new};
+use super::{Failure, Result};
 use crate::config::Config;
 use crate::geometry::coordinates;
 use crate::runtime::Study;
@@ -46,7 +46,7 @@ pub(super) struct Arguments {
     threads: Option<u16>,
 }
 
-pub(super) fn study(arguments: &Arguments) -> Result<(), Failure> {
+pub(super) fn study(arguments: &Arguments) -> Result<()> {
     let config = arguments.configured.load(None)?;
     refuse_existing(arguments.out.as_deref())?;
     if !config.is_emulated() {
@@ -124,7 +124,7 @@ struct Report<'a> {
 }
 
 /// Writes a CSV row for each trial; a cell for which the trial has no number is empty.
-fn write_csv(path: &Path, trials: &[TrialResult], config: &Config) -> Result<(), Failure> {
+fn write_csv(path: &Path, trials: &[TrialResult], config: &Config) -> Result<()> {
     let mut writer = csv::Writer::from_writer(Vec::new());
     for (number, trial) in trials.iter().enumerate() {
         let target_mm = match trial.target {

@@ -3,7 +3,7 @@
 use super::arguments::{Configured, number_in};
 use super::output::print_stderr;
 use super::perform::open_bus;
-use super::{Failure, io_runtime};
+use super::{Failure, Result, io_runtime};
 use crate::archive::{CandumpLine, interface_name, unix_us};
 use crate::canopen::Frame;
 use crate::emulator::{VirtualStage, VirtualStageConfig};
@@ -42,7 +42,7 @@ pub(super) struct Arguments {
     seconds: Option<f64>,
 }
 
-fn write_data_sheets(stage: &VirtualStageConfig, dir: &Path) -> Result<(), Failure> {
+fn write_data_sheets(stage: &VirtualStageConfig, dir: &Path) -> Result<()> {
     std::fs::create_dir_all(dir).map_err(|error| Failure::io(dir, error))?;
     let drives = [("insertion.eds", &stage.insertion.0), ("rotation.eds", &stage.rotation.0)];
     for (name, drive) in drives {
@@ -52,7 +52,7 @@ fn write_data_sheets(stage: &VirtualStageConfig, dir: &Path) -> Result<(), Failu
     Ok(())
 }
 
-pub(super) fn serve(arguments: &Arguments) -> Result<(), Failure> {
+pub(super) fn serve(arguments: &Arguments) -> Result<()> {
     let config = arguments.configured.load(Some(VCAN_TOML))?;
     let stage = config.virtual_stage()?;
     if let Some(dir) = &arguments.write_eds {
@@ -86,7 +86,7 @@ fn frame_log(
     path: Option<&Path>,
     interface: &str,
     clock: Clock,
-) -> Result<impl FnMut(Direction, &Frame) + use<>, Failure> {
+) -> Result<impl FnMut(Direction, &Frame) + use<>> {
     let file = path.map(|path| match File::create_new(path) {
         Ok(file) => Ok((LineWriter::new(file), path.display().to_string())),
         Err(error) => Err(Failure::io(path, error)),

@@ -7,10 +7,10 @@ mod recordings;
 pub(super) mod tracker;
 
 use self::recordings::{collect_fiducials, record_turn};
-use super::Failure;
 use super::arguments::{Configured, number_in, text_of};
 use super::output::{merged, print_stderr, print_stdout, refuse_existing, write_new};
 use super::records::{Insertion, Insertions};
+use super::{Failure, Result};
 use crate::archive::sha256_hex;
 use crate::calibration::{FiducialPair, NeedleFit, PosedRow, RegistrationFit, TipFit, TurnSample};
 use crate::config::RegistrationConfig;
@@ -109,7 +109,7 @@ pub(super) struct Output {
     json: bool,
 }
 
-pub(super) fn calibrate(calibration: &Calibration) -> Result<(), Failure> {
+pub(super) fn calibrate(calibration: &Calibration) -> Result<()> {
     match calibration {
         Calibration::Needle { insertions, output } => needle(insertions, output),
         Calibration::Registration(arguments) => registration(arguments),
@@ -120,20 +120,14 @@ pub(super) fn calibrate(calibration: &Calibration) -> Result<(), Failure> {
 
 impl Output {
     /// Refuses a file that exists, before anything is measured.
-    pub(super) fn refuse_existing(&self) -> Result<(), Failure> {
+    pub(super) fn refuse_existing(&self) -> Result<()> {
         refuse_existing(self.out.as_deref())
     }
 
     /// Writes the result: `json` for programs, and two templates for the values of `json` and `more`: the
     /// operator's `summary`, and `toml` for the configuration. There is no TOML of a rehearsal: it would pass for
     /// a calibration of the rig.
-    fn write(
-        &self,
-        json: &Value,
-        more: Shown,
-        summary: &str,
-        toml: Option<&str>,
-    ) -> Result<(), Failure> {
+    fn write(&self, json: &Value, more: Shown, summary: &str, toml: Option<&str>) -> Result<()> {
         let show = |template| screen(template, json, more.clone()).map_err(Failure::environment);
         print_stderr(show(summary)?);
         match (toml, &self.out) {
@@ -148,7 +142,7 @@ impl Output {
     }
 }
 
-fn to_toml(overlay: &Value) -> Result<String, Failure> {
+fn to_toml(overlay: &Value) -> Result<String> {
     toml::to_string(overlay).map_err(Failure::environment)
 }
 
@@ -175,7 +169,7 @@ fn angles_json(rotation: &Rotation3<f64>) -> Value {
 }
 
 /// Curvature, bevel zero, sensor tilt and torsion from insertions.
-fn needle(insertions: &Insertions, output: &Output) -> Result<(), Failure> {
+fn needle(insertions: &Insertions, output: &Output) -> Result<()> {
     output.refuse_existing()?;
     let (config, insertions) = insertions.read(None)?;
     if let Some(Insertion { path, .. }) = insertions.iter().find(|run| run.is_rehearsal) {
@@ -217,7 +211,7 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<(), Failure> {
 }
 
 /// The rows of an insertion; every row must have an orientation.
-fn posed_rows(Insertion { path, recording, .. }: &Insertion) -> Result<Vec<PosedRow>, Failure> {
+fn posed_rows(Insertion { path, recording, .. }: &Insertion) -> Result<Vec<PosedRow>> {
     if recording.lacks_roll() {
         let why = "its orientations do not turn with the base; a needle is calibrated from those of a sensor \
                    of six degrees of freedom";
@@ -250,7 +244,7 @@ fn torsion_json(torsion: &TorsionConfig) -> Value {
 }
 
 /// The tracker's pose on the bench from fiducials.
-fn registration(arguments: &RegistrationArguments) -> Result<(), Failure> {
+fn registration(arguments: &RegistrationArguments) -> Result<()> {
     let path = &arguments.file;
     let config = arguments.configured.load(None)?;
     arguments.output.refuse_existing()?;
@@ -288,7 +282,7 @@ fn registration(arguments: &RegistrationArguments) -> Result<(), Failure> {
 }
 
 /// The tip's offset and tilt on the sensor, from the sensor's circle while the base turns.
-fn tip(arguments: &TipArguments) -> Result<(), Failure> {
+fn tip(arguments: &TipArguments) -> Result<()> {
     let path = &arguments.file;
     if arguments.rehearse && arguments.output.out.is_some() {
         return Err(Failure::configuration(

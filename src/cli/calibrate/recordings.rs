@@ -10,7 +10,7 @@ use crate::cli::perform::Options;
 use crate::cli::records::{ReplayedRun, position_at, replay_run};
 use crate::cli::stage::{load_stage, perform, sensor_off_axis};
 use crate::cli::tracker::{Listener, listen};
-use crate::cli::{Failure, finish_with};
+use crate::cli::{Failure, Result, finish_with};
 use crate::geometry::Pose;
 use crate::tracker::{Event, Registration};
 use crate::units::Time;
@@ -38,7 +38,7 @@ const LINE_POLL: Duration = Duration::from_millis(20);
 const ANY_RMS_MM: f64 = 1e4;
 
 /// Collects points of the tracker that `configured` names into the new file `path`.
-pub(super) fn collect_fiducials(path: &Path, configured: &Configured) -> Result<(), Failure> {
+pub(super) fn collect_fiducials(path: &Path, configured: &Configured) -> Result<()> {
     let mut listener = listen(configured, false)?;
     if listener.config.tracker.is_standard_input() {
         let why = "--collect reads the operator's lines from standard input, not the tracker's";
@@ -219,7 +219,7 @@ pub(super) fn record_turn(
     path: &Path,
     configured: &Configured,
     rehearse: bool,
-) -> Result<(String, f64), Failure> {
+) -> Result<(String, f64)> {
     // A rehearsal does not write it.
     refuse_existing(Some(path).filter(|_| !rehearse))?;
     let configured = configured.clone().rehearsed(rehearse);

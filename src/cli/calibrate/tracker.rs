@@ -3,10 +3,10 @@
 
 use super::{Output, fit_table};
 use crate::calibration::{RestSample, TrackerFit};
-use crate::cli::Failure;
 use crate::cli::arguments::{Configured, number_in, text_of};
 use crate::cli::output::print_stderr;
 use crate::cli::tracker::{Unreadable, listen, source_label};
+use crate::cli::{Failure, Result};
 use crate::config::TrackerSection;
 use crate::table::Table;
 use crate::text::escaped;
@@ -37,7 +37,7 @@ pub(in crate::cli) struct Arguments {
     output: Output,
 }
 
-pub(super) fn calibrate(arguments: &Arguments) -> Result<(), Failure> {
+pub(super) fn calibrate(arguments: &Arguments) -> Result<()> {
     arguments.output.refuse_existing()?;
     let path = &arguments.file;
     let config = arguments.configured.load(None)?;
@@ -58,7 +58,7 @@ pub(in crate::cli) struct RestArguments {
     output: Output,
 }
 
-pub(in crate::cli) fn rest(arguments: &RestArguments) -> Result<(), Failure> {
+pub(in crate::cli) fn rest(arguments: &RestArguments) -> Result<()> {
     arguments.output.refuse_existing()?;
     let mut listener = listen(&arguments.configured, false)?;
     let source = source_label(&listener.config);
@@ -81,7 +81,7 @@ fn fit_and_write(
     source: &str,
     text: Option<&str>,
     output: &Output,
-) -> Result<(), Failure> {
+) -> Result<()> {
     let bad_input = |error| Failure::bad_input(source.as_ref(), error);
     let fit = TrackerFit::of(samples).map_err(bad_input)?;
     let found = serde_json::to_value(&fit).map_err(Failure::environment)?;
@@ -115,7 +115,7 @@ fn rest_sample(gate: &Gate, sample: &Sample) -> RestSample {
 fn recorded(text: &str, tracker: &TrackerSection) -> Result<Vec<RestSample>, String> {
     let text = text.trim_start_matches('\u{feff}');
     let events = match text.trim_start().starts_with('{') {
-        true => ndjson::recording(text).map_err(|error| error.to_string())?,
+        true => ndjson::recording(text)?,
         false => csv::recording(text, &mapping(text, &tracker.csv), &tracker.tool)
             .map_err(|error| format!("{error}; see [tracker.csv]"))?,
     };

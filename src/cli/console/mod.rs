@@ -12,9 +12,9 @@ pub(super) use self::view::minutes;
 
 use self::keys::Keys;
 use self::screen::{Screen, Setup};
-use super::Failure;
 use super::ending::folder_bytes;
 use super::output::plain;
+use super::{Failure, Result};
 use crate::config::Config;
 use crate::runtime::{Interrupt, Operator};
 use crate::session::{Input, Lane, OperatorCommand, Progress, Record, Severity};
@@ -116,7 +116,7 @@ impl Console {
     ///
     /// # Errors
     /// There is no terminal.
-    pub(super) fn open_keys() -> Result<File, Failure> {
+    pub(super) fn open_keys() -> Result<File> {
         let keys = File::open("/dev/tty").ok().filter(|_| stderr().is_terminal());
         keys.ok_or_else(|| {
             Failure::configuration(
@@ -126,7 +126,7 @@ impl Console {
     }
 
     /// Takes the terminal for a run of `config`. Ctrl-C and q raise `interrupt`.
-    pub(super) fn open(config: &Config, interrupt: Interrupt) -> Result<Self, Failure> {
+    pub(super) fn open(config: &Config, interrupt: Interrupt) -> Result<Self> {
         let keys = Console::open_keys()?;
         let shared = Arc::new(Shared::new(Setup::of(config), interrupt));
         let terminal = take_terminal()?;

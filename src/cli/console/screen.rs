@@ -6,7 +6,7 @@ use crate::canopen::{Frame, NodeId, cob};
 use crate::config::Config;
 use crate::geometry::coordinates;
 use crate::session::{
-    Approach, Direction, Input, Lane, Progress, Record, SampleRecord, Severity, State, StepRecord,
+    Approach, Direction, Input, Lane, Progress, Record, Severity, State, StepRecord,
 };
 use crate::stage::Axis;
 use crate::tracker::GateName;
@@ -124,7 +124,12 @@ impl Screen {
     pub(super) fn take(&mut self, record: &Record) {
         match record {
             Record::Can { time, direction, frame } => self.take_frame(*time, *direction, frame),
-            Record::Sample(sample) => self.take_sample(sample),
+            Record::Sample(sample) => {
+                push_recent(&mut self.samples, sample.received.receive_time, ());
+                if let Some(refusal) = &sample.refused {
+                    *self.refused.entry(refusal.gate).or_default() += 1;
+                }
+            }
             Record::Step(step) => self.take_step(step),
             Record::Stage(stage) => {
                 self.time = stage.time;
@@ -186,14 +191,6 @@ impl Screen {
             {
                 drive.state = Statusword(u16::from_le_bytes([low, high])).state();
             }
-        }
-    }
-
-    fn take_sample(&mut self, sample: &SampleRecord) {
-        let time = sample.received.receive_time;
-        push_recent(&mut self.samples, time, ());
-        if let Some(refusal) = &sample.refused {
-            *self.refused.entry(refusal.gate).or_default() += 1;
         }
     }
 

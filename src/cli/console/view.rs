@@ -3,7 +3,6 @@
 use super::screen::{Drive, Screen};
 use crate::canopen::cia402::DriveState;
 use crate::session::{Severity, State};
-use crate::stage::Axis as StageAxis;
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::style::{Color, Modifier, Style};
@@ -163,11 +162,8 @@ fn plot(
 fn render_panels(screen: &Screen, frame: &mut Frame<'_>, area: Rect, is_wide: bool) {
     let (tracker, stage, bus) = (tracker_lines(screen), drive_lines(screen), bus_lines(screen));
     if !is_wide {
-        let [tracker, _, _] = tracker;
-        let [bus, ..] = bus;
-        let [insertion, rotation, _] = stage;
-        frame.render_widget(Paragraph::new([tracker, insertion, rotation, bus].join("\n")), area);
-        return;
+        let lines = [&tracker[0][..], &stage[0], &stage[1], &bus[0]].join("\n");
+        return frame.render_widget(Paragraph::new(lines), area);
     }
     let columns = Layout::horizontal([27, 27, 24].map(Constraint::Fill)).areas::<3>(area);
     let panels = [("tracker", tracker), ("drives", stage), ("bus, record", bus)];
@@ -195,11 +191,7 @@ fn tracker_lines(screen: &Screen) -> [String; 3] {
 }
 
 fn drive_lines(screen: &Screen) -> [String; 3] {
-    let drive = |axis: StageAxis, drive: &Drive| {
-        let (scale, unit) = match axis {
-            StageAxis::Insertion => (1.0, "mm"),
-            StageAxis::Rotation => (f64::to_degrees(1.0), "°"),
-        };
+    let drive = |drive: &Drive, scale: f64, unit: &str| {
         let state = drive.state.map_or("-", short_name);
         let (position, error) = (drive.position * scale, drive.following_error * scale);
         format!("{position:.2} {unit} {error:+.2} {state}")
@@ -210,8 +202,8 @@ fn drive_lines(screen: &Screen) -> [String; 3] {
         screen.drives.iter().filter_map(|drive| drive.emergency).max_by_key(|(at, _)| *at);
     let emergency = emergency.map_or_else(|| "none".to_owned(), |(_, emcy)| emcy.to_string());
     [
-        drive(StageAxis::Insertion, insertion),
-        drive(StageAxis::Rotation, rotation),
+        drive(insertion, 1.0, "mm"),
+        drive(rotation, f64::to_degrees(1.0), "°"),
         format!("EMCY {emergency}"),
     ]
 }

@@ -6,7 +6,7 @@ use self::picture::picture;
 use super::arguments::Configured;
 use super::mask::mask_reader;
 use super::output::{print_result, refuse_existing, write_new};
-use super::{Failure, STOPPED, finish_with};
+use super::{Result, STOPPED, finish_with};
 use crate::geometry::FixedAngles;
 use crate::plan::{Answer, Arc, Problem, Status, Tip, World, plan as solve, plan_with_reserve};
 use crate::text::screen;
@@ -32,7 +32,7 @@ pub(super) struct Arguments {
     out: Option<PathBuf>,
 }
 
-pub(super) fn plan(arguments: &Arguments) -> Result<(), Failure> {
+pub(super) fn plan(arguments: &Arguments) -> Result<()> {
     refuse_existing(arguments.out.as_deref())?;
     let (config, _) = arguments.configured.load_with_warnings()?;
     let (world, problem) = config.to_plan(&mask_reader(arguments.configured.path()))?;
@@ -52,10 +52,7 @@ pub(super) fn plan(arguments: &Arguments) -> Result<(), Failure> {
     }
     let text = || screen(include_str!("plan.txt"), &object, context! {});
     print_result(arguments.json, &object, text)?;
-    finish_with(match answer.status {
-        Status::Plan => 0,
-        Status::None | Status::Budget => STOPPED,
-    })
+    finish_with(if answer.status == Status::Plan { 0 } else { STOPPED })
 }
 
 /// Parses the name of a picture, for clap.

@@ -1,7 +1,7 @@
 //! The picture of a plan, as SVG.
 
 use super::ROW_MM;
-use crate::cli::Failure;
+use crate::cli::{Failure, Result};
 use crate::plan::{Answer, Obstacle, Problem, Tip, World};
 use crate::text::screen;
 use minijinja::context;
@@ -15,11 +15,7 @@ const CIRCLE_POINTS: u32 = 48;
 const MASK_STEP_MM: f64 = 2.0;
 
 /// Draws the plan as SVG: from the side, y over z, and from above, x over z.
-pub(super) fn picture(
-    world: &World,
-    problem: &Problem,
-    answer: &Answer,
-) -> Result<String, Failure> {
+pub(super) fn picture(world: &World, problem: &Problem, answer: &Answer) -> Result<String> {
     let [min, max] = [world.workspace.min_mm, world.workspace.max_mm];
     let path = answer.path.as_ref();
     let points = path.map(|path| path.points_mm(ROW_MM)).unwrap_or_default();

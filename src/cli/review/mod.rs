@@ -4,7 +4,7 @@ mod read;
 
 use super::output::{print_result, print_stderr};
 use super::records::{RUNS, describe, newest_first, open};
-use super::{Failure, finish_with};
+use super::{Failure, Result, finish_with};
 use crate::archive::{Verdict, VerdictKind, file};
 use crate::review::{
     Campaign, Comparison, Condition, Folder, GENERATOR, Run, html, to_json, to_text,
@@ -54,7 +54,7 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-pub(super) fn review(arguments: &Arguments) -> Result<(), Failure> {
+pub(super) fn review(arguments: &Arguments) -> Result<()> {
     let mut paths = arguments.paths.clone();
     if paths.is_empty() {
         let newest = newest_first(Path::new(RUNS)).next();
@@ -104,14 +104,10 @@ pub(super) fn review(arguments: &Arguments) -> Result<(), Failure> {
 }
 
 /// Reviews one run: writes its page, then prints its summary.
-fn review_one(path: &Path, arguments: &Arguments) -> Result<(), Failure> {
+fn review_one(path: &Path, arguments: &Arguments) -> Result<()> {
     let run = read::run(path)?;
-    let page = match &arguments.html {
-        _ if arguments.no_html => None,
-        Some(file) => Some(file.clone()),
-        None => Some(path.join(file::REPORT)),
-    };
-    let page_written = page.map(|page| {
+    let page = arguments.html.clone().unwrap_or_else(|| path.join(file::REPORT));
+    let page_written = (!arguments.no_html).then(|| {
         let written = html(&run).map_err(io::Error::other).and_then(|text| match arguments.html {
             None => write_report(&page, &text),
             Some(_) => File::create_new(&page)?.write_all(text.as_bytes()),
@@ -137,7 +133,7 @@ fn print_with(
     json: bool,
     mut object: Value,
     text: impl FnOnce() -> Result<String, TemplateError>,
-) -> Result<(), Failure> {
+) -> Result<()> {
     let Some(failure) = failure else { return print_result(json, &object, text) };
     object["error"] = json!(failure.to_string());
     print_result(json, &object, text)?;
@@ -146,7 +142,7 @@ fn print_with(
 }
 
 /// Starts the viewer with the recording of the run in `path`, without waiting for it to end.
-fn open_viewer(path: &Path) -> Result<(), Failure> {
+fn open_viewer(path: &Path) -> Result<()> {
     let recording = path.join(file::RECORDING);
     let shown = recording.display();
     if !recording.is_file() {
@@ -195,7 +191,7 @@ fn verdict_parser() -> impl TypedValueParser<Value = VerdictKind> {
 }
 
 /// Closes a record that was left open, and makes its `run.rrd` if that is missing or was changed.
-fn close_record(path: &Path, json: bool) -> Result<(), Failure> {
+fn close_record(path: &Path, json: bool) -> Result<()> {
     let is_closed = RunFolder::open(path)?.is_closed() && !is_being_written(path);
     let repaired = match is_closed && lacks_recording(path)? {
         true => None,
@@ -241,12 +237,12 @@ fn close_record(path: &Path, json: bool) -> Result<(), Failure> {
 }
 
 /// True if the record in `path` does not have the `run.rrd` that its manifest lists.
-fn lacks_recording(path: &Path) -> Result<bool, Failure> {
+fn lacks_recording(path: &Path) -> Result<bool> {
     Ok(RunFolder::open(path)?.recording_change()?.is_some())
 }
 
 /// Adds a verdict to the manifest of a record that is closed and unchanged.
-fn add_verdict(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<(), Failure> {
+fn add_verdict(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<()> {
     if reason.trim().is_empty() {
         return Err(Failure::configuration("--reason is empty: say why"));
     }

@@ -1,7 +1,7 @@
 //! Reads run folders for a review.
 
 use crate::archive::{StepsTable, TrackerTimes, file};
-use crate::cli::Failure;
+use crate::cli::Result;
 use crate::cli::records::folders_in;
 use crate::review::{
     Condition, Folder, Line, Motion, Run, figures_of_steps, parse_event, parse_frame,
@@ -11,15 +11,15 @@ use std::io;
 use std::path::Path;
 
 /// The whole run in `path`. [`Run::unreadable`] names the files that cannot be read.
-pub(super) fn run(path: &Path) -> Result<Run, Failure> {
+pub(super) fn run(path: &Path) -> Result<Run> {
     let (record, folder) = open(path)?;
     let mut unreadable = Vec::new();
-    let steps = record.text(file::STEPS).unwrap_or_else(|error| {
-        unreadable.push(error.to_string());
-        String::new()
+    let steps = record.text(file::STEPS).map_err(|error| error.to_string()).and_then(|text| {
+        let shown = path.join(file::STEPS);
+        StepsTable::parse(&text).map_err(|error| format!("{}: {error}", shown.display()))
     });
-    let steps = StepsTable::parse(&steps).unwrap_or_else(|error| {
-        unreadable.push(format!("{}: {error}", path.join(file::STEPS).display()));
+    let steps = steps.unwrap_or_else(|error| {
+        unreadable.push(error);
         StepsTable::default()
     });
     let samples = lines(&record, file::TRACKER, TrackerTimes::parse, &mut unreadable);
@@ -93,10 +93,9 @@ pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), TelemetryError> {
         Err(TelemetryError::Record { reason, .. }) => Condition::Changed(reason),
         Err(error) => return Err(error),
     };
-    let has_figures = !record.manifest().figures.is_empty();
-    let figures_of_steps = match has_figures {
-        true => None,
-        false => record.text(file::STEPS).ok().and_then(|text| figures_of_steps(&text)),
+    let figures_of_steps = match record.manifest().figures.is_empty() {
+        true => record.text(file::STEPS).ok().and_then(|text| figures_of_steps(&text)),
+        false => None,
     };
     let folder = Folder {
         figures_of_steps,

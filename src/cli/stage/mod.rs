@@ -8,12 +8,11 @@ pub(super) use self::motion::perform;
 pub(super) use self::status::{drive_json, read_status};
 
 use self::distance::Distance;
-use super::Failure;
 use super::arguments::{About, Configured, RealTimeArguments};
 use super::output::print_stderr;
 use super::records::last_run_on_a_bus;
 use super::stop::stop;
-use crate::archive::Manifest;
+use super::{Failure, Result};
 use crate::config::{CanInterface, Config};
 use crate::operation::{AnswerSettings, Goal, Move, Operation, OperationConfig};
 use crate::session::AxisMove;
@@ -61,7 +60,7 @@ pub(super) struct StageArguments {
 
 impl StageArguments {
     /// Joins these arguments and those `after` the operation, in the order of the command line.
-    fn joined(&self, after: &Configured) -> Result<Configured, Failure> {
+    fn joined(&self, after: &Configured) -> Result<Configured> {
         if let (Some(config), Some(again)) = (&self.config, after.path()) {
             return Err(Failure::configuration(format_args!(
                 "--config is given twice, {} and {}: nothing was done, give one",
@@ -156,7 +155,7 @@ pub(super) enum Motion {
 
 impl Motion {
     /// The motion that the words of `line` name, as on the command line of `stage`.
-    fn of(line: &str) -> Result<Self, clap::Error> {
+    pub(super) fn of(line: &str) -> Result<Self, clap::Error> {
         Motion::try_parse_from(["stage"].into_iter().chain(line.split_whitespace()))
     }
 
@@ -228,7 +227,7 @@ impl Motion {
     }
 
     /// The operation that this motion asks of the stage of `config`.
-    fn plan(&self, config: &Config) -> Result<OperationConfig, Failure> {
+    pub(super) fn plan(&self, config: &Config) -> Result<OperationConfig> {
         let stage = config.stage.to_stage(&config.can)?;
         let operation = match self {
             Motion::Home { axis, .. } => match Operation::home(&stage, *axis) {
@@ -242,9 +241,11 @@ impl Motion {
             },
             Motion::Jog { axis, by, to, speed, .. } => jog_goal(&stage, *axis, *by, *to)
                 .and_then(|goal| with_speed(jog_move(config, *axis, goal), *speed, &stage))
+                .map(Operation::Move)
                 .map_err(Failure::configuration)?,
             Motion::Withdraw { by, speed, .. } => withdrawal_move(config, &stage, *by)
                 .and_then(|withdrawal| with_speed(withdrawal, *speed, &stage))
+                .map(Operation::Move)
                 .map_err(Failure::configuration)?,
             Motion::Prove { handedness: false, .. } => Operation::Prove,
             Motion::Prove { handedness: true, .. } => {
@@ -263,24 +264,6 @@ impl Motion {
     }
 }
 
-/// The operation that `manifest` records, on the stage of `config`; `None` for an insertion.
-pub(super) fn recorded_operation(
-    manifest: &Manifest,
-    config: &Config,
-) -> Result<Option<OperationConfig>, Failure> {
-    let Some(name) = &manifest.operation else { return Ok(None) };
-    // The record says `prove-handedness` for `prove --handedness`.
-    let command = name.split('-').next().unwrap_or_default();
-    let motion = Motion::of(&format!("{command} {}", manifest.arguments.join(" ")));
-    let motion = motion.map_err(|_| {
-        Failure::configuration(format_args!(
-            "the record does not say what `stage {name}` was to do; replay it with the bench that \
-             recorded it"
-        ))
-    })?;
-    motion.plan(config).map(Some)
-}
-
 /// A parser of an axis's name, for clap.
 fn axis() -> impl TypedValueParser<Value = Axis> {
     PossibleValuesParser::new(["insertion", "rotation"]).map(|name| match name.as_str() {
@@ -289,7 +272,7 @@ fn axis() -> impl TypedValueParser<Value = Axis> {
     })
 }
 
-pub(super) fn stage(arguments: &Arguments) -> Result<(), Failure> {
+pub(super) fn stage(arguments: &Arguments) -> Result<()> {
     let Arguments { emulated, rehearse, json, realtime, ref command, .. } = *arguments;
     let configured = match command {
         StageCommand::Motion(motion) => &motion.common().configured,
@@ -326,38 +309,37 @@ pub(super) fn stage(arguments: &Arguments) -> Result<(), Failure> {
     }
 }
 
-/// Loads the configuration of a stage to move, with the `emulator_key` that an emulated stage also needs.
+/// Loads the configuration of a stage to move, with the `emulator_key` that an emulated stage also needs. Refuses
+/// the emulated stage in memory unless it is asked for.
 pub(super) fn load_stage(
     mut configured: Configured,
     emulated: bool,
     emulator_key: impl Fn(&Config) -> Option<String>,
-) -> Result<(Config, Configured), Failure> {
+) -> Result<(Config, Configured)> {
     let mut config = configured.load(None)?;
-    check_bus(config.bus(), emulated)?;
+    match (config.bus(), emulated) {
+        // An operator who forgot to name the rig must not take the emulated stage for the rig.
+        (CanInterface::Memory, false) => {
+            return Err(Failure::configuration(format_args!(
+                "no stage is named: give its configuration, --config my-rig.toml, or rehearse on the \
+                 emulated stage with --rehearse{}",
+                last_run_on_a_bus("")
+            )));
+        }
+        (CanInterface::Memory, true) | (_, false) => {}
+        (interface, true) => {
+            return Err(Failure::configuration(format_args!(
+                "--virtual moves the emulated stage in memory, but can.interface is \"{interface}\": \
+                 leave one of the two out"
+            )));
+        }
+    }
     if let Some(key) = emulator_key(&config) {
         print_stderr(format_args!("emulated    {key}"));
         configured.set.push(key);
         config = configured.load(None)?;
     }
     Ok((config, configured))
-}
-
-/// Refuses the emulated stage in memory without `--virtual` or a rehearsal: an operator who forgot to name the
-/// rig must not take it for the rig.
-fn check_bus(interface: &CanInterface, emulated: bool) -> Result<(), Failure> {
-    let is_memory = interface == &CanInterface::Memory;
-    match (is_memory, emulated) {
-        (true, true) | (false, false) => Ok(()),
-        (false, true) => Err(Failure::configuration(format_args!(
-            "--virtual moves the emulated stage in memory, but can.interface is \"{interface}\": \
-             leave one of the two out"
-        ))),
-        (true, false) => Err(Failure::configuration(format_args!(
-            "no stage is named: give its configuration, --config my-rig.toml, or rehearse on the \
-             emulated stage with --rehearse{}",
-            last_run_on_a_bus("")
-        ))),
-    }
 }
 
 /// A rotation has arrived at this distance from its goal.
@@ -395,16 +377,12 @@ fn jog_goal(
 }
 
 /// `jog` at `speed`, if one is given.
-fn with_speed(
-    jog: Move,
-    speed: Option<Distance>,
-    stage: &StageConfig,
-) -> Result<Operation, String> {
-    let Some(asked) = speed else { return Ok(Operation::Move(jog)) };
+fn with_speed(jog: Move, speed: Option<Distance>, stage: &StageConfig) -> Result<Move, String> {
+    let Some(asked) = speed else { return Ok(jog) };
     let speed = asked.along(jog.axis)?;
     let max = stage.axis(jog.axis).limits.speed_max;
     if speed > 0.0 && speed <= max {
-        return Ok(Operation::Move(Move { speed, ..jog }));
+        return Ok(Move { speed, ..jog });
     }
     let (max, unit) = jog.axis.in_unit(max);
     // Undo the rounding of the conversion to radians and back.
@@ -414,15 +392,12 @@ fn with_speed(
 
 /// A move of `axis` at its jog speed.
 fn jog_move(config: &Config, axis: Axis, goal: Goal) -> Move {
-    let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
-    let (speed, acceleration, arrival) = match axis {
-        Axis::Insertion => {
-            (insertion.jog_speed, insertion.jog_acceleration, config.insertion.arrival_mm)
-        }
-        Axis::Rotation => {
-            (rotation.jog_speed, rotation.jog_acceleration, ROTATION_ARRIVAL_DEG.to_radians())
-        }
+    let arrival = match axis {
+        Axis::Insertion => config.insertion.arrival_mm,
+        Axis::Rotation => ROTATION_ARRIVAL_DEG.to_radians(),
     };
+    let section = config.stage.axis(axis);
+    let (speed, acceleration) = (section.jog_speed, section.jog_acceleration);
     Move { axis, goal, speed, acceleration, arrival }
 }
 

@@ -5,7 +5,7 @@ use crate::archive::{file, proof};
 use crate::cli::ending::{after_operation, ending, status};
 use crate::cli::output::{merged, print_result, print_stderr};
 use crate::cli::perform::{Job, Options, Performed, end_json};
-use crate::cli::{Failure, finish_with};
+use crate::cli::{Failure, Result, finish_with};
 use crate::config::Config;
 use crate::runtime::RunReport;
 use crate::session::AxisMove;
@@ -18,39 +18,35 @@ pub(super) fn operate(
     path: Option<&Path>,
     motion: &Motion,
     arguments: &Arguments,
-) -> Result<(), Failure> {
+) -> Result<()> {
     let options = Options {
         about: motion.common().about.clone(),
         realtime: arguments.realtime,
         quiet: arguments.quiet,
         ..Options::default()
     };
-    let Performed { report, done, .. } = job(config, motion, options)?.perform()?;
-    let proof = proof_of(&report);
-    let object = to_json(motion.name(), &done, &proof, &report);
-    let text = [summary(config, path, motion, &done, &report)].into_iter().chain(proof);
+    let performed = job(config, motion, options)?.perform()?;
+    let proof = proof_of(&performed.report);
+    let object = to_json(motion.name(), &performed, &proof);
+    let text = [summary(config, path, motion, &performed)].into_iter().chain(proof);
     print_result(arguments.json, &object, || Ok(text.collect::<Vec<_>>().join("\n")))?;
-    finish_with(status(config, &report))
+    finish_with(status(config, &performed.report))
 }
 
 /// Runs the motion that `line` describes as on the command line of `stage`, and prints its summary on stderr.
-pub(in crate::cli) fn perform(
-    config: &Config,
-    line: &str,
-    options: Options,
-) -> Result<RunReport, Failure> {
+pub(in crate::cli) fn perform(config: &Config, line: &str, options: Options) -> Result<RunReport> {
     let motion = Motion::of(line).map_err(Failure::configuration)?;
-    let Performed { report, done, .. } = job(config, &motion, options)?.perform()?;
-    print_stderr(summary(config, None, &motion, &done, &report));
-    Ok(report)
+    let performed = job(config, &motion, options)?.perform()?;
+    print_stderr(summary(config, None, &motion, &performed));
+    Ok(performed.report)
 }
 
-fn job<'a>(config: &'a Config, motion: &'a Motion, options: Options) -> Result<Job<'a>, Failure> {
+fn job<'a>(config: &'a Config, motion: &'a Motion, options: Options) -> Result<Job<'a>> {
     let run_config = motion.plan(config)?.into();
     Ok(Job { config, run_config, motion: Some(motion), options })
 }
 
-fn to_json(name: &str, done: &[AxisMove], proof: &Option<String>, report: &RunReport) -> Value {
+fn to_json(name: &str, performed: &Performed, proof: &Option<String>) -> Value {
     let axis = |done: &AxisMove| {
         let (to, unit) = done.axis.in_unit(done.to);
         let from = done.from.map(|from| done.axis.in_unit(from).0);
@@ -61,10 +57,10 @@ fn to_json(name: &str, done: &[AxisMove], proof: &Option<String>, report: &RunRe
     };
     let object = json!({
         "operation": name,
-        "axes": done.iter().map(axis).collect::<Vec<_>>(),
+        "axes": performed.done.iter().map(axis).collect::<Vec<_>>(),
         "proof": proof,
     });
-    merged(object, &end_json(report))
+    merged(object, &end_json(&performed.report))
 }
 
 /// What the motion has proved, from its record.
@@ -73,13 +69,8 @@ fn proof_of(report: &RunReport) -> Option<String> {
 }
 
 /// The summary, the stop reason last.
-fn summary(
-    config: &Config,
-    path: Option<&Path>,
-    motion: &Motion,
-    done: &[AxisMove],
-    report: &RunReport,
-) -> String {
+fn summary(config: &Config, path: Option<&Path>, motion: &Motion, performed: &Performed) -> String {
+    let Performed { report, done, .. } = performed;
     let line = |done: &AxisMove| {
         let (to, unit) = done.axis.in_unit(done.to);
         let axis = done.axis;

@@ -2,7 +2,7 @@
 
 use crate::cli::output::{has_no_reader, print_stderr, print_stdout, print_wrapped};
 use crate::cli::perform::open_bus;
-use crate::cli::{ENVIRONMENT_FAILED, Failure, finish_with};
+use crate::cli::{ENVIRONMENT_FAILED, Failure, Result, finish_with};
 use crate::config::Config;
 use crate::emulator::VirtualStage;
 use crate::runtime::{Clock, Interrupt, talk_live, talk_virtual};
@@ -21,7 +21,7 @@ const SWITCHES: [&str; 3] = ["negative_limit", "positive_limit", "home_switch"];
 const SIGNAL_POLL: Duration = Duration::from_millis(50);
 
 /// Runs `dialogue` with the drives of `config` to its end.
-fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<(), Failure> {
+fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<()> {
     if config.is_emulated() {
         let mut stage = VirtualStage::new(config.virtual_stage()?, Time::ZERO);
         talk_virtual(dialogue, &mut stage);
@@ -32,7 +32,7 @@ fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<(), Failure> {
 }
 
 /// Resets the faults of both drives, then prints their status.
-pub(super) fn reset(config: &Config, as_json: bool) -> Result<(), Failure> {
+pub(super) fn reset(config: &Config, as_json: bool) -> Result<()> {
     let stage = config.stage.to_stage(&config.can)?;
     let mut reset = Reset::new(&stage, Time::ZERO);
     talk(config, &mut reset)?;
@@ -45,7 +45,7 @@ pub(super) fn reset(config: &Config, as_json: bool) -> Result<(), Failure> {
 }
 
 /// Prints the status each second, until Ctrl-C or until stdout is closed.
-pub(super) fn watch(config: &Config, as_json: bool) -> Result<(), Failure> {
+pub(super) fn watch(config: &Config, as_json: bool) -> Result<()> {
     let interrupt = Interrupt::listen()?;
     loop {
         let read = status(config, as_json);
@@ -65,14 +65,14 @@ pub(super) fn watch(config: &Config, as_json: bool) -> Result<(), Failure> {
 }
 
 /// Reads the status of both drives.
-pub(in crate::cli) fn read_status(config: &Config) -> Result<StatusReader, Failure> {
+pub(in crate::cli) fn read_status(config: &Config) -> Result<StatusReader> {
     let stage = config.stage.to_stage(&config.can)?;
     let mut reader = StatusReader::new(&stage, Time::ZERO);
     talk(config, &mut reader)?;
     Ok(reader)
 }
 
-pub(super) fn status(config: &Config, as_json: bool) -> Result<(), Failure> {
+pub(super) fn status(config: &Config, as_json: bool) -> Result<()> {
     let reader = read_status(config)?;
     let (mut object, mut lines, mut errors) = (json!({}), Vec::new(), Vec::new());
     for axis in Axis::BOTH {

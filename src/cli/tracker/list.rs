@@ -1,9 +1,9 @@
 //! `needle-bench tracker list`: the tools of the stream.
 
 use super::{RATE_TIME_MIN_S, listen};
-use crate::cli::Failure;
 use crate::cli::arguments::{Configured, number_in};
 use crate::cli::output::{print_stderr, print_stdout};
+use crate::cli::{Failure, Result};
 use crate::text::{clipped, table};
 use crate::tracker::gate::is_same_tool;
 use crate::tracker::{Event, Gate, Sample, Validity};
@@ -96,7 +96,7 @@ impl Tool {
     }
 }
 
-pub(super) fn list(arguments: &ListArguments) -> Result<(), Failure> {
+pub(super) fn list(arguments: &ListArguments) -> Result<()> {
     let mut listener = listen(&arguments.configured, true)?;
     let until = listener.now() + Duration::from_secs_f64(arguments.seconds);
     let configured = listener.config.tracker.tool.clone();

@@ -11,7 +11,7 @@ use self::watch::{WatchArguments, watch};
 use super::arguments::{Configured, text_of};
 use super::calibrate::tracker::{RestArguments, rest};
 use super::output::print_stderr;
-use super::{Failure, io_runtime};
+use super::{Failure, Result, io_runtime};
 use crate::config::{Config, TrackerMode, TrackerSection, TrackerSource};
 use crate::runtime::{Clock, Interrupt};
 use crate::text::clipped;
@@ -36,7 +36,7 @@ pub(super) enum TrackerCommand {
     Rest(RestArguments),
 }
 
-pub(super) fn tracker(command: &TrackerCommand) -> Result<(), Failure> {
+pub(super) fn tracker(command: &TrackerCommand) -> Result<()> {
     match command {
         TrackerCommand::List(arguments) => list(arguments),
         TrackerCommand::Watch(arguments) => watch(arguments),
@@ -45,23 +45,13 @@ pub(super) fn tracker(command: &TrackerCommand) -> Result<(), Failure> {
     }
 }
 
-/// Opens the stream of the tracker's tool and, if the target is tracked, of the target's, in real time.
-pub(super) fn open_tracker(
-    config: &Config,
-    runtime: &Runtime,
-    clock: Clock,
-) -> Result<Link, Failure> {
-    let tools = [Some(&config.tracker.tool), config.goal.tool.as_ref()];
-    open(config, tools.into_iter().flatten().cloned().collect(), runtime, clock)
-}
-
 /// Opens the stream of `tools`, or of every tool if none is named, in real time.
-fn open(
+pub(super) fn open_tracker(
     config: &Config,
     tools: Vec<String>,
     runtime: &Runtime,
     clock: Clock,
-) -> Result<Link, Failure> {
+) -> Result<Link> {
     let tracker = &config.tracker;
     let address = &tracker.address;
     let now = move || clock.now();
@@ -95,10 +85,7 @@ fn open(
 }
 
 /// Loads the recording that replaces a tracker, to begin at `start`; `None` if the configuration names none.
-pub(super) fn load_replay(
-    tracker: &TrackerSection,
-    start: Time,
-) -> Result<Option<StreamReplay>, Failure> {
+pub(super) fn load_replay(tracker: &TrackerSection, start: Time) -> Result<Option<StreamReplay>> {
     let Some(file) = &tracker.file else { return Ok(None) };
     let text = text_of(Path::new(file))?;
     let recording = match tracker.source {
@@ -156,7 +143,7 @@ pub(super) struct Listener {
 }
 
 /// Opens the stream of the tool that `configured` names, or of every tool. Refuses an emulated tracker.
-pub(super) fn listen(configured: &Configured, every_tool: bool) -> Result<Listener, Failure> {
+pub(super) fn listen(configured: &Configured, every_tool: bool) -> Result<Listener> {
     if configured.path().is_none() && configured.set.is_empty() {
         return Err(Failure::configuration(format!("tracker: none is named; {NO_TRACKER}")));
     }
@@ -171,12 +158,12 @@ pub(super) fn listen(configured: &Configured, every_tool: bool) -> Result<Listen
 
 impl Listener {
     /// Opens the stream of the tool of `config`, or of every tool.
-    pub(super) fn open(config: Config, every_tool: bool) -> Result<Self, Failure> {
+    pub(super) fn open(config: Config, every_tool: bool) -> Result<Self> {
         let runtime = io_runtime()?;
         let interrupt = Interrupt::listen()?;
         let clock = Clock::start();
         let tools = if every_tool { vec![] } else { vec![config.tracker.tool.clone()] };
-        let link = open(&config, tools, &runtime, clock)?;
+        let link = open_tracker(&config, tools, &runtime, clock)?;
         Ok(Listener {
             config,
             clock,
@@ -249,8 +236,8 @@ impl Listener {
     pub(super) fn for_each_sample(
         &mut self,
         seconds: Option<f64>,
-        mut take: impl FnMut(&Sample) -> Result<(), Failure>,
-    ) -> Result<(), Failure> {
+        mut take: impl FnMut(&Sample) -> Result<()>,
+    ) -> Result<()> {
         let timeout = self.now() + self.config.tracker.timeout;
         let (mut until, mut has_sample) = (timeout, false);
         while let Some(event) = self.next(until) {

@@ -2,10 +2,10 @@
 
 use super::listen;
 use crate::archive::tracker_line;
-use crate::cli::Failure;
 use crate::cli::arguments::{Configured, number_in};
 use crate::cli::calibrate::tracker::{POSITION, QUATERNION, RECEIVED, STAMP};
 use crate::cli::output::{print_stderr, refuse_existing};
+use crate::cli::{Failure, Result};
 use crate::session::SampleRecord;
 use crate::tracker::Sample;
 use crate::units::Time;
@@ -83,7 +83,7 @@ impl Recording {
     }
 }
 
-pub(super) fn record(arguments: &RecordArguments) -> Result<(), Failure> {
+pub(super) fn record(arguments: &RecordArguments) -> Result<()> {
     let path = &arguments.file;
     let is_csv = path.extension().is_some_and(|ending| ending == "csv");
     refuse_existing(Some(path))?;

@@ -1,9 +1,9 @@
 //! `needle-bench tracker watch`: one line a second on the configured tool.
 
 use super::{Listener, RATE_TIME_MIN_S, listen};
-use crate::cli::Failure;
 use crate::cli::arguments::{Configured, number_in};
 use crate::cli::output::{has_no_reader, print_stdout};
+use crate::cli::{Failure, Result};
 use crate::config::TrackerSection;
 use crate::tracker::{AcquisitionClock, Event, Gate, GateCounts, Refusal};
 use crate::units::Time;
@@ -138,7 +138,7 @@ impl Watch {
     }
 }
 
-pub(super) fn watch(arguments: &WatchArguments) -> Result<(), Failure> {
+pub(super) fn watch(arguments: &WatchArguments) -> Result<()> {
     let mut listener = listen(&arguments.configured, false)?;
     let mut watch = Watch::new(&listener.config.tracker);
     let start = listener.now();
