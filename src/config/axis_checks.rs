@@ -2,7 +2,7 @@
 
 use super::Config;
 use super::checks::{ROTATION_ACCELERATION_MAX, rounded_down};
-use super::reader::Reader;
+use super::reader::{Reader, contradictions};
 use crate::session::PROFILE_PEAK;
 use crate::stage::{Axis, AxisConfig, Reference};
 
@@ -83,7 +83,6 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
         let checks = Checks { config, which, axis: config.stage.axis(which) };
         checks.reference(reader);
         checks.home(reader);
-        checks.homing_direction(reader);
         checks.stopping(reader);
         checks.optional_objects(reader);
         checks.following_error_timeout(reader);
@@ -100,54 +99,47 @@ struct Checks<'a> {
 }
 
 impl Checks<'_> {
+    /// The key of this axis; its `UNIT` is that of the axis.
     fn key(&self, key: &str) -> String {
-        format!("stage.{}.{key}", self.which)
+        format!("stage.{}.{}", self.which, key.replace("UNIT", self.which.unit()))
     }
 
     fn number(&self, key: &str) -> f64 {
         self.config.number(&self.key(key))
     }
 
-    /// The keys of the soft limits, and the limits.
-    fn limits(&self) -> ([String; 2], [f64; 2]) {
-        let keys = ["min", "max"].map(|end| format!("{end}_{}", self.which.unit()));
-        let limits = [&keys[0], &keys[1]].map(|key| self.number(key));
-        (keys.map(|key| self.key(&key)), limits)
-    }
-
     fn reference(&self, reader: &mut Reader) {
         let axis = self.axis;
-        let [reference, homing, zero] = ["reference", "homing", "zero"].map(|key| self.key(key));
+        let [reference, homing, zero, high] =
+            ["reference", "homing", "zero", "max_UNIT"].map(|key| self.key(key));
+        let [min, max] = ["min_UNIT", "max_UNIT"].map(|key| self.number(key));
+        let unit = self.which.unit();
         let homed = axis.reference == Reference::Homing;
-        reader.refuse_if(&[&reference, &homing], homed && axis.homing.is_none(), || {
-            format!("{reference} is \"homing\", and there is no [{homing}] that says how")
-        });
-        reader.refuse_if(&[&zero, &reference], homed && axis.zero.is_none(), || {
-            format!(
-                "{zero} is \"start\", but {reference} is \"homing\": give the counts, 0 for the drive's \
-                 zero"
-            )
-        });
         // The limits of a real axis protect its screw, its needle or the sensor's cable. Limits that count from
         // the start of each command do not: three jogs can go three times as far.
-        let ([_, high], [min, max]) = self.limits();
         let has_moving_limits = self.config.stage.hardware && axis.zero.is_none() && !axis.wraps;
-        reader.refuse_if(&[&zero, &high, "stage.hardware"], has_moving_limits, || {
-            let unit = self.which.unit();
-            format!(
+        contradictions! { reader;
+            [&reference, &homing] if homed && axis.homing.is_none() =>
+                "{reference} is \"homing\", and there is no [{homing}] that says how";
+            [&zero, &reference] if homed && axis.zero.is_none() =>
+                "{zero} is \"start\", but {reference} is \"homing\": give the counts, 0 for the drive's \
+                 zero";
+            [&zero, &high, "stage.hardware"] if has_moving_limits =>
                 "{zero} is \"start\": limits of {min} to {max} {unit} would count anew from each start; give \
-                 the counts at 0 {unit} (stage status), or home the axis ({reference})"
-            )
-        });
+                 the counts at 0 {unit} (stage status), or home the axis ({reference})";
+        }
     }
 
-    fn offset_key(&self) -> String {
-        format!("homing.offset_{}", self.which.unit())
-    }
-
-    /// The home position, mm or deg: the drive's zero is the home offset (607C) away from it.
-    fn home_position(&self, offset: f64) -> f64 {
-        let zero_counts = self.axis.zero.map_or(f64::NAN, f64::from);
+    /// Home, where the drive's zero is the home offset (607C) away from it, is within the limits. An insertion
+    /// axis that homes on an end switch moves between that switch and the other end: the limits must be on that
+    /// side of home.
+    fn home(&self, reader: &mut Reader) {
+        let [low, high, zero, offset_key, method_key, sign_key] =
+            ["min_UNIT", "max_UNIT", "zero", "homing.offset_UNIT", "homing.method", "sign"]
+                .map(|key| self.key(key));
+        let [min, max, offset, sign] =
+            [&low, &high, &offset_key, &sign_key].map(|key| self.config.number(key));
+        let unit = self.which.unit();
         let counts_per_unit = match self.which {
             Axis::Insertion => {
                 self.number("counts_per_mm.counts") / self.number("counts_per_mm.mm")
@@ -156,66 +148,47 @@ impl Checks<'_> {
                 self.number("counts_per_turn.counts") / self.number("counts_per_turn.turns") / 360.0
             }
         };
+        let zero_counts = self.axis.zero.map_or(f64::NAN, f64::from);
         // Not -offset, which would print as -0.000.
-        0.0 - offset - self.number("sign") * zero_counts / counts_per_unit
-    }
+        let home_at = |offset: f64| 0.0 - offset - sign * zero_counts / counts_per_unit;
+        let home = home_at(offset);
+        contradictions! { reader;
+            [&low, &high, &zero, &offset_key] if home < min || home > max =>
+                "{offset_key} is {offset}, which puts home at {home:.3} {unit} with {zero} = {zero_counts}, \
+                 allowed: {low} to {high}, which are {min} and {max}";
+        }
 
-    fn home(&self, reader: &mut Reader) {
-        let ([low, high], [min, max]) = self.limits();
-        let (zero, offset_key) = (self.key("zero"), self.key(&self.offset_key()));
-        let offset = self.config.number(&offset_key);
-        let home = self.home_position(offset);
-        reader.refuse_if(&[&low, &high, &zero, &offset_key], home < min || home > max, || {
-            let (unit, zero_counts) = (self.which.unit(), self.axis.zero.unwrap_or_default());
-            format!(
-                "{offset_key} is {offset}, which puts home at {home:.3} {unit} with {zero} = \
-                 {zero_counts}, allowed: {low} to {high}, which are {min} and {max}"
-            )
-        });
-    }
-
-    /// An insertion axis that homes on an end switch moves between that switch and the other end: the limits
-    /// must be on that side of home.
-    fn homing_direction(&self, reader: &mut Reader) {
         let Some(homing) = self.axis.homing.filter(|_| self.which == Axis::Insertion) else {
             return;
         };
-        let sign = self.number("sign");
         let method = homing.method;
         let (direction, other_method) = match method {
             1 | 17 => (-sign, method + 1),
             2 | 18 => (sign, method - 1),
             _ => return,
         };
-        let ([low, high], [min, max]) = self.limits();
-        let offset = self.number(&self.offset_key());
-        let home = self.home_position(if offset.is_nan() { 0.0 } else { offset });
+        let home = home_at(if offset.is_nan() { 0.0 } else { offset });
         let (end, beyond, before) = match direction > 0.0 {
             true => ("deep", max - home, home - min),
             false => ("withdrawn", home - min, max - home),
         };
-        let [method_key, sign_key, zero] =
-            ["homing.method", "sign", "zero"].map(|key| self.key(key));
-        reader.refuse_if(&[&method_key, &sign_key, &zero, &low, &high], beyond > before, || {
-            let unit = self.which.unit();
-            format!(
+        contradictions! { reader;
+            [&method_key, &sign_key, &zero, &low, &high] if beyond > before =>
                 "{method_key} is {method}, which with sign = {sign} seeks the switch at the {end} end: home \
                  is {home:.3} {unit}, the limits of {min} to {max} {unit} go {beyond:.1} {unit} beyond it; \
-                 is it {other_method}?"
-            )
-        });
+                 is it {other_method}?";
+        }
     }
 
     fn stopping(&self, reader: &mut Reader) {
         for (name, stopping, allowed) in STOPPING {
-            let key = self.key(name);
-            let value = self.config.number(&key);
+            let key = &*self.key(name);
+            let value = self.config.number(key);
             let is_stopping = stopping.iter().any(|&option| f64::from(option) == value);
-            reader.refuse_if(
-                &["stage.hardware", &key],
-                self.config.stage.hardware && !is_stopping,
-                || format!("{key} is {value}, allowed with stage.hardware = true: {allowed}"),
-            );
+            contradictions! { reader;
+                ["stage.hardware", key] if self.config.stage.hardware && !is_stopping =>
+                    "{key} is {value}, allowed with stage.hardware = true: {allowed}";
+            }
         }
     }
 
@@ -223,28 +196,25 @@ impl Checks<'_> {
         for (n, index) in self.axis.optional_objects.iter().enumerate() {
             let needed = NEEDED.iter().find(|(indexes, _)| indexes.contains(index));
             let Some((_, why)) = needed else { continue };
-            if *index == SOFTWARE_LIMITS && self.axis.wraps {
-                continue;
+            let key = &*self.key(&format!("optional_objects[{n}]"));
+            contradictions! { reader;
+                [key] if *index != SOFTWARE_LIMITS || !self.axis.wraps =>
+                    "{key} is 0x{index:04X}, which is not optional; remove it: {why}";
             }
-            let key = self.key(&format!("optional_objects[{n}]"));
-            reader.refuse_if(&[&key], true, || {
-                format!("{key} is 0x{index:04X}, which is not optional; remove it: {why}")
-            });
         }
     }
 
     /// The bench's own limit is the drive's window plus the travel of two SYNC periods. With a timeout of at
     /// most two SYNC periods the drive reacts no later than the bench.
     fn following_error_timeout(&self, reader: &mut Reader) {
-        let key = self.key("following_error_timeout_ms");
+        let key = &*self.key("following_error_timeout_ms");
         let timeout_ms = self.axis.following_error_timeout_ms.unwrap_or_default();
         let max_ms = 2 * self.config.can.bus.sync_ms;
-        reader.refuse_if(&["can.sync_ms", &key], timeout_ms > max_ms, || {
-            format!(
+        contradictions! { reader;
+            ["can.sync_ms", key] if timeout_ms > max_ms =>
                 "{key} is {timeout_ms}, allowed: up to {max_ms} (twice can.sync_ms), so that the drive \
-                 notices no later than the bench"
-            )
-        });
+                 notices no later than the bench";
+        }
     }
 
     /// Refuses raw SDOs whose value does not fit, and those to objects that the bench writes itself.
@@ -254,19 +224,18 @@ impl Checks<'_> {
                 ["index", "value", "bits"].map(|name| self.key(&format!("sdo[{n}].{name}")));
             let (low, high) = (-(1i64 << (sdo.bits.max(1) - 1)), (1i64 << sdo.bits) - 1);
             let (index, value) = (sdo.index, sdo.value);
-            reader.refuse_if(&[&bits_key, &value_key], !(low..=high).contains(&value), || {
-                format!("{value_key} is {value}, allowed: {low} to {high}")
-            });
             let object = (index, sdo.subindex);
             let set_by = SET_BY.iter().find_map(|(set, key)| {
+                let is_given = *set == object && !self.number(key).is_nan();
                 let key = key.replace("UNIT", self.which.unit());
-                let is_given = *set == object && !self.number(&key).is_nan();
                 is_given.then(|| format!("{key} sets it: give one of the two"))
             });
-            if let Some(why) = reserved(index).map(str::to_owned).or(set_by) {
-                reader.refuse_if(&[&index_key], true, || {
-                    format!("{index_key} is 0x{index:04X}, not for raw SDOs: {why}")
-                });
+            let why = reserved(index).map(str::to_owned).or(set_by);
+            contradictions! { reader;
+                [&bits_key, &value_key] if !(low..=high).contains(&value) =>
+                    "{value_key} is {value}, allowed: {low} to {high}";
+                [&index_key] if why.is_some() =>
+                    "{index_key} is 0x{index:04X}, not for raw SDOs: {}", why.unwrap_or_default();
             }
         }
     }
@@ -305,12 +274,11 @@ fn accelerations(config: &Config, reader: &mut Reader) {
         ("stage.rotation.jog_acceleration_deg_per_s2", ROTATION_ACCELERATION_MAX),
     ] {
         let [acceleration, max] = [key, max_key].map(|key| config.number(key));
-        reader.refuse_if(&[key, max_key], PROFILE_PEAK * acceleration > max, || {
-            format!(
+        contradictions! { reader;
+            [key, max_key] if PROFILE_PEAK * acceleration > max =>
                 "{key} is {acceleration}, allowed: up to {:.3}: the last set-point brakes {PROFILE_PEAK} \
                  times as hard, and {max_key} is {max}",
-                rounded_down(max / PROFILE_PEAK, 3)
-            )
-        });
+                rounded_down(max / PROFILE_PEAK, 3);
+        }
     }
 }

@@ -3,7 +3,7 @@
 use super::axis_checks;
 use super::goal;
 use super::needle;
-use super::reader::{REGISTRATION, Reader};
+use super::reader::{FIDUCIALS, REGISTRATION, Reader, contradictions};
 use super::registration::GivenRegistration;
 use super::study::StudyConfig;
 use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
@@ -41,9 +41,10 @@ fn check_limits(config: &Config, reader: &mut Reader) {
     let limited = std::mem::take(&mut reader.limited);
     let mut limit = |key: &str, allowed: &str, other: &str, is_wrong: fn(f64, f64) -> bool| {
         let [value, limit] = [key, other].map(|key| config.number(key));
-        reader.refuse_if(&[key, other], is_wrong(value, limit), || {
-            format!("{key} is {value}, allowed: {allowed} {other}, which is {limit}")
-        });
+        contradictions! { reader;
+            [key, other] if is_wrong(value, limit) =>
+                "{key} is {value}, allowed: {allowed} {other}, which is {limit}";
+        }
     };
     for (key, other) in limited {
         limit(&key, "up to", other, |value, max| value > max);
@@ -58,16 +59,14 @@ fn check_limits(config: &Config, reader: &mut Reader) {
 
 /// At most one step is taken per SYNC period.
 fn check_step(config: &Config, reader: &mut Reader) {
-    let keys = ["insertion.step_mm", "insertion.speed_mm_per_s", "can.sync_ms"];
-    let [step, speed, sync_ms] = keys.map(|key| config.number(key));
-    let per_sync = speed * sync_ms / 1e3;
-    let [step_key, speed_key, sync_key] = keys;
-    reader.refuse_if(&keys, per_sync > step, || {
-        format!(
-            "{step_key} is {step}, allowed: at least what {speed_key} = {speed} moves in {sync_key} = \
-             {sync_ms}, which is {per_sync}"
-        )
-    });
+    let (step, speed) = (config.insertion.step_mm, config.insertion.speed_mm_per_s);
+    let sync_ms = config.can.bus.sync_ms;
+    let per_sync = speed * f64::from(sync_ms) / 1e3;
+    contradictions! { reader;
+        ["insertion.step_mm", "insertion.speed_mm_per_s", "can.sync_ms"] if per_sync > step =>
+            "insertion.step_mm is {step}, allowed: at least what insertion.speed_mm_per_s = {speed} \
+             moves in can.sync_ms = {sync_ms}, which is {per_sync}";
+    }
 }
 
 /// The axis can follow the fastest rotation that the control law may command, and its reversal.
@@ -75,25 +74,21 @@ fn check_rotation(config: &Config, reader: &mut Reader) {
     let section = section_name(&config.control.kind.to_string());
     let key = &*format!("control.{section}.rotation_max_deg_per_mm");
     let (per_mm, speed) = (config.number(key), config.insertion.speed_mm_per_s);
-    let (speed_key, sync_key) = ("insertion.speed_mm_per_s", "can.sync_ms");
-    let max_key = "stage.rotation.speed_max_deg_per_s";
+    let (speed_key, max_key) = ("insertion.speed_mm_per_s", "stage.rotation.speed_max_deg_per_s");
     let (deg_per_s, max) = (per_mm * speed, config.number(max_key));
-    reader.refuse_if(&[key, speed_key, max_key], deg_per_s > max, || {
-        format!(
+    contradictions! { reader;
+        [key, speed_key, max_key] if deg_per_s > max =>
             "{key} is {per_mm}: at {speed} mm/s that is {deg_per_s} deg/s, over {max_key} = {max}; turn \
              by {:.4} deg/mm or insert at {:.4} mm/s",
-            rounded_down(max / speed, 4),
-            rounded_down(max / per_mm, 4),
-        )
-    });
+            rounded_down(max / speed, 4), rounded_down(max / per_mm, 4);
+    }
     let (max_key, max) = (ROTATION_ACCELERATION_MAX, config.number(ROTATION_ACCELERATION_MAX));
     let peak = rotation_peak(per_mm, speed, config.can.bus.sync_period());
-    reader.refuse_if(&[key, speed_key, sync_key, max_key], peak > max, || {
-        format!(
+    contradictions! { reader;
+        [key, speed_key, "can.sync_ms", max_key] if peak > max =>
             "{key} is {per_mm}: reversed at {speed} mm/s, that is {peak:.0} deg/s², over \
-             {max_key} = {max}; turn or insert more slowly"
-        )
-    });
+             {max_key} = {max}; turn or insert more slowly";
+    }
 }
 
 /// Rounded down to this many decimals, so that a value that a message suggests is allowed.
@@ -113,31 +108,27 @@ fn check_torsion(section: &str, torsion: TorsionConfig, reader: &mut Reader) {
 fn check_study(config: &Config, reader: &mut Reader) {
     for key in StudyConfig::KEYS {
         let Some([low, high]) = config.range(key) else { continue };
-        let key = format!("study.{}", key.name);
-        reader.refuse_if(&[&key], low > high, || {
-            format!("{key} is [{low}, {high}], allowed: the lower number first")
-        });
+        let key = &*format!("study.{}", key.name);
+        contradictions! { reader;
+            [key] if low > high => "{key} is [{low}, {high}], allowed: the lower number first";
+        }
     }
     let study = &config.study;
-    let [moves, tool] = ["study.target_move_mm", "goal.tool"];
-    let drift = "emulator.target_drift_mm_per_mm";
     let is_drifting = config.emulator.target_drift_mm_per_mm != Vector3::zeros();
-    for (key, is_moving) in [(moves, study.target_move_mm.is_some()), (drift, is_drifting)] {
-        reader.refuse_if(&[key, tool], is_moving && config.goal.tool.is_none(), || {
-            format!("{key} has no effect without {tool}: name the tool that is the target")
-        });
+    for (key, is_moving) in [
+        ("study.target_move_mm", study.target_move_mm.is_some()),
+        ("emulator.target_drift_mm_per_mm", is_drifting),
+    ] {
+        contradictions! { reader;
+            [key, "goal.tool"] if is_moving && config.goal.tool.is_none() =>
+                "{key} has no effect without goal.tool: name the tool that is the target";
+        }
     }
     let least_mm = match study.target_depth_mm {
         Some([low, _]) => low,
         None => config.goal.position_mm.map_or(f64::INFINITY, |target_mm| target_mm.norm()),
     };
     let [_, move_mm] = study.target_move_mm.unwrap_or_default();
-    reader.refuse_if(&[moves, "study.target_depth_mm", "goal.position_mm"], move_mm > least_mm, || {
-        format!(
-            "{moves} reaches {move_mm}, allowed: up to the least distance of the target from the start, \
-             {least_mm} mm; it would move faster than the needle"
-        )
-    });
     let or_emulated = |drawn: Option<[f64; 2]>, key: &str| {
         drawn.unwrap_or_else(|| [config.number(&format!("emulator.torsion.{key}")); 2])
     };
@@ -146,15 +137,17 @@ fn check_study(config: &Config, reader: &mut Reader) {
     let [low, high] = or_emulated(offset, "offset_deg");
     let [half_width, _] = or_emulated(half_width, "half_width_deg");
     let offset = low.abs().max(high.abs());
-    let is_outside =
-        is_torsion_drawn && config.emulator.torsion.creep_mm == 0.0 && offset > half_width;
-    let [key, band] = ["study.torsion_offset_deg", "study.torsion_half_width_deg"];
-    reader.refuse_if(&[key, band], is_outside, || {
-        format!(
-            "{key} reaches {offset}, allowed without emulator.torsion.creep_mm: up to the least of \
-             {band}, which is {half_width}: the tip would start outside its own band"
-        )
-    });
+    let has_creep = config.emulator.torsion.creep_mm != 0.0;
+    contradictions! { reader;
+        ["study.target_move_mm", "study.target_depth_mm", "goal.position_mm"] if move_mm > least_mm =>
+            "study.target_move_mm reaches {move_mm}, allowed: up to the least distance of the target from \
+             the start, {least_mm} mm; it would move faster than the needle";
+        ["study.torsion_offset_deg", "study.torsion_half_width_deg"]
+            if is_torsion_drawn && !has_creep && offset > half_width =>
+            "study.torsion_offset_deg reaches {offset}, allowed without emulator.torsion.creep_mm: up to \
+             the least of study.torsion_half_width_deg, which is {half_width}: the tip would start outside \
+             its own band";
+    }
 }
 
 /// Correlated noise needs both its standard deviation and its correlation time. If the correlation time is
@@ -163,21 +156,20 @@ fn check_noise(config: &Config, reader: &mut Reader) {
     let time_s = config.tracker.noise.map_or(0.0, |noise| noise.correlation_time.as_secs_f64());
     let run_s = config.insertion.depth_mm / config.insertion.speed_mm_per_s;
     let key = "tracker.noise.correlation_time_s";
-    let keys = [key, "insertion.depth_mm", "insertion.speed_mm_per_s"];
-    reader.refuse_if(&keys, time_s > run_s, || {
-        format!(
+    contradictions! { reader;
+        [key, "insertion.depth_mm", "insertion.speed_mm_per_s"] if time_s > run_s =>
             "{key} is {time_s}, allowed: up to the {:.3} s of the insertion; noise that lasts longer \
              is an error of the registration, tracker.registration.sd_mm",
-            rounded_down(run_s, 3)
-        )
-    });
+            rounded_down(run_s, 3);
+    }
     let noise = config.emulator.noise;
-    let keys = ["emulator.noise.correlated_sd_mm", "emulator.noise.correlation_time_s"];
-    let is_given = [noise.correlated_sd_mm.is_some(), noise.correlation_time.is_some()];
-    for (given, other) in [(0, 1), (1, 0)] {
-        reader.refuse_if(&keys, is_given[given] && !is_given[other], || {
-            format!("{} is given without {}: give both", keys[given], keys[other])
-        });
+    let sd = ("emulator.noise.correlated_sd_mm", noise.correlated_sd_mm.is_some());
+    let time = ("emulator.noise.correlation_time_s", noise.correlation_time.is_some());
+    for ((key, is_given), (other, other_is_given)) in [(sd, time), (time, sd)] {
+        contradictions! { reader;
+            [key, other] if is_given && !other_is_given =>
+                "{key} is given without {other}: give both";
+        }
     }
 }
 
@@ -189,158 +181,130 @@ fn check_bus(config: &Config, reader: &mut Reader) {
     ];
     for [first, second] in [[0, 1], [0, 2], [1, 2]] {
         let ((first, node), (second, other)) = (nodes[first], nodes[second]);
-        reader.refuse_if(&[first, second], node == other, || {
-            format!("{second} is {other}, the same as {first}: each node needs its own number")
-        });
+        contradictions! { reader;
+            [first, second] if node == other =>
+                "{second} is {other}, the same as {first}: each node needs its own number";
+        }
     }
-
-    let interface = &config.can.interface;
-    let wrong_bus = config.stage.hardware && interface.is_for_tests();
-    reader.refuse_if(&["stage.hardware", "can.interface"], wrong_bus, || {
-        format!(
+    let (interface, hardware) = (&config.can.interface, config.stage.hardware);
+    contradictions! { reader;
+        ["stage.hardware", "can.interface"] if hardware && interface.is_for_tests() =>
             "can.interface is \"{interface}\", a bus made for tests, but stage.hardware is true: \
-             name the interface of the real stage, such as \"can0\""
-        )
-    });
-    let unjudged = config.stage.hardware && !config.tracker.gates.stream;
-    reader.refuse_if(&["stage.hardware", "tracker.gates.stream"], unjudged, || {
-        "tracker.gates.stream is false, but stage.hardware is true: with a real needle a stream that \
-         contradicts the insertion must end the run; set it to true"
-            .to_owned()
-    });
-    let unprotected = !config.stage.hardware && !interface.is_virtual();
-    reader.refuse_if(&["stage.hardware", "can.interface"], unprotected, || {
-        format!(
+             name the interface of the real stage, such as \"can0\"";
+        ["stage.hardware", "tracker.gates.stream"] if hardware && !config.tracker.gates.stream =>
+            "tracker.gates.stream is false, but stage.hardware is true: with a real needle a stream that \
+             contradicts the insertion must end the run; set it to true";
+        ["stage.hardware", "can.interface"] if !hardware && !interface.is_virtual() =>
             "can.interface is \"{interface}\", which may have real drives on it, but stage.hardware \
              is false: start from bench-config/rig-epos4.toml, or name \"vcan0\" or \"udp\" for \
-             emulated drives"
-        )
-    });
+             emulated drives";
+    }
 }
 
 fn check_tracker(config: &Config, reader: &mut Reader) {
     let interface = &config.can.interface;
-    let source = config.tracker.source;
+    let tracker = &config.tracker;
+    let source = tracker.source;
     let is_emulated = source == TrackerSource::Emulated;
     let is_in_memory = *interface == CanInterface::Memory;
-    let keys = ["tracker.source", "can.interface"];
-    reader.refuse_if(&keys, is_emulated && !is_in_memory, || {
-        format!(
-            "tracker.source is \"emulated\", allowed only with can.interface = \"memory\", which is \
-             \"{interface}\": it sees the emulated needle alone. Set tracker.source = \"openigtlink\""
-        )
-    });
-    let is_recorded = config.tracker.file.is_some() || source == TrackerSource::Csv;
-    reader.refuse_if(&keys, is_in_memory && !is_emulated && !is_recorded, || {
-        let recording = match source {
-            TrackerSource::Ndjson => ", or a recording as tracker.file",
-            _ => "",
-        };
-        format!(
-            "tracker.source is \"{source}\", but can.interface = \"memory\" is the emulated stage, \
-             which only its own tracker sees: name \"vcan0\" with vcan-stage on it{recording}"
-        )
-    });
-
-    let keys = ["tracker.latency_ms", "tracker.hold_after_s"];
-    let ([latency, after], [latency_ms, after_s]) = (keys, keys.map(|key| config.number(key)));
-    reader.refuse_if(&keys, latency_ms * 1e-3 >= after_s, || {
-        format!(
-            "{latency} is {latency_ms}, allowed: under {after}, which is {after_s} s: no position would \
-             be young enough to steer by"
-        )
-    });
+    let is_recorded = tracker.file.is_some() || source == TrackerSource::Csv;
+    let recording = match source {
+        TrackerSource::Ndjson => ", or a recording as tracker.file",
+        _ => "",
+    };
+    let latency_ms = config.number("tracker.latency_ms");
+    let after_s = config.number("tracker.hold_after_s");
     // The longest way without a position: latency, tracker period, two SYNCs until the hold begins, braking.
-    let (speed, hold_mm) = (config.insertion.speed_mm_per_s, config.tracker.hold.after_mm);
-    let braking = config.tracker.hold.braking_mm_per_s2;
+    let (speed, hold_mm) = (config.insertion.speed_mm_per_s, tracker.hold.after_mm);
+    let braking = tracker.hold.braking_mm_per_s2;
     let is_seen_here = config.tip_source() == TrackerSource::Emulated;
     let period_s = if is_seen_here { config.emulator.tracker_rate_hz.recip() } else { 0.0 };
     let noticed_s = period_s + (latency_ms + 2.0 * f64::from(config.can.bus.sync_ms)) * 1e-3;
     let least_mm = speed * noticed_s + 0.5 * speed * speed / braking;
     let [key, brake] = ["tracker.hold_after_mm", "tracker.hold_braking_mm_per_s2"];
-    let keys = [key, "insertion.speed_mm_per_s", brake, latency];
-    reader.refuse_if(&keys, hold_mm <= least_mm, || {
-        format!(
-            "{key} is {hold_mm}, allowed: over the {:.3} mm to standstill from {speed} mm/s \
-             with {brake} = {braking} and {latency} = {latency_ms}: insert slower or brake harder",
-            (least_mm * 1e3).ceil() / 1e3
-        )
-    });
+    contradictions! { reader;
+        ["tracker.source", "can.interface"] if is_emulated && !is_in_memory =>
+            "tracker.source is \"emulated\", allowed only with can.interface = \"memory\", which is \
+             \"{interface}\": it sees the emulated needle alone. Set tracker.source = \"openigtlink\"";
+        ["tracker.source", "can.interface"] if is_in_memory && !is_emulated && !is_recorded =>
+            "tracker.source is \"{source}\", but can.interface = \"memory\" is the emulated stage, \
+             which only its own tracker sees: name \"vcan0\" with vcan-stage on it{recording}";
+        ["tracker.latency_ms", "tracker.hold_after_s"] if latency_ms * 1e-3 >= after_s =>
+            "tracker.latency_ms is {latency_ms}, allowed: under tracker.hold_after_s, which is {after_s} s: \
+             no position would be young enough to steer by";
+        [key, "insertion.speed_mm_per_s", brake, "tracker.latency_ms"] if hold_mm <= least_mm =>
+            "{key} is {hold_mm}, allowed: over the {:.3} mm to standstill from {speed} mm/s with {brake} = \
+             {braking} and tracker.latency_ms = {latency_ms}: insert slower or brake harder",
+            (least_mm * 1e3).ceil() / 1e3;
+    }
 
-    let Some(workspace) = &config.tracker.workspace else { return };
+    let Some(workspace) = &tracker.workspace else { return };
     let [min_mm, max_mm] = [workspace.min_mm, workspace.max_mm].map(<[f64; 3]>::from);
     let is_empty = min_mm.iter().zip(max_mm).any(|(&min, max)| min >= max);
-    reader.refuse_if(&["tracker.workspace.min_mm", "tracker.workspace.max_mm"], is_empty, || {
-        format!(
+    contradictions! { reader;
+        ["tracker.workspace.min_mm", "tracker.workspace.max_mm"] if is_empty =>
             "tracker.workspace.min_mm is {min_mm:?}, allowed: each under that of \
-             tracker.workspace.max_mm, which is {max_mm:?}"
-        )
-    });
+             tracker.workspace.max_mm, which is {max_mm:?}";
+    }
 }
 
 /// Fiducials determine a pose, and cannot be given beside one.
 fn check_registration(config: &Config, reader: &mut Reader) {
-    let key = "tracker.registration.fiducials";
-    if reader.is_given(key) {
+    if reader.is_given(FIDUCIALS) {
         let mut pose = expanded(GivenRegistration::KEYS, &[]).into_iter();
         let other = |key: &Key| reader.is_given(&format!("{REGISTRATION}.{}", key.name));
         if let Some(other) = pose.find(other) {
             let other = other.name;
             let message = format!("fiducials are given along with {other}: give one of the two");
-            reader.refuse(REGISTRATION, key, &message);
+            reader.refuse(REGISTRATION, FIDUCIALS, &message);
         }
     }
-    reader.check_result(&[key, REGISTRATION], config.registration_sd_mm());
+    reader.check_result(&[FIDUCIALS, REGISTRATION], config.registration_sd_mm());
 }
 
 /// Keys that only some sources of tip positions allow.
 fn check_source(config: &Config, reader: &mut Reader) {
     let tracker = &config.tracker;
     let source = tracker.source;
-    let [key, file, address, request] =
-        ["tracker.source", "tracker.file", "tracker.address", "tracker.request"];
-    reader.refuse_if(&[key, file], source == TrackerSource::Csv && tracker.file.is_none(), || {
-        format!("{key} is \"{source}\", and there is no {file} to read")
-    });
-    let recording = format!("\"{}\"", tracker.file.as_deref().unwrap_or_default());
-    let is_file = matches!(source, TrackerSource::Ndjson | TrackerSource::Csv);
+    let is_recorded = tracker.file.is_some();
+    let file = tracker.file.as_deref().unwrap_or_default();
     let is_ndjson = source == TrackerSource::Ndjson;
+    let is_csv = source == TrackerSource::Csv;
     let is_openigtlink = source == TrackerSource::OpenIgtLink;
     let is_asked = tracker.request != TrackerRequest::None;
     let is_standard_input = tracker.address == STANDARD_INPUT;
-    for (other, is_given, value, has_it, sources) in [
-        (file, tracker.file.is_some(), &*recording, is_file, "\"ndjson\" or \"csv\""),
-        (address, is_standard_input, "\"-\"", is_ndjson, "\"ndjson\""),
-        (request, is_asked, "given", is_openigtlink, "\"openigtlink\""),
-    ] {
-        reader.refuse_if(&[other, key], is_given && !has_it, || {
-            format!("{other} is {value}, allowed with {key} = {sources}, which is \"{source}\"")
-        });
+    contradictions! { reader;
+        ["tracker.source", "tracker.file"] if is_csv && !is_recorded =>
+            "tracker.source is \"csv\", and there is no tracker.file to read";
+        ["tracker.file", "tracker.source"] if is_recorded && !is_ndjson && !is_csv =>
+            "tracker.file is \"{file}\", allowed with tracker.source = \"ndjson\" or \"csv\", which is \
+             \"{source}\"";
+        ["tracker.address", "tracker.source"] if is_standard_input && !is_ndjson =>
+            "tracker.address is \"-\", allowed with tracker.source = \"ndjson\", which is \"{source}\"";
+        ["tracker.request", "tracker.source"] if is_asked && !is_openigtlink =>
+            "tracker.request is given, allowed with tracker.source = \"openigtlink\", which is \
+             \"{source}\"";
+        ["tracker.file", "stage.hardware"] if is_recorded && config.stage.hardware =>
+            "tracker.file is \"{file}\", but stage.hardware is true: a recording does not see the needle \
+             that would move";
     }
-    let is_real = tracker.file.is_some() && config.stage.hardware;
-    reader.refuse_if(&[file, "stage.hardware"], is_real, || {
-        format!(
-            "{file} is {recording}, but stage.hardware is true: a recording does not see the needle \
-             that would move"
-        )
-    });
     let times = [
         ("tracker.csv.time", Some(&tracker.csv.time)),
         ("tracker.csv.stamp", tracker.csv.stamp.as_ref()),
     ];
     for (key, columns) in times {
-        let is_empty = columns.is_some_and(|columns| columns.named().next().is_none());
-        reader.refuse_if(&[key], is_empty, || {
-            format!("{key} names no column, expected the name of one as s, ms, us or ns")
-        });
+        contradictions! { reader;
+            [key] if columns.is_some_and(|columns| columns.named().next().is_none()) =>
+                "{key} names no column, expected the name of one as s, ms, us or ns";
+        }
     }
 }
 
 /// Each kind of fault allows only some keys, and needs some of them.
 fn check_faults(config: &Config, reader: &mut Reader) {
     for (i, fault) in config.emulator.fault.iter().enumerate() {
-        let (table, what) =
-            (format!("emulator.fault[{i}]"), format!("a fault of kind \"{}\"", fault.kind));
+        let table = format!("emulator.fault[{i}]");
+        let what = format!("a fault of kind \"{}\"", fault.kind);
         let others = &Fault::KEYS[1..];
         reader.check_own_keys(&table, &what, others, &fault.kind.keys(), fault.check());
     }

@@ -1,11 +1,11 @@
 //! `[goal]`: where the needle is steered: into the plane, or to a target around obstacles.
 
 use super::pose::{POSITION, PoseConfig};
-use super::reader::Reader;
+use super::reader::{Reader, contradictions};
 use super::tracker::FILE;
 use super::{Config, ConfigError, TrackerSource};
 use crate::control::ControlKind;
-use crate::keys::{Field, Key, Rule, choice, not_blank, over, section, within};
+use crate::keys::{Field, Rule, choice, find, not_blank, over, section, within};
 use crate::plan::{Obstacle, Problem, Tip, Workspace, World};
 use crate::session::{Goal, TargetTool};
 use crate::tracker::{Gate, Registration};
@@ -291,68 +291,54 @@ const CLEARANCE_MIN_MM: f64 = 0.1;
 /// Reports contradictions in `[goal]`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
     let goal = &config.goal;
-    let [kind, position, workspace] = ["goal.kind", "goal.position_mm", "goal.workspace_mm"];
     let is_target = goal.kind == GoalKind::Target;
-    reader.refuse_if(&[position, kind], is_target && goal.position_mm.is_none(), || {
-        format!("{kind} is \"target\", and {position} is not given: say where it is")
-    });
-    let [tool, obstacle, drawn] = ["goal.tool", "goal.obstacle", "study.obstacles"];
     let is_drawn = config.study.obstacles.is_some_and(|obstacles| obstacles > 0);
+    contradictions! { reader;
+        ["goal.position_mm", "goal.kind"] if is_target && goal.position_mm.is_none() =>
+            "goal.kind is \"target\", and goal.position_mm is not given: say where it is";
+    }
     // A printed configuration has the default.
-    let default = GoalConfig::KEYS.iter().find(|key| key.name == "workspace_mm");
-    let default = default.and_then(Key::default_value);
+    let default = find(GoalConfig::KEYS, "workspace_mm").and_then(|key| key.default_value());
     let given = [
-        (position, goal.position_mm.is_some()),
-        (tool, goal.tool.is_some()),
-        (obstacle, !goal.obstacle.is_empty()),
-        (workspace, goal.workspace_mm != WorkspaceConfig::take(default.as_ref())),
+        ("goal.position_mm", goal.position_mm.is_some()),
+        ("goal.tool", goal.tool.is_some()),
+        ("goal.obstacle", !goal.obstacle.is_empty()),
+        ("goal.workspace_mm", goal.workspace_mm != WorkspaceConfig::take(default.as_ref())),
         ("study.target_depth_mm", config.study.target_depth_mm.is_some()),
-        (drawn, is_drawn),
+        ("study.obstacles", is_drawn),
     ];
     for (key, is_given) in given {
-        reader.refuse_if(&[key, kind], !is_target && is_given, || {
-            format!("{key} has no effect, since {kind} is \"plane\": set {kind} = \"target\"")
-        });
+        contradictions! { reader;
+            [key, "goal.kind"] if !is_target && is_given =>
+                "{key} has no effect, since goal.kind is \"plane\": set goal.kind = \"target\"";
+        }
     }
-    let (clearance, clearance_mm) = ("goal.clearance_mm", goal.clearance_mm);
+    let clearance_mm = goal.clearance_mm;
     let is_too_near = (is_drawn || !goal.obstacle.is_empty()) && clearance_mm < CLEARANCE_MIN_MM;
-    reader.refuse_if(&[clearance, obstacle, drawn], is_too_near, || {
-        format!(
-            "{clearance} is {clearance_mm}, allowed with obstacles: at least {CLEARANCE_MIN_MM}; with less \
-             a path may lead through a thin obstacle"
-        )
-    });
-    let is_tip = goal.tool.as_ref() == Some(&config.tracker.tool);
-    reader.refuse_if(&[tool, "tracker.tool"], is_tip, || {
-        format!("{tool} is tracker.tool, the needle's tip: name the target's own tool")
-    });
     let has_one_tool = config.tip_source() == TrackerSource::Csv;
-    reader.refuse_if(&[tool, "tracker.source"], goal.tool.is_some() && has_one_tool, || {
-        format!("{tool} needs a stream of two tools, and tracker.source = \"csv\" has one")
-    });
-    let (law, chosen) = ("control.kind", config.control.kind);
-    let cannot_follow = is_target && chosen != ControlKind::NestedSaturation;
-    reader.refuse_if(&[law, kind], cannot_follow, || {
-        format!("{law} is \"{chosen}\", allowed with {kind} = \"target\": \"nested-saturation\"")
-    });
+    let law = config.control.kind;
     let WorkspaceConfig { min, max } = goal.workspace_mm;
     let is_box = is_box(&min, &max);
-    reader.refuse_if(&[workspace], !is_box, || {
-        format!("{workspace}: each coordinate of max must be over that of min")
-    });
     let has_plane = min.x <= 0.0 && max.x >= 0.0;
-    let in_plane = "goal.in_plane";
-    reader.refuse_if(&[workspace, in_plane], is_box && goal.in_plane && !has_plane, || {
-        format!("{workspace} does not contain the plane x = 0, to which {in_plane} keeps the path")
-    });
     let aside_mm = goal.position_mm.map_or(0.0, |target_mm| target_mm.x);
-    let is_aside = is_target && goal.in_plane && aside_mm != 0.0;
-    reader.refuse_if(&[position, in_plane], is_aside, || {
-        format!(
-            "{position} is {aside_mm} mm off the plane, allowed with {in_plane}: 0; steer in space with \
-             {in_plane} = false"
-        )
-    });
+    contradictions! { reader;
+        ["goal.clearance_mm", "goal.obstacle", "study.obstacles"] if is_too_near =>
+            "goal.clearance_mm is {clearance_mm}, allowed with obstacles: at least {CLEARANCE_MIN_MM}; with \
+             less a path may lead through a thin obstacle";
+        ["goal.tool", "tracker.tool"] if goal.tool.as_ref() == Some(&config.tracker.tool) =>
+            "goal.tool is tracker.tool, the needle's tip: name the target's own tool";
+        ["goal.tool", "tracker.source"] if goal.tool.is_some() && has_one_tool =>
+            "goal.tool needs a stream of two tools, and tracker.source = \"csv\" has one";
+        ["control.kind", "goal.kind"] if is_target && law != ControlKind::NestedSaturation =>
+            "control.kind is \"{law}\", allowed with goal.kind = \"target\": \"nested-saturation\"";
+        ["goal.workspace_mm"] if !is_box =>
+            "goal.workspace_mm: each coordinate of max must be over that of min";
+        ["goal.workspace_mm", "goal.in_plane"] if is_box && goal.in_plane && !has_plane =>
+            "goal.workspace_mm does not contain the plane x = 0, to which goal.in_plane keeps the path";
+        ["goal.position_mm", "goal.in_plane"] if is_target && goal.in_plane && aside_mm != 0.0 =>
+            "goal.position_mm is {aside_mm} mm off the plane, allowed with goal.in_plane: 0; steer in space \
+             with goal.in_plane = false";
+    }
     // Files are not read here, so a sphere stands for every mask.
     let placeholder = |_: &str, _: Option<u32>, _: &PoseConfig| {
         Ok(Obstacle::Sphere { centre_mm: Vector3::zeros(), radius_mm: 0.0 })

@@ -18,6 +18,21 @@ pub(super) const FIDUCIALS: &str = "tracker.registration.fiducials";
 /// A message shows at most this many keys of a table.
 const FORM_KEYS_MAX: usize = 4;
 
+/// Reports contradictions: `[keys] if CONDITION => "message", arguments;`. See [`Reader::refuse_if`].
+macro_rules! contradictions {
+    (
+        $reader:expr;
+        $([$($key:expr),+] if $is_contradiction:expr => $message:literal $(, $argument:expr)*;)+
+    ) => {$(
+        $reader.refuse_if(
+            &[$($key),+],
+            $is_contradiction,
+            || format!($message $(, $argument)*),
+        );
+    )+};
+}
+pub(super) use contradictions;
+
 /// The merged configuration while it is read.
 pub(super) struct Reader {
     /// The given keys; reading adds the defaults of the others.

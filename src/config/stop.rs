@@ -3,7 +3,7 @@
 
 use super::can::CanInterface;
 use super::error::ConfigError;
-use super::reader::{Reader, is_inside, merge};
+use super::reader::{Reader, contradictions, is_inside, merge};
 use super::value::{self, Entries};
 use super::{Config, Source};
 use crate::stage;
@@ -76,20 +76,24 @@ impl StopConfig {
         let config = Config::of(reader.read(Config::KEYS));
         let interface = config.can.interface;
         let [insertion, rotation] = [config.stage.insertion.node, config.stage.rotation.node];
-        let not_given = |key: &str| format!("{key} is not given, and a stop needs it");
         let is_named = reader.is_given(INTERFACE);
-        reader.refuse_if(&[INTERFACE], !is_named, || not_given(INTERFACE));
-        reader.refuse_if(&[INTERFACE], is_named && interface == CanInterface::Memory, || {
-            format!("{INTERFACE} is \"memory\", where there is no drive to stop")
-        });
         let has_defaults = is_named && interface.is_virtual();
-        for key in NODES {
-            reader.refuse_if(&[key], !has_defaults && !reader.is_given(key), || not_given(key));
+        contradictions! { reader;
+            [INTERFACE] if !is_named => "{INTERFACE} is not given, and a stop needs it";
+            [INTERFACE] if is_named && interface == CanInterface::Memory =>
+                "{INTERFACE} is \"memory\", where there is no drive to stop";
         }
-        reader.refuse_if(&NODES, insertion == rotation, || {
-            let [first, second] = NODES;
-            format!("{second} is {rotation}, the same as {first}: each node needs its own number")
-        });
+        for key in NODES {
+            contradictions! { reader;
+                [key] if !has_defaults && !reader.is_given(key) =>
+                    "{key} is not given, and a stop needs it";
+            }
+        }
+        let [first, second] = NODES;
+        contradictions! { reader;
+            [first, second] if insertion == rotation =>
+                "{second} is {rotation}, the same as {first}: each node needs its own number";
+        }
         reader.check_found_no_problem_with(&NEEDED)?;
         tree.retain(|key, _| {
             let used = USED.iter().find(|used| key == *used || is_inside(key, used));
