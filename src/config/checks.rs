@@ -107,7 +107,7 @@ fn check_torsion(section: &str, torsion: TorsionConfig, reader: &mut Reader) {
 /// Each range has its lower end first, and no trial draws a torsion offset outside its torsion band.
 fn check_study(config: &Config, reader: &mut Reader) {
     for key in StudyConfig::KEYS {
-        let Some([low, high]) = config.range(key) else { continue };
+        let Some([low, high]) = config.range(key.name) else { continue };
         let key = &*format!("study.{}", key.name);
         contradictions! { reader;
             [key] if low > high => "{key} is [{low}, {high}], allowed: the lower number first";

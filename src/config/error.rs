@@ -32,12 +32,6 @@ pub struct ConfigError {
     pub problems: Vec<Problem>,
 }
 
-impl From<Vec<Problem>> for ConfigError {
-    fn from(problems: Vec<Problem>) -> Self {
-        ConfigError { problems }
-    }
-}
-
 impl ConfigError {
     /// Fails with the `problems`, if there are any.
     pub(super) fn unless_empty(problems: Vec<Problem>) -> Result<(), Self> {
@@ -46,7 +40,12 @@ impl ConfigError {
 
     /// One problem without a place in a file.
     pub(super) fn of(message: impl fmt::Display) -> Self {
-        ConfigError { problems: vec![Problem::at(None, message)] }
+        ConfigError::at(None, message)
+    }
+
+    /// One problem at `origin`.
+    pub(super) fn at(origin: Option<Origin>, message: impl fmt::Display) -> Self {
+        ConfigError { problems: vec![Problem::at(origin, message)] }
     }
 }
 

@@ -59,11 +59,11 @@ const CALIBRATION_FILES: [CalibrationFile; 3] = [
 /// Keys of calibration files that are not measured values: overriding one keeps the `fit`.
 const NOT_MEASURED: [&str; 2] = ["tracker.registration.sd_mm", "evaluation"];
 
-/// The entries, of layer number `layer`, of the preset that `layers` name.
-pub(super) fn preset(layers: &[Entries], layer: usize) -> Result<Entries, ConfigError> {
-    let named = topmost(layers, "emulator.tracker").map(|entry| &entry.value);
+/// The entries, of layer number `layer`, of the preset that `entries` name.
+pub(super) fn preset(entries: &Entries, layer: usize) -> Result<Entries, ConfigError> {
+    let named = topmost(entries, "emulator.tracker").map(|entry| &entry.value);
     let preset = TrackerPreset::take(named);
-    Ok(value::parse_file(&preset.to_string(), preset.toml(), layer)?)
+    value::parse_file(&preset.to_string(), preset.toml(), layer)
 }
 
 /// Calibration files that cannot be used: for each the keys whose values are therefore unknown, and why.
@@ -71,16 +71,15 @@ pub(super) type Unusable = Vec<(Vec<&'static str>, ConfigError)>;
 
 /// Adds the content of the named calibration files to the layers that name them, as if it were written
 /// there. Returns the files that cannot be used.
-pub(super) fn add_calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Unusable {
+pub(super) fn add_calibrations(entries: &mut Entries, read: ReadFile<'_>) -> Unusable {
     let mut unusable = Vec::new();
     for file in &CALIBRATION_FILES {
-        if let Err(error) = file.add_to(layers, read) {
-            unusable.push(([file.holds, file.instead_of].concat(), error));
+        match file.content(entries, read) {
+            Ok(content) => entries.extend(content),
+            Err(error) => unusable.push(([file.holds, file.instead_of].concat(), error)),
         }
         // From here on the layers hold the file's content, or a higher layer replaces it.
-        for layer in layers.iter_mut() {
-            layer.retain(|(key, entry)| key != file.key || !entry.value.is_str());
-        }
+        entries.retain(|(key, entry)| key != file.key || !entry.value.is_str());
     }
     unusable
 }
@@ -102,23 +101,21 @@ impl CalibrationFile {
             && !is_among(key, &NOT_MEASURED)
     }
 
-    /// Adds the content of the file to the layer that names it, unless a higher layer replaces it.
-    fn add_to(&self, layers: &mut [Entries], read: ReadFile<'_>) -> Result<(), ConfigError> {
-        let Some(naming) = topmost(layers, self.key).cloned() else { return Ok(()) };
-        let Some(path) = naming.value.as_str() else { return Ok(()) };
-        let refusal = |message: String| {
-            ConfigError::from(vec![Problem::at(Some(naming.origin.clone()), message)])
-        };
-        let mut others = self.instead_of.iter().filter_map(|key| topmost(layers, key));
-        if others.any(|other| other.layer > naming.layer && !other.is_beside(&naming)) {
-            return Ok(());
+    /// The content of the file, in the layer that names it; nothing if a higher layer replaces it.
+    fn content(&self, entries: &Entries, read: ReadFile<'_>) -> Result<Entries, ConfigError> {
+        let Some(naming) = topmost(entries, self.key) else { return Ok(Vec::new()) };
+        let Some(path) = naming.value.as_str() else { return Ok(Vec::new()) };
+        let refusal = |message: String| ConfigError::at(Some(naming.origin.clone()), message);
+        let mut others = self.instead_of.iter().filter_map(|key| topmost(entries, key));
+        if others.any(|other| other.layer > naming.layer && !other.is_beside(naming)) {
+            return Ok(Vec::new());
         }
         // Several `--set` are one source. But of a key that the file merely holds, the later `--set` counts.
         let is_twice = |(key, entry): &&(String, Entry)| {
-            is_among(key, self.instead_of) && entry.is_beside(&naming)
+            is_among(key, self.instead_of) && entry.is_beside(naming)
                 || is_among(key, self.holds) && entry.layer == naming.layer
         };
-        if let Some((key, _)) = layers.iter().flatten().find(is_twice) {
+        if let Some((key, _)) = entries.iter().find(is_twice) {
             let message = format!("{} is given along with {key}: give one of the two", self.key);
             return Err(refusal(message));
         }
@@ -131,13 +128,9 @@ impl CalibrationFile {
             refusal(format!("{}: {error}; {} --out writes it", self.key, self.made_by))
         })?;
         let name = path.display().to_string();
-        let entries = value::parse_file(&name, &text, naming.layer)?;
-        self.check(&name, &entries)?;
-        let is_naming = |layer: &&mut Entries| layer.iter().any(|(_, e)| e.layer == naming.layer);
-        if let Some(layer) = layers.iter_mut().find(is_naming) {
-            layer.extend(entries);
-        }
-        Ok(())
+        let content = value::parse_file(&name, &text, naming.layer)?;
+        self.check(&name, &content)?;
+        Ok(content)
     }
 
     /// Checks that a calibration file has all of its keys and no others.
@@ -167,7 +160,7 @@ fn is_among(key: &str, keys: &[&str]) -> bool {
 }
 
 /// The value of `key` in the highest layer that has it.
-fn topmost<'a>(layers: &'a [Entries], key: &str) -> Option<&'a Entry> {
-    let mut entries = layers.iter().rev().flat_map(|layer| layer.iter().rev());
-    entries.find(|(name, _)| name == key).map(|(_, entry)| entry)
+fn topmost<'a>(entries: &'a Entries, key: &str) -> Option<&'a Entry> {
+    let named = entries.iter().filter(|(name, _)| name == key);
+    named.map(|(_, entry)| entry).max_by_key(|entry| entry.layer)
 }

@@ -73,6 +73,7 @@ use crate::session::InsertionConfig;
 use reader::{Reader, Tree};
 use std::path::Path;
 use toml::{Table, Value};
+use value::Entries;
 
 /// The default configuration, commented: what each key means.
 #[cfg(test)]
@@ -164,13 +165,13 @@ impl Config {
         sets: &[String],
         read: ReadFile<'_>,
     ) -> Result<(Self, Vec<String>), ConfigError> {
-        let mut layers = layers(sources, sets)?;
-        let unusable = include::add_calibrations(&mut layers, read);
-        let (mut config, mut tree) = Config::checked(reader::merge(layers.clone()), unusable)?;
+        let mut entries = entries(sources, sets)?;
+        let unusable = include::add_calibrations(&mut entries, read);
+        let (mut config, mut tree) = Config::checked(reader::merge(entries.clone()), unusable)?;
         if config.emulator.rehearse {
             let implied = rehearsal::layer(&config);
-            layers[0].extend(value::parse_file("rehearsal", &implied, PRESET)?);
-            (config, tree) = Config::checked(reader::merge(layers), Vec::new())?;
+            entries.extend(value::parse_file("rehearsal", &implied, PRESET)?);
+            (config, tree) = Config::checked(reader::merge(entries), Vec::new())?;
         }
         let warnings = warnings::all(&config, &tree);
         Ok((config, warnings))
@@ -224,22 +225,22 @@ impl Config {
     }
 }
 
-/// The layers, from the lowest: the preset that the others name, the files, the command line.
-fn layers(sources: &[Source<'_>], sets: &[String]) -> Result<Vec<value::Entries>, ConfigError> {
+/// The entries of all layers: the files, the command line, and the preset that these name.
+fn entries(sources: &[Source<'_>], sets: &[String]) -> Result<Entries, ConfigError> {
     let files = sources.iter().zip(PRESET + 1..);
     let files = files.map(|(s, layer)| value::parse_file(s.name, s.text, layer));
     let sets = sets.iter().zip(PRESET + 1 + sources.len()..);
     let sets = sets.map(|(set, layer)| value::parse_set(set, layer));
-    let (mut layers, mut problems) = (Vec::new(), Vec::new());
-    for layer in files.chain(sets) {
-        match layer {
-            Ok(layer) => layers.push(layer),
-            Err(more) => problems.extend(more),
+    let (mut entries, mut problems) = (Vec::new(), Vec::new());
+    for source in files.chain(sets) {
+        match source {
+            Ok(more) => entries.extend(more),
+            Err(error) => problems.extend(error.problems),
         }
     }
     ConfigError::unless_empty(problems)?;
-    layers.insert(0, include::preset(&layers, PRESET)?);
-    Ok(layers)
+    entries.extend(include::preset(&entries, PRESET)?);
+    Ok(entries)
 }
 
 /// True if `name` can be part of a folder's name.

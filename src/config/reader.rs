@@ -98,21 +98,21 @@ impl Reader {
                 .iter()
                 .filter(|other| key.is_alternative_to(other))
                 .map(|other| join(path, other.name))
-                .find(|other| self.is_given(other));
+                .find_map(|other| self.given(&other).map(|entry| (other, entry)));
             let has_default = has_defaults || key.default_holds == DefaultHolds::Everywhere;
-            match alternative {
-                None if has_default => self.add_default(key, &key_path),
-                None => {}
-                Some(other) if self.is_beside(&key_path, &other) => {
-                    self.refuse_if(&[&other, &key_path], key.instead_of.is_some(), || {
-                        format!("{key_path} is given along with {other}: give one of the two")
-                    });
-                }
+            let given = self.tree.get(&key_path);
+            if let Some((other, other_entry)) = alternative {
+                let is_beside = given.is_some_and(|entry| entry.is_beside(other_entry));
                 // The source of higher precedence counts.
-                Some(other) if self.layer(&key_path) < self.layer(&other) => {
-                    _ = self.tree.remove(&key_path)
+                if !is_beside && given.is_some_and(|entry| entry.layer < other_entry.layer) {
+                    self.tree.remove(&key_path);
                 }
-                Some(_) => {}
+                contradictions! { self;
+                    [&other, &key_path] if is_beside && key.instead_of.is_some() =>
+                        "{key_path} is given along with {other}: give one of the two";
+                }
+            } else if has_default {
+                self.add_default(key, &key_path);
             }
             self.limited.extend(key.at_most.map(|max| (key_path.clone(), max)));
             if let Some(value) = self.value(key, &key.kind, &key_path, has_defaults) {
@@ -133,7 +133,8 @@ impl Reader {
             DefaultHolds::Undecided | DefaultHolds::ForHardware | DefaultHolds::Everywhere => true,
         };
         let Some(default) = key.default.filter(|_| holds && !is_complete) else { return };
-        for (entry_path, entry) in value::parse_default(path, default) {
+        let entries = value::parse_set(&format!("{path}={default}"), 0).unwrap_or_default();
+        for (entry_path, entry) in entries {
             self.tree.entry(entry_path).or_insert(entry);
         }
     }
@@ -151,8 +152,13 @@ impl Reader {
             return Some(self.table(kind, key.narrowed, path, has_defaults));
         }
         let Some(entry) = self.tree.get(path) else {
-            if !key.is_optional {
-                self.refuse_missing(path, &words.expected);
+            let is_wrong = |key: &str| self.failed.contains(key);
+            if !key.is_optional && !is_wrong(path) && !ancestors(path).any(is_wrong) {
+                let origin = ancestors(path).find_map(|outer| self.origin(outer));
+                let expected = words.expected;
+                let message =
+                    format!("{path} is missing and has no default here, expected {expected}");
+                self.fail(path, origin, message);
             }
             return None;
         };
@@ -313,30 +319,9 @@ impl Reader {
         self.given(key).is_some()
     }
 
-    /// True if both keys are given in one source.
-    fn is_beside(&self, key: &str, other: &str) -> bool {
-        let both = self.tree.get(key).zip(self.tree.get(other));
-        both.is_some_and(|(one, other)| one.is_beside(other))
-    }
-
-    /// The layer of a key; 0 for a default or a missing key.
-    fn layer(&self, key: &str) -> usize {
-        self.tree.get(key).map_or(0, |entry| entry.layer)
-    }
-
     /// Where `key` was given; `None` for a default.
     fn origin(&self, key: &str) -> Option<Origin> {
         self.given(key).map(|entry| entry.origin.clone())
-    }
-
-    /// Reports that `key` is missing, unless it or a table around it was found wrong before.
-    fn refuse_missing(&mut self, key: &str, expected: &str) {
-        if std::iter::once(key).chain(ancestors(key)).any(|key| self.failed.contains(key)) {
-            return;
-        }
-        let origin = ancestors(key).find_map(|outer| self.origin(outer));
-        let message = format!("{key} is missing and has no default here, expected {expected}");
-        self.fail(key, origin, message);
     }
 
     /// Reports that the source of `keys` is unusable.
@@ -394,33 +379,28 @@ fn form(keys: &[Key]) -> String {
     format!(", {{ {} }}", fields.join(", "))
 }
 
-/// Merges `layers`, the lowest first: a higher layer overrides a lower one.
-pub(super) fn merge(layers: Vec<Entries>) -> Tree {
+/// Merges the entries of all layers: a higher layer overrides a lower one. An array and a table that is
+/// replaced as a whole are removed from the layers below.
+pub(super) fn merge(mut entries: Entries) -> Tree {
+    entries.sort_by_key(|(_, entry)| entry.layer);
     let mut tree = Tree::new();
-    for (key, entry) in layers.into_iter().flatten() {
-        overlay(&mut tree, key, entry);
+    for (key, entry) in entries {
+        let replaced = match entry.value {
+            // Fiducials take the place of a pose.
+            Value::Array(_) if key == FIDUCIALS => Some(REGISTRATION),
+            Value::Array(_) => Some(key.as_str()),
+            _ => find(Config::KEYS, &key).filter(|key| key.is_whole).map(|_| key.as_str()),
+        };
+        if let Some(replaced) = replaced {
+            tree.retain(|other, below: &mut Entry| {
+                // Two alternatives in one source are both kept, so that the reader refuses them.
+                let is_alternative = !is_inside(other, &key) && below.is_beside(&entry);
+                below.layer >= entry.layer || is_alternative || !is_inside(other, replaced)
+            });
+        }
+        tree.insert(key, entry);
     }
     tree
-}
-
-/// Adds an entry to `tree`, over the layers below. If it replaces an array or a table as a whole, that one is
-/// removed from the layers below.
-fn overlay(tree: &mut Tree, key: String, entry: Entry) {
-    let layer = entry.layer;
-    let replaced = match entry.value {
-        // Fiducials take the place of a pose.
-        Value::Array(_) if key == FIDUCIALS => Some(REGISTRATION),
-        Value::Array(_) => Some(key.as_str()),
-        _ => find(Config::KEYS, &key).filter(|key| key.is_whole).map(|_| key.as_str()),
-    };
-    if let Some(replaced) = replaced {
-        tree.retain(|other, below| {
-            // Two alternatives in one source are both kept, so that the reader refuses them.
-            let is_alternative = !is_inside(other, &key) && below.is_beside(&entry);
-            below.layer >= layer || is_alternative || !is_inside(other, replaced)
-        });
-    }
-    tree.insert(key, entry);
 }
 
 /// True if `key` is a key of the table `outer` or an element of the array `outer`, at any depth.
@@ -430,9 +410,5 @@ pub(super) fn is_inside(key: &str, outer: &str) -> bool {
 
 /// The keys around `key`, nearest first: of `a.b[0].c`: `a.b[0]`, `a.b`, `a`.
 pub(super) fn ancestors(key: &str) -> impl Iterator<Item = &str> {
-    std::iter::successors(parent(key), |key| parent(key))
-}
-
-fn parent(key: &str) -> Option<&str> {
-    key.rfind(['.', '[']).and_then(|end| key.get(..end))
+    std::iter::successors(Some(key), |key| key.get(..key.rfind(['.', '['])?)).skip(1)
 }

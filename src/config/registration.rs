@@ -112,18 +112,13 @@ impl Config {
     /// # Errors
     /// Those of [`Config::to_toml`].
     pub fn calibration_toml(&self) -> Result<String, toml::ser::Error> {
-        let tip = ["offset_mm", "tilt", "fit"].into_iter().filter_map(|key| {
-            Some((key.to_owned(), self.value_at(&format!("tracker.tip_{key}"))?.clone()))
-        });
-        let tip = Value::Table(tip.collect());
-        let parts = [
-            ("registration", self.value_at("tracker.registration")),
-            ("tip", Some(&tip)),
-            ("needle", self.value_at("needle")),
-        ];
-        let given =
-            parts.into_iter().filter_map(|(key, part)| Some((key.to_owned(), part?.clone())));
-        toml::to_string(&given.collect::<Table>())
+        let given = |name: &str, key: &str| Some((name.to_owned(), self.value_at(key)?.clone()));
+        let tip =
+            ["offset_mm", "tilt", "fit"].map(|name| given(name, &format!("tracker.tip_{name}")));
+        let tip = Value::Table(tip.into_iter().flatten().collect());
+        let registration = given("registration", "tracker.registration");
+        let parts = [registration, Some(("tip".to_owned(), tip)), given("needle", "needle")];
+        toml::to_string(&parts.into_iter().flatten().collect::<Table>())
     }
 }
 

@@ -45,33 +45,30 @@ impl StopConfig {
     /// The interface or a node is wrong or missing. Of a source that is not TOML the lines that can be read
     /// count; its syntax errors are reported only together with such an error.
     pub fn from_source(source: Option<Source<'_>>, sets: &[String]) -> Result<Self, ConfigError> {
-        let mut layers = Vec::new();
+        let mut entries = Vec::new();
         let mut problems = Vec::new();
         if let Some(Source { name, text }) = source {
-            match value::parse_file(name, text, 1) {
-                Ok(entries) => layers.push(entries),
-                Err(syntax) => {
-                    problems = syntax;
-                    layers.push(value::recover_file("salvaged", &salvaged(text), 1).0);
-                }
-            }
+            entries = value::parse_file(name, text, 1).unwrap_or_else(|error| {
+                problems = error.problems;
+                value::recover_file("salvaged", &salvaged(text), 1).0
+            });
         }
         for (set, layer) in sets.iter().zip(2..) {
             match value::parse_set(set, layer) {
-                Ok(entries) => layers.push(entries),
+                Ok(more) => entries.extend(more),
                 // It was meant to set the interface or a node.
-                Err(problems) if names_what_a_stop_needs(set) => return Err(problems.into()),
+                Err(error) if names_what_a_stop_needs(set) => return Err(error),
                 Err(_) => {}
             }
         }
-        Self::read(layers).map_err(|error| {
+        Self::read(entries).map_err(|error| {
             problems.extend(error.problems);
             ConfigError { problems }
         })
     }
 
-    fn read(layers: Vec<Entries>) -> Result<Self, ConfigError> {
-        let mut tree = merge(layers);
+    fn read(entries: Entries) -> Result<Self, ConfigError> {
+        let mut tree = merge(entries);
         let mut reader = Reader::new(tree.clone());
         let config = Config::of(reader.read(Config::KEYS));
         let interface = config.can.interface;

@@ -1,10 +1,10 @@
 //! `[study]`: the ranges from which the trials of a study are drawn.
 
 use super::pose::{POSITION, TIP_PITCH};
-use super::{Config, ConfigError, GoalKind, WorkspaceConfig};
+use super::{Config, ConfigError, EmulatorConfig, GoalKind, WorkspaceConfig};
 use crate::emulator::split_mix64;
 use crate::geometry::TURN;
-use crate::keys::{Field, Key, Words, find, over, section, within};
+use crate::keys::{Field, Words, find, over, section, within};
 use crate::math;
 use crate::needle::{HALF_WIDTH, HALF_WIDTH_PER_MM, OFFSET};
 use crate::study::Prior;
@@ -99,7 +99,7 @@ impl Config {
             if key.name.starts_with("target") || key.name.starts_with("obstacle") {
                 continue;
             }
-            let Some([low, high]) = self.range(key) else { continue };
+            let Some([low, high]) = self.range(key.name) else { continue };
             let draw = |number| low + (high - low) * fraction(seed, number);
             let drawn = draw(number);
             match key.name {
@@ -137,28 +137,20 @@ impl Config {
     /// not be read. This is not checked as the configuration is read, since a drawn one has both the error and
     /// what it was drawn to.
     fn check_relative_errors(&self) -> Result<(), ConfigError> {
-        let (study, emulator) = (&self.study, &self.emulator);
-        let creep = [emulator.torsion.creep_mm, emulator.torsion.creep_mm_per_mm];
-        let curvature_per_mm = emulator.arc.curvature_per_mm();
-        for (error, range, key, emulated) in [
-            (
-                "curvature_error",
-                study.curvature_error,
-                "emulator.curvature_per_mm",
-                curvature_per_mm,
-            ),
-            ("creep_error", study.creep_error, "emulator.torsion.creep_mm", creep[0]),
-            ("creep_error", study.creep_error, "emulator.torsion.creep_mm_per_mm", creep[1]),
+        let torsion = self.emulator.torsion;
+        for (error, name, emulated) in [
+            ("curvature_error", "curvature_per_mm", self.emulator.arc.curvature_per_mm()),
+            ("creep_error", "torsion.creep_mm", torsion.creep_mm),
+            ("creep_error", "torsion.creep_mm_per_mm", torsion.creep_mm_per_mm),
         ] {
-            let (Some([low, high]), Some(key_of)) = (range, find(Config::KEYS, key)) else {
-                continue;
-            };
-            let allowed = key_of.kind.range(&key_of.rule);
+            let key = find(EmulatorConfig::KEYS, name);
+            let (Some([low, high]), Some(key)) = (self.range(error), key) else { continue };
+            let range = key.kind.range(&key.rule);
             for drawn in [low, high].map(|error| emulated * (1.0 + error)) {
-                if allowed.is_some_and(|allowed| !allowed.contains(drawn)) {
+                if range.is_some_and(|range| !range.contains(drawn)) {
                     return Err(ConfigError::of(format!(
-                        "study.{error} = [{low}, {high}] may draw {key} = {drawn}, allowed: {}",
-                        Words::of_key(&key_of).allowed
+                        "study.{error} = [{low}, {high}] may draw emulator.{name} = {drawn}, allowed: {}",
+                        Words::of_key(&key).allowed
                     )));
                 }
             }
@@ -247,8 +239,8 @@ impl Config {
     }
 
     /// The range at this `key` of `[study]`, in the key's unit; `None` if it is not given.
-    pub(super) fn range(&self, key: &Key) -> Option<[f64; 2]> {
-        let range = self.value_at(&format!("study.{}", key.name));
+    pub(super) fn range(&self, key: &str) -> Option<[f64; 2]> {
+        let range = self.value_at(&format!("study.{key}"));
         range.filter(|range| range.is_array()).map(|range| Field::take(Some(range)))
     }
 

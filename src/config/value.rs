@@ -5,7 +5,7 @@ use std::fmt;
 use toml::de::{DeArray, DeTable, DeValue};
 use toml::{Spanned, Table, Value};
 
-use super::error::Problem;
+use super::error::{ConfigError, Problem};
 use super::reader::is_inside;
 
 /// Where a value was given.
@@ -43,14 +43,14 @@ impl Entry {
     }
 }
 
-/// The entries of one source in the order they were written: (dotted key, entry).
+/// The entries of one or more sources, each source's in the order they were written: (dotted key, entry).
 pub(super) type Entries = Vec<(String, Entry)>;
 
 /// Reads a TOML file.
 ///
 /// # Errors
 /// The syntax errors of the file, at most one per line. A duplicate key is one too.
-pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries, Vec<Problem>> {
+pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries, ConfigError> {
     let (entries, errors) = recover_file(name, text, layer);
     if errors.is_empty() {
         return Ok(entries);
@@ -68,7 +68,7 @@ pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries
     };
     let mut problems: Vec<Problem> = errors.into_iter().map(problem).collect();
     problems.dedup_by(|next, last| next.origin == last.origin);
-    Err(problems)
+    Err(ConfigError { problems })
 }
 
 /// The part of a TOML file that can be read, and its errors. If a key is given twice, the first one counts.
@@ -78,8 +78,7 @@ pub(super) fn recover_file(
     layer: usize,
 ) -> (Entries, Vec<toml::de::Error>) {
     let (table, errors) = DeTable::parse_recoverable(text);
-    let origin = |offset| Origin::File { name: name.to_owned(), line: position(text, offset).0 };
-    let mut flat = Flattener { text, layer, origin: &origin, entries: Vec::new() };
+    let mut flat = Flattener { file: Some(name), text, layer, entries: Vec::new() };
     flat.table("", table.get_ref());
     (flat.entries, errors)
 }
@@ -126,7 +125,7 @@ fn number_with_unit(text: &str, line: usize) -> Option<String> {
     })
 }
 
-/// Reads one `key=value` of `--set`.
+/// Reads one `key=value` of `--set`. A default is read in the same way, in layer 0.
 ///
 /// The value is TOML. A value that is not valid TOML is a string, because shells remove quotes:
 /// `--set can.interface=can0` and `--set 'can.interface="can0"'` are the same.
@@ -134,19 +133,18 @@ fn number_with_unit(text: &str, line: usize) -> Option<String> {
 /// # Errors
 /// If the key or the value is missing, or if the value begins like a TOML string, array or table but is
 /// not valid.
-pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, Vec<Problem>> {
-    let syntax = |message: String| vec![Problem { origin: Some(Origin::Set), message }];
+pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, ConfigError> {
+    let refusal = |message: String| ConfigError::at(Some(Origin::Set), message);
     let (key, written) =
         text.split_once('=').map(|(k, v)| (k.trim(), v.trim())).unwrap_or_default();
     if key.is_empty() || written.is_empty() || key.split('.').any(str::is_empty) {
-        return Err(syntax(format!(
-            "--set {text}: expected key=value, for example insertion.depth_mm=100"
+        return Err(refusal(format!(
+            "{text}: expected key=value, for example insertion.depth_mm=100"
         )));
     }
-    let origin = |_| Origin::Set;
     match DeValue::parse(written) {
         Ok(value) => {
-            let mut flat = Flattener { text: written, layer, origin: &origin, entries: Vec::new() };
+            let mut flat = Flattener { file: None, text: written, layer, entries: Vec::new() };
             flat.value(key.to_owned(), &value);
             Ok(flat.entries)
         }
@@ -158,7 +156,7 @@ pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, Vec<Problem
                     format!("{written} is not a TOML value: {}", message.replace('\n', ", "))
                 }
             };
-            Err(syntax(format!("--set {key}: {message}")))
+            Err(refusal(format!("{key}: {message}")))
         }
         Err(_) => {
             let value = Value::String(written.to_owned());
@@ -166,17 +164,6 @@ pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, Vec<Problem
             Ok(vec![(key.to_owned(), Entry { value, source_text, origin: Origin::Set, layer })])
         }
     }
-}
-
-/// The entries of a default, which is declared as `toml`.
-pub(super) fn parse_default(key: &str, toml: &str) -> Entries {
-    // A default has no origin; any will do, since layer 0 marks it as a default.
-    let origin = |_| Origin::Set;
-    let mut flat = Flattener { text: toml, layer: 0, origin: &origin, entries: Vec::new() };
-    if let Ok(value) = DeValue::parse(toml) {
-        flat.value(key.to_owned(), &value);
-    }
-    flat.entries
 }
 
 /// The key of element `index` of the array `key`.
@@ -203,9 +190,10 @@ fn position(text: &str, offset: usize) -> (usize, usize) {
 
 /// Turns the tables of one source into entries.
 struct Flattener<'a> {
+    /// The file's name; `None` on the command line.
+    file: Option<&'a str>,
     text: &'a str,
     layer: usize,
-    origin: &'a dyn Fn(usize) -> Origin,
     entries: Entries,
 }
 
@@ -230,7 +218,10 @@ impl Flattener<'_> {
             DeValue::Array(array) => Value::from(vec![false; array.len()]),
             DeValue::Table(_) => Value::from(Table::new()),
         };
-        let origin = (self.origin)(spanned.span().start);
+        let origin = self.file.map_or(Origin::Set, |name| {
+            let (line, _) = position(self.text, spanned.span().start);
+            Origin::File { name: name.to_owned(), line }
+        });
         let source_text = self.source_text(&value, spanned);
         let entry = Entry { value, source_text, origin, layer: self.layer };
         self.entries.push((key.clone(), entry));

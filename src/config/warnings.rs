@@ -2,6 +2,7 @@
 //! not converge with the control law, a rehearsal without a registration.
 
 use super::reader::{REGISTRATION, Tree, is_inside};
+use super::value::Entry;
 use super::{Config, ObserverKind, TrackerSource};
 use crate::control::ControlKind;
 use crate::keys::{Field as _, Kind};
@@ -15,39 +16,34 @@ pub(super) fn all(config: &Config, tree: &Tree) -> Vec<String> {
     warnings
 }
 
-/// The check of handedness always uses this section.
-const ALWAYS_USED: &str = "observer.invariant";
-
 /// A warning for each section of `tree` that is given and that `config` does not use. A configuration
 /// printed in full, as in a run folder, gives all sections and gets no warning.
 fn unused_sections(config: &Config, tree: &Tree) -> Vec<String> {
     let (law, observer) = (config.control.kind.to_string(), config.observer.kind.to_string());
-    let observers: Vec<String> = config.observer.kinds().iter().map(ToString::to_string).collect();
+    let mut used: Vec<String> = config.observer.kinds().iter().map(ToString::to_string).collect();
+    // The check of handedness always uses the section of the invariant observer.
+    used.extend([law.clone(), ObserverKind::Invariant.to_string()]);
     let mut warnings = Vec::new();
-    for (table, chosen, kinds, used) in [
-        ("control", &law, ControlKind::KIND, std::slice::from_ref(&law)),
-        ("observer", &observer, ObserverKind::KIND, &observers),
+    for (table, chosen, kinds, or_shadow) in [
+        ("control", law, ControlKind::KIND, false),
+        ("observer", observer, ObserverKind::KIND, true),
     ] {
         let Kind::OneOf(kinds) = kinds else { continue };
         let mut in_table = tree.iter().filter(|(key, _)| is_inside(key, table));
         let is_printed_in_full = in_table.all(|(_, entry)| entry.layer > 0);
-        if is_printed_in_full {
-            continue;
-        }
-        for (kind, _) in kinds.iter().filter(|(kind, _)| !used.iter().any(|used| used == kind)) {
+        for (kind, _) in kinds {
             let section = format!("{table}.{}", section_name(kind));
             let given = tree.iter().find(|(key, entry)| {
                 entry.layer > 0 && is_inside(key, &section) && !entry.value.is_table()
             });
-            let Some((key, entry)) = given.filter(|_| section != ALWAYS_USED) else { continue };
-            let or_shadow = match table {
-                "observer" => format!(", or add \"{kind}\" to observer.shadows"),
-                _ => String::new(),
-            };
+            let Some((key, Entry { origin, .. })) = given else { continue };
+            if is_printed_in_full || used.iter().any(|used| used == kind) {
+                continue;
+            }
             warnings.push(format!(
-                "{}{key} has no effect, since {table}.kind is \"{chosen}\": choose {table}.kind = \
-                 \"{kind}\"{or_shadow}",
-                entry.origin
+                "{origin}{key} has no effect, since {table}.kind is \"{chosen}\": choose {table}.kind = \
+                 \"{kind}\"{}",
+                if or_shadow { format!(", or add \"{kind}\" to observer.shadows") } else { String::new() },
             ));
         }
     }

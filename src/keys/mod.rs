@@ -14,7 +14,7 @@ pub(crate) use reference::{json_schema, toml_reference};
 pub(crate) use units::unit_of;
 pub(crate) use words::Words;
 
-use toml::{Table, Value};
+use toml::Value;
 use units::converted;
 
 /// The declaration of a key.
@@ -204,7 +204,7 @@ impl Key {
 
     /// The default, if there is one.
     pub(crate) fn default_value(&self) -> Option<Value> {
-        toml::from_str::<Table>(&format!("default = {}", self.default?)).ok()?.remove("default")
+        self.default?.parse().ok()
     }
 
     /// The keys of a table; none of a value.
