@@ -3,8 +3,9 @@
 use super::needle::torsion;
 use super::{CanInterface, Config, ConfigError, ReadMask, TrackerSource, rehearsal};
 use crate::canopen::ObjectAddress;
+use crate::emulator::drive::DriveConfig;
 use crate::emulator::fault::Fault;
-use crate::emulator::{TargetModel, VirtualStageConfig, drive};
+use crate::emulator::{TargetModel, VirtualStageConfig};
 use crate::observer::{InvariantConfig, ObserverConfig};
 use crate::session::{InsertionConfig, SessionConfig};
 use crate::stage::{AxisConfig, Sign};
@@ -17,10 +18,7 @@ const EMULATED_PRODUCT_CODE: u32 = 0x402;
 impl Config {
     /// The bus of a run; that of a rehearsal is memory.
     pub fn bus(&self) -> &CanInterface {
-        match self.emulator.rehearse {
-            true => &CanInterface::Memory,
-            false => &self.can.interface,
-        }
+        if self.emulator.rehearse { &CanInterface::Memory } else { &self.can.interface }
     }
 
     /// True if the drives, the needle and the tracker are emulated in this process.
@@ -30,10 +28,7 @@ impl Config {
 
     /// The source of a run's tip positions; that of a rehearsal is the emulated tracker.
     pub fn tip_source(&self) -> TrackerSource {
-        match self.emulator.rehearse {
-            true => TrackerSource::Emulated,
-            false => self.tracker.source,
-        }
+        if self.emulator.rehearse { TrackerSource::Emulated } else { self.tracker.source }
     }
 
     /// The settings of a session, including the planned path to its target. Fails if an obstacle is a mask.
@@ -121,20 +116,19 @@ impl Config {
 
     /// The drive of `axis`, which reaches `units_per_s` mm or turns per second, and its counts per mm or turn,
     /// negative if it counts in the opposite direction.
-    fn emulated_drive(&self, axis: &AxisConfig, units_per_s: f64) -> (drive::DriveConfig, f64) {
+    fn emulated_drive(&self, axis: &AxisConfig, units_per_s: f64) -> (DriveConfig, f64) {
         let counts_per_unit = axis.ratio.to_f64();
         let vendor = axis.vendor_id.unwrap_or(EMULATED_VENDOR_ID);
         let product = axis.product_code.unwrap_or(EMULATED_PRODUCT_CODE);
-        let speed_max_counts_per_s = (2.0 * counts_per_unit * units_per_s).ceil() as u32;
         let raw_objects = axis.sdo.iter().filter(|_| self.emulator.rehearse);
-        let drive = drive::DriveConfig {
-            speed_max_counts_per_s,
+        let drive = DriveConfig {
+            speed_max_counts_per_s: (2.0 * counts_per_unit * units_per_s).ceil() as u32,
             model: self.emulator.drives,
             homed: self.emulator.homed,
             more_objects: raw_objects
                 .map(|raw| (ObjectAddress::new(raw.index, raw.subindex), raw.bits))
                 .collect(),
-            ..drive::DriveConfig::new(axis.node, vendor, product)
+            ..DriveConfig::new(axis.node, vendor, product)
         };
         let sign = if axis.sign == Sign::Negative { -1.0 } else { 1.0 };
         (drive, counts_per_unit * sign)

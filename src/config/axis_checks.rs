@@ -83,9 +83,7 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
         let checks = Checks { config, which, axis: config.stage.axis(which) };
         checks.reference(reader);
         checks.home(reader);
-        checks.stopping(reader);
-        checks.optional_objects(reader);
-        checks.following_error_timeout(reader);
+        checks.drive(reader);
         checks.raw_sdos(reader);
     }
     accelerations(config, reader);
@@ -180,7 +178,7 @@ impl Checks<'_> {
         }
     }
 
-    fn stopping(&self, reader: &mut Reader) {
+    fn drive(&self, reader: &mut Reader) {
         for (name, stopping, allowed) in STOPPING {
             let key = &*self.key(name);
             let value = self.config.number(key);
@@ -190,9 +188,6 @@ impl Checks<'_> {
                     "{key} is {value}, allowed with stage.hardware = true: {allowed}";
             }
         }
-    }
-
-    fn optional_objects(&self, reader: &mut Reader) {
         for (n, index) in self.axis.optional_objects.iter().enumerate() {
             let needed = NEEDED.iter().find(|(indexes, _)| indexes.contains(index));
             let Some((_, why)) = needed else { continue };
@@ -202,11 +197,8 @@ impl Checks<'_> {
                     "{key} is 0x{index:04X}, which is not optional; remove it: {why}";
             }
         }
-    }
-
-    /// The bench's own limit is the drive's window plus the travel of two SYNC periods. With a timeout of at
-    /// most two SYNC periods the drive reacts no later than the bench.
-    fn following_error_timeout(&self, reader: &mut Reader) {
+        // The bench's own limit is the drive's window plus the travel of two SYNC periods. With a timeout of at
+        // most two SYNC periods the drive reacts no later than the bench.
         let key = &*self.key("following_error_timeout_ms");
         let timeout_ms = self.axis.following_error_timeout_ms.unwrap_or_default();
         let max_ms = 2 * self.config.can.bus.sync_ms;

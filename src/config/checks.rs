@@ -254,9 +254,11 @@ fn check_registration(config: &Config, reader: &mut Reader) {
         let mut pose = expanded(GivenRegistration::KEYS, &[]).into_iter();
         let other = |key: &Key| reader.is_given(&format!("{REGISTRATION}.{}", key.name));
         if let Some(other) = pose.find(other) {
-            let other = other.name;
-            let message = format!("fiducials are given along with {other}: give one of the two");
-            reader.refuse(REGISTRATION, FIDUCIALS, &message);
+            let message = format!(
+                "{REGISTRATION}: fiducials are given along with {}: give one of the two",
+                other.name
+            );
+            reader.fail(REGISTRATION, FIDUCIALS, message);
         }
     }
     reader.check_result(&[FIDUCIALS, REGISTRATION], config.registration_sd_mm());

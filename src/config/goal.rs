@@ -149,10 +149,8 @@ impl ObstacleConfig {
                 let from_mm = self.from_mm.ok_or_else(|| needs("from_mm"))?;
                 let to_mm = self.to_mm.ok_or_else(|| needs("to_mm"))?;
                 if from_mm == to_mm {
-                    return Err((
-                        "to_mm",
-                        "to_mm equals from_mm: a cylinder needs a length".to_owned(),
-                    ));
+                    let message = "to_mm equals from_mm: a cylinder needs a length";
+                    return Err(("to_mm", message.to_owned()));
                 }
                 let radius_mm = self.radius_mm.ok_or_else(|| needs("radius_mm"))?;
                 Obstacle::Cylinder { from_mm, to_mm, radius_mm }

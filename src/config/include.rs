@@ -135,22 +135,18 @@ impl CalibrationFile {
 
     /// Checks that a calibration file has all of its keys and no others.
     fn check(&self, name: &str, entries: &Entries) -> Result<(), ConfigError> {
-        let mut problems = Vec::new();
-        for (key, entry) in entries {
-            let is_around = self.holds.iter().any(|table| is_inside(table, key));
-            if !is_around && !is_among(key, self.holds) {
-                let message = format!("{key} does not belong in a file for {}", self.key);
-                problems.push(Problem::at(Some(entry.origin.clone()), message));
-            }
-        }
-        let mut held = self.holds.iter();
-        let missing = held.find(|held| !entries.iter().any(|(key, _)| key == *held));
-        if let (Some(key), true) = (missing, problems.is_empty()) {
-            let origin = Origin::File { name: name.to_owned(), line: 1 };
-            let message = format!("{key} is missing in a file for {}", self.key);
-            problems.push(Problem::at(Some(origin), message));
-        }
-        ConfigError::unless_empty(problems)
+        let is_foreign = |key: &str| {
+            !is_among(key, self.holds) && !self.holds.iter().any(|held| is_inside(held, key))
+        };
+        let foreign = entries.iter().filter(|(key, _)| is_foreign(key)).map(|(key, entry)| {
+            let message = format!("{key} does not belong in a file for {}", self.key);
+            Problem::at(Some(entry.origin.clone()), message)
+        });
+        ConfigError::unless_empty(foreign.collect())?;
+        let is_missing = |held: &&&str| !entries.iter().any(|(key, _)| key == **held);
+        let Some(key) = self.holds.iter().find(is_missing) else { return Ok(()) };
+        let message = format!("{key} is missing in a file for {}", self.key);
+        Err(ConfigError::at(Some(Origin::File { name: name.to_owned(), line: 1 }), message))
     }
 }
 

@@ -89,7 +89,7 @@ impl Reader {
         if let Some(entry) = self.tree.get(path).filter(|entry| !entry.value.is_table()) {
             let message =
                 format!("{path} is {}, expected a table{}", entry.source_text, form(&keys));
-            self.fail(path, Some(entry.origin.clone()), message);
+            self.fail(path, path, message);
         }
         let mut table = Table::new();
         for key in &keys {
@@ -152,13 +152,11 @@ impl Reader {
             return Some(self.table(kind, key.narrowed, path, has_defaults));
         }
         let Some(entry) = self.tree.get(path) else {
-            let is_wrong = |key: &str| self.failed.contains(key);
-            if !key.is_optional && !is_wrong(path) && !ancestors(path).any(is_wrong) {
-                let origin = ancestors(path).find_map(|outer| self.origin(outer));
+            if !key.is_optional && !outward(path).any(|key| self.failed.contains(key)) {
                 let expected = words.expected;
                 let message =
                     format!("{path} is missing and has no default here, expected {expected}");
-                self.fail(path, origin, message);
+                self.fail(path, path, message);
             }
             return None;
         };
@@ -174,7 +172,7 @@ impl Reader {
                 Ok(value) => Some(value),
                 Err(why) => {
                     let message = format!("{path} is {}, {why}", entry.source_text);
-                    self.fail(path, Some(entry.origin.clone()), message);
+                    self.fail(path, path, message);
                     None
                 }
             },
@@ -219,14 +217,8 @@ impl Reader {
 
     /// True if `key`, a key inside it or a table around it was found wrong or missing.
     pub(super) fn is_wrong(&self, key: &str) -> bool {
-        let is_part = |failed: &String| failed == key || is_inside(failed, key);
-        self.failed.iter().any(is_part) || ancestors(key).any(|outer| self.failed.contains(outer))
-    }
-
-    /// Reports that the key `path` is wrong, on the line of `place` or else on its own.
-    pub(super) fn refuse(&mut self, path: &str, place: &str, message: &str) {
-        let origin = self.origin(place).or_else(|| self.origin(path));
-        self.fail(path, origin, format!("{path}: {message}"));
+        outward(key).any(|outer| self.failed.contains(outer))
+            || self.failed.iter().any(|failed| is_inside(failed, key))
     }
 
     /// Checks a table at `table_path` that may have only some of the keys in `all`, depending on its kind. `what` is
@@ -251,11 +243,12 @@ impl Reader {
             let is_allowed = |entry: &Entry| is_recorded && key.default == Some(&entry.source_text);
             if self.given(&key_path).is_some_and(|entry| !is_allowed(entry)) {
                 let known = known.join(", ");
-                self.refuse(&key_path, &key_path, &format!("{what} has no such key, only {known}"));
+                let message = format!("{key_path}: {what} has no such key, only {known}");
+                self.fail(&key_path, &key_path, message);
             }
         }
         if let (false, Err((key, message))) = (self.is_wrong(table_path), made) {
-            self.refuse(table_path, &join(table_path, key), &message);
+            self.fail(table_path, &join(table_path, key), format!("{table_path}: {message}"));
         }
     }
 
@@ -292,10 +285,10 @@ impl Reader {
             let is_reported = |outer: &str| {
                 self.failed.contains(outer) || self.tree.contains_key(outer) && !is_known(outer)
             };
-            if is_known(key) || ancestors(key).any(is_reported) {
+            if is_known(key) || outward(key).skip(1).any(is_reported) {
                 continue;
             }
-            let hint = match ancestors(key).find_map(|outer| self.known.get_key_value(outer)) {
+            let hint = match outward(key).find_map(|outer| self.known.get_key_value(outer)) {
                 Some((value, Some(allowed))) => {
                     format!("{value} has no keys below it; allowed as its value: {allowed}")
                 }
@@ -319,11 +312,6 @@ impl Reader {
         self.given(key).is_some()
     }
 
-    /// Where `key` was given; `None` for a default.
-    fn origin(&self, key: &str) -> Option<Origin> {
-        self.given(key).map(|entry| entry.origin.clone())
-    }
-
     /// Reports that the source of `keys` is unusable.
     pub(super) fn fail_all(&mut self, keys: Vec<&str>, error: ConfigError) {
         self.problems
@@ -331,10 +319,12 @@ impl Reader {
         self.failed.extend(keys.into_iter().map(str::to_owned));
     }
 
-    /// Reports that a key is wrong.
-    fn fail(&mut self, key: &str, origin: Option<Origin>, message: String) {
+    /// Reports that `key` is wrong, at the place of the key `given`, or else of the nearest table around it.
+    pub(super) fn fail(&mut self, key: &str, given: &str, message: String) {
+        let entry = outward(given).find_map(|key| self.given(key));
+        let problem = Problem::at(entry.map(|entry| entry.origin.clone()), message);
         self.failed.insert(key.to_owned());
-        self.problems.push((key.to_owned(), Problem::at(origin, message)));
+        self.problems.push((key.to_owned(), problem));
     }
 }
 
@@ -408,7 +398,7 @@ pub(super) fn is_inside(key: &str, outer: &str) -> bool {
     key.strip_prefix(outer).is_some_and(|rest| rest.starts_with(['.', '[']))
 }
 
-/// The keys around `key`, nearest first: of `a.b[0].c`: `a.b[0]`, `a.b`, `a`.
-pub(super) fn ancestors(key: &str) -> impl Iterator<Item = &str> {
-    std::iter::successors(Some(key), |key| key.get(..key.rfind(['.', '['])?)).skip(1)
+/// `key` and the keys around it, nearest first: of `a.b[0].c`: itself, `a.b[0]`, `a.b`, `a`.
+fn outward(key: &str) -> impl Iterator<Item = &str> {
+    std::iter::successors(Some(key), |key| key.get(..key.rfind(['.', '['])?))
 }

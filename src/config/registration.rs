@@ -4,7 +4,6 @@ use super::Config;
 use super::error::ConfigError;
 use super::pose::PoseConfig;
 use crate::calibration::{FiducialPair, RegistrationFit, RegistrationRecord};
-use crate::geometry::Pose;
 use crate::keys::{Field, Kind, Rule, find, over, section, within};
 use nalgebra::Vector3;
 use toml::{Table, Value};
@@ -55,17 +54,6 @@ impl RegistrationConfig {
     pub fn rms_max_mm() -> f64 {
         let default = find(Fiducials::KEYS, "rms_max_mm").and_then(|key| key.default_value());
         f64::take(default.as_ref())
-    }
-
-    /// `X_WT`: the tracker's pose on the bench.
-    ///
-    /// # Errors
-    /// The fiducials determine no pose.
-    pub fn x_wt(&self) -> Result<Pose, ConfigError> {
-        match self {
-            RegistrationConfig::Given(given) => Ok(given.x_wt.to_pose()),
-            RegistrationConfig::Fiducials(fiducials) => Ok(fiducials.fit()?.x_wt),
-        }
     }
 }
 

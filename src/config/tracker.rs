@@ -158,7 +158,11 @@ impl TrackerSection {
                 self.source
             ))
         })?;
-        Ok(Registration::new(registration.x_wt()?).with_tip(self.x_sb()))
+        let x_wt = match registration {
+            RegistrationConfig::Given(given) => given.x_wt.to_pose(),
+            RegistrationConfig::Fiducials(fiducials) => fiducials.fit()?.x_wt,
+        };
+        Ok(Registration::new(x_wt).with_tip(self.x_sb()))
     }
 
     /// `X_SB`: the tip in the sensor's frame.
