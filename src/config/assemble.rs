@@ -54,7 +54,7 @@ impl Config {
     /// # Errors
     /// No registration; values that the needle, the stage or the observers refuse.
     pub fn session_without_goal(&self) -> Result<SessionConfig, ConfigError> {
-        let invariant = self.observer.to_invariant();
+        let invariant = self.invariant();
         let mut observers = self.observers();
         Ok(SessionConfig {
             x_wp: self.plane.to_pose(),
@@ -62,7 +62,6 @@ impl Config {
             needle: self.believed_needle()?,
             needle_torsion: self.believed_torsion()?,
             handedness: InvariantConfig {
-                registration_sd_mm: self.registration_sd_mm()?,
                 // Only one of the two places may have the real noise.
                 position_sd_mm: invariant.position_sd_mm.max(self.tracker.to_track().noise_sd_mm),
                 ..invariant

@@ -101,7 +101,9 @@ fn check_torsion(section: &str, torsion: TorsionConfig, reader: &mut Reader) {
     let keys = TorsionConfig::KEYS.iter().map(|key| format!("{section}.torsion.{}", key.name));
     let keys: Vec<String> = keys.collect();
     let keys: Vec<&str> = keys.iter().map(String::as_str).collect();
-    reader.check_result(&keys, needle::torsion(torsion, section));
+    if let Err(error) = needle::torsion(torsion, section) {
+        reader.refuse(&keys, error.to_string());
+    }
 }
 
 /// Each range has its lower end first, and no trial draws a torsion offset outside its torsion band.
@@ -261,7 +263,9 @@ fn check_registration(config: &Config, reader: &mut Reader) {
             reader.fail(REGISTRATION, FIDUCIALS, message);
         }
     }
-    reader.check_result(&[FIDUCIALS, REGISTRATION], config.registration_sd_mm());
+    if let Err(error) = config.registration_sd_mm() {
+        reader.refuse(&[FIDUCIALS, REGISTRATION], error.to_string());
+    }
 }
 
 /// Keys that only some sources of tip positions allow.

@@ -5,7 +5,7 @@
 use super::Config;
 use crate::geometry::FixedAngles;
 use crate::keys::{Rule, choice, section, within};
-use crate::observer::{self, CoupledConfig, FiniteDifferenceConfig, InvariantConfig};
+use crate::observer::{CoupledConfig, FiniteDifferenceConfig, InvariantConfig, ObserverConfig};
 use crate::session::Samples;
 
 const START_PITCH: Rule = within(-80.0, 80.0);
@@ -54,29 +54,30 @@ impl ObserverSection {
         }
         kinds
     }
-
-    /// The settings of the invariant observer, without the error of the registration.
-    pub fn to_invariant(&self) -> InvariantConfig {
-        InvariantConfig { start: self.start, ..self.invariant }
-    }
 }
 
 impl Config {
+    /// The settings of the invariant observer.
+    pub(super) fn invariant(&self) -> InvariantConfig {
+        InvariantConfig {
+            start: self.observer.start,
+            // A configuration whose fiducials determine no registration was refused.
+            registration_sd_mm: self.registration_sd_mm().unwrap_or_default(),
+            ..self.observer.invariant
+        }
+    }
+
     /// The observer that steers, then its shadows.
-    pub fn observers(&self) -> impl Iterator<Item = observer::ObserverConfig> + '_ {
+    pub fn observers(&self) -> impl Iterator<Item = ObserverConfig> + '_ {
         self.observer.kinds().into_iter().map(|kind| match kind {
-            ObserverKind::Invariant => observer::ObserverConfig::Invariant(InvariantConfig {
-                // Fails without a registration, as in an evaluation of recordings.
-                registration_sd_mm: self.registration_sd_mm().unwrap_or_default(),
-                ..self.observer.to_invariant()
-            }),
-            ObserverKind::Coupled => observer::ObserverConfig::Coupled(CoupledConfig {
+            ObserverKind::Invariant => ObserverConfig::Invariant(self.invariant()),
+            ObserverKind::Coupled => ObserverConfig::Coupled(CoupledConfig {
                 start: self.observer.start,
                 position_sd_mm: self.observer.invariant.position_sd_mm,
                 ..self.observer.coupled
             }),
             ObserverKind::FiniteDifference => {
-                observer::ObserverConfig::FiniteDifference(self.observer.finite_difference)
+                ObserverConfig::FiniteDifference(self.observer.finite_difference)
             }
         })
     }

@@ -6,7 +6,7 @@ use toml::{Table, Value};
 
 use super::Config;
 use super::error::{ConfigError, Problem, nearest_key};
-use super::value::{self, Entries, Entry, Origin, element, join};
+use super::value::{self, Entries, Entry, Origin, join};
 use crate::keys::{DefaultHolds, Key, Kind, Rule, Words, expanded, find, tables};
 
 /// The merged sources: the entry of the highest layer, by dotted key.
@@ -18,17 +18,15 @@ pub(super) const FIDUCIALS: &str = "tracker.registration.fiducials";
 /// A message shows at most this many keys of a table.
 const FORM_KEYS_MAX: usize = 4;
 
-/// Reports contradictions: `[keys] if CONDITION => "message", arguments;`. See [`Reader::refuse_if`].
+/// Reports contradictions: `[keys] if CONDITION => "message", arguments;`. See [`Reader::refuse`].
 macro_rules! contradictions {
     (
         $reader:expr;
         $([$($key:expr),+] if $is_contradiction:expr => $message:literal $(, $argument:expr)*;)+
     ) => {$(
-        $reader.refuse_if(
-            &[$($key),+],
-            $is_contradiction,
-            || format!($message $(, $argument)*),
-        );
+        if $is_contradiction {
+            $reader.refuse(&[$($key),+], format!($message $(, $argument)*));
+        }
     )+};
 }
 pub(super) use contradictions;
@@ -164,7 +162,7 @@ impl Reader {
             (Kind::Array(of, count), Value::Array(given))
                 if count.is_none_or(|count| count == given.len()) =>
             {
-                let places = (0..given.len()).map(|i| element(path, i));
+                let places = (0..given.len()).map(|i| format!("{path}[{i}]"));
                 let elements = places.filter_map(|path| self.value(key, of, &path, true));
                 Some(Value::Array(elements.collect()))
             }
@@ -184,20 +182,14 @@ impl Reader {
         self.tree.contains_key(path) || self.tree.keys().any(|key| is_inside(key, path))
     }
 
-    /// Reports `message` if `is_contradiction`, at the one of `keys` from the source of highest precedence.
-    /// Reports nothing if one of them was found wrong before.
-    pub(super) fn refuse_if(
-        &mut self,
-        keys: &[&str],
-        is_contradiction: bool,
-        message: impl FnOnce() -> String,
-    ) {
-        if !is_contradiction || keys.iter().any(|&key| self.failed.contains(key)) {
+    /// Reports `message` at the one of `keys` from the source of highest precedence. Reports nothing if one of
+    /// them was found wrong before.
+    pub(super) fn refuse(&mut self, keys: &[&str], message: String) {
+        if keys.iter().any(|&key| self.failed.contains(key)) {
             return;
         }
         let entries = keys.iter().filter_map(|&key| Some((key, self.tree.get(key)?)));
         let given = entries.filter(|(_, entry)| entry.layer > 0).max_by_key(|(_, e)| e.layer);
-        let message = message();
         let problem = match given {
             // `--set a.b is …` would name a key that was not set.
             Some((key, Entry { origin: Origin::Set, .. })) if !message.starts_with(key) => {
@@ -206,13 +198,6 @@ impl Reader {
             given => Problem::at(given.map(|(_, entry)| entry.origin.clone()), message),
         };
         self.problems.push((keys[0].to_owned(), problem));
-    }
-
-    /// Reports the error of `result`, which was computed from the values of `keys`.
-    pub(super) fn check_result<T>(&mut self, keys: &[&str], result: Result<T, ConfigError>) {
-        if let Err(error) = result {
-            self.refuse_if(keys, true, || error.to_string());
-        }
     }
 
     /// True if `key`, a key inside it or a table around it was found wrong or missing.

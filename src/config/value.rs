@@ -166,11 +166,6 @@ pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, ConfigError
     }
 }
 
-/// The key of element `index` of the array `key`.
-pub(super) fn element(key: &str, index: usize) -> String {
-    format!("{key}[{index}]")
-}
-
 /// The key `name` in the table `path`. Names that need quotes in TOML keep them, so that they are
 /// never taken for a dotted key.
 pub(super) fn join(path: &str, name: &str) -> String {
@@ -228,7 +223,9 @@ impl Flattener<'_> {
         match spanned.get_ref() {
             DeValue::Table(table) => self.table(&key, table),
             DeValue::Array(array) => {
-                array.iter().enumerate().for_each(|(i, item)| self.value(element(&key, i), item));
+                for (i, item) in array.iter().enumerate() {
+                    self.value(format!("{key}[{i}]"), item);
+                }
             }
             _ => {}
         }
