@@ -324,7 +324,7 @@ pub(super) fn end_json(report: &RunReport) -> Value {
         "duration_s": report.end.as_secs_f64(),
         "run_dir": report.run_dir.display().to_string(),
         "record_error": match &report.record {
-            Ok(finished) => finished.faults.first().cloned(),
+            Ok(manifest) => manifest.faults.first().cloned(),
             Err(error) => Some(error.to_string()),
         },
         "emulated": report.emulated.as_ref().map(emulated_json),

@@ -123,7 +123,7 @@ fn to_json(config: &Config, report: &RunReport, preflight: &[Check]) -> Value {
         "plane_missed_by_mm": plane_missed_by_mm(report),
         "plan_status": plan_status(config, report),
         "rehearsal": config.emulator.rehearse,
-        "record_dropped": report.record.as_ref().ok().map(|finished| finished.dropped),
+        "record_dropped": report.record.as_ref().ok().and_then(|manifest| manifest.dropped),
         "preflight": preflight,
     });
     merged(figures, &more)

@@ -43,14 +43,14 @@ fn not_made(why: &dyn Display) -> Option<String> {
 
 /// Completes the record of a run that has ended with its `run.rrd`.
 pub fn complete_record(report: &mut RunReport, describe: Describe, operator: &mut dyn Operator) {
-    let Ok(finished) = &mut report.record else { return };
+    let Ok(manifest) = &mut report.record else { return };
     let end = report.end;
-    let fault = make_recording(&finished.run_dir, describe, &mut |made| {
+    let fault = make_recording(&report.run_dir, describe, &mut |made| {
         let (made_s, end_s) = (made.as_secs_f64(), end.as_secs_f64());
         let text = format!("making run.rrd: {made_s:.0} s of {end_s:.0} s done");
         operator.event(end, Lane::Session, Severity::Info, &text);
     });
-    finished.faults.extend(fault);
+    manifest.faults.extend(fault);
 }
 
 /// Makes `run.rrd` from the closed record in `dir`, and notes it in the manifest. Returns the fault if
@@ -291,8 +291,9 @@ mod tests {
         let (time, text) = (Time::from_secs_f64(7.0), "late".to_owned());
         let (lane, severity) = (Lane::Session, Severity::Warning);
         recorder.record(Entry::from(Record::Event { time, lane, severity, text }));
-        let finished = recorder.finish(|manifest| manifest.set_outcome(&Outcome::Completed));
-        (scratch, finished.unwrap().run_dir, time)
+        let run_dir = recorder.run_dir().to_path_buf();
+        recorder.finish(|manifest| manifest.set_outcome(&Outcome::Completed)).unwrap();
+        (scratch, run_dir, time)
     }
 
     fn describe() -> Describe {

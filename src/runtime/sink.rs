@@ -4,7 +4,7 @@ use super::drive::Witness;
 use super::interrupt::Interrupt;
 use super::timing::{DurationHistogram, TimingReport};
 use super::virtual_time::EmulationReport;
-use crate::archive::DriveIdentity;
+use crate::archive::{DriveIdentity, Manifest};
 use crate::canopen::NodeId;
 use crate::emulator::Truth;
 use crate::session::{
@@ -12,7 +12,7 @@ use crate::session::{
 };
 use crate::stage::{Axis, Identity};
 use crate::study::RunFigures;
-use crate::telemetry::{Entry, Finished, RecordNews, Recorder, TelemetryError};
+use crate::telemetry::{Entry, RecordNews, Recorder, TelemetryError};
 use crate::tracker::GateCounts;
 use crate::units::Time;
 use serde::Serialize;
@@ -82,8 +82,8 @@ pub struct RunReport {
     pub timing: Option<TimingReport>,
     /// The run folder.
     pub run_dir: PathBuf,
-    /// What the closed record holds, or why it could not be closed.
-    pub record: Result<Finished, TelemetryError>,
+    /// The manifest of the closed record, or why it could not be closed.
+    pub record: Result<Manifest, TelemetryError>,
     /// What is known only in an emulated run; `None` in any other.
     pub emulated: Option<EmulationReport>,
 }

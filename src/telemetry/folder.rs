@@ -9,7 +9,6 @@ use nix::sys::statvfs::statvfs;
 use std::fs::{self, File, OpenOptions};
 use std::io::ErrorKind::{AlreadyExists, InvalidInput, Unsupported};
 use std::io::{self, Write as _};
-use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 /// Runs of one name in one second are distinguished by a number, up to this.
@@ -82,18 +81,6 @@ pub(super) fn reserve_manifest(dir: &Path) -> Result<(), TelemetryError> {
         fs::write(&path, vec![b' '; written as usize + RESERVE_BYTES])
     };
     reserve().map_err(TelemetryError::file(&path))
-}
-
-/// Checks that the open `file` is still at `path`.
-///
-/// # Errors
-/// The system's error, or that another file has taken its place.
-pub(super) fn check_is_at(file: &File, path: &Path) -> io::Result<()> {
-    let (open, found) = (file.metadata()?, fs::symlink_metadata(path)?);
-    if (open.dev(), open.ino()) == (found.dev(), found.ino()) {
-        return Ok(());
-    }
-    Err(io::Error::other("another file has taken its place"))
 }
 
 /// A write lock on a whole file. It belongs to the file as it was opened (F_OFD_SETLK), and unlike that of

@@ -6,12 +6,14 @@
 //! which may block.
 
 use super::TelemetryError;
-use super::folder::{self, check_is_at, check_not_full};
+use super::folder::{self, check_not_full};
 use super::worker::{Backpressure, Sink, Worker};
 use crate::archive::{Manifest, file};
 use rtrb::{Consumer, Producer, RingBuffer};
 use std::collections::BTreeSet;
-use std::fs::File;
+use std::fs::{self, File};
+use std::io;
+use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -109,7 +111,14 @@ impl Folder {
 
 /// Checks that the open file is still at its path: writing to a removed or renamed file does not fail.
 fn check_in_place((path, file): &OpenPath) -> Result<(), TelemetryError> {
-    check_is_at(file, path).map_err(TelemetryError::file(path))
+    let check = || {
+        let (open, found) = (file.metadata()?, fs::symlink_metadata(path)?);
+        match (open.dev(), open.ino()) == (found.dev(), found.ino()) {
+            true => Ok(()),
+            false => Err(io::Error::other("another file has taken its place")),
+        }
+    };
+    check().map_err(TelemetryError::file(path))
 }
 
 impl Sink for Folder {
@@ -139,7 +148,6 @@ impl Sink for Folder {
 mod tests {
     use super::*;
     use crate::telemetry::tests::Scratch;
-    use std::fs;
     use std::path::Path;
     use std::thread;
     use std::time::Instant;

@@ -30,7 +30,7 @@ mod worker;
 
 pub use error::TelemetryError;
 pub use folder::{check_room, free_mb, is_being_written, lock, try_to_write, write_manifest};
-pub use recorder::{Finished, Recorder};
+pub use recorder::Recorder;
 pub use recording::Recording;
 pub use repair::{Repaired, note_recording, repair};
 pub use run_folder::RunFolder;

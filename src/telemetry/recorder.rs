@@ -4,11 +4,9 @@ use super::keeper::keep;
 use super::recording::live;
 use super::text::{TextFiles, WRITER};
 use super::vitals::RecordNews;
-use super::worker::{Backpressure, Worker, WriterResult};
+use super::worker::{Backpressure, Worker};
 use super::{Entry, Scene, TelemetryError, folder, utc_text};
-use crate::archive::{
-    Counts, DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex, unix_us_of,
-};
+use crate::archive::{DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex, unix_us_of};
 use rtrb::Consumer;
 use std::fs::{self, File};
 use std::net::SocketAddr;
@@ -22,30 +20,17 @@ const CLOSING_LIMIT: Duration = Duration::from_secs(15);
 /// After that, writing the manifest is given up after this long without progress.
 const MANIFEST_LIMIT: Duration = Duration::from_secs(5);
 
-/// The record of a finished run.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Finished {
-    /// The run folder.
-    pub run_dir: PathBuf,
-    /// Lines of the text files.
-    pub counts: Counts,
-    /// Records that were lost.
-    pub dropped: Dropped,
-    /// Failures, with the reasons; empty if the record is complete.
-    pub faults: Vec<String>,
-}
-
 /// A run folder that is being filled.
 pub struct Recorder {
     run_dir: PathBuf,
     config_toml: String,
+    /// The manifest so far, with the failures so far.
     manifest: Manifest,
     text: Worker<Entry>,
     live: Option<Worker<Entry>>,
     keeper: Worker<Box<Manifest>>,
     /// Problems that the keeper found.
     problems: Consumer<String>,
-    faults: Vec<String>,
     /// Shows other processes that the folder is being written.
     lock: Option<File>,
 }
@@ -77,18 +62,8 @@ impl Recorder {
             for_keeper.push((path, config));
             let text = Worker::start(WRITER, QUEUE_ENTRIES, backpressure, || Ok(files))?;
             let (keeper, problems) = keep(run_dir.clone(), for_keeper)?;
-            let (live, faults) = (None, Vec::new());
-            Ok(Recorder {
-                run_dir,
-                config_toml,
-                manifest,
-                text,
-                live,
-                keeper,
-                problems,
-                faults,
-                lock,
-            })
+            let live = None;
+            Ok(Recorder { run_dir, config_toml, manifest, text, live, keeper, problems, lock })
         };
         fill(run_dir.clone()).inspect_err(|_| discard(&run_dir))
     }
@@ -136,7 +111,7 @@ impl Recorder {
             Some(RecordNews::Failed(TelemetryError::Recording(problem)))
         })?;
         if let RecordNews::Failed(error) = &news {
-            self.faults.push(error.to_string());
+            self.manifest.faults.push(error.to_string());
         }
         Some(news)
     }
@@ -149,7 +124,7 @@ impl Recorder {
 
     /// Completes the text files, seals them and writes the final manifest, to which `sum_up` adds the
     /// outcome and the figures of the run. Takes at most 22 s if the disk is stalled, and longer only while
-    /// the writer makes progress. Failures are listed in the manifest and in the result.
+    /// the writer makes progress. Returns the final manifest, which lists the failures.
     ///
     /// # Errors
     /// [`TelemetryError`] if the final manifest cannot be written, or if the content of the text files is
@@ -157,53 +132,49 @@ impl Recorder {
     pub fn finish(
         mut self,
         sum_up: impl FnOnce(&mut Manifest),
-    ) -> Result<Finished, TelemetryError> {
+    ) -> Result<Manifest, TelemetryError> {
         // Collects the failures since the last call.
         while self.news().is_some() {}
-        let open = self.manifest.clone();
-        sum_up(&mut self.manifest);
-        self.manifest.ended_utc = Some(utc_text(SystemTime::now()));
-        let closed = self.text.close(&self.manifest, CLOSING_LIMIT);
+        let mut manifest = self.manifest.clone();
+        sum_up(&mut manifest);
+        manifest.ended_utc = Some(utc_text(SystemTime::now()));
+        let closed = self.text.close(&manifest, CLOSING_LIMIT);
         if let Some(live) = &mut self.live {
-            live.close_within(&self.manifest, live::FAREWELL_MAX);
+            live.close_within(&manifest, live::FAREWELL_MAX);
         }
-        let (written, fault) = match &closed {
-            Ok((written, fault)) => (Some(written), fault.as_ref()),
-            Err(silent) => (None, Some(silent)),
-        };
-        let fault = fault.map(ToString::to_string).filter(|fault| !self.faults.contains(fault));
-        self.faults.extend(fault);
-        // An entry that is not in the files is lost, for whatever reason.
-        let lost = written.map(|written| self.text.given.saturating_sub(written.entries));
-        let dropped = Dropped {
-            text_files: lost.unwrap_or(self.text.dropped),
+        let mut dropped = Dropped {
+            text_files: self.text.dropped,
             recording: 0,
             live: self.live.as_ref().map_or(0, |live| live.dropped),
         };
-        // The record stays open if the content of the text files is unknown.
-        let mut manifest = match written {
-            None => open,
-            Some(WriterResult { counts, files, .. }) => {
+        let fault = match &closed {
+            Ok((written, fault)) => {
+                // An entry that is not in the files is lost, for whatever reason.
+                dropped.text_files = self.text.given.saturating_sub(written.entries);
+                manifest.counts = Some(written.counts);
+                manifest.files.clone_from(&written.files);
                 let config = FileSeal::of(self.config_toml.as_bytes());
-                self.manifest.counts = Some(*counts);
-                self.manifest.files.clone_from(files);
-                self.manifest.files.insert(file::CONFIG.to_owned(), config);
-                self.manifest
+                manifest.files.insert(file::CONFIG.to_owned(), config);
+                fault.as_ref()
+            }
+            Err(silent) => {
+                // The record stays open if the content of the text files is unknown.
+                manifest = self.manifest;
+                Some(silent)
             }
         };
+        let fault = fault.map(ToString::to_string).filter(|fault| !manifest.faults.contains(fault));
+        manifest.faults.extend(fault);
         manifest.dropped = Some(dropped);
-        manifest.faults.clone_from(&self.faults);
-        let keeper_result = self.keeper.close(&manifest, MANIFEST_LIMIT).map(|(_, fault)| fault);
-        match (closed, keeper_result) {
-            (Ok((written, _)), Ok(None)) => {
-                // The keeper has added these to the manifest.
+        match (closed, self.keeper.close(&manifest, MANIFEST_LIMIT)) {
+            (Ok(_), Ok((_, None))) => {
+                // The keeper has added these to the manifest that it wrote.
                 while let Ok(problem) = self.problems.pop() {
-                    self.faults.push(problem);
+                    manifest.faults.push(problem);
                 }
-                let (run_dir, counts, faults) = (self.run_dir, written.counts, self.faults);
-                Ok(Finished { run_dir, counts, dropped, faults })
+                Ok(manifest)
             }
-            (Err(error), _) | (_, Err(error) | Ok(Some(error))) => {
+            (Err(error), _) | (_, Err(error) | Ok((_, Some(error)))) => {
                 // A writer that was given up may still write, so the folder stays locked until the process ends.
                 std::mem::forget(self.lock);
                 Err(error)

@@ -58,11 +58,8 @@ impl RunFolder {
     pub fn verify(&self) -> Result<(), TelemetryError> {
         let files = &self.manifest.files;
         let mut changes = Vec::new();
-        for (name, FileSeal { bytes, sha256 }) in files {
-            if name == file::RECORDING {
-                continue;
-            }
-            changes.extend(self.change(name, Some(*bytes), sha256)?);
+        for (name, seal) in files.iter().filter(|(name, _)| *name != file::RECORDING) {
+            changes.extend(self.change(name, Some(seal.bytes), &seal.sha256)?);
         }
         if self.is_closed() {
             let unsealed = file::TEXT_FILES
@@ -88,12 +85,13 @@ impl RunFolder {
     /// # Errors
     /// [`TelemetryError::File`].
     pub fn recording_change(&self) -> Result<Option<String>, TelemetryError> {
-        match self.manifest.files.get(file::RECORDING) {
-            Some(FileSeal { bytes, sha256 }) => self.change(file::RECORDING, Some(*bytes), sha256),
-            None if self.dir.join(file::RECORDING).exists() => {
-                Ok(Some(format!("{} has no seal in the manifest", file::RECORDING)))
+        let name = file::RECORDING;
+        match self.manifest.files.get(name) {
+            Some(seal) => self.change(name, Some(seal.bytes), &seal.sha256),
+            None if self.dir.join(name).exists() => {
+                Ok(Some(format!("{name} has no seal in the manifest")))
             }
-            None => Ok(Some(format!("{} is missing", file::RECORDING))),
+            None => Ok(Some(format!("{name} is missing"))),
         }
     }
 

@@ -5,7 +5,7 @@ mod recording;
 pub(in crate::telemetry) mod synthetic;
 
 use super::*;
-use crate::archive::{EventLine, Manifest, StepRow, file, steps_csv_header};
+use crate::archive::{Counts, EventLine, Manifest, StepRow, file, steps_csv_header};
 use crate::canopen::NodeId;
 use crate::session::{Outcome, Record};
 use crate::stage::{AxisConfig, AxisLimits, CountsRatio};
@@ -70,12 +70,13 @@ fn axis(node: u8, counts: u32, max: f64) -> AxisConfig {
     AxisConfig::new(NodeId::new(node).unwrap(), CountsRatio::new(counts, 1).unwrap(), limits)
 }
 
-/// Records `entries` as one run in `parent`.
-fn record(parent: &Path, entries: impl IntoIterator<Item = Entry>) -> Finished {
+/// Records `entries` as one run in `parent`; returns its folder and the lines of its text files.
+fn record(parent: &Path, entries: impl IntoIterator<Item = Entry>) -> (PathBuf, Counts) {
     let mut recorder = recorder(parent, Backpressure::Block);
     entries.into_iter().for_each(|entry| recorder.record(entry));
     assert!(recorder.news().is_none());
-    recorder.finish(completed).unwrap()
+    let run_dir = recorder.run_dir().to_path_buf();
+    (run_dir, recorder.finish(completed).unwrap().counts.unwrap())
 }
 
 /// The end of a run that reached its depth.
@@ -96,8 +97,8 @@ fn recording_of(dir: &Path, entries: impl IntoIterator<Item = Entry>) -> PathBuf
 fn a_run_leaves_every_file() {
     let scratch = Scratch::new("run");
     let entries = synthetic::run(30, 5);
-    let finished = record(&scratch.0, entries.clone());
-    let dir = finished.run_dir.as_path();
+    let (run_dir, counts) = record(&scratch.0, entries.clone());
+    let dir = run_dir.as_path();
     let text = |name: &str| fs::read_to_string(dir.join(name)).unwrap();
 
     let names: BTreeSet<String> = fs::read_dir(dir)
@@ -124,9 +125,9 @@ fn a_run_leaves_every_file() {
     assert_eq!(text("steps.csv").lines().collect::<Vec<_>>(), expected);
 
     let count = |name: &str| text(name).lines().count() as u64;
-    assert_eq!(count("can.log"), finished.counts.can_frames);
+    assert_eq!(count("can.log"), counts.can_frames);
     assert_eq!(text("can.log").lines().next(), Some("(1700000000.001000) memory 000#8200 T"));
-    assert_eq!(count("tracker.ndjson"), finished.counts.tracker_samples);
+    assert_eq!(count("tracker.ndjson"), counts.tracker_samples);
     for line in text("tracker.ndjson").lines() {
         serde_json::from_str::<serde_json::Value>(line).unwrap();
     }
@@ -228,11 +229,11 @@ fn the_manifest_of_a_run_that_was_not_closed_has_no_outcome() {
 #[test]
 fn two_runs_never_share_a_folder() {
     let scratch = Scratch::new("twice");
-    let first = record(&scratch.0, synthetic::run(1, 1));
-    let steps = fs::read(first.run_dir.join("steps.csv")).unwrap();
-    let second = record(&scratch.0, synthetic::run(3, 1));
-    assert_ne!(first.run_dir, second.run_dir);
-    assert_eq!(fs::read(first.run_dir.join("steps.csv")).unwrap(), steps);
+    let (first, _) = record(&scratch.0, synthetic::run(1, 1));
+    let steps = fs::read(first.join("steps.csv")).unwrap();
+    let (second, _) = record(&scratch.0, synthetic::run(3, 1));
+    assert_ne!(first, second);
+    assert_eq!(fs::read(first.join("steps.csv")).unwrap(), steps);
 }
 
 #[test]
@@ -244,13 +245,13 @@ fn nan_and_infinity_break_no_file() {
             synthetic::spoil(entry, value);
         }
     }
-    let finished = record(&scratch.0, entries.clone());
-    assert_eq!(finished.counts.steps, 3);
-    let steps = fs::read_to_string(finished.run_dir.join("steps.csv")).unwrap();
+    let (run_dir, recorded) = record(&scratch.0, entries.clone());
+    assert_eq!(recorded.steps, 3);
+    let steps = fs::read_to_string(run_dir.join("steps.csv")).unwrap();
     let columns = steps_csv_header().matches(',').count();
     assert!(steps.lines().all(|row| row.matches(',').count() == columns));
-    let tracker = fs::read_to_string(finished.run_dir.join("tracker.ndjson")).unwrap();
-    assert_eq!(tracker.lines().count() as u64, finished.counts.tracker_samples);
+    let tracker = fs::read_to_string(run_dir.join("tracker.ndjson")).unwrap();
+    assert_eq!(tracker.lines().count() as u64, recorded.tracker_samples);
     assert!(!tracker.is_empty());
     for line in tracker.lines() {
         let sample: serde_json::Value = serde_json::from_str(line).unwrap();

@@ -1,25 +1,18 @@
 //! Tests of the last lines of a run.
 
 use super::*;
-use crate::archive::{Counts, Dropped};
 use crate::canopen::emcy::EmcyCode;
 use crate::cli::arguments::Configured;
 use crate::runtime::Holds;
 use crate::stage::{PerAxis, SetPoint};
 use crate::study::RunFigures;
-use crate::telemetry::{Finished, TelemetryError};
+use crate::telemetry::TelemetryError;
 use crate::tracker::GateCounts;
 use crate::units::Time;
 use std::path::PathBuf;
 
 fn report(outcome: Outcome, faults: &[&str]) -> RunReport {
-    let run_dir = PathBuf::from("runs/a");
-    let finished = Finished {
-        run_dir: run_dir.clone(),
-        counts: Counts::default(),
-        dropped: Dropped::default(),
-        faults: faults.iter().map(|fault| (*fault).to_owned()).collect(),
-    };
+    let faults = faults.iter().map(|fault| (*fault).to_owned()).collect();
     RunReport {
         outcome,
         figures: RunFigures::default(),
@@ -28,8 +21,8 @@ fn report(outcome: Outcome, faults: &[&str]) -> RunReport {
         gates: GateCounts::default(),
         end: Time::ZERO,
         timing: None,
-        run_dir,
-        record: Ok(finished),
+        run_dir: PathBuf::from("runs/a"),
+        record: Ok(Manifest { faults, ..Manifest::default() }),
         emulated: None,
     }
 }

@@ -382,7 +382,7 @@ fn behind_a_refused_frame_only_the_stop_is_sent() {
     assert_eq!(bus.accepted.iter().find(stale), None, "{:?}", bus.accepted);
     let outcome = &report.outcome;
     assert!(matches!(outcome, Outcome::Stopped(reason) if reason.starts_with("can: ")));
-    let log = report.record.unwrap().run_dir.join("can.log");
+    let log = report.run_dir.join("can.log");
     let log = std::fs::read_to_string(log).unwrap();
     let sent: Vec<&str> = log.lines().filter_map(|l| l.split(' ').nth(2)).collect();
     assert_eq!(sent, bus.accepted);

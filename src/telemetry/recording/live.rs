@@ -1,6 +1,5 @@
 //! Shows the run to viewers while it goes on. Records that its queue cannot take are dropped and counted.
 
-use super::Logged;
 use super::content::{Content, builder, log_manifest};
 use crate::archive::Manifest;
 use crate::telemetry::worker::{Backpressure, Sink, Worker};
@@ -37,14 +36,15 @@ pub(in crate::telemetry) fn serve(
     };
     // The server would report a used port only on its own thread.
     TcpListener::bind(address).map_err(|e| failed(e.to_string()))?;
-    let open = move || -> Logged<Content> {
+    let open = move || {
         let memory_limit = MemoryLimit::from_bytes(HISTORY_BYTES);
         let options = ServerOptions { memory_limit, ..ServerOptions::default() };
         let (ip, port) = (address.ip().to_string(), address.port());
-        let stream = builder(&manifest).serve_grpc_opts(ip, port, options)?;
-        Content::open(stream, &manifest, &config_toml, &scene)
+        let served = builder(&manifest).serve_grpc_opts(ip, port, options);
+        let content =
+            served.and_then(|stream| Content::open(stream, &manifest, &config_toml, &scene));
+        content.map_err(|error| error.to_string())
     };
-    let open = move || open().map_err(|error| error.to_string());
     Worker::start("live view", QUEUE_ENTRIES, Backpressure::DropAndCount, open)
         .map_err(|error| failed(error.to_string()))
 }

@@ -32,15 +32,12 @@ use rerun::{
 /// The result of a function that logs.
 type Logged<T = ()> = RecordingStreamResult<T>;
 
-/// The name of a column with its value in a row. The name has the unit; the layout has the colours.
-type NamedValue<N> = (N, f64);
-
-/// Logs a row of a table at the entity `path`: a number for each of its columns, all at the current time. An
-/// unknown value is NaN, which a viewer draws as a gap.
+/// Logs a row of a table at the entity `path`: the name and the number of each of its columns, all at the current
+/// time. A name has the unit; the layout has the colours. An unknown value is NaN, which a viewer draws as a gap.
 fn log_row<N: AsRef<str>>(
     stream: &RecordingStream,
     path: &str,
-    row: impl IntoIterator<Item = NamedValue<N>>,
+    row: impl IntoIterator<Item = (N, f64)>,
 ) -> Logged {
     let cells = row.into_iter().filter_map(|(name, value)| {
         // Only an empty name is refused.

@@ -1,19 +1,12 @@
-//! The tables of the stage: positions at every SYNC, speeds and lags, and the limits. A lag is the
-//! following error: commanded minus measured position.
+//! The tables of the stage: positions at every SYNC (`stage`), speeds and lags ten times a second (`motion`), and
+//! the limits once a second (`limits`). A lag is the following error: commanded minus measured position.
 
-use super::{Logged, NamedValue, log_row};
+use super::{Logged, log_row};
 use crate::stage::Feedback;
 use crate::telemetry::Scene;
 use crate::units::Time;
 use rerun::RecordingStream;
 use std::time::Duration;
-
-/// The table of positions at every SYNC.
-pub(super) const STAGE: &str = "stage";
-/// The table of speeds and lags, ten times a second.
-pub(super) const MOTION: &str = "motion";
-/// The table of limits, once a second.
-pub(super) const LIMITS: &str = "limits";
 
 /// The interval of a row: each speed is the mean over it, each lag the largest in magnitude.
 const MOTION_INTERVAL: Duration = Duration::from_millis(100);
@@ -22,12 +15,12 @@ const LIMITS_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Logs records of the stage as rows.
 pub(super) struct Motion {
-    limits: Vec<NamedValue<&'static str>>,
+    limits: Vec<(&'static str, f64)>,
     limits_due: Time,
     window: Option<Window>,
 }
 
-/// The interval since the last row of [`MOTION`].
+/// The interval since the last row of `motion`.
 #[derive(Debug, Clone, Copy)]
 struct Window {
     begin: Time,
@@ -53,9 +46,9 @@ impl Motion {
         let columns =
             ["insertion_cmd_mm", "insertion_meas_mm", "rotation_cmd_deg", "rotation_meas_deg"];
         let positions = positions(stage);
-        log_row(stream, STAGE, columns.into_iter().zip(positions))?;
+        log_row(stream, "stage", columns.into_iter().zip(positions))?;
         if stage.time >= self.limits_due {
-            log_row(stream, LIMITS, self.limits.iter().copied())?;
+            log_row(stream, "limits", self.limits.iter().copied())?;
             self.limits_due = stage.time + LIMITS_INTERVAL;
         }
         let lags = [positions[0] - positions[1], positions[2] - positions[3]];
@@ -78,7 +71,7 @@ impl Motion {
                 "insertion_lag_mm",
                 "rotation_lag_deg",
             ];
-            log_row(stream, MOTION, columns.into_iter().zip(speeds.chain(window.worst_lags)))?;
+            log_row(stream, "motion", columns.into_iter().zip(speeds.chain(window.worst_lags)))?;
             window = new_window;
         }
         self.window = Some(window);
@@ -88,14 +81,14 @@ impl Motion {
     /// Logs the limits once more at the end of the run, so that their lines reach it.
     pub(super) fn end(&self, stream: &RecordingStream) -> Logged {
         match self.window {
-            Some(_) => log_row(stream, LIMITS, self.limits.iter().copied()),
+            Some(_) => log_row(stream, "limits", self.limits.iter().copied()),
             None => Ok(()),
         }
     }
 }
 
-/// The columns of [`LIMITS`] with their values.
-fn limits(scene: &Scene) -> Vec<NamedValue<&'static str>> {
+/// The columns of `limits` with their values.
+fn limits(scene: &Scene) -> Vec<(&'static str, f64)> {
     let (insertion, rotation) = (&scene.stage.insertion, &scene.stage.rotation);
     let rotation_speed_max = rotation.limits.speed_max.to_degrees();
     let sync_period = scene.stage.bus.sync_period();

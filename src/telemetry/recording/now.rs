@@ -11,9 +11,6 @@ use rerun::{RecordingStream, TextDocument};
 use std::fmt::Write as _;
 use std::time::Duration;
 
-/// The entity of the page.
-pub(super) const NOW: &str = "now";
-
 /// An event explains a state that follows within this time, which is longer than any stop takes.
 const REASON_AGE_MAX: Duration = Duration::from_secs(5);
 
@@ -86,7 +83,7 @@ impl Now {
 
     /// Logs the page.
     pub(super) fn log(&self, stream: &RecordingStream) -> Logged {
-        stream.log(NOW, &TextDocument::from_markdown(self.page()))
+        stream.log("now", &TextDocument::from_markdown(self.page()))
     }
 
     fn page(&self) -> String {

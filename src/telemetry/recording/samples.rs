@@ -8,13 +8,6 @@ use crate::units::Time;
 use rerun::{RecordingStream, TextLog};
 use std::time::Duration;
 
-/// The table of the samples that have an acquisition time.
-pub(super) const SAMPLES: &str = "samples";
-/// The table of samples per second, accepted and refused.
-pub(super) const SAMPLE_RATES: &str = "sample_rates";
-/// The lane of the gates.
-pub(super) const GATE_LANE: &str = "gate";
-
 /// Rates are means over this interval.
 const RATE_INTERVAL: Duration = Duration::from_millis(500);
 
@@ -37,7 +30,7 @@ impl Samples {
     ) -> Logged {
         if let Some(acquisition_time) = sample.acquisition_time {
             let delay_ms = sample.received.receive_time.seconds_after(acquisition_time) * 1e3;
-            log_row(stream, SAMPLES, [("delay_ms", delay_ms)])?;
+            log_row(stream, "samples", [("delay_ms", delay_ms)])?;
         }
         let gate = sample.refused.as_ref().map(|refusal| refusal.gate);
         if gate == Some(GateName::Tool) {
@@ -53,7 +46,7 @@ impl Samples {
                 None => ("accepted".to_owned(), Meaning::Good),
                 Some(gate) => (format!("refused: {gate}"), Meaning::Fault),
             };
-            states.log(stream, GATE_LANE, &state, meaning)?;
+            states.log(stream, "gate", &state, meaning)?;
         }
         let time = sample.received.receive_time;
         let begin = *self.window_begin.get_or_insert(time);
@@ -65,7 +58,7 @@ impl Samples {
         let rates = rates.map(|(name, n)| (name, f64::from(n) / interval_s));
         (self.accepted, self.refused) = (0, 0);
         self.window_begin = Some(time);
-        log_row(stream, SAMPLE_RATES, rates)
+        log_row(stream, "sample_rates", rates)
     }
 }
 

@@ -28,12 +28,6 @@ const CHI_SQUARE_95: f64 = 7.815;
 pub(super) const TRAILS: [&str; 3] =
     ["bench/plane/path/estimate", "bench/plane/path/true", MEASURED_PATH];
 const MEASURED_PATH: &str = "bench/plane/path/measured";
-/// The planned path from the present tip to the target; only the newest is shown.
-const PLANNED_PATH: &str = "bench/plane/planned";
-/// The present position of the target, which may move.
-const SEEN_TARGET: &str = "bench/plane/goal/target_seen";
-/// Points around the target, and whether the tip can still reach them.
-const REACH: &str = "bench/plane/goal/reach";
 /// Distance between the points of the planned path, mm.
 const PLANNED_STEP_MM: f64 = 2.0;
 const ELLIPSOID_PATH: &str = "bench/plane/tip/covariance";
@@ -81,14 +75,16 @@ impl Space {
         }
         if let Some(approach) = &step.decision.approach {
             if let Some(path) = &approach.path {
+                // From the present tip to the target; only the newest is shown.
                 let points: Vec<_> = path.points_mm(PLANNED_STEP_MM).iter().map(point).collect();
                 let strip = LineStrips3D::new([points]).with_colors([COMMANDED]);
-                stream.log(PLANNED_PATH, &strip)?;
+                stream.log("bench/plane/planned", &strip)?;
             }
+            // The target may move.
             let seen = Points3D::new([point(&approach.target_mm)])
                 .with_colors([MEASURED])
                 .with_radii([0.5]);
-            stream.log(SEEN_TARGET, &seen)?;
+            stream.log("bench/plane/goal/target_seen", &seen)?;
             self.log_reach(stream, step, &approach.target_mm)?;
         }
         if let Some(truth) = truth {
@@ -124,7 +120,7 @@ impl Space {
         let colours: Vec<Color> = colours.collect();
         let points = points.iter().map(|(point_mm, _)| point(point_mm));
         let points = Points3D::new(points).with_colors(colours).with_radii([0.4]);
-        stream.log(REACH, &points)
+        stream.log("bench/plane/goal/reach", &points)
     }
 }
 

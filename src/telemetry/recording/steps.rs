@@ -1,4 +1,5 @@
-//! The tables of the steps: state, bounds, errors, command and measurement.
+//! The tables of the steps: state, bounds, errors, command and measurement (`steps`), and the estimates of the
+//! observers that run alongside (`shadows/NAME`).
 
 use super::{Logged, log_row};
 use crate::archive::{STEP_COLUMNS, StepRow, is_truth_column};
@@ -11,21 +12,16 @@ use crate::telemetry::Scene;
 use crate::units::wrap_angle;
 use rerun::RecordingStream;
 
-/// The table of the steps.
-pub(super) const STEPS: &str = "steps";
-/// The path of the tables of the observers that run alongside.
-pub(super) const SHADOWS: &str = "shadows";
-
 /// The six coordinates, each with the unit in which it is shown.
-pub(super) const COORDINATES: [(&str, &str); 6] =
+const COORDINATES: [(&str, &str); 6] =
     [("x", "mm"), ("y", "mm"), ("z", "mm"), ("yaw", "deg"), ("pitch", "deg"), ("roll", "deg")];
 /// Indices of the reduced coordinates x, pitch and roll: those that matter for the plane.
-pub(super) const REDUCED: [usize; 3] = [0, 4, 5];
+const REDUCED: [usize; 3] = [0, 4, ROLL];
 const ROLL: usize = 5;
 const UNKNOWN: [f64; 6] = [f64::NAN; 6];
 
 /// The column of coordinate `n` with this provenance: `x_est_mm`.
-pub(super) fn column(n: usize, provenance: &str) -> String {
+fn column(n: usize, provenance: &str) -> String {
     let (name, unit) = COORDINATES[n];
     format!("{name}_{provenance}_{unit}")
 }
@@ -58,17 +54,20 @@ impl Steps {
             let error = in_degrees(error(estimate, truth));
             (0..6).filter(move |_| has_truth).map(move |n| (column(n, "error"), error[n]))
         };
-        let estimate = step.decision.estimate.as_ref().map_or(UNKNOWN, coordinates_of);
+        let of = |estimate: &Option<Estimate>| {
+            estimate.as_ref().map_or(UNKNOWN, |estimate| coordinates(&estimate.x_pb))
+        };
+        let estimate = of(&step.decision.estimate);
         let (mut shown, mut truth_shown) = (estimate, truth);
         self.unwrap_roll(&mut shown);
         self.unwrap_roll(&mut truth_shown);
         for (name, shadow) in &step.decision.shadows {
-            let estimate = shadow.as_ref().map_or(UNKNOWN, coordinates_of);
+            let estimate = of(shadow);
             let mut shown = estimate;
             shown[ROLL] = nearest_turn(shown[ROLL], self.last_roll_rad);
             let shown = in_degrees(shown);
             let row = (0..6).map(|n| (column(n, "est"), shown[n])).chain(errors(estimate));
-            log_row(stream, &format!("{SHADOWS}/{name}"), row)?;
+            log_row(stream, &format!("shadows/{name}"), row)?;
         }
         let cells = StepRow::new(step, known_truth);
         let recorded = STEP_COLUMNS
@@ -95,7 +94,7 @@ impl Steps {
         let age_ms = step.tip_meas_age_s.map_or(f64::NAN, |age_s| age_s * 1e3);
         let age = [("tip_meas_age_ms".to_owned(), age_ms)];
         let row = recorded.chain(bounds).chain(innovation).chain(age).chain(errors(estimate));
-        log_row(stream, STEPS, row.chain(target_band(step)))
+        log_row(stream, "steps", row.chain(target_band(step)))
     }
 
     /// Removes the jumps of the roll at ±180°: shifts it by whole turns to the value nearest to the last roll
@@ -124,10 +123,6 @@ fn target_band(step: &StepRecord) -> Vec<(String, f64)> {
 /// `angle_rad` plus or minus whole turns, within half a turn of `reference_rad`.
 fn nearest_turn(angle_rad: f64, reference_rad: f64) -> f64 {
     reference_rad + wrap_angle(angle_rad - reference_rad)
-}
-
-fn coordinates_of(estimate: &Estimate) -> [f64; 6] {
-    coordinates(&estimate.x_pb)
 }
 
 /// Coordinates in mm and degrees.
