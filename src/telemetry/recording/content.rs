@@ -82,7 +82,7 @@ impl Content {
             now_time: Time::ZERO,
             motion: Motion::new(scene),
             samples: Samples::default(),
-            steps: Steps::new(scene),
+            steps: Steps::default(),
             space: Space::open(&stream, scene)?,
             stream,
         })

@@ -8,7 +8,6 @@ use crate::geometry::coordinates;
 use crate::observer::Estimate;
 use crate::plan::Path;
 use crate::session::{Decision, StepRecord};
-use crate::telemetry::Scene;
 use crate::units::wrap_angle;
 use rerun::RecordingStream;
 
@@ -30,18 +29,13 @@ fn column(n: usize, provenance: &str) -> String {
 const ELSEWHERE: [&str; 4] = ["step", "time_s", "insertion_mm", "rotation_rad"];
 
 /// Logs records of steps as rows.
+#[derive(Default)]
 pub(super) struct Steps {
-    /// Whether the steps have the truth.
-    has_truth: bool,
     /// The last roll that was shown, without jumps at ±180°.
     last_roll_rad: f64,
 }
 
 impl Steps {
-    pub(super) fn new(scene: &Scene) -> Self {
-        Steps { has_truth: scene.truth, last_roll_rad: 0.0 }
-    }
-
     pub(super) fn log(
         &mut self,
         stream: &RecordingStream,
@@ -49,7 +43,7 @@ impl Steps {
         known_truth: Option<&Truth>,
     ) -> Logged {
         let truth = known_truth.map_or(UNKNOWN, |t| coordinates(t.x_pb()));
-        let has_truth = self.has_truth;
+        let has_truth = known_truth.is_some();
         let errors = |estimate: [f64; 6]| {
             let error = in_degrees(error(estimate, truth));
             (0..6).filter(move |_| has_truth).map(move |n| (column(n, "error"), error[n]))
