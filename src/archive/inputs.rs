@@ -67,8 +67,9 @@ fn word_and_values(input: &Input) -> (&'static str, Vec<Value>) {
             }
             Event::Status { device, status } => {
                 let Status { code, subcode, error_name, message } = status;
-                let values = [json!(code), json!(subcode), json!(error_name), json!(message)];
-                ("status", [json!(device)].into_iter().chain(values).collect())
+                let values =
+                    [json!(device), json!(code), json!(subcode), json!(error_name), json!(message)];
+                ("status", values.into())
             }
         },
     }
@@ -92,7 +93,7 @@ pub struct Inputs {
     /// The time of the last input that was read.
     last_time: Time,
     /// Lines read so far.
-    line: usize,
+    pub line: usize,
     lines: Lines,
 }
 

@@ -46,7 +46,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<()> {
     let begun = Instant::now();
     let replayed =
         run_again(&recorded, what_if).map_err(|error| Failure::bad_input(&arguments.run, error))?;
-    let speed = replayed.duration_s() / begun.elapsed().as_secs_f64();
+    let speed = replayed.duration_s / begun.elapsed().as_secs_f64();
     if let Some(path) = &arguments.out {
         write_new(path, &replayed.steps_csv())?;
     }
@@ -69,7 +69,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<()> {
             "rows_beyond": cut.rows_beyond,
         })),
         "outcome": replayed.outcome,
-        "duration_s": replayed.duration_s(),
+        "duration_s": replayed.duration_s,
         "real_time_factor": speed,
         "what_if": null,
     });

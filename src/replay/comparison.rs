@@ -190,9 +190,9 @@ impl<'a> Comparison<'a> {
             self.note_difference(file::CAN, line, Some(&text), None);
         }
         if outcome != Some(&recorded) {
-            let words = |outcome: &Outcome| match outcome {
-                Outcome::Completed => "completed".to_owned(),
-                Outcome::Stopped(reason) => format!("stopped: {reason}"),
+            let words = |outcome: &Outcome| match outcome.stop_reason() {
+                None => "completed".to_owned(),
+                Some(reason) => format!("stopped: {reason}"),
             };
             let replayed = outcome.map_or("not ended".to_owned(), words);
             let recorded = words(&recorded);

@@ -11,8 +11,6 @@ use crate::units::Time;
 pub(super) struct RecordedInputs {
     started_unix_us: i64,
     inputs: Inputs,
-    /// Lines of `inputs.log` read so far.
-    line: usize,
     received: Entries<LoggedFrame>,
     samples: Entries<Sample>,
 }
@@ -35,7 +33,6 @@ impl RecordedInputs {
         Ok(RecordedInputs {
             started_unix_us: recorded.started_unix_us()?,
             inputs: recorded.inputs()?,
-            line: 1,
             received: recorded.frames(Direction::Received)?,
             samples: Entries::new(samples)?,
         })
@@ -49,7 +46,6 @@ impl RecordedInputs {
     /// The next input; `None` after the last.
     pub(super) fn next(&mut self) -> Result<Option<Next>, String> {
         let Some((time, recorded)) = self.inputs.next().transpose()? else { return Ok(None) };
-        self.line += 1;
         Ok(Some(match recorded {
             RecordedInput::Input(input) => Next::Input(time, input),
             RecordedInput::Frame => match self.received.take()? {
@@ -85,7 +81,7 @@ impl RecordedInputs {
 
     /// The error for files that do not belong together; `what` says how the last input does not fit.
     pub(super) fn mismatch(&self, what: &str) -> String {
-        format!("the files are not of one run: {} line {} {what}", file::INPUTS, self.line)
+        format!("the files are not of one run: {} line {} {what}", file::INPUTS, self.inputs.line)
     }
 
     /// The next received frame that `inputs.log` does not refer to.

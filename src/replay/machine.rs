@@ -58,8 +58,8 @@ pub struct Replayed {
     pub truncation: Option<Truncation>,
     /// How the session ended; `None` if a truncated record ends before it.
     pub outcome: Option<Outcome>,
-    /// The time line from its first input to its last.
-    pub span: (Time, Time),
+    /// Length of the session's own time line, s.
+    pub duration_s: f64,
     /// The replayed rows of `steps.csv`, with the recorded truth.
     pub steps: Vec<String>,
     /// The figures of the recorded observer.
@@ -74,11 +74,6 @@ impl Replayed {
         let header = steps_csv_header();
         let rows = [&header].into_iter().chain(&self.steps);
         rows.flat_map(|row| [row, "\n"]).collect()
-    }
-
-    /// Length of the session's own time line, s.
-    pub fn duration_s(&self) -> f64 {
-        self.span.1.seconds_after(self.span.0)
     }
 }
 
@@ -162,7 +157,7 @@ pub fn replay_to(
             logged.line
         ));
     }
-    replay.finish(recorded, (inputs.begun(), end))
+    replay.finish(recorded, inputs.begun(), end)
 }
 
 struct Replay<'a> {
@@ -225,7 +220,13 @@ impl Replay<'_> {
         Ok(truth)
     }
 
-    fn finish(mut self, recorded: &Recorded<'_>, span: (Time, Time)) -> Result<Replayed, String> {
+    /// Closes the replay of inputs from `begun` to `end`.
+    fn finish(
+        mut self,
+        recorded: &Recorded<'_>,
+        begun: Time,
+        end: Time,
+    ) -> Result<Replayed, String> {
         let outcome = self.session.outcome().cloned();
         let is_truncated = self.comparison.is_truncated();
         let Comparison { rows, samples, sent, .. } = &self.comparison;
@@ -234,7 +235,7 @@ impl Replay<'_> {
         let Comparison { difference, rows: mut beyond, columns, first_end, .. } = self.comparison;
         let mut truncation = None;
         if is_truncated {
-            let (file_end, file) = first_end.unwrap_or((span.1, file::INPUTS));
+            let (file_end, file) = first_end.unwrap_or((end, file::INPUTS));
             while beyond.take()?.is_some() {}
             let rows_beyond = beyond.taken - rows;
             let end = recorded.end(&columns)?;
@@ -249,7 +250,7 @@ impl Replay<'_> {
             samples,
             truncation,
             outcome,
-            span,
+            duration_s: end.seconds_after(begun),
             steps: self.steps,
             figures: self.figures.report(),
             what_if: self.has_what_if.then(|| self.what_if.report()),

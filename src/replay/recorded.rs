@@ -47,21 +47,18 @@ impl Recorded<'_> {
 
     /// The frames of `can.log` in this direction.
     pub(super) fn frames(&self, wanted: Direction) -> Result<Entries<LoggedFrame>, String> {
-        let frames = self.numbered(file::CAN)?.map(|numbered| {
-            let (line, text) = numbered?;
-            match CandumpLine::parse(&text) {
-                Some(CandumpLine { unix_us, direction, frame, .. }) => {
-                    Ok((direction, LoggedFrame { line, unix_us, frame, text }))
-                }
-                None => Err(format!(
-                    "{} line {line}: {text:?} is not a frame as candump -L -x writes it",
-                    file::CAN
-                )),
+        let parse = |(line, text): (usize, String)| match CandumpLine::parse(&text) {
+            Some(CandumpLine { unix_us, direction, frame, .. }) => {
+                Ok((direction, LoggedFrame { line, unix_us, frame, text }))
             }
-        });
-        Entries::new(frames.filter_map(move |logged| match logged {
-            Ok((direction, logged)) => (direction == wanted).then_some(Ok(logged)),
-            Err(error) => Some(Err(error)),
+            None => Err(format!(
+                "{} line {line}: {text:?} is not a frame as candump -L -x writes it",
+                file::CAN
+            )),
+        };
+        Entries::new(self.numbered(file::CAN)?.filter_map(move |numbered| {
+            let logged = numbered.and_then(parse);
+            logged.map(|(direction, frame)| (direction == wanted).then_some(frame)).transpose()
         }))
     }
 

@@ -6,9 +6,9 @@ use crate::archive::{DriveIdentity, Manifest};
 use crate::text::{escaped, screen};
 use minijinja::context;
 use serde::Serialize;
-use serde_json::{Map, Value, json};
+use serde_json::{Map, json};
 use std::collections::BTreeMap;
-use toml::Table;
+use toml::Value;
 
 /// The keys of a manifest that describe bench, rig and people, except for the drives.
 const SETTING: [&str; 9] = [
@@ -85,7 +85,7 @@ impl Comparison {
     }
 
     /// One JSON object, units in its keys.
-    pub fn to_json(&self) -> Value {
+    pub fn to_json(&self) -> serde_json::Value {
         let figure = |[a, b]: &[Figure; 2]| {
             let values = json!({ "a": a.value, "b": b.value, "b_minus_a": difference(a, b) });
             (a.key.clone(), values)
@@ -162,27 +162,25 @@ pub(super) type Differences = BTreeMap<String, Difference>;
 /// Invalid TOML, with its line.
 pub fn keys(toml: &str) -> Result<Keys, toml::de::Error> {
     let mut keys = Keys::new();
-    flatten("", &toml.parse::<Table>()?, &mut keys);
+    flatten(String::new(), &Value::Table(toml.parse()?), &mut keys);
     Ok(keys)
 }
 
-/// Adds the keys of the `table` at `path` to `keys`.
-fn flatten(path: &str, table: &Table, keys: &mut Keys) {
-    for (name, value) in table {
-        let key = if path.is_empty() { name.clone() } else { format!("{path}.{name}") };
-        match value {
-            toml::Value::Table(table) => flatten(&key, table, keys),
-            toml::Value::Array(values) if values.iter().any(toml::Value::is_table) => {
-                for (n, value) in values.iter().enumerate() {
-                    let element = format!("{key}[{n}]");
-                    match value {
-                        toml::Value::Table(table) => flatten(&element, table, keys),
-                        other => drop(keys.insert(element, other.to_string())),
-                    }
-                }
+/// Adds the `value` at `path` to `keys`: a table key by key, an array with tables element by element.
+fn flatten(path: String, value: &Value, keys: &mut Keys) {
+    match value {
+        Value::Table(table) => {
+            for (name, value) in table {
+                let key = if path.is_empty() { name.clone() } else { format!("{path}.{name}") };
+                flatten(key, value, keys);
             }
-            other => drop(keys.insert(key, other.to_string())),
         }
+        Value::Array(values) if values.iter().any(Value::is_table) => {
+            for (n, value) in values.iter().enumerate() {
+                flatten(format!("{path}[{n}]"), value, keys);
+            }
+        }
+        other => drop(keys.insert(path, other.to_string())),
     }
 }
 
