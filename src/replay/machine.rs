@@ -186,19 +186,18 @@ impl Replay<'_> {
     }
 
     fn record(&mut self, record: Record) -> Result<(), String> {
-        let truth = match &record {
+        let mut truth = None;
+        match &record {
             Record::Sample(sample) | Record::Target(sample) => {
                 self.comparison.check_sample(sample)?;
-                None
             }
             Record::Stage(stage) => {
                 self.figures.take_feedback(stage);
                 self.what_if.take_feedback(stage);
-                None
             }
-            Record::Step(step) => self.step(step.as_ref().clone())?,
-            _ => None,
-        };
+            Record::Step(step) => truth = self.step(step.as_ref().clone())?,
+            _ => {}
+        }
         match self.comparison.difference {
             None => (self.take)(record, truth),
             Some(_) => Ok(()),

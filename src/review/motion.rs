@@ -36,12 +36,10 @@ impl Motion {
         let stage = config.and_then(|config| config.stage.to_stage(&config.can).ok());
         let started_us = unix_us_of(&folder.manifest.started_utc);
         let Some((stage, started_us)) = stage.zip(started_us) else { return Motion::default() };
-        Motion {
-            commanded: PerAxis::from_fn(|axis| {
-                course(frames, started_us, &stage, axis, cob::rpdo1)
-            }),
-            measured: PerAxis::from_fn(|axis| course(frames, started_us, &stage, axis, cob::tpdo1)),
-        }
+        let courses = |cob_id: fn(NodeId) -> u16| {
+            PerAxis::from_fn(|axis| course(frames, started_us, &stage, axis, cob_id))
+        };
+        Motion { commanded: courses(cob::rpdo1), measured: courses(cob::tpdo1) }
     }
 }
 
