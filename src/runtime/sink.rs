@@ -55,7 +55,6 @@ pub struct Sink<'a> {
     recorder: Recorder,
     figures: RunFigures,
     holds: Holds,
-    drives: Vec<DriveIdentity>,
     stops_on_failure: bool,
     /// How long it took to hand each record to the recorder, ns.
     record_times: DurationHistogram,
@@ -103,7 +102,6 @@ impl<'a> Sink<'a> {
             recorder,
             figures: RunFigures::default(),
             holds: Holds::default(),
-            drives: Vec::new(),
             stops_on_failure,
             record_times: DurationHistogram::default(),
             operator,
@@ -112,7 +110,7 @@ impl<'a> Sink<'a> {
     }
 
     fn identify(&mut self, axis: Axis, node: NodeId, identity: &Identity) {
-        self.drives.push(DriveIdentity {
+        self.recorder.identify_drive(DriveIdentity {
             axis: axis.to_string(),
             node: node.get(),
             vendor_id: identity.vendor,
@@ -120,7 +118,6 @@ impl<'a> Sink<'a> {
             revision: identity.revision,
             serial: identity.serial,
         });
-        self.recorder.identify_drives(self.drives.clone());
     }
 
     /// Reports the recorder's news, and records them as far as possible. Returns the reason to stop the run if

@@ -116,9 +116,9 @@ impl Recorder {
         Some(news)
     }
 
-    /// Puts the drives found on the bus into the manifest, without waiting for it to be written.
-    pub fn identify_drives(&mut self, drives: Vec<DriveIdentity>) {
-        self.manifest.drives = drives;
+    /// Puts a drive found on the bus into the manifest, without waiting for it to be written.
+    pub fn identify_drive(&mut self, drive: DriveIdentity) {
+        self.manifest.drives.push(drive);
         self.keeper.give(Box::new(self.manifest.clone()));
     }
 
