@@ -50,7 +50,7 @@ fn tip(run: &Run, name: &str, title: &'static str, y: &'static str) -> Chart {
     let of = |provenance| coordinate(run, name, provenance);
     let (estimate, jump) = (of("est"), jump(name));
     let layers = vec![
-        area("estimate ± 2 σ", ESTIMATE, band(&depth, &estimate, &of("sd"), jump)),
+        band("estimate ± 2 σ", &depth, &estimate, &of("sd"), jump),
         dots("measured", MEASURED, points(&depth, &of("meas"))),
         Layer::new("estimate", ESTIMATE, Shape::Broad, pieces(&depth, &estimate, jump)),
         Layer::new("truth", TRUTH, Shape::Line, pieces(&depth, &of("true"), jump)),
@@ -82,7 +82,7 @@ fn target_error(run: &Run, limits: &Limits) -> Chart {
     let sd: Column =
         sd.map(|((mm, rad), left_mm)| Some(math::hypot((*mm)?, (*rad)? * (*left_mm)?))).collect();
     let mut layers = vec![
-        area("prediction ± 2 σ", ESTIMATE, band(&depth, &error, &sd, f64::INFINITY)),
+        band("prediction ± 2 σ", &depth, &error, &sd, f64::INFINITY),
         line("prediction", ESTIMATE, points(&depth, &error)),
     ];
     layers.extend(limits.get("target_error_mm").map(|mm| Layer::level("goal.tolerance_mm", *mm)));
@@ -232,12 +232,8 @@ fn dots(name: &'static str, colour: &'static str, points: Points) -> Layer {
     Layer::new(name, colour, Shape::Points, vec![points])
 }
 
-fn area(name: &'static str, colour: &'static str, pieces: Vec<Points>) -> Layer {
-    Layer::new(name, colour, Shape::Area, pieces)
-}
-
-/// Outlines of the band of ± 2 standard deviations around the estimate, in the same pieces as its line.
-fn band(depth: &Column, est: &Column, sd: &Column, jump: f64) -> Vec<Points> {
+/// The band of ± 2 standard deviations around the estimate, in the same pieces as its line.
+fn band(name: &'static str, depth: &Column, est: &Column, sd: &Column, jump: f64) -> Layer {
     let known = depth.iter().zip(est).zip(sd);
     let known = known.filter_map(|((x, y), sd)| Some(((*x)?, (*y)?, *sd)));
     let known: Vec<(f64, f64, Option<f64>)> = known.collect();
@@ -248,7 +244,8 @@ fn band(depth: &Column, est: &Column, sd: &Column, jump: f64) -> Vec<Points> {
         };
         edge(-1.0).into_iter().chain(edge(1.0).into_iter().rev()).collect()
     };
-    known.chunk_by(|(_, a, _), (_, b, _)| (b - a).abs() <= jump).map(outline).collect()
+    let pieces = known.chunk_by(|(_, a, _), (_, b, _)| (b - a).abs() <= jump).map(outline);
+    Layer::new(name, ESTIMATE, Shape::Area, pieces.collect())
 }
 
 fn depth(run: &Run) -> Column {
