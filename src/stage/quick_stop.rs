@@ -123,12 +123,13 @@ impl AxisStop {
                     }
                 },
             };
-            self.wait_to_read_again(trouble).await?;
             let is_stopped = self.sdo.nmt_state() == Some(NmtState::Stopped);
             if is_stopped || command.is_some() && !obeys {
-                // Another master may have started the node again. In Stopped a node answers no SDO.
+                // Another master may have started the node again. In Stopped a node answers no SDO, so this must
+                // leave before the next request does.
                 self.sdo.leave_operational();
             }
+            self.wait_to_read_again(trouble).await?;
         }
     }
 

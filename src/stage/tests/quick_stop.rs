@@ -155,6 +155,21 @@ fn a_drive_that_stops_by_itself_in_nmt_stopped_is_seen_to_stand() {
     assert_eq!((result, seen.controlwords), (Ok(7), vec![]));
 }
 
+/// The command that leads the node out of Stopped leaves before the request that the node could not answer there.
+#[test]
+fn a_node_is_led_out_of_nmt_stopped_before_it_is_read() {
+    let mut quick_stop = QuickStop::watch(&config(), BEGUN, BEGUN + Duration::from_secs(2));
+    let (mut sent, mut now) = (Vec::new(), BEGUN);
+    quick_stop.handle_frame(now, &heartbeat_frame(node(1), NmtState::Stopped));
+    while !sent.contains(&"000#8001".to_owned()) {
+        now = quick_stop.deadline();
+        quick_stop.handle_timeout(now);
+        sent = std::iter::from_fn(|| quick_stop.poll_transmit()).map(|f| f.to_string()).collect();
+    }
+    let is_request = |frame: &String| frame.starts_with("601#40");
+    assert!(!sent.iter().any(is_request), "not before the node can answer: {sent:?}");
+}
+
 #[test]
 fn a_drive_that_ignores_quick_stop_gets_it_again_and_is_an_error() {
     let stop = stop_of_a_drive_that_obeys_late;
