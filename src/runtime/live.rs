@@ -44,7 +44,7 @@ struct Live<'a, W> {
     stale_before: Option<Time>,
     /// The time of the last input.
     last: Time,
-    /// The first deadline met since everything was sent.
+    /// When the SYNC was due, if a deadline was met since everything was sent.
     met: Option<Time>,
 }
 
@@ -97,7 +97,7 @@ impl<'a, W: Witness> Live<'a, W> {
         let deadline = self.session.deadline();
         if now >= deadline {
             self.timing.deadline_lateness.add_us(now.since(deadline));
-            self.met.get_or_insert(deadline);
+            self.met.get_or_insert(self.session.sync_due());
         }
         self.session.handle(now, input);
         self.last = now;

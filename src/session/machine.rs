@@ -125,6 +125,11 @@ pub trait Machine {
     /// When to call [`handle`](Self::handle) with [`Input::Tick`] if no input comes first.
     fn deadline(&self) -> Time;
 
+    /// When the next SYNC is due.
+    fn sync_due(&self) -> Time {
+        self.deadline()
+    }
+
     /// How the run ended; `None` until it has.
     fn outcome(&self) -> Option<&Outcome>;
 
@@ -292,6 +297,10 @@ impl Machine for Session {
             true => deadline.min(self.task.deadline(&self.shell)),
             false => deadline,
         }
+    }
+
+    fn sync_due(&self) -> Time {
+        self.shell.stage.sync_due()
     }
 
     fn outcome(&self) -> Option<&Outcome> {

@@ -204,9 +204,7 @@ impl Stage {
         if let Phase::Listening { until } = self.phase {
             deadline = deadline.min(until);
         }
-        if self.sync_runs() {
-            deadline = deadline.min(self.sync.deadline);
-        }
+        deadline = deadline.min(self.sync_due());
         for axis in Axis::BOTH {
             deadline = deadline.min(self.monitors[axis].deadline());
             if let Some(bring_up) = &self.bring_ups[axis] {
@@ -214,6 +212,11 @@ impl Stage {
             }
         }
         deadline
+    }
+
+    /// When the next SYNC is due.
+    pub fn sync_due(&self) -> Time {
+        if self.sync_runs() { self.sync.deadline } else { Time::NEVER }
     }
 
     /// Makes `set_point` the target of both axes at the next SYNC; a later call before that SYNC

@@ -78,6 +78,48 @@ impl Machine for Stalled {
     }
 }
 
+/// A machine whose SYNC was due 5 s before the start, and whose heartbeat was due another 5 s before that.
+struct Overdue(Option<Output>);
+
+impl Machine for Overdue {
+    fn handle(&mut self, time: Time, _: Input) {
+        self.0 = Some(Output::Transmit { time, frame: Frame::new(cob::SYNC, &[]) });
+    }
+    fn poll(&mut self) -> Option<Output> {
+        self.0.take()
+    }
+    fn deadline(&self) -> Time {
+        Time::from_nanos(-10_000_000_000)
+    }
+    fn sync_due(&self) -> Time {
+        Time::from_nanos(-5_000_000_000)
+    }
+    fn outcome(&self) -> Option<&Outcome> {
+        None
+    }
+    fn progress(&self) -> Progress {
+        Progress::default()
+    }
+    fn stage_counters(&self) -> Counters {
+        Counters::default()
+    }
+    fn stall_max(&self) -> Option<Duration> {
+        None
+    }
+}
+
+#[test]
+fn the_lateness_of_a_sync_counts_from_when_the_sync_was_due() {
+    let (clock, mut machine) = (Clock::start(), Overdue(None));
+    let mut bus = StampedBus { frame: None, stamp: SystemTime::now() };
+    let mut run = Live::new(&mut machine, &mut bus, None, clock, |_, _| {});
+    run.give(Input::Tick);
+    carry_out(&mut run);
+    let timing = run.timing.report(Counters::default());
+    assert!((5_000_000..9_000_000).contains(&timing.sync_late_us_max), "{timing:?}");
+    assert!(timing.deadline_late_us_max >= 10_000_000, "{timing:?}");
+}
+
 /// A bus with at most one frame on it, which the kernel received at `stamp`.
 struct StampedBus {
     frame: Option<Frame>,
