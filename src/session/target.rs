@@ -189,7 +189,8 @@ impl TargetTracking {
                 "the target is not found yet: too few positions agree".to_owned()
             }
             _ if !self.track.is_established() => {
-                format!("the target is lost, {} refused in a row", self.track.refused_in_a_row())
+                let (refused, limit) = (self.track.refused_in_a_row(), self.track.lost_after());
+                format!("the target is lost, {refused} refused in a row (limit {limit})")
             }
             Some(age_s) if age_s > limit_s => {
                 format!("the target was last seen {age_s:.2} s ago (limit {limit_s:.2})")

@@ -233,6 +233,11 @@ impl Track {
         self.refused_in_a_row
     }
 
+    /// The number of them that loses the track.
+    pub fn lost_after(&self) -> u32 {
+        self.settings.lost_after
+    }
+
     /// The last position believed.
     pub fn last_believed(&self) -> Option<&Fix> {
         self.last_believed.as_ref()
