@@ -62,8 +62,8 @@ pub struct Consistency {
     pub lo95: f64,
     /// Upper bound.
     pub hi95: f64,
-    /// The verdict.
-    pub verdict: Verdict,
+    /// The verdict; `None` for a single trial, which says too little.
+    pub verdict: Option<Verdict>,
 }
 
 impl Consistency {
@@ -73,7 +73,7 @@ impl Consistency {
         let freedom = FREEDOM * values.len() as f64;
         let part = 2.0 / (9.0 * freedom);
         let bound = |deviations: f64| FREEDOM * (1.0 - part + deviations * part.sqrt()).powi(3);
-        Some(Self::judge(mean(values.iter().copied())?, bound(-WITHIN_95), bound(WITHIN_95)))
+        Self::judge(values, bound(-WITHIN_95), bound(WITHIN_95))
     }
 
     /// The normalised innovation squared, averaged over the last third of each trial: 3 for a
@@ -92,10 +92,11 @@ impl Consistency {
             [_] => f64::INFINITY,
             _ => student_95(values.len() - 1) * spread / (values.len() as f64 - 1.0).sqrt(),
         };
-        Some(Self::judge(mean, freedom - within, freedom + within))
+        Self::judge(values, freedom - within, freedom + within)
     }
 
-    fn judge(mean: f64, lo95: f64, hi95: f64) -> Self {
+    fn judge(values: &[f64], lo95: f64, hi95: f64) -> Option<Self> {
+        let mean = mean(values.iter().copied())?;
         let verdict = if (lo95..=hi95).contains(&mean) {
             Verdict::Consistent
         } else if mean < lo95 {
@@ -103,7 +104,8 @@ impl Consistency {
         } else {
             Verdict::OverConfident
         };
-        Consistency { mean, lo95, hi95, verdict }
+        let verdict = (values.len() > 1).then_some(verdict);
+        Some(Consistency { mean, lo95, hi95, verdict })
     }
 }
 
@@ -144,12 +146,13 @@ mod tests {
     use crate::observer::{Belief, Shaft};
     use nalgebra::{Matrix6, Vector6};
 
-    /// One trial has no spread.
     #[test]
     fn one_trial_is_never_judged() {
-        let verdict = |values: &[f64]| Consistency::of_innovations(values).map(|c| c.verdict);
-        assert_eq!(verdict(&[9.0]), Some(Verdict::Consistent));
-        assert_eq!(verdict(&[9.0, 9.1]), Some(Verdict::OverConfident));
+        for of in [Consistency::of_innovations, Consistency::of_independent] {
+            let verdict = |values: &[f64]| of(values).expect("a mean").verdict;
+            assert_eq!(verdict(&[60.0]), None);
+            assert_eq!(verdict(&[60.0, 60.1]), Some(Verdict::OverConfident));
+        }
     }
 
     /// 95 % of consistent observers are found to be consistent, also with few trials.
@@ -160,7 +163,7 @@ mod tests {
                 let draw = |trial| 3.0 + WhiteNoise::Gaussian(1.0).draw(study, trial).x;
                 let values: Vec<f64> = (0..trials).map(draw).collect();
                 let judged = Consistency::of_innovations(&values).unwrap();
-                judged.verdict == Verdict::Consistent
+                judged.verdict == Some(Verdict::Consistent)
             };
             let found = (0..2000).filter(|&study| is_consistent(study)).count();
             assert!((1870..1930).contains(&found), "{trials} trials: {found} of 2000");
@@ -170,7 +173,7 @@ mod tests {
     #[test]
     fn an_error_that_is_not_finite_counts_as_over_confident() {
         let nees = Consistency::of_independent(&[6.0, f64::NAN]).unwrap();
-        assert_eq!(nees.verdict, Verdict::OverConfident);
+        assert_eq!(nees.verdict, Some(Verdict::OverConfident));
     }
 
     /// Errors `scale` times as large as their covariance says.
@@ -198,7 +201,11 @@ mod tests {
             (0.9, Verdict::UnderConfident),
         ] {
             let nees = verdicts(scale);
-            assert_eq!((nees.end.verdict, nees.last_third.verdict), (verdict, verdict), "{nees:?}");
+            assert_eq!(
+                [nees.end, nees.last_third].map(|c| c.verdict),
+                [Some(verdict); 2],
+                "{nees:?}"
+            );
         }
     }
 

@@ -56,6 +56,15 @@ fn study_json_has_its_documented_keys() {
 }
 
 #[test]
+fn a_single_trial_gets_no_verdict() {
+    let scratch = Scratch::new();
+    let said = needle_bench(&scratch, &["study", "--trials", "1", "--set", DEPTH]);
+    let line = |name: &str| said.stdout.lines().find(|line| line.starts_with(name));
+    assert!(line("NEES  ").is_some_and(|line| line.ends_with(" at the end")), "{}", said.stdout);
+    assert!(line("NIS  ").is_some_and(|line| line.ends_with(" third")), "{}", said.stdout);
+}
+
+#[test]
 fn the_command_that_a_study_prints_repeats_a_failed_trial() {
     let scratch = Scratch::new();
     scratch.write("my rig.toml", "insertion.depth_mm = 60\n");
