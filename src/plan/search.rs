@@ -425,7 +425,13 @@ impl Search<'_, '_> {
         let world = &self.field.world;
         let out_mm = -world.workspace.depth_mm(target_mm);
         if out_mm > *tolerance_mm {
-            return (format!("the target is {out_mm:.1} mm outside goal.workspace_mm"), false);
+            let behind_mm = (start.position_mm - target_mm).dot(&start.heading);
+            let behind = match behind_mm > *tolerance_mm {
+                true => format!(", {behind_mm:.1} mm behind the start"),
+                false => String::new(),
+            };
+            let reason = format!("the target is {out_mm:.1} mm outside goal.workspace_mm{behind}");
+            return (reason, false);
         }
         let distance_mm = world.distance_mm(target_mm);
         if distance_mm < clearance_mm - tolerance_mm {

@@ -144,7 +144,7 @@ fn an_unreachable_target_is_refused_before_power() {
     for (set, reason) in [
         ("goal.position_mm=[0.0, 60.0, 60.0]", "the target is out of reach"),
         ("goal.position_mm=[0.0, 40.0, 10.0]", "mm from the target"),
-        ("goal.position_mm=[0.0, 0.0, -20.0]", "outside goal.workspace_mm"),
+        ("goal.position_mm=[0.0, 0.0, -20.0]", "20.0 mm behind the start"),
         ("goal.position_mm=[0.0, 1.0, 45.0]", "inside an obstacle"),
         ("goal.position_mm=[0.0, 1.0, 48.5]", "from an obstacle"),
         ("goal.position_mm=[0.0, 90.0, 90.0]", "outside goal.workspace_mm"),

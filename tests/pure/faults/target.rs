@@ -46,6 +46,7 @@ fn changed(what: impl Fn(&mut Sample) + Clone + 'static) -> Stop {
 fn is_lost(stop: &Stop, why: &str) {
     let reason = stop.bench.reason();
     assert!(reason.starts_with("tracker: the target is lost, "), "{reason}");
+    assert!(reason.contains(" refused in a row (limit 5)"), "{reason}");
     assert!(reason.contains("; held and stopped; "), "{reason}");
     assert!(reason.contains(why), "{reason}");
     assert!(stop.detected_after() <= Duration::from_millis(300), "{:?}", stop.detected_after());
@@ -120,7 +121,7 @@ fn a_target_that_is_seen_where_no_path_leads() {
     let frame = ["no target within 5.0 s", "(limit 10.0, goal.tool_range_mm); another frame"];
     never_begins(&[], |sample| sample.position_mm.swap_rows(0, 2), frame);
     let far = ["goal.tool_range_mm=100"];
-    let behind = ["no path to the target", "outside goal.workspace_mm"];
+    let behind = ["no path to the target", "mm behind the start"];
     never_begins(&far, |sample| sample.position_mm.z -= 70.0, behind);
     let beside = ["no path to the target", "the target is out of reach"];
     never_begins(&far, |sample| sample.position_mm.y += 50.0, beside);
