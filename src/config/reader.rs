@@ -277,6 +277,7 @@ impl Reader {
                 Some((value, Some(allowed))) => {
                     format!("{value} has no keys below it; allowed as its value: {allowed}")
                 }
+                _ if key == "study.seed" => "give it to the study as an option: --seed".to_owned(),
                 _ => nearest_key(key, self.known.keys().map(String::as_str)),
             };
             let message = match entry.origin {

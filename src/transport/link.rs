@@ -265,7 +265,8 @@ fn read_to_end(
     while !outlet.events.is_abandoned() {
         let len = match input.read(&mut buffer) {
             Ok(0) => {
-                return format!("has ended{}", outlet.finish(clock(), reader));
+                let next = "start the program that feeds it again, then this command";
+                return format!("has ended{}; {next}", outlet.finish(clock(), reader));
             }
             Ok(len) => len,
             Err(error) if error.kind() == ErrorKind::Interrupted => continue,
@@ -375,7 +376,7 @@ mod tests {
                 "N 1",
                 "ndjson: line 2: expected ident (column 2)",
                 "ndjson: line 3: EOF while parsing an object (column 7)",
-                "tracker: standard input has ended",
+                "tracker: standard input has ended; start the program that feeds it again, then this command",
             ]
         );
     }

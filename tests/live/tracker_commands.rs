@@ -236,7 +236,11 @@ fn commands_without_a_tracker_or_its_tool_fail_with_the_reason() {
     }
     let emulated =
         ["tracker", "list", "--set", "tracker.source=emulated", "--set", "can.interface=memory"];
-    fails(needle_bench(&scratch, &emulated), 2, "is \"emulated\", which is part of a run");
+    fails(
+        needle_bench(&scratch, &emulated),
+        2,
+        "is \"emulated\": that tracker exists in a run alone",
+    );
     let closed = free_address().port();
     let gone = ["--seconds", "1", "--set", "tracker.timeout_s=1"];
     for command in [&["list"][..], &["watch"], &["record", "a.csv"]] {

@@ -150,7 +150,8 @@ pub(super) fn listen(configured: &Configured, every_tool: bool) -> Result<Listen
     let config = configured.load(Some(ANY_STAGE))?;
     if config.tip_source() == TrackerSource::Emulated {
         return Err(Failure::configuration(format!(
-            "tracker.source is \"emulated\", which is part of a run; {NO_TRACKER}"
+            "tracker.source is \"emulated\": that tracker exists in a run alone, see `needle-bench run`; to \
+             listen to another, {NO_TRACKER}"
         )));
     }
     Listener::open(config, every_tool)

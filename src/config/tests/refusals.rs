@@ -18,6 +18,10 @@ fn an_unknown_key_is_refused_with_the_nearest_known_one() {
         "bench.toml:1: unknown key \"depth_mm\"; did you mean \"insertion.depth_mm\"?"
     );
     assert_eq!(
+        set_refusal(&["study.seed=3"]),
+        "--set study.seed: unknown key; give it to the study as an option: --seed"
+    );
+    assert_eq!(
         refusal("[insertoin]\ndepth_mm = 100\nstep_mm = 1"),
         "bench.toml:1: unknown key \"insertoin\"; did you mean \"insertion\"?"
     );
