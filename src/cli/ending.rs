@@ -94,7 +94,7 @@ pub(super) fn after_insertion(
     }
     let depth_mm = depth_mm(config, report);
     let next = match (required(config, &report.stage_at_end), possible_withdrawal(config, report)) {
-        (Some(operation), _) => next_stage(operation, path, report),
+        (Some(required), _) => next_stage(required.operation(), path, report),
         (None, Err(_)) if depth_mm.is_none() => next_stage("status", path, report),
         (None, Err(_)) => next_review(report),
         (None, Ok(withdrawal)) => next_stage("withdraw", path, report) + &withdrawal.options(),
@@ -145,8 +145,9 @@ pub(super) fn after_operation(
         None => "not known where the axes stand".to_owned(),
     };
     let next = match (required, remaining) {
+        (Some(required), _) => next_stage(required.operation(), path, report),
         (None, Some(remaining)) => next_stage("withdraw", path, report) + remaining,
-        _ => next_stage(required.unwrap_or("status"), path, report),
+        (None, None) => next_stage("status", path, report),
     };
     Some(format!("stage       {positions}; {}\n{next}", drives(&report.stage_at_end)))
 }
@@ -162,14 +163,30 @@ fn next_stage(operation: &str, path: Option<&Path>, report: &RunReport) -> Strin
     format!("next        needle-bench stage {operation} {}", path.display())
 }
 
-/// The operation of the stage that is required before any other: `status` if the drives are not known to stand
-/// without power, `reset` if a drive is in Fault and a run would not reset it.
-fn required(config: &Config, stage: &StageAtEnd) -> Option<&'static str> {
+/// An operation of the stage that is required before any other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Required {
+    /// The drives are not known to stand without power.
+    Status,
+    /// A drive is in Fault, and a run would not reset it.
+    Reset,
+}
+
+impl Required {
+    fn operation(self) -> &'static str {
+        match self {
+            Required::Status => "status",
+            Required::Reset => "reset",
+        }
+    }
+}
+
+fn required(config: &Config, stage: &StageAtEnd) -> Option<Required> {
     if stage.unknown.is_some() {
-        return Some("status");
+        return Some(Required::Status);
     }
     let is_any_in_fault = Axis::BOTH.into_iter().any(|axis| is_in_fault(&stage.drives[axis]));
-    (is_any_in_fault && !config.stage.power.fault_reset_on_start).then_some("reset")
+    (is_any_in_fault && !config.stage.power.fault_reset_on_start).then_some(Required::Reset)
 }
 
 fn is_in_fault(drive: &DriveReport) -> bool {
@@ -264,13 +281,12 @@ pub(super) fn possible_withdrawal(
     if depth_mm <= config.insertion.arrival_mm {
         return Err(format!("the needle is {}", needle_at(config, Some(depth_mm))));
     }
-    let stage = &report.stage_at_end;
-    match required(config, stage) {
+    match required(config, &report.stage_at_end) {
         None => Ok(Withdrawal::from_depth(config, depth_mm)),
-        Some(_) if stage.unknown.is_some() => {
+        Some(Required::Reset) => Err("a drive is in fault: find why, then stage reset".to_owned()),
+        Some(Required::Status) => {
             Err("the drives are not known to stand; look at the stage".to_owned())
         }
-        Some(_) => Err("a drive is in fault: find why, then stage reset".to_owned()),
     }
 }
 

@@ -1,6 +1,7 @@
 //! Tests of the last lines of a run.
 
 use super::*;
+use crate::archive::Manifest;
 use crate::canopen::emcy::EmcyCode;
 use crate::cli::arguments::Configured;
 use crate::runtime::Holds;
