@@ -13,10 +13,15 @@ const ROLL_SPACING_RAD: f64 = TAU / ROLLS as f64;
 /// A roll with a larger standard deviation than this at the start needs several hypotheses.
 const ONE_ROLL_SD_RAD: f64 = 0.5 * ROLL_SPACING_RAD;
 
+/// True if one hypothesis is enough for a roll with this standard deviation.
+pub(super) fn is_one_roll(sd_rad: f64) -> bool {
+    sd_rad <= ONE_ROLL_SD_RAD
+}
+
 /// Rolls at the start: value, standard deviation, share. Rolls with a smaller share than
 /// `share_min` are left out.
 pub(super) fn rolls(start_rad: f64, sd_rad: f64, share_min: f64) -> Vec<(f64, f64, f64)> {
-    if sd_rad <= ONE_ROLL_SD_RAD {
+    if is_one_roll(sd_rad) {
         return vec![(start_rad, sd_rad, 1.0)];
     }
     let unknown = sd_rad > 0.25 * TAU;

@@ -8,9 +8,12 @@ use crate::needle::{Increment, Needle, TipPosition};
 use crate::observer::mixture::{self, ALIKE_SD};
 use crate::observer::{Belief, Estimate, Observer, Shaft, start};
 use nalgebra::{Matrix3, Matrix6, Matrix6x3, Vector3};
+use std::f64::consts::PI;
 
 /// Copies below this fraction of the largest weight are dropped.
 const WEIGHT_MIN: f64 = 1e-5;
+/// Weight of each challenger at its start, as a fraction of the weight of the last copy.
+const CHALLENGER_WEIGHT: f64 = 1e-4;
 /// x depends on the sine of the roll, so near ±90° it does not correct the roll.
 const ROLL_SEEN_RAD: f64 = 80.0 / 180.0 * std::f64::consts::PI;
 /// Indices into an error (displacement; turn) in the plane frame. These components change the reduced state:
@@ -34,6 +37,9 @@ const FIBRE: [usize; 3] = [1, 2, 3];
 ///
 /// Copies start at rolls around the circle. Their weights are the likelihoods of the innovations in all three
 /// coordinates, and fade in the same way. Unlikely copies are dropped, and those that agree are merged.
+/// The last copy left may have a wrong roll that x alone does not correct. So new copies around the circle challenge
+/// it, at the earliest `memory_mm` after the last start of copies. They displace a wrong copy, and a right one
+/// displaces them.
 ///
 /// The stated covariance is the one that the gains follow from. It counts old positions for less than they
 /// contribute, so it is larger than the error's: NEES is about 2.3 (`docs/steering.md`).
@@ -45,6 +51,8 @@ pub(super) struct CoupledBank {
     /// The tip's motion since the last correction, in its frame then, and its depth.
     motion: Pose,
     motion_mm: f64,
+    /// Insertion since copies were last started.
+    since_start_mm: f64,
     /// Normalised innovation squared (NIS) of the likeliest copy at the last correction.
     nis: Option<f64>,
 }
@@ -156,25 +164,49 @@ impl CoupledBank {
             bank: Vec::new(),
             motion: Pose::identity(),
             motion_mm: 0.0,
+            since_start_mm: 0.0,
             nis: None,
         }
     }
 
-    /// The copies with which the bank starts, at the first position.
-    fn initial_bank(&self, tip_meas: &TipPosition) -> Vec<RollHypothesis> {
-        let CoupledConfig { start, start_sd, position_sd_mm, .. } = self.config;
-        let rolls = start::rolls(start.roll, start_sd.roll, WEIGHT_MIN).into_iter();
-        rolls
-            .map(|(roll, roll_sd, share)| {
-                let angles = FixedAngles { roll, ..start };
-                let sd = FixedAngles { roll: roll_sd, ..start_sd };
-                RollHypothesis {
-                    x_pb: Pose { rotation: angles.to_rotation(), translation: tip_meas.mm() },
-                    covariance: start::covariance(&angles, &sd, position_sd_mm),
-                    log_weight: math::ln(share),
-                }
-            })
-            .collect()
+    /// Starts copies at a measured position, at the rolls that `start` and `start_sd` allow. `log_weight` is that of
+    /// the likeliest of them.
+    fn start_copies(
+        &mut self,
+        start: &FixedAngles,
+        start_sd: &FixedAngles,
+        tip_meas: &TipPosition,
+        log_weight: f64,
+    ) {
+        self.since_start_mm = 0.0;
+        let position_sd_mm = self.config.position_sd_mm;
+        for (roll, roll_sd, share) in start::rolls(start.roll, start_sd.roll, WEIGHT_MIN) {
+            let angles = FixedAngles { roll, ..*start };
+            let sd = FixedAngles { roll: roll_sd, ..*start_sd };
+            self.bank.push(RollHypothesis {
+                x_pb: Pose { rotation: angles.to_rotation(), translation: tip_meas.mm() },
+                covariance: start::covariance(&angles, &sd, position_sd_mm),
+                log_weight: log_weight + math::ln(share),
+            });
+        }
+    }
+
+    /// Starts the bank if it is empty. Challenges the last copy if none was started over the memory and the roll was
+    /// not known at the start. The challengers' heading is as uncertain as that of the start.
+    fn start_copies_if_due(&mut self, tip_meas: &TipPosition) {
+        let CoupledConfig { start, start_sd, memory_mm, .. } = self.config;
+        match self.bank[..] {
+            [] => self.start_copies(&start, &start_sd, tip_meas, 0.0),
+            [ref last]
+                if self.since_start_mm >= memory_mm && !start::is_one_roll(start_sd.roll) =>
+            {
+                let angles = FixedAngles::from_rotation(&last.x_pb.rotation);
+                let log_weight = last.log_weight + math::ln(CHALLENGER_WEIGHT);
+                let unknown = FixedAngles { roll: PI, ..start_sd };
+                self.start_copies(&angles, &unknown, tip_meas, log_weight);
+            }
+            _ => {}
+        }
     }
 
     fn forgetting(&self, depth_mm: f64) -> f64 {
@@ -212,10 +244,11 @@ impl Observer for CoupledBank {
 
     fn correct(&mut self, tip_meas: &TipPosition, independent: f64) {
         let variance_mm2 = self.config.position_sd_mm.powi(2) / independent;
-        let mut bank = self.bank_after(&[]);
+        self.bank = self.bank_after(&[]);
+        self.since_start_mm += self.motion_mm;
         (self.motion, self.motion_mm) = (Pose::identity(), 0.0);
         let mut likeliest = (f64::NEG_INFINITY, None);
-        bank.retain_mut(|copy| {
+        self.bank.retain_mut(|copy| {
             let square = copy.correct(tip_meas, variance_mm2);
             if copy.log_weight > likeliest.0 {
                 likeliest = (copy.log_weight, square);
@@ -224,11 +257,8 @@ impl Observer for CoupledBank {
         });
         self.nis = likeliest.1;
         // The bank starts at the first position, and starts again if no copy can explain a position.
-        if bank.is_empty() {
-            bank = self.initial_bank(tip_meas);
-        }
-        mixture::reduce(&mut bank, WEIGHT_MIN);
-        self.bank = bank;
+        self.start_copies_if_due(tip_meas);
+        mixture::reduce(&mut self.bank, WEIGHT_MIN);
     }
 
     fn position_mm(&self) -> Option<Vector3<f64>> {

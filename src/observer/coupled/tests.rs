@@ -74,6 +74,23 @@ fn finds_the_pose_from_every_roll() {
     }
 }
 
+/// After a half turn that the observer does not see, its copies have the wrong roll.
+#[test]
+fn a_wrong_last_copy_is_displaced_by_its_challengers() {
+    for roll in [0.0, PI / 3.0, PI / 2.0] {
+        let start = Pose {
+            rotation: FixedAngles { roll, ..FixedAngles::default() }.to_rotation(),
+            translation: Vector3::zeros(),
+        };
+        let mut observer = bank(PI);
+        let mut tip = follow(&mut observer, start, 100, 0.3, noise);
+        tip.rotation *= FixedAngles { roll: PI, ..FixedAngles::default() }.to_rotation();
+        let tip = follow(&mut observer, tip, 150, 0.3, noise);
+        let error = (observer.estimate().unwrap().x_pb.inverse() * tip).log();
+        assert!(error.v.norm() < 0.1 && error.w.norm() < 0.08, "roll {roll}: {error:?}");
+    }
+}
+
 /// The reduced state of one copy follows from x alone.
 #[test]
 fn y_and_z_do_not_correct_the_reduced_state() {
