@@ -178,6 +178,7 @@ impl Checks<'_> {
         }
     }
 
+    /// Stopping options that leave the axis moving, objects that are not optional, and the following-error timeout.
     fn drive(&self, reader: &mut Reader) {
         for (name, stopping, allowed) in STOPPING {
             let key = &*self.key(name);
