@@ -44,7 +44,7 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<()> {
         let (mut scores, mut files) = (Vec::new(), Vec::new());
         for Insertion { path, recording, .. } in &insertions {
             let scored = score_once(&observer, recording).and_then(|score| {
-                // Also the roll error of the same observer without the roll at the start, if it is told the roll.
+                // An observer that is told the roll at the start is scored again without it.
                 let roll_unknown = observer.with_roll_unknown();
                 let without_roll = roll_unknown.map(|other| score_once(&other, recording));
                 let roll_unknown_rms_deg = without_roll.transpose()?.and_then(|it| it.roll_rms_deg);

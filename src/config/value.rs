@@ -43,7 +43,7 @@ impl Entry {
     }
 }
 
-/// The entries of one or more sources, each source's in the order they were written: (dotted key, entry).
+/// Entries of one or more sources, as (dotted key, entry). Those of one source are in the order of its text.
 pub(super) type Entries = Vec<(String, Entry)>;
 
 /// Reads a TOML file.
