@@ -20,13 +20,13 @@ pub(super) fn all(config: &Config, tree: &Tree) -> Vec<String> {
 /// printed in full, as in a run folder, gives all sections and gets no warning.
 fn unused_sections(config: &Config, tree: &Tree) -> Vec<String> {
     let (law, observer) = (config.control.kind.to_string(), config.observer.kind.to_string());
-    let mut used: Vec<String> = config.observer.kinds().iter().map(ToString::to_string).collect();
     // The check of handedness always uses the section of the invariant observer.
-    used.extend([law.clone(), ObserverKind::Invariant.to_string()]);
+    let observers = config.observer.kinds().into_iter().chain([ObserverKind::Invariant]);
+    let observers: Vec<String> = observers.map(|kind| kind.to_string()).collect();
     let mut warnings = Vec::new();
-    for (table, chosen, kinds, or_shadow) in [
-        ("control", law, ControlKind::KIND, false),
-        ("observer", observer, ObserverKind::KIND, true),
+    for (table, chosen, kinds, used) in [
+        ("control", &law, ControlKind::KIND, std::slice::from_ref(&law)),
+        ("observer", &observer, ObserverKind::KIND, &observers),
     ] {
         let Kind::OneOf(kinds) = kinds else { continue };
         let mut in_table = tree.iter().filter(|(key, _)| is_inside(key, table));
@@ -43,7 +43,7 @@ fn unused_sections(config: &Config, tree: &Tree) -> Vec<String> {
             warnings.push(format!(
                 "{origin}{key} has no effect, since {table}.kind is \"{chosen}\": choose {table}.kind = \
                  \"{kind}\"{}",
-                if or_shadow { format!(", or add \"{kind}\" to observer.shadows") } else { String::new() },
+                if table == "observer" { format!(", or add \"{kind}\" to observer.shadows") } else { String::new() },
             ));
         }
     }

@@ -126,9 +126,7 @@ pub trait Machine {
     fn deadline(&self) -> Time;
 
     /// When the next SYNC is due.
-    fn sync_due(&self) -> Time {
-        self.deadline()
-    }
+    fn sync_due(&self) -> Time;
 
     /// How the run ended; `None` until it has.
     fn outcome(&self) -> Option<&Outcome>;

@@ -149,10 +149,10 @@ pub(super) fn listen(configured: &Configured, every_tool: bool) -> Result<Listen
     }
     let config = configured.load(Some(ANY_STAGE))?;
     if config.tip_source() == TrackerSource::Emulated {
-        return Err(Failure::configuration(format!(
-            "tracker.source is \"emulated\": that tracker exists in a run alone, see `needle-bench run`; to \
-             listen to another, {NO_TRACKER}"
-        )));
+        return Err(Failure::configuration(
+            "tracker.source is \"emulated\": that tracker exists in a run alone; set it to \"openigtlink\" and \
+             tracker.address to \"HOST:PORT\", or give --config my-rig.toml",
+        ));
     }
     Listener::open(config, every_tool)
 }

@@ -64,6 +64,9 @@ impl Machine for Stalled {
     fn deadline(&self) -> Time {
         Time::from_nanos(-1_000_000_000)
     }
+    fn sync_due(&self) -> Time {
+        self.deadline()
+    }
     fn outcome(&self) -> Option<&Outcome> {
         self.0.as_ref()
     }
@@ -244,6 +247,9 @@ impl Machine for Answering {
             true => Time::ZERO,
             false => Time::NEVER,
         }
+    }
+    fn sync_due(&self) -> Time {
+        self.deadline()
     }
     fn outcome(&self) -> Option<&Outcome> {
         self.outcome.as_ref()
