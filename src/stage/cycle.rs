@@ -1,6 +1,6 @@
 //! The SYNC cycle: sends set-points, takes positions, enables and stops the axes.
 
-use super::drive::Drive;
+use super::drive::{Drive, Reading};
 use super::machine::Phase;
 use super::supervision::refused_to_switch_on;
 use super::{Axis, Feedback, PerAxis, Progress, SetPoint, Stage, StageEvent};
@@ -15,8 +15,8 @@ use std::time::Duration;
 
 /// Interval at which a drive that does not obey is commanded again by SDO.
 const REPEAT_PERIOD: Duration = Duration::from_millis(100);
-/// An object of a drive that sends no TPDO is read by SDO once in this many SYNCs.
-const READ_SYNCS: u64 = 10;
+/// Least interval of the requests by SDO to a drive that sends no TPDO.
+const READ_PERIOD: Duration = Duration::from_millis(30);
 
 impl Stage {
     /// Checks the answers to the last SYNC, then sends the RPDOs that were not sent ahead, and the next SYNC.
@@ -44,7 +44,7 @@ impl Stage {
             Phase::Listening { .. } | Phase::BringUp | Phase::Stopped => return,
         }
         for axis in Axis::BOTH {
-            self.read_by_sdo(axis);
+            self.read_by_sdo(now, axis);
             if let Some(rpdo) = self.drives[axis].rpdo_due() {
                 self.send(rpdo);
             }
@@ -287,6 +287,7 @@ impl Stage {
         for axis in Axis::BOTH {
             self.drives[axis].next_counts = None;
             self.drives[axis].watch_standstill();
+            self.drives[axis].reading = Reading::begun(now);
         }
     }
 
@@ -313,18 +314,26 @@ impl Stage {
     }
 
     /// While the stage stops, reads the statusword and the position of a drive that sends no TPDO, such as
-    /// one that has left Operational: one object at a time, a few times a second.
-    fn read_by_sdo(&mut self, axis: Axis) {
+    /// one that has left Operational: in turn, each after the answer to the other.
+    fn read_by_sdo(&mut self, now: Time, axis: Axis) {
         let stops = matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. });
         if !stops || self.drives[axis].fresh {
             return;
         }
-        let object = match self.sync_count % READ_SYNCS {
-            3 => object::STATUSWORD,
-            7 => object::POSITION_ACTUAL,
-            _ => return,
+        let Reading { object, sent, is_answered } = self.drives[axis].reading;
+        let answer_time = if is_answered { Duration::ZERO } else { self.config.bus.sdo_timeout() };
+        let wait = answer_time.max(READ_PERIOD);
+        let waited = now.since(sent);
+        // If it can be avoided, not at once after a controlword: an SDO server takes one request at a time.
+        let is_commanded = self.repeat_due == now + REPEAT_PERIOD;
+        if waited < wait || is_commanded && waited < 2 * wait {
+            return;
+        }
+        let object = match object {
+            object::STATUSWORD => object::POSITION_ACTUAL,
+            _ => object::STATUSWORD,
         };
-        self.drives[axis].requested = Some(object);
+        self.drives[axis].reading = Reading { object, sent: now, is_answered: false };
         self.send_sdo(axis, SdoRequest::Upload(object));
     }
 
@@ -335,11 +344,12 @@ impl Stage {
         else {
             return;
         };
+        let drive = &mut self.drives[axis];
         // A reply without a request may be another node's.
-        if self.drives[axis].requested.take_if(|requested| *requested == object).is_none() {
+        if drive.reading.is_answered || drive.reading.object != object {
             return;
         }
-        let drive = &mut self.drives[axis];
+        drive.reading.is_answered = true;
         if object == object::STATUSWORD {
             if let Some(word) = value.at_least(2) {
                 drive.take_statusword(Statusword(word as u16));

@@ -6,9 +6,10 @@ use super::standstill::Standstill;
 use super::{
     Axis, AxisConfig, Commanded, DriveFlag, FoundFault, LimitCheck, StageConfig, Unwrapper,
 };
-use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
+use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword, object};
 use crate::canopen::emcy::{Emcy, EmcyCode};
 use crate::canopen::{Frame, ObjectAddress, cob};
+use crate::units::Time;
 
 /// Longest time from Fault Reset to the end of the fault.
 const RESET_TIMEOUT: Duration = Duration::from_millis(500);
@@ -77,7 +78,10 @@ pub(super) struct Drive {
     second_tpdo: Option<Frame>,
     /// SYNCs in a row with such a second TPDO1.
     conflicts: u32,
+    /// Bit 11 (internal limit active) was set in the last statusword.
     was_limited: bool,
+    /// How often bit 11 was set anew.
+    limited: u64,
     /// The bits that the statusword has shown since the drive was enabled; those of `BEFORE_POWER` count from
     /// the first statusword.
     shown: u16,
@@ -88,14 +92,28 @@ pub(super) struct Drive {
     /// SYNCs in a row without a new target, and how many of them may be due to lost answers.
     held_syncs: u32,
     held_syncs_max: u32,
-    /// The object that was requested by SDO while the drive stops.
-    pub(super) requested: Option<ObjectAddress>,
+    pub(super) reading: Reading,
     /// The fault that the drive was found in, if its bring-up was abandoned.
     pub(super) found_fault: Option<FoundFault>,
     /// The last emergency message, and how many times in a row it came.
     emcy: (Option<Emcy>, u64),
     pub(super) controlword: Controlword,
     standstill: Standstill,
+}
+
+/// The last request by SDO to a drive that stops.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Reading {
+    pub(super) object: ObjectAddress,
+    pub(super) sent: Time,
+    pub(super) is_answered: bool,
+}
+
+impl Reading {
+    /// The state at the beginning of a stop: the statusword is read next.
+    pub(super) fn begun(now: Time) -> Self {
+        Reading { object: object::POSITION_ACTUAL, sent: now, is_answered: true }
+    }
 }
 
 impl Drive {
@@ -123,12 +141,13 @@ impl Drive {
             second_tpdo: None,
             conflicts: 0,
             was_limited: false,
+            limited: 0,
             shown: 0,
             was_warning: false,
             warnings: 0,
             held_syncs: 0,
             held_syncs_max: config.bus.missed_feedback_max.max(1).into(),
-            requested: None,
+            reading: Reading::begun(Time::ZERO),
             found_fault: None,
             emcy: (None, 0),
             controlword: Controlword::DISABLE_VOLTAGE,
@@ -280,12 +299,17 @@ impl Drive {
         second.map(|frame| (self.conflicts, frame))
     }
 
-    /// To be called for each statusword while the drive must follow. True if this is the first of them to show
-    /// an active limit inside the drive. In homing that is normal: the axis may rest on a limit switch.
+    /// To be called for each statusword while the drive must follow. True if it shows anew that a limit inside the
+    /// drive is active, and this is the 1st, 2nd, 4th, 8th … time. In homing that is normal: the axis may rest on a
+    /// limit switch.
     pub(super) fn note_internal_limit(&mut self) -> bool {
         let is_limited = self.statusword.is_some_and(|word| word.has(Statusword::INTERNAL_LIMIT));
         let was_limited = std::mem::replace(&mut self.was_limited, is_limited);
-        is_limited && !was_limited && !self.homing_mode
+        if !is_limited || was_limited || self.homing_mode {
+            return false;
+        }
+        self.limited += 1;
+        self.limited.is_power_of_two()
     }
 
     /// The bits that an enabled drive must show.

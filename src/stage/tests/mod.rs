@@ -14,12 +14,13 @@ mod set_points;
 mod stopping;
 mod supervision;
 
+use std::collections::VecDeque;
 use std::time::Duration;
 
 use drive::TestDrive;
 
 use super::*;
-use crate::canopen::{Frame, NodeId};
+use crate::canopen::{Frame, NodeId, cob};
 use crate::units::Time;
 
 const COUNTS_PER_MM: i32 = 4646;
@@ -114,6 +115,9 @@ struct Bench {
     rotation: TestDrive,
     /// All frames that the stage has sent.
     sent: Vec<(Time, Frame)>,
+    /// SDO answers arrive so much later, and these still have to.
+    sdo_delay: Duration,
+    delayed: VecDeque<(Time, Frame)>,
     events: Vec<StageEvent>,
     /// Number of events that `run_until` has passed.
     seen: usize,
@@ -133,6 +137,8 @@ impl Bench {
             rotation: TestDrive::new(nodes.rotation, -20),
             stage,
             sent: Vec::new(),
+            sdo_delay: Duration::ZERO,
+            delayed: VecDeque::new(),
             events: Vec::new(),
             seen: 0,
         }
@@ -154,7 +160,15 @@ impl Bench {
                     self.sent.push((self.now, frame));
                     let mut answers = self.insertion.handle_frame(self.now, &frame);
                     answers.extend(self.rotation.handle_frame(self.now, &frame));
-                    answers.iter().for_each(|answer| self.stage.handle_frame(self.now, answer));
+                    for answer in answers {
+                        let is_sdo =
+                            [1, 2].iter().any(|&id| answer.cob_id() == Some(cob::sdo_tx(node(id))));
+                        if is_sdo && !self.sdo_delay.is_zero() {
+                            self.delayed.push_back((self.now + self.sdo_delay, answer));
+                        } else {
+                            self.stage.handle_frame(self.now, &answer);
+                        }
+                    }
                 }
             }
         }
@@ -167,9 +181,13 @@ impl Bench {
 
     fn step(&mut self) {
         self.settle();
+        let delayed = self.delayed.front().map_or(Time::NEVER, |(due, _)| *due);
         let deadlines =
-            [self.stage.deadline(), self.insertion.deadline(), self.rotation.deadline()];
-        self.now = self.now.max(deadlines.into_iter().min().expect("three"));
+            [self.stage.deadline(), self.insertion.deadline(), self.rotation.deadline(), delayed];
+        self.now = self.now.max(deadlines.into_iter().min().expect("four"));
+        while let Some((_, answer)) = self.delayed.pop_front_if(|(due, _)| *due <= self.now) {
+            self.stage.handle_frame(self.now, &answer);
+        }
         for heartbeat in
             [self.insertion.handle_timeout(self.now), self.rotation.handle_timeout(self.now)]
                 .concat()

@@ -78,6 +78,31 @@ fn a_drive_that_left_nmt_operational_loses_power_by_sdo() {
     assert_eq!(bench.rotation.state, DriveState::SwitchOnDisabled);
 }
 
+/// The drives obey, and answer SDO only after several SYNCs; or SYNC is so slow that few readings fit into the timeout.
+#[test]
+fn a_stop_by_sdo_is_confirmed_at_every_sync_period_and_delay_of_the_answers() {
+    for (sync_ms, delay_ms) in
+        [(10, 0), (10, 35), (10, 45), (10, 60), (10, 100), (1, 5), (1, 8), (5, 25), (100, 0)]
+    {
+        let mut config = config();
+        config.bus.sync_ms = sync_ms;
+        config.bus.heartbeat_timeout_ms = 300;
+        let mut bench = Bench::new(config);
+        bench.until_feedback();
+        bench.sdo_delay = Duration::from_millis(delay_ms);
+        bench.rotation.nmt = NmtState::PreOperational;
+        bench.until_fault();
+        let begun = bench.now;
+        let context = format!("SYNC every {sync_ms} ms, answers after {delay_ms} ms");
+        assert!(bench.until_stopped(), "{context}");
+        assert!(bench.now.since(begun) < Duration::from_secs(2), "{context}");
+        assert!(
+            bench.has_sent("602#2316100100000000"),
+            "{context}: its heartbeat consumer stays on"
+        );
+    }
+}
+
 #[test]
 fn a_drive_without_supply_does_not_delay_the_end_beyond_its_timeouts() {
     let mut bench = Bench::ready();
