@@ -48,6 +48,8 @@ pub(crate) struct Insertion {
     is_seen: bool,
     /// Since when the set-points have been at their end while the measured depth is still short of it.
     short_since: Option<Time>,
+    /// Since when the needle has been at their end without a break.
+    here_since: Option<Time>,
 }
 
 /// A step that is due, with the measurement that it uses.
@@ -75,6 +77,7 @@ impl Insertion {
             newest: None,
             is_seen: false,
             short_since: None,
+            here_since: None,
         }
     }
 
@@ -162,19 +165,23 @@ impl Insertion {
         insertion_meas_mm: f64,
     ) -> Result<(), String> {
         let goal_mm = self.profile.goal_mm();
-        let here_mm = match self.config.mode {
+        let (here_mm, settle) = match self.config.mode {
             // Step 0 waits for a measurement, not for the axis.
             InsertionMode::Continuous if self.next_step == 0 => return Ok(()),
-            InsertionMode::Continuous => DUE_TOLERANCE_MM,
-            InsertionMode::Stepwise => self.config.arrival_mm,
+            InsertionMode::Continuous => (DUE_TOLERANCE_MM, Duration::ZERO),
+            InsertionMode::Stepwise => (self.config.arrival_mm, self.config.settle),
         };
         let off_mm = (goal_mm - insertion_meas_mm).abs();
-        if self.profile.position_mm() < goal_mm || off_mm <= here_mm {
+        let is_here = off_mm <= here_mm;
+        self.here_since = is_here.then(|| self.here_since.unwrap_or(time));
+        // An axis that hunts about its target crosses it again and again, and does not arrive.
+        let has_settled = self.here_since.is_some_and(|since| time.since(since) >= settle);
+        if self.profile.position_mm() < goal_mm || has_settled {
             self.short_since = None;
             return Ok(());
         }
         let waited = time.since(*self.short_since.get_or_insert(time));
-        if waited < ARRIVAL_TIMEOUT {
+        if is_here || waited < ARRIVAL_TIMEOUT + settle {
             return Ok(());
         }
         Err(format!(
@@ -296,5 +303,36 @@ fn from_origin(origin: SetPoint, at: SetPoint) -> SetPoint {
     SetPoint {
         insertion_mm: at.insertion_mm - origin.insertion_mm,
         rotation_rad: at.rotation_rad - origin.rotation_rad,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+
+    /// Depths at every other SYNC: at the end of the step, and away from it.
+    #[test]
+    fn a_stepwise_needle_that_hunts_about_its_target_is_given_up() {
+        let sets = ["insertion.mode=\"stepwise\""].map(str::to_owned);
+        let config = Config::from_sources(&[], &sets).unwrap().session().unwrap().insertion;
+        let at = SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 };
+        let mut insertion = Insertion::new(config, at, at);
+        insertion.profile.go_to(1.0);
+        let period = Duration::from_millis(10);
+        while insertion.profile.position_mm() < 1.0 {
+            insertion.advance(period);
+        }
+        let given_up = |off_mm: f64, insertion: &mut Insertion| {
+            (0..600_u32).find(|&k| {
+                let time = Time::ZERO + period * k;
+                let depth_mm = 1.0 + off_mm * f64::from(k % 2);
+                insertion.check_arrival(time, depth_mm).is_err()
+            })
+        };
+        assert_eq!(given_up(0.04, &mut insertion.clone()), None);
+        let limit = ARRIVAL_TIMEOUT + insertion.config.settle;
+        let syncs = given_up(0.3, &mut insertion).expect("it hunts");
+        assert!((limit..limit + 2 * period).contains(&(period * syncs)), "after {syncs} SYNCs");
     }
 }

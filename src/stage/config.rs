@@ -406,11 +406,15 @@ impl StageConfig {
             ));
         }
         // The axis brakes first, and the answer to a SYNC counts only when the next is due.
-        let needed = self.standstill_window(axis) + 2 * self.bus.sync_period();
+        let braking_s =
+            config.quick_stop_deceleration.map_or(0.0, |by| config.limits.speed_max / by);
+        let needed = Duration::try_from_secs_f64(braking_s)
+            .unwrap_or(Duration::MAX)
+            .saturating_add(self.standstill_window(axis) + 2 * self.bus.sync_period());
         if needed >= self.power.stop_timeout {
             return Err(format!(
-                "{axis}: more than {:.0} ms are needed to see it stand, and stop_timeout_s is {:.3}: set \
-                 a longer one",
+                "{axis}: more than {:.0} ms are needed to brake from the highest speed and to see it stand, \
+                 and stop_timeout_s is {:.3}: set a longer one",
                 needed.as_secs_f64() * 1e3,
                 self.power.stop_timeout.as_secs_f64()
             ));
@@ -475,8 +479,13 @@ mod tests {
         );
         assert_eq!(
             text(|c| c.insertion.ratio = CountsRatio::new(20, 1).expect("not zero")),
-            "insertion: more than 2520 ms are needed to see it stand, and stop_timeout_s is 2.000: set a \
-             longer one"
+            "insertion: more than 2520 ms are needed to brake from the highest speed and to see it stand, and \
+             stop_timeout_s is 2.000: set a longer one"
+        );
+        // From 5 mm/s at 2 mm/s².
+        assert!(
+            text(|c| c.insertion.quick_stop_deceleration = Some(2.0))
+                .starts_with("insertion: more than 2570 ms are needed to brake")
         );
         assert!(text(|c| c.insertion.limits.speed_max = f64::NAN).starts_with("insertion: limits"));
     }

@@ -285,9 +285,11 @@ fn moves_keep_to_the_acceleration_of_their_axis() {
     let sets = [
         "stage.insertion.acceleration_max_mm_per_s2=40",
         "stage.insertion.jog_acceleration_mm_per_s2=35.5555",
+        "stage.insertion.quick_stop_deceleration_mm_per_s2=40",
         "stage.insertion.withdraw_speed_mm_per_s=5",
         "stage.rotation.acceleration_max_deg_per_s2=24000",
         "stage.rotation.jog_acceleration_deg_per_s2=21333",
+        "stage.rotation.quick_stop_deceleration_deg_per_s2=24000",
         "stage.rotation.jog_speed_deg_per_s=360",
         "emulator.insertion_start_mm=30",
     ];

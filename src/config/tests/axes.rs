@@ -95,6 +95,12 @@ fn accelerations_over_the_axis_limits_are_refused() {
         "bench.toml:1: tracker.hold_braking_mm_per_s2 is 40, allowed: up to \
          stage.insertion.acceleration_max_mm_per_s2, which is 39"
     );
+    assert_eq!(
+        refusal("insertion.acceleration_mm_per_s2 = 30"),
+        "bench.toml:1: insertion.acceleration_mm_per_s2 is 30, allowed: up to \
+         stage.insertion.quick_stop_deceleration_mm_per_s2, which is 21.5239: a stop would brake too late \
+         to keep a soft limit"
+    );
     let about = |max: f64| format!("stage.rotation.acceleration_max_deg_per_s2 = {max:?}\n");
     assert_eq!(
         refusal(&about(3600.0)),
@@ -102,7 +108,9 @@ fn accelerations_over_the_axis_limits_are_refused() {
          that is 24000 deg/s², over stage.rotation.acceleration_max_deg_per_s2 = 3600; turn or insert more \
          slowly"
     );
-    let jog = about(24_000.0) + "stage.rotation.jog_acceleration_deg_per_s2 = 22000\n";
+    let jog = about(24_000.0)
+        + "stage.rotation.jog_acceleration_deg_per_s2 = 22000\n\
+           stage.rotation.quick_stop_deceleration_deg_per_s2 = 22000\n";
     assert_eq!(
         refusal(&jog),
         "bench.toml:1: stage.rotation.jog_acceleration_deg_per_s2 is 22000, allowed: up to \

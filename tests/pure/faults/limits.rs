@@ -57,6 +57,7 @@ fn limits([mm_per_s2, deg_per_s2]: [f64; 2]) -> [String; 2] {
 fn a_run_at_its_acceleration_limits_completes() {
     for (sets, peaks, end_mm) in RUNS {
         let common = [
+            "stage.insertion.quick_stop_deceleration_mm_per_s2=80",
             "insertion.depth_mm=12",
             "tracker.resume=automatic",
             "tracker.hold_after_mm=3",
