@@ -6,30 +6,32 @@ use crate::units::wrap_angle;
 use nalgebra::Matrix6;
 use std::f64::consts::TAU;
 
-/// Number and spacing of the hypotheses for an unknown roll. Their standard deviation is half the
-/// spacing.
-const ROLLS: u32 = 8;
-const ROLL_SPACING_RAD: f64 = TAU / ROLLS as f64;
 /// A roll with a larger standard deviation than this at the start needs several hypotheses.
-const ONE_ROLL_SD_RAD: f64 = 0.5 * ROLL_SPACING_RAD;
+const ONE_ROLL_SD_RAD: f64 = TAU / 16.0;
 
 /// True if one hypothesis is enough for a roll with this standard deviation.
 pub(super) fn is_one_roll(sd_rad: f64) -> bool {
     sd_rad <= ONE_ROLL_SD_RAD
 }
 
-/// Rolls at the start: value, standard deviation, share. Rolls with a smaller share than
-/// `share_min` are left out.
-pub(super) fn rolls(start_rad: f64, sd_rad: f64, share_min: f64) -> Vec<(f64, f64, f64)> {
+/// Rolls at the start: value, standard deviation, share. If one is not enough, there are `count` around the circle,
+/// and their standard deviation is half their spacing. Rolls with a smaller share than `share_min` are left out.
+pub(super) fn rolls(
+    start_rad: f64,
+    sd_rad: f64,
+    count: u32,
+    share_min: f64,
+) -> Vec<(f64, f64, f64)> {
     if is_one_roll(sd_rad) {
         return vec![(start_rad, sd_rad, 1.0)];
     }
+    let spacing_rad = TAU / f64::from(count);
     let unknown = sd_rad > 0.25 * TAU;
-    (0..ROLLS)
-        .map(|k| wrap_angle(f64::from(k) * ROLL_SPACING_RAD))
+    (0..count)
+        .map(|k| wrap_angle(f64::from(k) * spacing_rad))
         .map(|off| {
             let share = if unknown { 1.0 } else { math::exp(-0.5 * (off / sd_rad).powi(2)) };
-            (start_rad + off, ONE_ROLL_SD_RAD, share)
+            (start_rad + off, 0.5 * spacing_rad, share)
         })
         .filter(|&(_, _, share)| share > share_min)
         .collect()

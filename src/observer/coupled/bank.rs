@@ -10,6 +10,9 @@ use crate::observer::{Belief, Estimate, Observer, Shaft, start};
 use nalgebra::{Matrix3, Matrix6, Matrix6x3, Vector3};
 use std::f64::consts::PI;
 
+/// Number of copies for an unknown roll. x alone corrects the roll of a copy, so they must start near enough to the
+/// true one: eight were too few (`docs/decisions/0029-coupled-from-anywhere.md`).
+const ROLLS: u32 = 16;
 /// Copies below this fraction of the largest weight are dropped.
 const WEIGHT_MIN: f64 = 1e-5;
 /// Weight of each challenger at its start, as a fraction of the weight of the last copy.
@@ -36,7 +39,7 @@ const FIBRE: [usize; 3] = [1, 2, 3];
 /// `exp(−Δℓ / memory_mm)`.
 ///
 /// Copies start at rolls around the circle. Their weights are the likelihoods of the innovations in all three
-/// coordinates, and fade in the same way. Unlikely copies are dropped, and those that agree are merged.
+/// coordinates, and fade half as fast. Unlikely copies are dropped, and those that agree are merged.
 /// The last copy left may have a wrong roll that x alone does not correct. So new copies around the circle challenge
 /// it, at the earliest `memory_mm` after the last start of copies. They displace a wrong copy, and a right one
 /// displaces them.
@@ -115,12 +118,13 @@ fn gain(p: &Matrix6<f64>, s: &Matrix3<f64>) -> Option<Matrix6x3<f64>> {
 
 impl RollHypothesis {
     /// Propagates the copy over a motion of the tip. Old knowledge fades: the covariance grows by the factor
-    /// `forgetting`, and the log weight shrinks by it.
+    /// `forgetting`, and the log weight shrinks by the root of it. A roll that was wrong stays wrong for longer than a
+    /// position helps the gains.
     fn propagate(&mut self, motion: &Pose, forgetting: f64) {
         self.x_pb = (self.x_pb * *motion).renormalized();
         let ad = motion.inverse().adjoint();
         self.covariance = ad * self.covariance * ad.transpose() * forgetting;
-        self.log_weight /= forgetting;
+        self.log_weight /= forgetting.sqrt();
     }
 
     /// Corrects with a measured position. Returns the normalised innovation squared (NIS), or `None`
@@ -180,7 +184,7 @@ impl CoupledBank {
     ) {
         self.since_start_mm = 0.0;
         let position_sd_mm = self.config.position_sd_mm;
-        for (roll, roll_sd, share) in start::rolls(start.roll, start_sd.roll, WEIGHT_MIN) {
+        for (roll, roll_sd, share) in start::rolls(start.roll, start_sd.roll, ROLLS, WEIGHT_MIN) {
             let angles = FixedAngles { roll, ..*start };
             let sd = FixedAngles { roll: roll_sd, ..*start_sd };
             self.bank.push(RollHypothesis {

@@ -8,6 +8,8 @@ use crate::math;
 use crate::needle::{Needle, TipPosition, Torsion, TorsionConfig};
 use crate::observer::start;
 
+/// Number of rolls that the bank starts with if the roll is unknown.
+const ROLLS: u32 = 8;
 /// Relative standard deviation of a configured torsion in one half of the bank…
 const TORSION_SD_TIGHT: f64 = 0.04;
 /// … and in the other half, which takes over if the first is wrong.
@@ -114,7 +116,7 @@ impl InvariantConfig {
         tip_meas: &TipPosition,
     ) -> Vec<Hypothesis> {
         let priors = self.priors(torsion.config());
-        let rolls = start::rolls(self.start.roll, self.start_sd.roll, super::WEIGHT_MIN);
+        let rolls = start::rolls(self.start.roll, self.start_sd.roll, ROLLS, super::WEIGHT_MIN);
         let each = rolls.iter().flat_map(|roll| priors.iter().map(move |prior| (roll, prior)));
         each.map(|(&(roll, roll_sd, share), prior)| {
             let angles = FixedAngles { roll, ..self.start };
