@@ -1,8 +1,9 @@
 //! A recorded insertion: what stage and tracker measured, and where the tip was.
 
+use crate::geometry::so3;
 use crate::table::{Table, TableError};
+use crate::units::wrap_angle;
 use nalgebra::{Rotation3, Vector3};
-use std::f64::consts::TAU;
 
 /// The columns that a recording must have, in any order.
 const REQUIRED: [&str; 5] = ["insertion_mm", "rotation_rad", "x_mm", "y_mm", "z_mm"];
@@ -61,21 +62,38 @@ impl Recording {
     }
 
     /// True if the orientations contain no roll. A sensor with five degrees of freedom measures only the heading,
-    /// so its orientations do not turn with the base. A tracker without orientations may send the same one in
-    /// every row.
+    /// so its orientations do not turn with the base about the needle's axis. A tracker without orientations may
+    /// send the same one in every row.
     pub fn lacks_roll(&self) -> bool {
         let first = &self.rows[0];
-        let turns = self.rows.iter().filter_map(|row| {
-            let seen_rad = first.sensor_orientation?.angle_to(&row.sensor_orientation?);
-            let base_rad = (row.rotation_meas_rad - first.rotation_meas_rad).rem_euclid(TAU);
-            Some((seen_rad, base_rad.min(TAU - base_rad)))
+        let axis = self.axis();
+        let (mut is_fixed, mut roll_rad, mut largest_rad, mut base_rad) =
+            (true, 0.0, 0.0f64, 0.0f64);
+        for (last, row) in self.rows.iter().zip(&self.rows[1..]) {
+            let (Some(start), Some(before), Some(now)) =
+                (first.sensor_orientation, last.sensor_orientation, row.sensor_orientation)
+            else {
+                return false;
+            };
+            is_fixed &= start.angle_to(&now) < SAME_MAX_RAD;
+            // A change of heading is no roll, however large the needle's bend makes it.
+            roll_rad += so3::log(&(before.inverse() * now)).dot(&axis);
+            largest_rad = largest_rad.max(wrap_angle(roll_rad).abs());
+            let turn_rad = row.rotation_meas_rad - first.rotation_meas_rad;
+            base_rad = base_rad.max(wrap_angle(turn_rad).abs());
+        }
+        let is_without = base_rad > TURNED_RAD && largest_rad < 0.5 * TURNED_RAD;
+        self.rows.len() > 1 && (is_fixed || is_without)
+    }
+
+    /// The needle's axis in the sensor's frame: the mean direction of its motion there; zero if it does not move.
+    fn axis(&self) -> Vector3<f64> {
+        let steps = self.rows.iter().zip(&self.rows[1..]);
+        let steps = steps.filter_map(|(last, row)| {
+            let way_mm = row.position_meas_mm - last.position_meas_mm;
+            Some(last.sensor_orientation?.inverse() * way_mm)
         });
-        let largest =
-            |(seen, base): (f64, f64), turn: (f64, f64)| (seen.max(turn.0), base.max(turn.1));
-        let (seen_rad, base_rad) = turns.fold((0.0, 0.0), largest);
-        self.rows.len() > 1
-            && first.sensor_orientation.is_some()
-            && (seen_rad < SAME_MAX_RAD || (base_rad > TURNED_RAD && seen_rad < 0.5 * TURNED_RAD))
+        steps.sum::<Vector3<f64>>().try_normalize(f64::MIN_POSITIVE).unwrap_or_default()
     }
 
     /// True if `other` has the same rows; their line numbers may differ.
@@ -104,27 +122,29 @@ mod tests {
         assert_eq!(posed.rows[0].position_meas_mm, Vector3::new(1.0, 2.0, 3.0));
     }
 
-    /// The base turns by 20 degrees a mm, and the sensor by `turns` times that.
+    /// The base turns by 20 degrees a mm, and the sensor by `turns` times that; the needle bends to one side.
     #[test]
     fn orientations_that_do_not_turn_with_the_base_lack_roll() {
         let recording = |depth_mm: u32, turns: f64| {
             let row = |mm: u32| {
                 let (mm, bend_rad) = (f64::from(mm), f64::from(mm) / 122.0);
                 let roll = Rotation3::from_axis_angle(&Vector3::z_axis(), turns * 0.35 * mm);
+                let bend = Rotation3::from_axis_angle(&Vector3::x_axis(), bend_rad);
+                let (sin, cos) = bend_rad.sin_cos();
                 RecordedRow {
                     line: 1,
                     insertion_meas_mm: mm,
                     rotation_meas_rad: 0.35 * mm,
-                    position_meas_mm: Vector3::new(0.0, 0.0, mm),
-                    sensor_orientation: Some(
-                        Rotation3::from_axis_angle(&Vector3::x_axis(), bend_rad) * roll,
-                    ),
+                    position_meas_mm: 122.0 * Vector3::new(0.0, cos - 1.0, sin),
+                    sensor_orientation: Some(bend * roll),
                 }
             };
             Recording { rows: (0..depth_mm).map(row).collect() }
         };
-        assert!(recording(100, 0.0).lacks_roll());
-        assert!(!recording(100, 1.0).lacks_roll());
+        for depth_mm in [100, 250] {
+            assert!(recording(depth_mm, 0.0).lacks_roll(), "{depth_mm} mm");
+            assert!(!recording(depth_mm, 1.0).lacks_roll(), "{depth_mm} mm");
+        }
         // The base has turned by too little to see it.
         assert!(!recording(7, 0.0).lacks_roll());
         // The sensor lacks half a radian of the turn.
