@@ -1,10 +1,10 @@
 //! `needle-bench replay`: runs a recorded session again and compares the results.
 
-use super::output::{print_result, refuse_existing, write_new};
+use super::output::{print_result, print_stderr, refuse_existing, write_new};
 use super::records::{open, recorded_run_config};
 use super::{Failure, Result, STOPPED, finish_with};
 use crate::archive::file;
-use crate::config::{Config, Source};
+use crate::config::{CanInterface, Config, Source};
 use crate::operation::RunConfig;
 use crate::replay::{Recorded, replay as run_again};
 use crate::session::ObserverConfig;
@@ -13,7 +13,7 @@ use crate::text::screen;
 use clap::Args;
 use minijinja::context;
 use serde_json::json;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 #[derive(Debug, Args)]
@@ -85,13 +85,16 @@ pub(super) fn replay(arguments: &Arguments) -> Result<()> {
             "estimate_rms": estimate_rms,
             "final_error": final_error,
         });
-        if let (Some(observer), Some(rms), Some(last)) = (observer, estimate_rms, final_error) {
+        let is_known = estimate_rms.is_some() && final_error.is_some();
+        if is_known || title == "what_if" {
             let title = title.replace('_', " ");
-            let (rms, last) = (rms.to_string(), last.to_string());
+            let rms = estimate_rms.map(|error| error.to_string());
+            let last = final_error.map(|error| error.to_string());
             rows.push(context! { title, observer, rms, last });
         }
     }
-    let more = context! { figures => rows };
+    let has_truth = folder.manifest().bus == CanInterface::Memory.to_string();
+    let more = context! { figures => rows, has_truth };
     let text = || screen(include_str!("replay.txt"), &object, more);
     print_result(arguments.json, &object, text)?;
     finish_with(replayed.difference.map_or(0, |_| STOPPED))
@@ -102,12 +105,17 @@ fn what_if(text: &str, sets: &[String]) -> Result<Option<ObserverConfig>> {
     if sets.is_empty() {
         return Ok(None);
     }
-    let config = Config::from_sources(&[Source { name: file::CONFIG, text }], sets)?;
     for set in sets {
         let key = set.split('=').next().unwrap_or_default().trim();
         if key == "observer.shadows" {
             return Err(Failure::configuration(format_args!(
                 "--set {key}: a replay tries one other observer; name the observer by observer.kind"
+            )));
+        }
+        if key == "observer.samples" {
+            return Err(Failure::configuration(format_args!(
+                "--set {key}: a replay corrects with the samples that the run took; to try others: \
+                 needle-bench evaluate RUN"
             )));
         }
         if !key.starts_with("observer.") {
@@ -116,6 +124,14 @@ fn what_if(text: &str, sets: &[String]) -> Result<Option<ObserverConfig>> {
                  recorded; for another path insert again, with needle-bench run or study"
             )));
         }
+    }
+    let source = Source { name: file::CONFIG, text };
+    let unread = |_: &Path| Err("a replay reads no other file".to_owned());
+    // The shadows of the run do not make another observer's keys count here.
+    let sets = [&["observer.shadows=[]".to_owned()], sets].concat();
+    let (config, warnings) = Config::with_warnings(&[source], &sets, &unread)?;
+    for warning in warnings {
+        print_stderr(format_args!("warning: {warning}"));
     }
     Ok(Some(config.session_without_goal()?.observer))
 }

@@ -2,7 +2,7 @@
 //! not converge with the control law, a rehearsal without a registration.
 
 use super::reader::{REGISTRATION, Tree, is_inside};
-use super::value::Entry;
+use super::value::{Entry, Origin};
 use super::{Config, ObserverKind, TrackerSource};
 use crate::control::ControlKind;
 use crate::keys::{Field as _, Kind};
@@ -17,7 +17,7 @@ pub(super) fn all(config: &Config, tree: &Tree) -> Vec<String> {
 }
 
 /// A warning for each section of `tree` that is given and that `config` does not use. A configuration
-/// printed in full, as in a run folder, gives all sections and gets no warning.
+/// printed in full, as in a run folder, gives all sections: only `--set` gets a warning there.
 fn unused_sections(config: &Config, tree: &Tree) -> Vec<String> {
     let (law, observer) = (config.control.kind.to_string(), config.observer.kind.to_string());
     // The check of handedness always uses the section of the invariant observer.
@@ -34,10 +34,11 @@ fn unused_sections(config: &Config, tree: &Tree) -> Vec<String> {
         for (kind, _) in kinds {
             let section = format!("{table}.{}", section_name(kind));
             let given = tree.iter().find(|(key, entry)| {
-                entry.layer > 0 && is_inside(key, &section) && !entry.value.is_table()
+                let is_meant = !is_printed_in_full || entry.origin == Origin::Set;
+                is_meant && entry.layer > 0 && is_inside(key, &section) && !entry.value.is_table()
             });
             let Some((key, Entry { origin, .. })) = given else { continue };
-            if is_printed_in_full || used.iter().any(|used| used == kind) {
+            if used.iter().any(|used| used == kind) {
                 continue;
             }
             warnings.push(format!(

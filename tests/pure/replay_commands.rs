@@ -59,7 +59,26 @@ fn replay_repeats_a_run_answers_what_if_and_refuses_an_edited_one() {
         assert!(refused(set).contains("takes observer.… alone"), "{set}");
     }
     assert!(refused("observer.shadows=[]").contains("name the observer by observer.kind"));
+    assert!(refused("observer.samples=\"all\"").contains("needle-bench evaluate RUN"));
     assert!(refused("observer.knid=\"coupled\"").contains("unknown key"));
+
+    // The run is shorter than the baseline; and a section is given whose observer is not chosen.
+    let sets = [
+        "--set",
+        "observer.kind=\"finite-difference\"",
+        "--set",
+        "observer.finite_difference.baseline_mm=30",
+    ];
+    let said = replayed(
+        &scratch,
+        &run_dir,
+        &[&sets[..], &["--set", "observer.coupled.memory_mm=5"]].concat(),
+    );
+    assert_identical(&said);
+    let row = "\nwhat if     finite-difference: no estimate\n";
+    assert!(said.stdout.contains(row), "{}", said.stdout);
+    let warning = "warning: --set observer.coupled.memory_mm has no effect";
+    assert!(said.stderr.contains(warning), "{}", said.stderr);
     let said = replayed(&scratch, &run_dir, &["--out", "coupled.csv"]);
     assert_eq!(said.status, 2, "{}", said.stderr);
     assert!(said.stderr.contains("coupled.csv: "), "{}", said.stderr);
