@@ -12,13 +12,13 @@ pub struct StepsTable {
 }
 
 impl StepsTable {
-    /// Reads `text`. A partial last line, as a killed bench leaves it, is left out. Empty and missing fields
-    /// are unknown.
+    /// Reads `text`. A partial last line, as a killed bench leaves it, is left out. Empty fields are unknown.
     ///
     /// # Errors
-    /// A field that is not a number.
+    /// A row that is not as long as the header, or a field that is not a number.
     pub fn parse(text: &str) -> Result<Self, TableError> {
         let table = Table::parse(without_partial_line(text));
+        table.check_row_lengths()?;
         let columns = table.columns().map(|column| {
             let numbers = table.rows().iter().map(|row| match row.text(&column) {
                 "" => Ok(None),
@@ -32,6 +32,15 @@ impl StepsTable {
     /// The column `name` from the first row to the last; unknown in every row if there is no such column.
     pub fn column(&self, name: &str) -> Vec<Option<f64>> {
         self.columns.get(name).cloned().unwrap_or_else(|| vec![None; self.rows])
+    }
+
+    /// Where `step` does not count up by one, in words. It is no error: a writer that cannot keep up leaves out rows.
+    pub fn miscount(&self) -> Option<String> {
+        let steps: Vec<f64> = self.column("step").into_iter().flatten().collect();
+        let [before, next] = *steps.windows(2).find(|pair| pair[1] != pair[0] + 1.0)? else {
+            return None;
+        };
+        Some(format!("step {next} follows step {before}: rows are missing, doubled or swapped"))
     }
 }
 
@@ -54,5 +63,20 @@ mod tests {
     fn a_value_that_is_not_a_number_is_refused_with_its_line() {
         let error = StepsTable::parse("step,x_mm\n0,1\n1,gone\n").unwrap_err();
         assert_eq!(error.to_string(), "line 3: x_mm is \"gone\", expected a number");
+        let error = StepsTable::parse("step,x_mm\n0,1\n1\n2,3\n").unwrap_err();
+        assert_eq!(error.to_string(), "line 3: 1 fields where the header has 2");
+    }
+
+    #[test]
+    fn rows_that_are_missing_doubled_or_swapped_are_noticed() {
+        let said = |csv: &str| StepsTable::parse(csv).unwrap().miscount();
+        assert_eq!(said("step,x_mm\n0,1\n1,2\n2,3\n3,"), None);
+        assert_eq!(said(""), None);
+        let why = |next, before| {
+            Some(format!("step {next} follows step {before}: rows are missing, doubled or swapped"))
+        };
+        assert_eq!(said("step,x_mm\n0,1\n2,3\n"), why(2, 0));
+        assert_eq!(said("step,x_mm\n0,1\n0,1\n1,2\n"), why(0, 0));
+        assert_eq!(said("step,x_mm\n0,1\n2,3\n1,2\n"), why(2, 0));
     }
 }

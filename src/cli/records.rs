@@ -34,11 +34,13 @@ const RECORDINGS_TOML: (&str, &str) =
 /// Smallest distance between two rows of a run, mm: a hold gives one row.
 const ROWS_APART_MM: f64 = 0.05;
 
-/// The runs in `dir`, the newest first.
+/// The runs in `dir`, the newest first. A folder's name does not count: it may be a copy, or renamed.
 pub(super) fn newest_first(dir: &Path) -> impl Iterator<Item = RunFolder> + use<> {
-    // A folder's name starts with its time.
-    let folders = folders_in(dir).unwrap_or_default();
-    folders.into_iter().rev().filter_map(|folder| RunFolder::open(&folder).ok())
+    let folders = folders_in(dir).unwrap_or_default().into_iter();
+    let mut runs: Vec<RunFolder> = folders.filter_map(|it| RunFolder::open(&it).ok()).collect();
+    // The folders are sorted by name, and this sort keeps that order of runs that started at the same time.
+    runs.sort_by(|a, b| a.manifest().started_utc.cmp(&b.manifest().started_utc));
+    runs.into_iter().rev()
 }
 
 /// The folders in `dir`, by name.

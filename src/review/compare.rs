@@ -43,8 +43,9 @@ impl Comparison {
     pub fn of(a: &Run, b: &Run) -> Self {
         let mut warnings = Vec::new();
         let mut keys = Vec::new();
-        for Run { folder, .. } in [a, b] {
+        for Run { folder, unreadable, .. } in [a, b] {
             warnings.extend(folder.caution().map(|caution| format!("{}: {caution}", folder.dir)));
+            warnings.extend(unreadable.iter().cloned());
             keys.push(folder.keys().unwrap_or_else(|error| {
                 warnings.push(format!("{}: configuration: {error}", folder.dir));
                 Keys::new()
@@ -230,6 +231,8 @@ mod tests {
     fn json_has_both_values_and_their_difference() {
         let mut open = other();
         open.folder.condition = Condition::Open;
+        open.unreadable
+            .push("runs/b/steps.csv: line 3: 1 fields where the header has 20".to_owned());
         let json = Comparison::of(&run(), &open).to_json();
         assert_eq!(json["configuration"]["observer.kind"]["b"], "\"coupled\"");
         assert_eq!(json["figures"]["off_plane_rms_mm"]["b_minus_a"], 0.25);
@@ -237,6 +240,7 @@ mod tests {
             json["warnings"][0],
             "runs/b: the record is not closed; if its bench has ended, close it: needle-bench review runs/b --repair"
         );
+        assert_eq!(json["warnings"][1], open.unreadable[0]);
     }
 
     #[test]

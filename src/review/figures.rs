@@ -110,7 +110,7 @@ pub(super) fn limits(config: &Config) -> Result<Limits, ConfigError> {
 }
 
 /// The figures of a run with their limits. An operation of the stage has fewer.
-fn figures(folder: &Folder, report: &FigureReport, limits: &Limits) -> Vec<Figure> {
+fn figures(folder: &Folder, report: Option<&FigureReport>, limits: &Limits) -> Vec<Figure> {
     let is_insertion = folder.manifest.operation.is_none();
     let values = serde_json::to_value(report).unwrap_or_default();
     let of_report = |&(key, label, unit, decimals): &(&'static str, &str, _, _)| Figure {
@@ -123,7 +123,7 @@ fn figures(folder: &Folder, report: &FigureReport, limits: &Limits) -> Vec<Figur
     };
     let mut all: Vec<Figure> = FIGURES.iter().map(of_report).collect();
     // An open record's manifest may not name the bus.
-    let has_truth = folder.is_emulated() || report.final_error.is_some();
+    let has_truth = folder.is_emulated() || report.is_some_and(|it| it.final_error.is_some());
     let provenance = if has_truth { "true" } else { "estimated" };
     for figure in all.iter_mut().filter(|figure| figure.key == OFF_PLANE) {
         figure.label = format!("off plane ({provenance}), RMS over {}", last_third(folder, report));
@@ -146,22 +146,22 @@ fn figures(folder: &Folder, report: &FigureReport, limits: &Limits) -> Vec<Figur
 
 /// The depth that the figures of the last third cover, in words. In a run that was stopped this is the last
 /// third of the depth that it reached.
-pub(super) fn last_third(folder: &Folder, report: &FigureReport) -> String {
-    match folder.manifest.outcome {
-        Some(RunOutcome::Completed) => "the last third".to_owned(),
-        Some(RunOutcome::Stopped) => {
-            format!("the last third of {:.1} mm, stopped", report.insertion_mm)
-        }
-        None => format!("the last third of {:.1} mm, not closed", report.insertion_mm),
-    }
+pub(super) fn last_third(folder: &Folder, report: Option<&FigureReport>) -> String {
+    let ending = match folder.manifest.outcome {
+        Some(RunOutcome::Completed) => return "the last third".to_owned(),
+        Some(RunOutcome::Stopped) => "stopped",
+        None => "not closed",
+    };
+    let of = report.map(|report| format!(" of {:.1} mm", report.insertion_mm));
+    format!("the last third{}, {ending}", of.unwrap_or_default())
 }
 
 /// The errors of the estimate: a figure for each coordinate.
-fn errors(folder: &Folder, report: &FigureReport) -> Vec<Figure> {
+fn errors(folder: &Folder, report: Option<&FigureReport>) -> Vec<Figure> {
     let rms = format!("estimate's error, RMS over {},", last_third(folder, report));
     let sets = [
-        ("estimate_rms", rms.as_str(), report.estimate_rms),
-        ("final_error", "estimate's error at the end,", report.final_error),
+        ("estimate_rms", rms.as_str(), report.and_then(|it| it.estimate_rms)),
+        ("final_error", "estimate's error at the end,", report.and_then(|it| it.final_error)),
     ];
     let mut all = Vec::new();
     for (set, label, error) in sets {
@@ -214,13 +214,21 @@ pub fn figures_of_steps(steps_csv: &str) -> Option<FigureReport> {
 impl Run {
     /// The run's figures, with limits if its configuration can be read.
     pub(super) fn limited_figures(&self) -> Vec<Figure> {
-        figures(&self.folder, &self.figures(), &self.folder.limits().unwrap_or_default())
+        let report = self.folder.figures();
+        figures(&self.folder, report.as_ref(), &self.folder.limits().unwrap_or_default())
+    }
+
+    /// Those of the figures that are known; all of them, as unknown, if none can be read.
+    pub(super) fn shown_figures(&self) -> Vec<Figure> {
+        let is_read = self.folder.figures().is_some();
+        let all = self.limited_figures().into_iter();
+        all.filter(|figure| figure.value.is_some() || !is_read).collect()
     }
 
     /// The run's figures with their limits, and the errors of the estimate.
     pub(super) fn all_figures(&self) -> Vec<Figure> {
         let mut all = self.limited_figures();
-        all.extend(errors(&self.folder, &self.figures()));
+        all.extend(errors(&self.folder, self.folder.figures().as_ref()));
         all
     }
 }
@@ -245,13 +253,22 @@ mod tests {
     #[test]
     fn a_run_that_was_not_closed_has_its_figures_from_its_steps() {
         let mut run = run();
-        let kept = run.figures();
+        let kept = run.folder.figures().unwrap();
         run.folder.manifest.figures.clear();
         run.folder.figures_of_steps = figures_of_steps(&steps_csv());
-        let found = run.figures();
+        let found = run.folder.figures().unwrap();
         assert_eq!((found.insertion_mm, found.steps), (kept.insertion_mm, kept.steps));
         assert_eq!((found.off_plane_rms_mm, found.steps_saturated), (Some(0.5), None));
         assert_eq!(found.estimate_rms.unwrap().x_mm, 0.25);
+    }
+
+    #[test]
+    fn figures_that_nothing_tells_are_unknown() {
+        let mut run = run();
+        run.folder.manifest.figures.clear();
+        let mut figures = run.limited_figures();
+        figures.retain(|figure| !figure.key.starts_with("sync"));
+        assert!(figures.len() > 8 && figures.iter().all(|figure| figure.value.is_none()));
     }
 
     #[test]

@@ -65,57 +65,73 @@ pub struct Run {
     pub motion: Motion,
     /// `events.log`.
     pub events: Vec<EventLine<'static>>,
-    /// Files that could not be read, with the reasons.
+    /// Files that could not be read, or whose rows are not those written, with the reasons.
     pub unreadable: Vec<String>,
 }
 
 impl Run {
-    /// The figures of its folder.
-    pub(super) fn figures(&self) -> FigureReport {
-        self.folder.figures().unwrap_or_default()
-    }
-
-    /// The depth, mm, at a time in s: linear between two steps; after the last step with the speed before it, up
-    /// to the final depth; `None` before the first step.
+    /// The depth, mm, at a time in s: linear between two steps, over the time that is not held; after the last step
+    /// with the speed before it, up to the final depth; `None` before the first step.
     pub(super) fn depth_over_time(&self) -> impl Fn(f64) -> Option<f64> {
         let (times, depths) = (self.steps.column("time_s"), self.steps.column("insertion_mm"));
-        let steps: Vec<(f64, f64)> =
+        let mut steps: Vec<(f64, f64)> =
             times.into_iter().zip(depths).filter_map(|(t, mm)| t.zip(mm)).collect();
-        let reached_mm = self.folder.final_depth_mm();
+        let last = steps.last().copied();
+        let end_mm = |mm: f64| self.folder.final_depth_mm().unwrap_or(mm).max(mm);
+        let reached_mm = last.map_or(0.0, |(_, mm)| end_mm(mm));
+        let stop_s = self.stop_time_s().filter(|stop_s| last.is_some_and(|(t, _)| *stop_s > t));
+        steps.extend(stop_s.map(|stop_s| (stop_s, reached_mm)));
+        let held = self.held();
+        let held_s = move |until_s: f64| {
+            held.iter().map(|(from_s, to_s)| (until_s.min(*to_s) - from_s).max(0.0)).sum::<f64>()
+        };
+        let moving_s =
+            move |from_s: f64, to_s: f64| to_s - from_s - (held_s(to_s) - held_s(from_s));
         move |time_s| {
             let after = steps.partition_point(|(t, _)| *t <= time_s);
             let (t0, mm0) = *steps.get(after.checked_sub(1)?)?;
-            let neighbour = steps.get(after).or_else(|| steps.get(after.checked_sub(2)?));
-            let speed = neighbour.map_or(f64::INFINITY, |(t1, mm1)| (mm1 - mm0) / (t1 - t0));
-            let end_mm = match steps.get(after) {
-                Some(_) => f64::INFINITY,
-                None => reached_mm.unwrap_or(mm0).max(mm0),
-            };
-            // A single step gives no speed.
-            let travel_mm = if speed.is_finite() { speed * (time_s - t0) } else { f64::INFINITY };
-            Some((mm0 + travel_mm).min(end_mm))
+            let next = steps.get(after);
+            let neighbour = next.or_else(|| steps.get(after.checked_sub(2)?));
+            // A single step gives no speed, nor does a step that was held throughout.
+            let speed = neighbour.map(|(t1, mm1)| (mm1 - mm0) / moving_s(t0, *t1));
+            let speed = speed.filter(|speed| speed.is_finite());
+            let travel_mm = speed.map_or(f64::INFINITY, |speed| speed * moving_s(t0, time_s));
+            let end_mm = next.map_or(reached_mm, |(_, mm1)| *mm1);
+            Some((mm0 + travel_mm).min(end_mm.max(mm0)))
         }
     }
 
-    /// The states that the run itself went through.
-    pub(super) fn states(&self) -> Vec<StateChange> {
-        let depth_mm = self.depth_over_time();
+    /// The times, s, and names of the states that the run itself went through.
+    fn session_states(&self) -> impl Iterator<Item = (f64, &str)> {
         let is_state =
             |line: &&EventLine<'_>| line.lane == Lane::Session && line.kind == EventKind::State;
-        let change = |line: &EventLine<'_>| StateChange {
-            time_s: line.time.as_secs_f64(),
-            insertion_mm: depth_mm(line.time.as_secs_f64()),
-            state: line.text.clone().into_owned(),
+        self.events.iter().filter(is_state).map(|line| (line.time.as_secs_f64(), &*line.text))
+    }
+
+    /// When the insertion was held, from and to in s.
+    pub(super) fn held(&self) -> Vec<(f64, f64)> {
+        let ends = self.session_states().skip(1).map(|(time_s, _)| time_s).chain([f64::INFINITY]);
+        let is_held = |name| State::named(Lane::Session, name).is_some_and(State::is_held);
+        let held = self.session_states().zip(ends).filter(|((_, name), _)| is_held(name));
+        held.map(|((from_s, _), to_s)| (from_s, to_s)).collect()
+    }
+
+    /// The states that the run itself went through, with their depths.
+    pub(super) fn states(&self) -> Vec<StateChange> {
+        let depth_mm = self.depth_over_time();
+        let change = |(time_s, name): (f64, &str)| StateChange {
+            time_s,
+            insertion_mm: depth_mm(time_s),
+            state: name.to_owned(),
         };
-        self.events.iter().filter(is_state).map(change).collect()
+        self.session_states().map(change).collect()
     }
 
     /// When the run was stopped, s; `None` if it was not stopped, or if the time is not recorded.
     pub(super) fn stop_time_s(&self) -> Option<f64> {
         let is_stopped = self.folder.manifest.outcome == Some(RunOutcome::Stopped);
-        let stopping = State::Stopping.as_str();
-        let change = self.states().into_iter().find(|change| change.state == stopping);
-        change.filter(|_| is_stopped).map(|change| change.time_s)
+        let change = self.session_states().find(|(_, name)| *name == State::Stopping.as_str());
+        change.filter(|_| is_stopped).map(|(time_s, _)| time_s)
     }
 
     /// The events of at least the severity `least`.
@@ -321,6 +337,7 @@ pub(super) mod tests {
         assert_eq!(utc("yesterday"), "yesterday");
     }
 
+    /// The run is held from 3.5 s on, between the steps at 3 and 4 s in 1 and 2 mm.
     #[test]
     fn states_are_listed_with_their_depths() {
         let states = run().states();
@@ -331,9 +348,34 @@ pub(super) mod tests {
             [
                 (0.0, None, "preparing"),
                 (2.0, Some(0.0), "inserting"),
-                (3.5, Some(1.5), "holding"),
+                (3.5, Some(2.0), "holding"),
                 (9.0, Some(3.0), "stopping"),
             ]
         );
+    }
+
+    /// Steps at 2, 3, 4 and 5 s, a millimetre apart.
+    #[test]
+    fn the_depth_stands_still_while_the_insertion_is_held() {
+        let mut run = run();
+        let events = [
+            "2.000 s  session   state    inserting",
+            "3.250 s  session   state    holding",
+            "3.750 s  session   state    inserting",
+        ];
+        run.events = events.iter().filter_map(|line| parse_event(&format!("    {line}"))).collect();
+        let depth_mm = run.depth_over_time();
+        assert_eq!(depth_mm(1.0), None);
+        for (time_s, known_mm) in [
+            (2.5, 0.5),
+            (3.125, 1.25),
+            (3.25, 1.5),
+            (3.5, 1.5),
+            (3.75, 1.5),
+            (4.0, 2.0),
+            (60.0, 3.0),
+        ] {
+            assert!((depth_mm(time_s).unwrap() - known_mm).abs() < 1e-9, "{time_s} s");
+        }
     }
 }

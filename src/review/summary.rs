@@ -17,8 +17,7 @@ use serde_json::{Map, Value, json};
 pub fn to_text(run: &Run, report: Option<&str>) -> Result<String, minijinja::Error> {
     let folder = &run.folder;
     let manifest = &folder.manifest;
-    let figures = run.figures();
-    let known = run.limited_figures().into_iter().filter(|figure| figure.value.is_some());
+    let figures = folder.figures();
     let proofs = run.events_from(Severity::Info).filter(|line| line.text.starts_with(PROVED));
     let verdict = manifest.verdict().map(|verdict| {
         let (reason, given) = (escaped(&verdict.reason), utc(&verdict.given_utc));
@@ -31,10 +30,10 @@ pub fn to_text(run: &Run, report: Option<&str>) -> Result<String, minijinja::Err
         report,
         positions => positions(&manifest.gates),
         states => minijinja::Value::from(Serde(run.states())),
-        rows => known.map(row).collect::<Vec<_>>(),
-        third => last_third(folder, &figures),
-        rms => figures.estimate_rms.map(|error| error.to_string()),
-        final_error => figures.final_error.map(|error| error.to_string()),
+        rows => run.shown_figures().into_iter().map(row).collect::<Vec<_>>(),
+        third => last_third(folder, figures.as_ref()),
+        rms => figures.as_ref().and_then(|it| it.estimate_rms).map(|error| error.to_string()),
+        final_error => figures.as_ref().and_then(|it| it.final_error).map(|error| error.to_string()),
         warnings => warnings(run),
         proofs => proofs.map(|line| line.text.to_string()).collect::<Vec<_>>(),
         verdict,
@@ -186,7 +185,7 @@ mod tests {
         assert_eq!(json["figures"]["final_error.roll_deg"], Value::Null);
         assert_eq!(json["limits"]["off_plane_rms_mm"], 1.0);
         assert_eq!(json["outside"], json!(["sync_late_us_max"]));
-        assert_eq!(json["states"][2]["insertion_mm"], 1.5);
+        assert_eq!(json["states"][2]["insertion_mm"], 2.0);
         assert_eq!(json["verdict"], Value::Null);
     }
 
@@ -196,7 +195,7 @@ mod tests {
         run.folder.manifest.timing.clear();
         assert_eq!(
             warnings(&run),
-            ["3.500 s at 1.5 mm, tracker: last tip 0.51 s old (limit 0.50)"]
+            ["3.500 s at 2.0 mm, tracker: last tip 0.51 s old (limit 0.50)"]
         );
     }
 

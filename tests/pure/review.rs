@@ -357,6 +357,46 @@ fn an_open_record_is_shown_and_closed_by_repair() {
     assert_eq!(review(&scratch, &[&dir, "--repair"]).status, 2, "repaired twice");
 }
 
+/// The figures of an open record come from its steps.
+#[test]
+fn figures_of_steps_that_cannot_be_read_are_unknown() {
+    let scratch = Scratch::new();
+    let (dir, other) = (run(&scratch, &[]), run(&scratch, &[]));
+    leave_open(&scratch, &dir);
+    let path = scratch.path().join(&dir).join("steps.csv");
+    let text = fs::read_to_string(&path).expect("steps");
+    let mut lines: Vec<&str> = text.lines().collect();
+    lines.remove(3);
+    fs::write(&path, lines.join("\n") + "\n").expect("written");
+    let said = review(&scratch, &[&dir]);
+    assert_all(&said.stdout, &["steps.csv: step 3 follows step 1", "off plane (true)"]);
+    lines[2] = "1,0.5";
+    fs::write(&path, lines.join("\n") + "\n").expect("written");
+    let said = review(&scratch, &[&dir, "--json"]);
+    let json = said.json();
+    assert!(
+        json["figures"]["insertion_mm"].is_null() && json["figures"]["steps"].is_null(),
+        "{json}"
+    );
+    assert_eq!(json["outside"], serde_json::json!([]));
+    let said = review(&scratch, &[&dir]);
+    assert!(!said.stdout.contains("OUTSIDE"), "{}", said.stdout);
+    let depth = said.stdout.lines().find(|line| line.starts_with("depth ")).expect("a depth");
+    assert!(depth.split_whitespace().nth(1) == Some("-"), "{depth}");
+    let said = review(&scratch, &[&dir, &other]);
+    assert_all(&said.stdout, &["steps.csv: line 3: 2 fields where the header has "]);
+}
+
+#[test]
+fn the_newest_run_is_the_last_to_start_whatever_its_name() {
+    let scratch = Scratch::new();
+    let earlier = run(&scratch, &[]);
+    fs::rename(scratch.path().join(earlier), scratch.path().join("runs/zz-copy")).expect("renamed");
+    let later = run(&scratch, &[]);
+    fs::create_dir(scratch.path().join("runs/zzz")).expect("a folder");
+    assert_eq!(review(&scratch, &["--json", "--no-html"]).json()["run_dir"], *later);
+}
+
 #[test]
 fn a_missing_run_rrd_is_made_again_by_repair() {
     let scratch = Scratch::new();

@@ -14,14 +14,15 @@ use std::path::Path;
 pub(super) fn run(path: &Path) -> Result<Run> {
     let (record, folder) = open(path)?;
     let mut unreadable = Vec::new();
+    let shown = path.join(file::STEPS);
     let steps = record.text(file::STEPS).map_err(|error| error.to_string()).and_then(|text| {
-        let shown = path.join(file::STEPS);
         StepsTable::parse(&text).map_err(|error| format!("{}: {error}", shown.display()))
     });
     let steps = steps.unwrap_or_else(|error| {
         unreadable.push(error);
         StepsTable::default()
     });
+    unreadable.extend(steps.miscount().map(|why| format!("{}: {why}", shown.display())));
     let samples = lines(&record, file::TRACKER, TrackerTimes::parse, &mut unreadable);
     let motion = match folder.manifest.operation {
         Some(_) => Motion::new(&lines(&record, file::CAN, parse_frame, &mut unreadable), &folder),

@@ -8,7 +8,6 @@ use crate::archive::RunOutcome;
 use crate::math;
 use crate::review::figures::{BLIND_DEPTH, Limits, OFF_PLANE, TARGET_DEPTH, TIP_AGE};
 use crate::review::run::Run;
-use crate::session::{Lane, State};
 use crate::stage::Axis;
 use crate::units::wrap_angle;
 
@@ -141,21 +140,18 @@ fn rotation_of_base(run: &Run) -> Chart {
     Chart::new("Rotation of the base", DEPTH, "rotation (deg)", layers)
 }
 
-/// Depth over time, with the holds.
+/// Depth over time, with the holds, to the last step or to the point where the run was stopped.
 fn insertion(run: &Run, limits: &Limits) -> Chart {
     let steps = points(&column(run, "time_s"), &depth(run));
-    let states = run.states();
-    let ends = states.iter().skip(1).map(|next| next.time_s).chain([f64::INFINITY]);
-    let is_held = |name: &str| State::named(Lane::Session, name).is_some_and(State::is_held);
-    let held = states.iter().zip(ends).filter(|(change, _)| is_held(&change.state));
-    let held = held.map(|(change, end)| (change.time_s, end)).collect();
-    let (last, mut course) = (steps.last().copied(), steps);
-    // From the last step to the point where the run was stopped.
-    if let (Some(stop_s), Some((last_s, depth_mm))) = (run.stop_time_s(), last)
-        && stop_s > last_s
-    {
-        course.push((stop_s, run.figures().insertion_mm.max(depth_mm)));
-    }
+    let (last, held, depth_mm) = (steps.last().copied(), run.held(), run.depth_over_time());
+    let end_s = last.map_or(0.0, |(last_s, _)| run.stop_time_s().unwrap_or(last_s).max(last_s));
+    let turns = held.iter().flat_map(|(from_s, to_s)| [*from_s, *to_s]).chain([end_s]);
+    let mut times: Vec<f64> = steps.iter().map(|(time_s, _)| *time_s).chain(turns).collect();
+    times.retain(|time_s| *time_s <= end_s);
+    times.sort_by(f64::total_cmp);
+    times.dedup();
+    let course = times.into_iter().filter_map(|time_s| Some((time_s, depth_mm(time_s)?)));
+    let course = course.filter(|(_, mm)| mm.abs() < VALUE_MAX).collect();
     let mut layers =
         vec![Layer::intervals("held", held), line("stage, measured", MEASURED, course)];
     if run.folder.manifest.outcome == Some(RunOutcome::Stopped) {

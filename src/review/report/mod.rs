@@ -41,9 +41,10 @@ pub fn html(run: &Run) -> Result<String, Error> {
     let Run { folder, .. } = run;
     let manifest = &folder.manifest;
     let limits = folder.limits().unwrap_or_default();
-    let known = run.limited_figures().into_iter().filter(|figure| figure.value.is_some());
-    let report = run.figures();
-    let rms = format!("RMS over {}", last_third(folder, &report));
+    let report = folder.figures();
+    let shown = run.shown_figures();
+    let rms = format!("RMS over {}", last_third(folder, report.as_ref()));
+    let report = report.unwrap_or_default();
     let errors = [(rms.as_str(), report.estimate_rms), ("at the end", report.final_error)];
     let page = environment.template_from_str(PAGE)?.render(context! {
         generator => Value::from_safe_string(GENERATOR.to_owned()),
@@ -54,7 +55,7 @@ pub fn html(run: &Run) -> Result<String, Error> {
         verdict => manifest.verdict().map(|v| format!("{}: {}", v.verdict, v.reason)),
         manifest => Value::from(Serde(manifest.clone())),
         warnings => record_warnings(run),
-        figures => known.map(figure).collect::<Vec<_>>(),
+        figures => shown.into_iter().map(figure).collect::<Vec<_>>(),
         errors => errors.into_iter().filter_map(error_row).collect::<Vec<_>>(),
         charts => curves::curves(run, &limits).iter().map(Chart::drawing).collect::<Vec<_>>(),
         states => Value::from(Serde(run.states())),
