@@ -114,7 +114,7 @@ impl TipFit {
         let (radius_mm, rms_mm) = (circle.radius_mm, circle.rms_mm());
         if rms_mm > rms_max_mm || rms_max_mm.is_nan() {
             return refused(format!(
-                "{points} positions, {rms_mm:.2} mm RMS off a circle (limit {rms_max_mm:.2}), {:.2} mm \
+                "{points} positions, {rms_mm:.2} mm RMS off a circle (limit {rms_max_mm:.2}, --rms-max-mm), {:.2} mm \
                  of it out of its plane; turn only the base, in air, with the insertion axis at rest",
                 circle.out_of_plane_rms_mm
             ));

@@ -35,6 +35,11 @@ impl Configured {
         self.config.as_deref().or(self.named.as_deref())
     }
 
+    /// True if a file or a key is given.
+    pub(super) fn is_given(&self) -> bool {
+        self.path().is_some() || !self.set.is_empty()
+    }
+
     /// The file, if no key overrides it: then it is the whole configuration.
     pub(super) fn whole_path(&self) -> Option<&Path> {
         self.path().filter(|_| self.set.is_empty())

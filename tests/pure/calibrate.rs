@@ -221,6 +221,10 @@ fn the_tip_on_the_sensor_is_computed_and_used() {
     }
     assert!(number(&config, "tracker.tip_tilt.pitch_deg").abs() < 1e-6);
     assert_eq!(config["tracker"]["tip_fit"]["points"].as_integer(), Some(90));
+    // The limit is that of a recording made with --run and the same configuration.
+    let set = ["--set", "tracker.gates.noise_sd_mm=0.8"];
+    let said = calibrate(&scratch, &[&["tip", "turn.csv", "--json"], &set[..]].concat());
+    assert!(said.stderr.contains("RMS off a circle (limit 1.60)"), "{}", said.stderr);
     // With a negative distance the sensor is ahead of the tip.
     let behind = calibrate(&scratch, &["tip", "turn.csv", "--along-mm", "-7", "--json"]);
     assert_eq!(behind.status, 0, "{}", behind.stderr);

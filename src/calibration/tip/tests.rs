@@ -196,7 +196,7 @@ fn turns_that_determine_no_tip_are_refused() {
         .zip(&mut inserted)
         .for_each(|(k, sample)| sample.position_meas_mm += axis * (0.05 * f64::from(k)));
     let text = refusal(&inserted);
-    assert!(text.contains("mm RMS off a circle (limit 0.50)"), "{text}");
+    assert!(text.contains("mm RMS off a circle (limit 0.50, --rms-max-mm)"), "{text}");
     assert!(
         text.ends_with("turn only the base, in air, with the insertion axis at rest"),
         "{text}"

@@ -91,7 +91,7 @@ pub(super) struct TipArguments {
           value_parser = number_in(-500.0..=500.0, "mm"))]
     along_mm: f64,
     /// Refuse positions with a larger RMS distance from a circle than this, mm; by default 0.5, and
-    /// with --run twice tracker.gates.noise_sd_mm where that is more.
+    /// with CONFIG or --run twice tracker.gates.noise_sd_mm where that is more.
     #[arg(long, value_name = "MM", value_parser = number_in(0.001..=100.0, "mm"))]
     rms_max_mm: Option<f64>,
     #[command(flatten)]
@@ -292,6 +292,10 @@ fn tip(arguments: &TipArguments) -> Result<()> {
     arguments.output.refuse_existing()?;
     let (text, noise_sd_mm) = match arguments.run {
         true => record_turn(path, &arguments.configured, arguments.rehearse)?,
+        false if arguments.configured.is_given() => {
+            let config = arguments.configured.load(None)?;
+            (text_of(path)?, config.tracker.to_track().noise_sd_mm)
+        }
         false => (text_of(path)?, 0.0),
     };
     let rms_max_mm = arguments.rms_max_mm.unwrap_or(RMS_MAX_MM.max(2.0 * noise_sd_mm));
