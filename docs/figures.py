@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The figure in the README, from the steps.csv of two runs:
+"""The figure in docs/study.md, from the steps.csv of two runs:
 
     cargo run -- run bench-config/paper-fig3.toml
     cargo run -- run bench-config/paper-fig4.toml

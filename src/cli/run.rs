@@ -36,8 +36,8 @@ pub(super) struct Arguments {
     /// On hardware: do not ask before the insertion. The preflight still refuses what fails.
     #[arg(long, short)]
     yes: bool,
-    /// Draw the emulated start and needle from [study] by this seed, and the noise: the trial of a
-    /// study that has this seed. (The noise alone: --set emulator.seed=SEED.)
+    /// Draw the emulated start and needle from [study] by this seed, the target if the study draws one, and
+    /// the noise: the trial of a study that has this seed. (The noise alone: --set emulator.seed=SEED.)
     #[arg(long, value_parser = parse_seed, allow_negative_numbers = true)]
     seed: Option<u64>,
     #[command(flatten)]

@@ -67,6 +67,14 @@ fn least_distance_mm(scratch: &Scratch, said: &Said) -> f64 {
     lines.map(distance_mm).fold(f64::INFINITY, f64::min)
 }
 
+#[test]
+fn the_configuration_of_the_study_also_runs() {
+    let scratch = Scratch::new();
+    let study = repository(STUDY);
+    let said = needle_bench(&scratch, &["run", &study, "--json", "--quiet"]);
+    assert_eq!(said.status, 0, "{}", said.stdout);
+}
+
 /// In the plane and in space.
 #[test]
 fn a_run_reaches_its_target_and_replays() {

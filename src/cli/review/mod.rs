@@ -153,7 +153,13 @@ fn open_viewer(path: &Path) -> Result<()> {
     }
     let started = Command::new("rerun").arg(&recording).stdout(Stdio::null()).spawn();
     started.map(drop).map_err(|error| {
-        Failure::environment(format!("rerun {shown}: {error}; install it: pip install rerun-sdk"))
+        let why = match error.kind() {
+            io::ErrorKind::NotFound => "was not found".to_owned(),
+            _ => format!("did not start: {error}"),
+        };
+        Failure::environment(format!(
+            "the viewer, the program rerun, {why}; install it: pip install rerun-sdk==0.36.3, then: rerun {shown}"
+        ))
     })
 }
 
