@@ -124,6 +124,9 @@ fn insertions_that_determine_no_needle_are_refused() {
         "{}",
         message(&huge)
     );
+    let mut degrees = recorded(CREEPING, 0.0);
+    degrees.iter_mut().flatten().for_each(|row| row.rotation_rad = row.rotation_rad.to_degrees());
+    assert!(message(&degrees).contains("is rotation_rad in rad"), "{}", message(&degrees));
     for rows in &mut rows {
         for row in rows {
             row.orientation = Rotation3::identity();
@@ -153,4 +156,18 @@ fn parameters_that_cannot_be_separated_have_no_covariance() {
         sandwich_covariance(&SMatrix::<f64, 2, 2>::new(1.0, 0.0, 0.0, 0.0), &gradients),
         None
     );
+}
+
+#[test]
+fn a_fit_that_no_needle_has_is_refused() {
+    let fit = NeedleFit::of(&recorded(CREEPING, 0.0), &NOISE).unwrap().torsion;
+    assert_eq!(fit.fault(), None);
+    let wide = TorsionConfig { half_width_rad: 111.5, ..CREEPING };
+    let why = "the torsion fits with half_width_deg = 6388.5 (limits 0 to 720)";
+    assert_eq!(TorsionFit { torsion: wide, ..fit }.fault().unwrap(), why);
+    let nowhere = TorsionConfig { creep_mm: f64::NAN, ..CREEPING };
+    assert!(TorsionFit { torsion: nowhere, ..fit }.fault().unwrap().contains("creep_mm = NaN"));
+    assert!(TorsionFit { sd: nowhere, ..fit }.fault().unwrap().contains("standard errors"));
+    let off = TorsionFit { roll_rms_rad: 0.8, ..fit }.fault();
+    assert_eq!(off.unwrap(), "the tip's roll is 46 deg RMS off the fit (limit 45)");
 }

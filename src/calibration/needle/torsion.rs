@@ -2,6 +2,7 @@
 
 use super::insertion::{ENTRY_MM, RecordedInsertion};
 use super::{CalibrationError, needle_error, sandwich_covariance};
+use crate::keys::Range;
 use crate::needle::{NeedleError, Play, Torsion, TorsionConfig};
 use nalgebra::{SMatrix, SVector};
 
@@ -20,6 +21,8 @@ const CLEAR_SD: f64 = 2.0;
 /// The lower bounds of the parameters: a creep shorter than the distance between rows is no creep.
 const MIN: [f64; PARAMETERS] = [0.0, 0.0, f64::NEG_INFINITY, 0.02, 0.0];
 const ITERATIONS_MAX: usize = 100;
+/// The tip's roll may be this far off the fit, RMS, deg: more is no torsion of a needle, but a wrong recording.
+const ROLL_RMS_MAX_DEG: f64 = 45.0;
 
 /// A torsion with its standard errors.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -36,8 +39,8 @@ pub struct TorsionFit {
 
 fn undetermined() -> CalibrationError {
     needle_error(
-        "the insertions do not determine the shaft's torsion; turn the base both ways, by more than the tip \
-         lags, at several depths",
+        "the insertions do not determine the shaft's torsion: is rotation_rad in rad, are the rows in their order, \
+         and does the base turn both ways, by more than the tip lags, at several depths?",
     )
 }
 
@@ -110,7 +113,45 @@ impl TorsionFit {
         let TorsionConfig { half_width_rad, half_width_rad_per_mm, .. } = fit.torsion;
         let has_band = is_clear(half_width_rad, fit.sd.half_width_rad)
             || is_clear(half_width_rad_per_mm, fit.sd.half_width_rad_per_mm);
-        if has_band { Ok(fit) } else { Self::fit(insertions, false) }
+        let fit = if has_band { fit } else { Self::fit(insertions, false)? };
+        match fit.fault() {
+            None => Ok(fit),
+            Some(fault) => Err(needle_error(format!(
+                "{fault}: is rotation_rad in rad, and are the rows in the order of the insertion?"
+            ))),
+        }
+    }
+
+    /// Why this is no torsion of a needle, in words.
+    pub(super) fn fault(&self) -> Option<String> {
+        let TorsionConfig { half_width_rad, half_width_rad_per_mm, offset_rad, .. } = self.torsion;
+        let [half_width_deg, half_width_deg_per_mm, offset_deg, roll_rms_deg] =
+            [half_width_rad, half_width_rad_per_mm, offset_rad, self.roll_rms_rad]
+                .map(f64::to_degrees);
+        let TorsionConfig { creep_mm, creep_mm_per_mm, .. } = self.torsion;
+        let values = [half_width_deg, half_width_deg_per_mm, offset_deg, creep_mm, creep_mm_per_mm];
+        let outside = TorsionConfig::KEYS.iter().zip(values).find_map(|(key, value)| {
+            let Range { low, high, .. } =
+                key.kind.range(&key.rule).filter(|range| !range.contains(value))?;
+            Some(format!(
+                "the torsion fits with {} = {value:.1} (limits {low} to {high})",
+                key.name
+            ))
+        });
+        let roll_is_off = roll_rms_deg > ROLL_RMS_MAX_DEG || roll_rms_deg.is_nan();
+        let off = roll_is_off.then(|| {
+            format!("the tip's roll is {roll_rms_deg:.0} deg RMS off the fit (limit {ROLL_RMS_MAX_DEG:.0})")
+        });
+        let sds = [self.sd.half_width_rad, self.sd.half_width_rad_per_mm, self.sd.offset_rad];
+        let sds = sds.iter().chain([
+            &self.sd.creep_mm,
+            &self.sd.creep_mm_per_mm,
+            &self.offset_spread_rad,
+        ]);
+        let is_unknown = !sds.sum::<f64>().is_finite();
+        let unknown =
+            is_unknown.then(|| "the torsion fits with no finite standard errors".to_owned());
+        outside.or(off).or(unknown)
     }
 
     /// Levenberg-Marquardt iteration within the bounds of the parameters, with or without a band.
