@@ -118,8 +118,8 @@ fn gain(p: &Matrix6<f64>, s: &Matrix3<f64>) -> Option<Matrix6x3<f64>> {
 
 impl RollHypothesis {
     /// Propagates the copy over a motion of the tip. Old knowledge fades: the covariance grows by the factor
-    /// `forgetting`, and the log weight shrinks by the root of it. A roll that was wrong stays wrong for longer than a
-    /// position helps the gains.
+    /// `forgetting`, and the log weight shrinks by the root of it: evidence against a wrong roll stays true, but
+    /// an old position says little about the present pose.
     fn propagate(&mut self, motion: &Pose, forgetting: f64) {
         self.x_pb = (self.x_pb * *motion).renormalized();
         let ad = motion.inverse().adjoint();
