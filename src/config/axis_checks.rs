@@ -261,20 +261,13 @@ fn reserved(index: u16) -> Option<&'static str> {
 /// The configured accelerations are within the limits of their axis: otherwise a run would be certain to stop.
 fn accelerations(config: &Config, reader: &mut Reader) {
     let along = "stage.insertion.acceleration_max_mm_per_s2";
-    let stops = [
-        "stage.insertion.quick_stop_deceleration_mm_per_s2",
-        "stage.rotation.quick_stop_deceleration_deg_per_s2",
-    ];
-    for (key, max_key, stop_key) in [
-        ("insertion.acceleration_mm_per_s2", along, stops[0]),
-        ("stage.insertion.jog_acceleration_mm_per_s2", along, stops[0]),
-        ("stage.rotation.jog_acceleration_deg_per_s2", ROTATION_ACCELERATION_MAX, stops[1]),
+    for (key, max_key) in [
+        ("insertion.acceleration_mm_per_s2", along),
+        ("stage.insertion.jog_acceleration_mm_per_s2", along),
+        ("stage.rotation.jog_acceleration_deg_per_s2", ROTATION_ACCELERATION_MAX),
     ] {
-        let [acceleration, max, stop] = [key, max_key, stop_key].map(|key| config.number(key));
+        let [acceleration, max] = [key, max_key].map(|key| config.number(key));
         contradictions! { reader;
-            [key, stop_key] if acceleration > stop =>
-                "{key} is {acceleration}, allowed: up to {stop_key}, which is {stop}: a stop would \
-                 brake too late to keep a soft limit";
             [key, max_key] if PROFILE_PEAK * acceleration > max =>
                 "{key} is {acceleration}, allowed: up to {:.3}: the last set-point brakes {PROFILE_PEAK} \
                  times as hard, and {max_key} is {max}",

@@ -72,8 +72,9 @@ section! {
         /// Speed of the insertion, mm/s.
         speed_mm_per_s: f64 [over(0.0, 100.0)] = 2.0,
             at_most("stage.insertion.speed_max_mm_per_s");
-        /// Acceleration and braking of the insertion, mm/s².
-        acceleration_mm_per_s2: f64 [over(0.0, 1000.0)] = 10.0;
+        /// Acceleration and braking of the insertion, mm/s². A stop must brake as hard, to keep a soft limit.
+        acceleration_mm_per_s2: f64 [over(0.0, 1000.0)] = 10.0,
+            at_most("stage.insertion.quick_stop_deceleration_mm_per_s2");
         /// How the needle advances.
         mode: InsertionMode = "continuous";
         /// Distance between two estimates and commands, mm.

@@ -97,6 +97,10 @@ const IDENTITY: Rule = Rule::Or("any", "a 32-bit whole number");
 const OBJECT: Rule = within(0x1000 as f64, 0xFFFF as f64);
 const SPEED_MAX: [&str; 2] =
     ["stage.insertion.speed_max_mm_per_s", "stage.rotation.speed_max_deg_per_s"];
+const QUICK_STOP: [&str; 2] = [
+    "stage.insertion.quick_stop_deceleration_mm_per_s2",
+    "stage.rotation.quick_stop_deceleration_deg_per_s2",
+];
 
 section! {
     /// An axis: its drive, scale and limits. Lengths are in mm, angles in rad.
@@ -156,7 +160,8 @@ section! {
             => ["2.0", "30.0"][AXIS], at_most(SPEED_MAX[AXIS]), hardware_may_omit;
         /// Acceleration of `needle-bench stage jog`, and of `withdraw`.
         jog_acceleration as (["jog_acceleration_mm_per_s2", "jog_acceleration_deg_per_s2"][AXIS]):
-            f64 [ACCELERATION[AXIS]] => ["10.0", "90.0"][AXIS], hardware_may_omit;
+            f64 [ACCELERATION[AXIS]] => ["10.0", "90.0"][AXIS], at_most(QUICK_STOP[AXIS]),
+            hardware_may_omit;
         /// Speed of `needle-bench stage withdraw`.
         withdraw_speed as (["withdraw_speed_mm_per_s", NO_KEY][AXIS]): Option<f64> [SPEED[AXIS]]
             = 2.0, at_most(SPEED_MAX[AXIS]), hardware_may_omit;
