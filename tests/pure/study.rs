@@ -127,6 +127,27 @@ fn trials_do_not_depend_on_the_number_of_threads() {
 
 /// A trial through a whole session is the same run (JSON may lose the last bit); one without a session differs by
 /// the rounding of the encoders.
+/// With eight copies at the start the coupled observer keeps a wrong roll here, and the run is stopped.
+#[test]
+fn the_coupled_observer_steers_a_start_that_misleads_it_into_the_plane() {
+    let scratch = Scratch::new();
+    let study = concat!(env!("CARGO_MANIFEST_DIR"), "/bench-config/study.toml");
+    for (seed, law) in
+        [("2441011085624716", "feedback-linearization"), ("2260397153495269", "nested-saturation")]
+    {
+        let law = format!("control.kind={law}");
+        let sets = ["observer.kind=coupled", "observer.samples=one-per-step", &law];
+        let sets = sets.iter().flat_map(|set| ["--set", *set]).collect::<Vec<_>>();
+        let said = needle_bench(
+            &scratch,
+            &[&["run", study, "--json", "-q", "--seed", seed], &sets[..]].concat(),
+        );
+        assert_eq!(said.status, 0, "{}", said.stderr);
+        let off_plane_mm = said.json()["off_plane_rms_mm"].as_f64().expect("a number");
+        assert!(off_plane_mm < 0.5, "{off_plane_mm} mm");
+    }
+}
+
 #[test]
 fn a_run_with_the_seed_of_a_trial_repeats_it() {
     let scratch = Scratch::new();
