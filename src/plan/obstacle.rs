@@ -1,7 +1,13 @@
 //! Obstacles and the distance to them.
 
 use super::mask::Mask;
+use crate::geometry::{Pose, Twist};
 use nalgebra::Vector3;
+
+/// A way between two poses is judged at points at most this far apart, mm …
+const WAY_SPACING_MM: f64 = 0.25;
+/// … and at no more points than this.
+const WAY_POINTS_MAX: f64 = 1000.0;
 
 /// Something that the needle must not come near. Lengths in mm, plane frame.
 #[derive(Debug, Clone, PartialEq)]
@@ -123,6 +129,19 @@ impl World {
         distances.fold(f64::INFINITY, f64::min)
     }
 
+    /// The least distance of the tip to an obstacle, mm, on its way `from` one pose `to` another with a constant
+    /// twist, as a needle moves whose base turns evenly.
+    pub fn distance_on_way_mm(&self, from: &Pose, to: &Pose) -> f64 {
+        let twist = (from.inverse() * *to).log();
+        let points = (twist.v.norm() / WAY_SPACING_MM).ceil().clamp(1.0, WAY_POINTS_MAX) as u32;
+        let passed = (0..points).map(|point| {
+            let fraction = f64::from(point) / f64::from(points);
+            let passed = Twist { v: twist.v * fraction, w: twist.w * fraction };
+            self.distance_mm(&(*from * Pose::exp(&passed)).translation)
+        });
+        passed.fold(self.distance_mm(&to.translation), f64::min)
+    }
+
     /// How far the tip may go from `point_mm` in any direction, mm, before it leaves the workspace or
     /// comes nearer than `clearance_mm` to an obstacle; negative where it must not be.
     pub fn slack_mm(&self, point_mm: &Vector3<f64>, clearance_mm: f64) -> f64 {
@@ -143,8 +162,29 @@ impl World {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::Pose;
     use proptest::prelude::*;
+    use std::f64::consts::PI;
+
+    /// Half a circle of 10 mm about the centre of a ball, and a straight past one.
+    #[test]
+    fn the_distance_on_a_way_is_that_of_its_nearest_point() {
+        let past_ball_at = |centre_mm| {
+            let everywhere = Vector3::repeat(f64::INFINITY);
+            World {
+                obstacles: vec![Obstacle::Sphere { centre_mm, radius_mm: 1.0 }],
+                workspace: Workspace { min_mm: -everywhere, max_mm: everywhere, start_mm: None },
+            }
+        };
+        let start = Pose::identity();
+        let half_circle = Twist { v: Vector3::z() * 9.9 * PI, w: -Vector3::x() * 0.99 * PI };
+        let distance_mm =
+            past_ball_at(Vector3::y() * 10.0).distance_on_way_mm(&start, &Pose::exp(&half_circle));
+        assert!((distance_mm - 9.0).abs() < 1e-9, "{distance_mm}");
+        let world = past_ball_at(Vector3::new(3.0, 0.0, 5.0));
+        let end = Pose { translation: Vector3::z() * 10.0, ..start };
+        assert!((world.distance_on_way_mm(&start, &end) - 2.0).abs() < 1e-9);
+        assert_eq!(world.distance_on_way_mm(&start, &start), world.distance_mm(&Vector3::zeros()));
+    }
 
     fn point(reach_mm: f64) -> impl Strategy<Value = Vector3<f64>> {
         prop::array::uniform3(-reach_mm..reach_mm).prop_map(Vector3::from)

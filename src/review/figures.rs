@@ -13,8 +13,8 @@ use std::collections::BTreeMap;
 const FIGURES: [(&str, &str, &str, usize); 14] = [
     (DEPTH, "depth", "mm", 2),
     (OFF_PLANE, "off plane", "mm", 3),
-    ("target_error_mm", "distance from the target at the end", "mm", 3),
-    ("target_error_est_mm", "distance from the target at the end, estimated", "mm", 3),
+    ("target_error_mm", "distance from the target at the last step", "mm", 3),
+    ("target_error_est_mm", "distance from the target at the last step, estimated", "mm", 3),
     ("clearance_mm_min", "distance from an obstacle, min, estimated", "mm", 2),
     ("settling_mm", "within 1 mm of the plane from", "mm", 1),
     ("steps", "steps", "", 0),
@@ -161,7 +161,7 @@ fn errors(folder: &Folder, report: Option<&FigureReport>) -> Vec<Figure> {
     let rms = format!("estimate's error, RMS over {},", last_third(folder, report));
     let sets = [
         ("estimate_rms", rms.as_str(), report.and_then(|it| it.estimate_rms)),
-        ("final_error", "estimate's error at the end,", report.and_then(|it| it.final_error)),
+        ("final_error", "estimate's error at the last step,", report.and_then(|it| it.final_error)),
     ];
     let mut all = Vec::new();
     for (set, label, error) in sets {

@@ -1,4 +1,4 @@
-//! The motion of the axes, from the recorded frames: an operation has no steps.
+//! The motion of the axes, from the recorded frames.
 
 use super::run::Folder;
 use crate::archive::{CandumpLine, unix_us_of};
@@ -12,7 +12,7 @@ const POINT_EVERY_S: f64 = 0.02;
 pub(super) type TimedFrame = (i64, Frame);
 
 /// Times, s since the start of the run, with positions in mm or degrees.
-type Course = Vec<(f64, f64)>;
+pub(super) type Course = Vec<(f64, f64)>;
 
 /// The commanded and the measured positions of the axes.
 #[derive(Debug, Clone, Default, PartialEq)]

@@ -2,7 +2,7 @@
 
 use super::compare::{Keys, keys};
 use super::figures::{Limits, limits};
-use super::motion::Motion;
+use super::motion::{Course, Motion};
 use crate::archive::{EventKind, EventLine, Manifest, RunOutcome, StepsTable, TrackerTimes};
 use crate::config::{CanInterface, Config, Source};
 use crate::session::{Lane, Severity, State};
@@ -61,7 +61,7 @@ pub struct Run {
     pub steps: StepsTable,
     /// The times in `tracker.ndjson`.
     pub samples: Vec<TrackerTimes>,
-    /// The motion of the axes, in an operation.
+    /// The motion of the axes.
     pub motion: Motion,
     /// `events.log`.
     pub events: Vec<EventLine<'static>>,
@@ -70,34 +70,17 @@ pub struct Run {
 }
 
 impl Run {
-    /// The depth, mm, at a time in s: linear between two steps, over the time that is not held; after the last step
-    /// with the speed before it, up to the final depth; `None` before the first step.
+    /// The depth, mm, at a time in s, from the measured positions of the insertion axis; `None` before the first
+    /// step, or without recorded positions.
     pub(super) fn depth_over_time(&self) -> impl Fn(f64) -> Option<f64> {
+        let course = &self.motion.measured.insertion;
         let (times, depths) = (self.steps.column("time_s"), self.steps.column("insertion_mm"));
-        let mut steps: Vec<(f64, f64)> =
-            times.into_iter().zip(depths).filter_map(|(t, mm)| t.zip(mm)).collect();
-        let last = steps.last().copied();
-        let end_mm = |mm: f64| self.folder.final_depth_mm().unwrap_or(mm).max(mm);
-        let reached_mm = last.map_or(0.0, |(_, mm)| end_mm(mm));
-        let stop_s = self.stop_time_s().filter(|stop_s| last.is_some_and(|(t, _)| *stop_s > t));
-        steps.extend(stop_s.map(|stop_s| (stop_s, reached_mm)));
-        let held = self.held();
-        let held_s = move |until_s: f64| {
-            held.iter().map(|(from_s, to_s)| (until_s.min(*to_s) - from_s).max(0.0)).sum::<f64>()
-        };
-        let moving_s =
-            move |from_s: f64, to_s: f64| to_s - from_s - (held_s(to_s) - held_s(from_s));
+        let first_step = times.into_iter().zip(depths).find_map(|(s, mm)| s.zip(mm));
+        let start = first_step
+            .and_then(|(time_s, depth_mm)| Some((time_s, position_mm(course, time_s)? - depth_mm)));
         move |time_s| {
-            let after = steps.partition_point(|(t, _)| *t <= time_s);
-            let (t0, mm0) = *steps.get(after.checked_sub(1)?)?;
-            let next = steps.get(after);
-            let neighbour = next.or_else(|| steps.get(after.checked_sub(2)?));
-            // A single step gives no speed, nor does a step that was held throughout.
-            let speed = neighbour.map(|(t1, mm1)| (mm1 - mm0) / moving_s(t0, *t1));
-            let speed = speed.filter(|speed| speed.is_finite());
-            let travel_mm = speed.map_or(f64::INFINITY, |speed| speed * moving_s(t0, time_s));
-            let end_mm = next.map_or(reached_mm, |(_, mm1)| *mm1);
-            Some((mm0 + travel_mm).min(end_mm.max(mm0)))
+            let (_, start_mm) = start.filter(|(begun_s, _)| time_s >= *begun_s)?;
+            Some(position_mm(course, time_s)? - start_mm)
         }
     }
 
@@ -139,6 +122,16 @@ impl Run {
         self.events.iter().filter(
             move |line| matches!(line.kind, EventKind::Event(severity) if severity >= least),
         )
+    }
+}
+
+/// The position at a time, linear between two points of `course`; `None` without any point.
+fn position_mm(course: &Course, time_s: f64) -> Option<f64> {
+    let after = course.partition_point(|(s, _)| *s <= time_s);
+    let before = after.checked_sub(1).and_then(|before| course.get(before));
+    match (before, course.get(after)) {
+        (Some((s0, mm0)), Some((s1, mm1))) => Some(mm0 + (mm1 - mm0) * (time_s - s0) / (s1 - s0)),
+        (only, other) => Some(only.or(other)?.1),
     }
 }
 
@@ -264,11 +257,6 @@ impl Folder {
         let figures = self.manifest.figures.clone();
         (!figures.is_empty()).then(|| serde_json::from_value(figures.into()).ok()).flatten()
     }
-
-    /// The depth at the end, mm, if the manifest has it.
-    fn final_depth_mm(&self) -> Option<f64> {
-        Some(self.figures_of_manifest()?.insertion_mm)
-    }
 }
 
 #[cfg(test)]
@@ -315,6 +303,8 @@ pub(super) mod tests {
             "    9.000 s  session   state    stopping",
             "   10.000 s  sess",
         ];
+        let mut motion = Motion::default();
+        motion.measured.insertion = vec![(1.0, 10.0), (2.0, 10.0), (5.0, 13.0), (9.0, 13.0)];
         Run {
             folder: Folder {
                 dir: "runs/a".to_owned(),
@@ -325,7 +315,7 @@ pub(super) mod tests {
             },
             steps: StepsTable::parse(&steps_csv()).unwrap(),
             samples: Vec::new(),
-            motion: Motion::default(),
+            motion,
             events: events.iter().filter_map(|line| parse_event(line)).collect(),
             unreadable: Vec::new(),
         }
@@ -337,7 +327,6 @@ pub(super) mod tests {
         assert_eq!(utc("yesterday"), "yesterday");
     }
 
-    /// The run is held from 3.5 s on, between the steps at 3 and 4 s in 1 and 2 mm.
     #[test]
     fn states_are_listed_with_their_depths() {
         let states = run().states();
@@ -348,34 +337,25 @@ pub(super) mod tests {
             [
                 (0.0, None, "preparing"),
                 (2.0, Some(0.0), "inserting"),
-                (3.5, Some(2.0), "holding"),
+                (3.5, Some(1.5), "holding"),
                 (9.0, Some(3.0), "stopping"),
             ]
         );
     }
 
-    /// Steps at 2, 3, 4 and 5 s, a millimetre apart.
+    /// The depth counts from the first step, at 2 s.
     #[test]
-    fn the_depth_stands_still_while_the_insertion_is_held() {
+    fn the_depth_at_a_time_is_the_measured_one() {
         let mut run = run();
-        let events = [
-            "2.000 s  session   state    inserting",
-            "3.250 s  session   state    holding",
-            "3.750 s  session   state    inserting",
-        ];
-        run.events = events.iter().filter_map(|line| parse_event(&format!("    {line}"))).collect();
-        let depth_mm = run.depth_over_time();
-        assert_eq!(depth_mm(1.0), None);
-        for (time_s, known_mm) in [
-            (2.5, 0.5),
-            (3.125, 1.25),
-            (3.25, 1.5),
-            (3.5, 1.5),
-            (3.75, 1.5),
-            (4.0, 2.0),
-            (60.0, 3.0),
-        ] {
-            assert!((depth_mm(time_s).unwrap() - known_mm).abs() < 1e-9, "{time_s} s");
+        run.motion.measured.insertion = vec![(1.0, 9.5), (2.5, 10.5), (3.0, 10.5), (4.0, 12.5)];
+        let depth_mm = |time_s| run.depth_over_time()(time_s);
+        assert_eq!(depth_mm(1.9), None);
+        let at_begin_mm = 9.5 + 1.0 / 1.5;
+        for (time_s, stage_mm) in [(2.0, at_begin_mm), (2.75, 10.5), (3.5, 11.5), (60.0, 12.5)] {
+            let off_mm = depth_mm(time_s).unwrap() - (stage_mm - at_begin_mm);
+            assert!(off_mm.abs() < 1e-9, "{time_s} s: {off_mm} mm off");
         }
+        run.motion = Motion::default();
+        assert_eq!(run.depth_over_time()(3.0), None);
     }
 }

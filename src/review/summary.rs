@@ -185,7 +185,7 @@ mod tests {
         assert_eq!(json["figures"]["final_error.roll_deg"], Value::Null);
         assert_eq!(json["limits"]["off_plane_rms_mm"], 1.0);
         assert_eq!(json["outside"], json!(["sync_late_us_max"]));
-        assert_eq!(json["states"][2]["insertion_mm"], 2.0);
+        assert_eq!(json["states"][2]["insertion_mm"], 1.5);
         assert_eq!(json["verdict"], Value::Null);
     }
 
@@ -195,7 +195,7 @@ mod tests {
         run.folder.manifest.timing.clear();
         assert_eq!(
             warnings(&run),
-            ["3.500 s at 2.0 mm, tracker: last tip 0.51 s old (limit 0.50)"]
+            ["3.500 s at 1.5 mm, tracker: last tip 0.51 s old (limit 0.50)"]
         );
     }
 

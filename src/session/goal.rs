@@ -2,6 +2,7 @@
 
 use super::target::TargetTool;
 use crate::control::{Bend, BendLaw, Command, ControlConfig, ControlKind};
+use crate::geometry::Pose;
 use crate::needle::Needle;
 use crate::observer::Estimate;
 use crate::plan::{
@@ -108,7 +109,8 @@ pub struct Approach {
     pub target_mm: Vector3<f64>,
     /// Distance of the estimated tip from the target, mm.
     pub distance_mm: f64,
-    /// Distance of the estimated tip from the nearest obstacle, mm; infinite without obstacles.
+    /// The least distance of the estimated tip from an obstacle since the step before, mm; infinite without
+    /// obstacles.
     pub clearance_mm: f64,
     /// Distance from the target at the end of the path, mm.
     pub error_mm: f64,
@@ -123,6 +125,8 @@ pub(super) struct Pursuit {
     goal: Goal,
     /// Position of the target, plane frame, mm; it may be off the plane.
     target_mm: Vector3<f64>,
+    /// The estimated tip at the last step.
+    tip_before: Option<Pose>,
     /// Depth at the replanner's last step, mm.
     planned_at_mm: f64,
     /// The needle's curvature as configured, per mm.
@@ -141,6 +145,7 @@ impl Pursuit {
             law: BendLaw::new(needle, control.nested_saturation),
             target_mm: goal.problem.target_mm,
             goal,
+            tip_before: None,
             planned_at_mm: 0.0,
             curvature_per_mm: needle.curvature_per_mm(),
         })
@@ -175,10 +180,11 @@ impl Pursuit {
     }
 
     /// The approach at the end of the insertion, without a path.
-    pub(super) fn end(&self, estimate: &Estimate) -> Approach {
-        let (target_mm, tip_mm) = (self.target_mm, estimate.x_pb.translation);
-        let distance_mm = (tip_mm - target_mm).norm();
-        let clearance_mm = self.goal.world.distance_mm(&tip_mm);
+    pub(super) fn end(&mut self, estimate: &Estimate) -> Approach {
+        let (target_mm, tip) = (self.target_mm, estimate.x_pb);
+        let distance_mm = (tip.translation - target_mm).norm();
+        let before = self.tip_before.replace(tip).unwrap_or(tip);
+        let clearance_mm = self.goal.world.distance_on_way_mm(&before, &tip);
         Approach { target_mm, distance_mm, clearance_mm, error_mm: distance_mm, path: None }
     }
 

@@ -5,6 +5,7 @@ use super::consistency::{TrialNees, nees};
 use super::figures::{ByDepth, FigureReport, OFF_PLANE_LIMIT_MM, RunFigures, TipError, last_third};
 use super::statistics::{mean, rms};
 use crate::emulator::{Truth, VirtualStageConfig};
+use crate::geometry::Pose;
 use crate::needle::{Reduced, shortest_into_plane_mm};
 use crate::plan::World;
 use crate::session::{Goal, Outcome, StepRecord};
@@ -91,6 +92,8 @@ pub struct TrialScorer {
 struct GoalScore {
     obstacles: World,
     tolerance_mm: f64,
+    /// The true tip at the last step.
+    tip_before: Option<Pose>,
     /// The least distance of the true tip from an obstacle so far, mm.
     clearance_mm: f64,
 }
@@ -115,6 +118,7 @@ impl TrialScorer {
             goal: goal.map(|goal| GoalScore {
                 obstacles: goal.world.clone(),
                 tolerance_mm: goal.problem.tolerance_mm,
+                tip_before: None,
                 clearance_mm: f64::INFINITY,
             }),
         }
@@ -124,7 +128,9 @@ impl TrialScorer {
     pub fn take(&mut self, step: &StepRecord, truth: &Truth) {
         self.figures.take_step(step, Some(truth));
         if let Some(goal) = &mut self.goal {
-            let distance_mm = goal.obstacles.distance_mm(&truth.x_pb().translation);
+            let tip = truth.x_pb();
+            let before = goal.tip_before.replace(*tip).unwrap_or(*tip);
+            let distance_mm = goal.obstacles.distance_on_way_mm(&before, tip);
             goal.clearance_mm = goal.clearance_mm.min(distance_mm);
         }
         let depth_mm = step.insertion_meas_mm;

@@ -24,10 +24,7 @@ pub(super) fn run(path: &Path) -> Result<Run> {
     });
     unreadable.extend(steps.miscount().map(|why| format!("{}: {why}", shown.display())));
     let samples = lines(&record, file::TRACKER, TrackerTimes::parse, &mut unreadable);
-    let motion = match folder.manifest.operation {
-        Some(_) => Motion::new(&lines(&record, file::CAN, parse_frame, &mut unreadable), &folder),
-        None => Motion::default(),
-    };
+    let motion = Motion::new(&lines(&record, file::CAN, parse_frame, &mut unreadable), &folder);
     let events = lines(&record, file::EVENTS, parse_event, &mut unreadable);
     // A record that is not closed has no `run.rrd` yet.
     let is_closed = !matches!(folder.condition, Condition::BeingWritten | Condition::Open);

@@ -36,9 +36,11 @@ pub(super) fn curves(run: &Run, limits: &Limits) -> Vec<Chart> {
         insertion(run, limits),
         tip_age(run, limits),
         blind_depth(run, limits),
-        motion(run, Axis::Insertion, "Motion of the insertion", "position (mm)"),
-        motion(run, Axis::Rotation, "Motion of the rotation", "position (deg)"),
     ];
+    if run.folder.manifest.operation.is_some() {
+        charts.push(motion(run, Axis::Insertion, "Motion of the insertion", "position (mm)"));
+        charts.push(motion(run, Axis::Rotation, "Motion of the rotation", "position (deg)"));
+    }
     charts.retain(Chart::has_curve);
     charts
 }
@@ -143,15 +145,13 @@ fn rotation_of_base(run: &Run) -> Chart {
 /// Depth over time, with the holds, to the last step or to the point where the run was stopped.
 fn insertion(run: &Run, limits: &Limits) -> Chart {
     let steps = points(&column(run, "time_s"), &depth(run));
-    let (last, held, depth_mm) = (steps.last().copied(), run.held(), run.depth_over_time());
+    let (last, depth_mm) = (steps.last().copied(), run.depth_over_time());
     let end_s = last.map_or(0.0, |(last_s, _)| run.stop_time_s().unwrap_or(last_s).max(last_s));
-    let turns = held.iter().flat_map(|(from_s, to_s)| [*from_s, *to_s]).chain([end_s]);
-    let mut times: Vec<f64> = steps.iter().map(|(time_s, _)| *time_s).chain(turns).collect();
-    times.retain(|time_s| *time_s <= end_s);
-    times.sort_by(f64::total_cmp);
-    times.dedup();
-    let course = times.into_iter().filter_map(|time_s| Some((time_s, depth_mm(time_s)?)));
+    let times = run.motion.measured.insertion.iter().map(|(time_s, _)| *time_s);
+    let times = times.take_while(|time_s| *time_s <= end_s).chain([end_s]);
+    let course = times.filter_map(|time_s| Some((time_s, depth_mm(time_s)?)));
     let course = course.filter(|(_, mm)| mm.abs() < VALUE_MAX).collect();
+    let held = run.held();
     let mut layers =
         vec![Layer::intervals("held", held), line("stage, measured", MEASURED, course)];
     if run.folder.manifest.outcome == Some(RunOutcome::Stopped) {
@@ -348,6 +348,7 @@ mod tests {
     fn an_operation_is_drawn_with_the_moment_of_its_stop() {
         let mut run = run();
         run.folder.manifest.set_outcome(&Outcome::Stopped("stage: drive in fault".to_owned()));
+        run.folder.manifest.operation = Some("jog".to_owned());
         run.motion.measured.insertion = vec![(8.5, 1.0), (8.9, 1.4), (9.1, 1.5)];
         let titles: Vec<_> = curves(&run, &Limits::new()).iter().map(|c| c.title).collect();
         assert!(titles.contains(&"Motion of the insertion"), "{titles:?}");
@@ -361,7 +362,7 @@ mod tests {
     fn the_hold_that_stopped_a_run_is_in_its_curves() {
         let mut run = run();
         run.folder.manifest.set_outcome(&Outcome::Stopped("tracker: no tip".to_owned()));
-        run.folder.manifest.figures.insert("insertion_mm".to_owned(), 3.5.into());
+        run.motion.measured.insertion = vec![(2.0, 10.0), (5.0, 13.0), (9.0, 13.5)];
         let at = |ms: i64, refused: Option<String>| TrackerTimes {
             receive_time_ns: ms * 1_000_000,
             acquisition_time_ns: refused.is_none().then_some(ms * 1_000_000),

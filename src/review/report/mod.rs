@@ -45,7 +45,7 @@ pub fn html(run: &Run) -> Result<String, Error> {
     let shown = run.shown_figures();
     let rms = format!("RMS over {}", last_third(folder, report.as_ref()));
     let report = report.unwrap_or_default();
-    let errors = [(rms.as_str(), report.estimate_rms), ("at the end", report.final_error)];
+    let errors = [(rms.as_str(), report.estimate_rms), ("at the last step", report.final_error)];
     let page = environment.template_from_str(PAGE)?.render(context! {
         generator => Value::from_safe_string(GENERATOR.to_owned()),
         css => Value::from_safe_string(CSS.to_owned()),
