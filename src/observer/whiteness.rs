@@ -40,6 +40,12 @@ impl PositionNoise {
         math::hypot(self.white_sd_mm, self.correlated_sd_mm)
     }
 
+    /// The variance of the mean of many positions that are `spacing_s` apart, relative to that of independent
+    /// positions: so many positions carry as much information as one independent one. At least 1.
+    pub fn inflation(&self, spacing_s: f64) -> f64 {
+        (self.long_mean_variance_mm2(spacing_s) / self.sd_mm().powi(2)).max(1.0)
+    }
+
     /// Variance of each coordinate of a mean of many positions that are `spacing_s` apart, times
     /// their number, mm²: `w² + c² (1 + φ) / (1 - φ)` with the correlation
     /// `φ = exp(-spacing / time)` of neighbours.

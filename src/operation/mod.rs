@@ -18,7 +18,7 @@ use self::home::Homing;
 use self::moving::MoveOneAxis;
 use self::prove::Prove;
 use crate::session::{Session, SessionConfig, Task};
-use crate::stage::{Axis, PerAxis, Stage, StageConfig};
+use crate::stage::{Axis, AxisUse, PerAxis, Stage, StageConfig};
 use crate::tracker::Gate;
 use crate::units::Time;
 use nalgebra::Vector3;
@@ -80,10 +80,13 @@ impl OperationConfig {
     /// The stage refuses its configuration, or has no homing for an axis that is to be homed.
     pub fn begin(self, now: Time) -> Result<Session, String> {
         let OperationConfig { stage: config, operation } = self;
-        let stage = match operation {
-            Operation::Home(axes) => Stage::for_homing(config.clone(), axes, now),
-            _ => Stage::new(config.clone(), now),
-        };
+        let purpose = PerAxis::from_fn(|axis| match &operation {
+            Operation::Home(axes) if axes[axis] => AxisUse::Home,
+            Operation::Home(_) => AxisUse::Hold,
+            Operation::Move(_) => AxisUse::Move,
+            Operation::Prove | Operation::Answer(_) => AxisUse::Steer,
+        });
+        let stage = Stage::for_use(config.clone(), purpose, now);
         let stage = stage.map_err(|error| format!("stage: {error}"))?;
         let task: Box<dyn Task> = match operation {
             Operation::Home(axes) => Box::new(Homing::new(&config, axes)),

@@ -116,6 +116,32 @@ mod tests {
         }
     }
 
+    proptest! {
+        /// A move that brakes at most as hard as a quick stop may end at the limit itself.
+        #[test]
+        fn a_profile_to_the_limit_could_stop_before_it(
+            goal in 0.05..20.0f64,
+            speed in 0.1..10.0f64,
+            acceleration in 0.5..200.0f64,
+            counts in 50..20_000u32,
+            period_ms in prop::sample::select(vec![1u64, 4, 10, 50]),
+        ) {
+            let period = Duration::from_millis(period_ms);
+            let ratio = CountsRatio::new(counts, 1).expect("not zero");
+            let scale = Scale::new(Axis::Insertion, ratio, Sign::Positive, 0);
+            let limits = AxisLimits { min: 0.0, max: goal, speed_max: 10.0, acceleration_max: None };
+            let check = LimitCheck::new(Axis::Insertion, scale, limits, period, false)
+                .with_quick_stop(Some(acceleration));
+            let mut limited = Limited { check, last: Commanded { counts: 0, step_counts: 0 } };
+            let mut profile = Profile::new(speed, acceleration);
+            profile.go_to(goal);
+            while profile.position_mm() < profile.goal_mm() {
+                let target = profile.advance(period);
+                prop_assert_eq!(limited.command(target), Ok(()));
+            }
+        }
+    }
+
     /// This shows that the bound is not too high.
     #[test]
     fn a_profile_reaches_its_peak_acceleration() {

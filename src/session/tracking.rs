@@ -47,6 +47,8 @@ pub(crate) struct Tracking {
     clock: AcquisitionClock,
     pub(super) track: Track,
     pub(super) travel: TravelCheck,
+    /// Acquisition time of the last position that was accepted with its depth.
+    accepted_at: Option<Time>,
     /// What the gates did with the samples so far.
     pub(super) counts: GateCounts,
     census: Census,
@@ -87,6 +89,7 @@ impl Tracking {
             clock: tracker.clock.clone(),
             track: Track::new(tracker.track),
             travel: TravelCheck::new(tracker.track.noise_sd_mm, config.needle.curvature_per_mm()),
+            accepted_at: None,
             counts: GateCounts::default(),
             census: Census::default(),
             unpaired_age_max: UNPAIRED_AGE_MAX.max(2 * config.stage.bus.sync_period()),
@@ -211,7 +214,8 @@ impl Tracking {
             let judged =
                 self.judge_one(&sample.record, acquisition_time, &tip_meas, history, estimation);
             if let Ok(stage_insertion_meas_mm) = judged {
-                self.travel.take(stage_insertion_meas_mm, &tip_meas.mm());
+                let independent = self.independent(acquisition_time);
+                self.travel.take(stage_insertion_meas_mm, &tip_meas.mm(), independent);
                 believed.push(Measurement {
                     acquisition_time,
                     stage_insertion_meas_mm,
@@ -224,6 +228,13 @@ impl Tracking {
         self.waiting = waiting;
         self.release_records();
         believed
+    }
+
+    /// How many independent positions an accepted one is worth, by the configured noise.
+    fn independent(&mut self, acquisition_time: Time) -> f64 {
+        let last = self.accepted_at.replace(acquisition_time);
+        let spacing_s = last.map_or(f64::INFINITY, |last| acquisition_time.seconds_after(last));
+        self.config.noise.map_or(1.0, |noise| noise.inflation(spacing_s).recip())
     }
 
     /// The stage's depth at the position's acquisition, if the position is accepted.

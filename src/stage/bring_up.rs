@@ -7,7 +7,7 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use super::dialogue::{ScriptRunner, Sdo};
-use super::{Axis, AxisConfig, Progress, StageConfig, StageEvent};
+use super::{Axis, AxisConfig, AxisUse, Progress, StageConfig, StageEvent};
 use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::Statusword;
 use crate::canopen::emcy::EmcyCode;
@@ -81,11 +81,11 @@ pub(super) struct BringUpState {
 }
 
 impl BringUp {
-    /// The bring-up of `axis`, to be homed in `homing_mode` or to be moved in cyclic synchronous position.
-    pub(super) fn new(config: &StageConfig, axis: Axis, homing_mode: bool, now: Time) -> Self {
+    /// The bring-up of `axis` for this `purpose`.
+    pub(super) fn new(config: &StageConfig, axis: Axis, purpose: AxisUse, now: Time) -> Self {
         let sdo = Sdo::new(config, axis);
         let state = Rc::new(Cell::new(BringUpState::default()));
-        let script = Script { axis, homing_mode, config: config.clone(), sdo, state };
+        let script = Script { axis, purpose, config: config.clone(), sdo, state };
         BringUp {
             runner: ScriptRunner::begin(&script.sdo, now, script.clone().run()),
             script,
@@ -137,8 +137,7 @@ pub(super) fn optional(address: ObjectAddress) -> Object {
 #[derive(Debug, Clone)]
 pub(super) struct Script {
     pub(super) axis: Axis,
-    /// The axis is brought up in homing mode, to be homed; otherwise in cyclic synchronous position.
-    pub(super) homing_mode: bool,
+    pub(super) purpose: AxisUse,
     pub(super) config: StageConfig,
     pub(super) sdo: Sdo,
     state: Rc<Cell<BringUpState>>,

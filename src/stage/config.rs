@@ -95,7 +95,7 @@ const FOLLOWING_LAG: Duration = Duration::from_millis(30);
 
 const IDENTITY: Rule = Rule::Or("any", "a 32-bit whole number");
 const OBJECT: Rule = within(0x1000 as f64, 0xFFFF as f64);
-const SPEED_MAX: [&str; 2] =
+pub(super) const SPEED_MAX: [&str; 2] =
     ["stage.insertion.speed_max_mm_per_s", "stage.rotation.speed_max_deg_per_s"];
 const QUICK_STOP: [&str; 2] = [
     "stage.insertion.quick_stop_deceleration_mm_per_s2",

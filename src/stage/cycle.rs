@@ -222,7 +222,7 @@ impl Stage {
             for axis in Axis::BOTH {
                 if let Err(limit) = self.drives[axis].arm() {
                     let fault = format!(
-                        "cannot start: the axis stands outside its limits: {limit}; move it back, or \
+                        "cannot start: the axis stands outside its limits: {limit}; jog it back, or \
                          correct its limits or zero"
                     );
                     return self.fail(now, fault);

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::standstill::Standstill;
 use super::{
-    Axis, AxisConfig, Commanded, DriveFlag, FoundFault, LimitCheck, StageConfig, Unwrapper,
+    Axis, AxisConfig, AxisUse, Commanded, DriveFlag, FoundFault, LimitCheck, StageConfig, Unwrapper,
 };
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword, object};
 use crate::canopen::emcy::{Emcy, EmcyCode};
@@ -49,8 +49,7 @@ pub(super) struct Drive {
     axis: Axis,
     config: AxisConfig,
     sync_period: Duration,
-    /// The drive is in homing mode: it follows no target, and its position is not known.
-    pub(super) homing_mode: bool,
+    purpose: AxisUse,
     /// Scale and limits, once the drive is [armed](Self::arm).
     armed: Option<LimitCheck>,
     commanded: Commanded,
@@ -117,13 +116,13 @@ impl Reading {
 }
 
 impl Drive {
-    /// A drive in homing mode or in cyclic synchronous position.
-    pub(super) fn new(config: &StageConfig, axis: Axis, homing_mode: bool) -> Self {
+    /// The drive of an axis that is used for this `purpose`.
+    pub(super) fn new(config: &StageConfig, axis: Axis, purpose: AxisUse) -> Self {
         Drive {
             axis,
             config: config.axis(axis).clone(),
             sync_period: config.bus.sync_period(),
-            homing_mode,
+            purpose,
             armed: None,
             commanded: Commanded { counts: 0, step_counts: 0 },
             next_counts: None,
@@ -155,6 +154,15 @@ impl Drive {
         }
     }
 
+    pub(super) fn purpose(&self) -> AxisUse {
+        self.purpose
+    }
+
+    /// True in homing mode: the drive follows no target, and its position is not known.
+    pub(super) fn in_homing_mode(&self) -> bool {
+        self.purpose == AxisUse::Home
+    }
+
     /// Makes `position`, where the axis stands, its target.
     pub(super) fn seed(&mut self, position: i32) {
         self.position = Unwrapper::new(position);
@@ -170,7 +178,7 @@ impl Drive {
         self.fresh = true;
         self.tpdo_of_wrong_length = None;
         // Until the drive follows its target, the target follows the drive.
-        if self.armed.is_none() || self.homing_mode {
+        if self.armed.is_none() || self.in_homing_mode() {
             self.commanded = Commanded { counts: self.position.counts(), step_counts: 0 };
         }
     }
@@ -305,7 +313,7 @@ impl Drive {
     pub(super) fn note_internal_limit(&mut self) -> bool {
         let is_limited = self.statusword.is_some_and(|word| word.has(Statusword::INTERNAL_LIMIT));
         let was_limited = std::mem::replace(&mut self.was_limited, is_limited);
-        if !is_limited || was_limited || self.homing_mode {
+        if !is_limited || was_limited || self.in_homing_mode() {
             return false;
         }
         self.limited += 1;
@@ -315,7 +323,7 @@ impl Drive {
     /// The bits that an enabled drive must show.
     fn flags(&self) -> impl Iterator<Item = DriveFlag> + use<> {
         // In homing mode bit 12 says that the axis is homed.
-        let homing_mode = self.homing_mode;
+        let homing_mode = self.in_homing_mode();
         let means_homed = move |flag: &DriveFlag| homing_mode && *flag == DriveFlag::FollowsCommand;
         DriveFlag::ALL.into_iter().filter(move |flag| !means_homed(flag))
     }
@@ -368,7 +376,7 @@ impl Drive {
     /// The limit outside which the axis stands.
     pub(super) fn arm(&mut self) -> Result<(), String> {
         let limits = self.limits_from_here();
-        if !self.homing_mode {
+        if self.purpose == AxisUse::Steer {
             limits.check_position(limits.scale.value(self.commanded.counts))?;
         }
         self.armed = Some(limits);
@@ -386,9 +394,10 @@ impl Drive {
 
     /// Scale and limits. If the axis has no configured zero, its present target is zero.
     fn limits_from_here(&self) -> LimitCheck {
-        let AxisConfig { limits, wraps, .. } = self.config;
+        let AxisConfig { limits, wraps, quick_stop_deceleration, .. } = self.config;
         let scale = self.config.scale(self.axis, self.commanded.counts);
         LimitCheck::new(self.axis, scale, limits, self.sync_period, wraps)
+            .with_quick_stop(quick_stop_deceleration)
     }
 
     /// Begins anew at the drive's last reading after homing, which has changed the drive's zero. Returns the
@@ -398,6 +407,14 @@ impl Drive {
         self.seed(self.position.counts() as i32);
         self.armed = Some(self.limits_from_here());
         self.measured()
+    }
+
+    /// Checks that the axis may be at `goal` (mm or rad).
+    pub(super) fn check_goal(&self, goal: f64) -> Result<(), String> {
+        match self.purpose {
+            AxisUse::Steer => self.limits().check_position(goal).map(drop),
+            _ => self.limits().check_position_from(goal, self.commanded.counts).map(drop),
+        }
     }
 
     /// The counts of `target` (mm or rad), if the axis may go there next.

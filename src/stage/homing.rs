@@ -1,5 +1,6 @@
 //! Homing: a drive finds its home by itself (CiA 402-2, mode 6), and the stage watches.
 
+use super::config::SPEED_MAX;
 use super::limits::SPEED;
 use super::machine::Phase;
 use super::{Axis, Stage, StageEvent};
@@ -29,10 +30,10 @@ section! {
         method: i8;
         /// Speed towards the switch (6099:1).
         speed_switch as (["speed_switch_mm_per_s", "speed_switch_deg_per_s"][AXIS]): Option<f64>
-            [SPEED[AXIS]];
+            [SPEED[AXIS]], at_most(SPEED_MAX[AXIS]);
         /// Speed towards zero (6099:2).
         speed_zero as (["speed_zero_mm_per_s", "speed_zero_deg_per_s"][AXIS]): Option<f64>
-            [SPEED[AXIS]];
+            [SPEED[AXIS]], at_most(SPEED_MAX[AXIS]);
         /// Acceleration (609A).
         acceleration as (["acceleration_mm_per_s2", "acceleration_deg_per_s2"][AXIS]): Option<f64>
             [over(0.0, 1e6)];
@@ -82,7 +83,7 @@ impl Stage {
     /// # Errors
     /// When the stage is not ready, or `axis` is not in homing mode.
     pub fn home(&mut self, now: Time, axis: Axis) -> Result<(), String> {
-        let homing = self.config.axis(axis).homing.filter(|_| self.drives[axis].homing_mode);
+        let homing = self.config.axis(axis).homing.filter(|_| self.drives[axis].in_homing_mode());
         let (Phase::Ready, Some(config)) = (self.phase, homing) else {
             return Err("the stage is not ready to home".to_owned());
         };

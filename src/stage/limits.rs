@@ -78,6 +78,7 @@ pub struct LimitCheck {
     limits: AxisLimits,
     period_s: f64,
     wraps: bool,
+    quick_stop_deceleration: Option<f64>,
 }
 
 impl LimitCheck {
@@ -90,10 +91,18 @@ impl LimitCheck {
         sync_period: Duration,
         wraps: bool,
     ) -> Self {
-        LimitCheck { scale, axis, limits, period_s: sync_period.as_secs_f64(), wraps }
+        let period_s = sync_period.as_secs_f64();
+        LimitCheck { scale, axis, limits, period_s, wraps, quick_stop_deceleration: None }
     }
 
-    /// The counts of `target` (mm or rad) if the axis may be sent there from `last`.
+    /// Also refuses a target from which a quick stop with this deceleration, per second squared, would end beyond
+    /// a limit.
+    pub fn with_quick_stop(self, deceleration: Option<f64>) -> Self {
+        LimitCheck { quick_stop_deceleration: deceleration, ..self }
+    }
+
+    /// The counts of `target` (mm or rad) if the axis may be sent there from `last`. An axis that stands outside
+    /// its limits may be held, and may come back.
     ///
     /// Rounding to whole counts changes a step by up to 1 count, and the difference of two steps by up to 2.
     /// The check allows that.
@@ -101,9 +110,23 @@ impl LimitCheck {
     /// # Errors
     /// The first limit that `target` breaks.
     pub fn check(&self, target: f64, last: Commanded) -> Result<i64, String> {
-        let counts = self.check_position(target)?;
+        let counts = self.check_position_from(target, last.counts)?;
         self.check_motion(target, counts, last)?;
+        self.check_stop(target, counts, last)?;
         Ok(counts)
+    }
+
+    /// As [`check_position`](Self::check_position), but up to where the axis is held, at `held` counts, it may
+    /// be outside.
+    ///
+    /// # Errors
+    /// The position limit that `target` breaks.
+    pub(super) fn check_position_from(&self, target: f64, held: i64) -> Result<i64, String> {
+        self.check_position(target).or_else(|error| {
+            let (held, AxisLimits { min, max, .. }) = (self.scale.value(held), self.limits);
+            let limits = AxisLimits { min: min.min(held), max: max.max(held), ..self.limits };
+            LimitCheck { limits, ..*self }.check_position(target).map_err(|_| error)
+        })
     }
 
     /// The counts of `target` (mm or rad) if the axis may be there.
@@ -129,6 +152,26 @@ impl LimitCheck {
             return Err(does_not_fit());
         }
         Ok(counts)
+    }
+
+    /// Checks that a quick stop that begins at `target` ends within the limit ahead. A step more than that is
+    /// allowed: a set-point has the mean speed of its step, and the axis may be slowing down to the limit.
+    fn check_stop(&self, target: f64, counts: i64, last: Commanded) -> Result<(), String> {
+        let Some(deceleration) = self.quick_stop_deceleration else { return Ok(()) };
+        let step = target - self.scale.value(last.counts);
+        // Rounding to whole counts changes a step by up to 1 count.
+        let step_counts = counts.saturating_sub(last.counts).unsigned_abs().saturating_sub(1);
+        let speed = step_counts as f64 / (self.scale.counts_per_unit() * self.period_s);
+        let beyond = speed * speed / (2.0 * deceleration) - step.abs();
+        let ahead = match step > 0.0 {
+            true => AxisLimits { min: f64::NEG_INFINITY, ..self.limits },
+            false => AxisLimits { max: f64::INFINITY, ..self.limits },
+        };
+        let end = target + beyond.max(0.0).copysign(step);
+        ahead.check_range(self.axis, end).map_err(|error| {
+            let [target, speed] = [target, speed].map(|value| self.axis.shown(value));
+            format!("{error}: there a quick stop from {target} at {speed}/s would end")
+        })
     }
 
     fn check_motion(&self, target: f64, counts: i64, last: Commanded) -> Result<(), String> {
@@ -249,6 +292,40 @@ mod tests {
         assert!(refused.contains("does not fit the drive's 32-bit position"), "{refused}");
         let wrapping = LimitCheck { wraps: true, ..near_the_end };
         assert_eq!(wrapping.check(0.011, last), Ok(i64::from(i32::MAX) + 1));
+    }
+
+    /// An axis that stands outside may be held and may come back, but goes no farther out, and not back out again.
+    #[test]
+    fn an_axis_outside_its_limits_may_only_come_back() {
+        let check = check(Sign::Negative, 0);
+        let held = |mm: f64| Commanded { counts: -(mm * 1000.0).round() as i64, step_counts: 0 };
+        for mm in [150.002, -1.002] {
+            let outward = mm + 0.001_f64.copysign(mm);
+            assert!(check.check(mm, held(mm)).is_ok(), "{mm}");
+            assert!(check.check(mm - 0.001_f64.copysign(mm), held(mm)).is_ok(), "{mm}");
+            let refused = text(check.check(outward, held(mm)));
+            assert!(refused.contains("the limit of"), "{refused}");
+            assert!(check.check(mm, held(mm - 0.001_f64.copysign(mm))).is_err(), "{mm}");
+        }
+        let across = check.check_position_from(-1.001, held(150.1).counts);
+        assert!(text(across).contains("is under the limit of -1.000 mm"));
+    }
+
+    /// From 149.9 mm at 5 mm/s a deceleration of 100 mm/s² needs 0.125 mm.
+    #[test]
+    fn a_set_point_from_which_a_quick_stop_would_end_outside_is_refused() {
+        let last = Commanded { counts: 149_850, step_counts: 50 };
+        let check = check(Sign::Positive, 0);
+        assert_eq!(check.check(149.9, last), Ok(149_900));
+        assert_eq!(check.with_quick_stop(Some(200.0)).check(149.9, last), Ok(149_900));
+        assert_eq!(
+            text(check.with_quick_stop(Some(50.0)).check(149.9, last)),
+            "insertion: 150.090 mm is over the limit of 150.000 mm (stage.insertion.max_mm): there a quick \
+             stop from 149.900 mm at 4.900 mm/s would end"
+        );
+        // Away from the limit it may be as fast.
+        let back = Commanded { counts: 149_950, step_counts: -50 };
+        assert_eq!(check.with_quick_stop(Some(1.0)).check(149.9, back), Ok(149_900));
     }
 
     proptest! {

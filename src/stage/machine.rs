@@ -81,27 +81,40 @@ pub struct Stage {
     outputs: VecDeque<Output>,
 }
 
+/// What an axis is used for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AxisUse {
+    /// It steers a needle, or is put to a test: it must be homed, and stand within its soft limits.
+    Steer,
+    /// It is moved by the operator: it must be homed. If it stands outside its soft limits, it may come back.
+    Move,
+    /// It is held while the other axis is homed.
+    Hold,
+    /// It is homed.
+    Home,
+}
+
 impl Stage {
     /// A stage that begins at `now`: it listens, then brings up its drives.
     ///
     /// # Errors
     /// When the configuration cannot work; nothing has been sent then.
     pub fn new(config: StageConfig, now: Time) -> Result<Self, String> {
-        Self::for_homing(config, PerAxis::default(), now)
+        Self::for_use(config, PerAxis::from_fn(|_| AxisUse::Steer), now)
     }
 
-    /// A stage that enables the `homed_axes` in homing mode, to be homed by [`Stage::home`]. It takes no
-    /// set-points.
+    /// A stage that begins at `now` and uses each axis for its `purpose`. An axis in homing mode takes no
+    /// set-points; [`Stage::home`] homes it.
     ///
     /// # Errors
-    /// When the configuration cannot work, or has no homing for one of these axes.
-    pub fn for_homing(
+    /// When the configuration cannot work, or has no homing for an axis that is to be homed.
+    pub fn for_use(
         config: StageConfig,
-        homed_axes: PerAxis<bool>,
+        purpose: PerAxis<AxisUse>,
         now: Time,
     ) -> Result<Self, String> {
         for axis in Axis::BOTH {
-            if homed_axes[axis] && config.axis(axis).homing.is_none() {
+            if purpose[axis] == AxisUse::Home && config.axis(axis).homing.is_none() {
                 return Err(no_homing(axis));
             }
         }
@@ -111,7 +124,7 @@ impl Stage {
         let mut stage = Stage {
             phase: Phase::Listening { until },
             bring_ups: PerAxis::default(),
-            drives: PerAxis::from_fn(|axis| Drive::new(&config, axis, homed_axes[axis])),
+            drives: PerAxis::from_fn(|axis| Drive::new(&config, axis, purpose[axis])),
             monitors: PerAxis::from_fn(|axis| {
                 HeartbeatConsumer::new(config.axis(axis).node, timeout)
             }),
@@ -166,7 +179,7 @@ impl Stage {
         {
             self.phase = Phase::BringUp;
             self.bring_ups = PerAxis::from_fn(|axis| {
-                Some(BringUp::new(&self.config, axis, self.drives[axis].homing_mode, now))
+                Some(BringUp::new(&self.config, axis, self.drives[axis].purpose(), now))
             });
         }
         for axis in Axis::BOTH {
@@ -229,7 +242,7 @@ impl Stage {
     /// sent then, and both axes keep their targets.
     pub fn command(&mut self, set_point: SetPoint) -> Result<(), String> {
         let not_ready = match self.phase {
-            Phase::Ready if self.drives.all(|drive| !drive.homing_mode) => None,
+            Phase::Ready if self.drives.all(|drive| !drive.in_homing_mode()) => None,
             Phase::Ready | Phase::Homing(_) => Some("in homing mode"),
             Phase::Stopping { .. } | Phase::Disabling { .. } => Some("while it stops"),
             Phase::Stopped => Some("after it has stopped"),
@@ -255,14 +268,14 @@ impl Stage {
         Ok(())
     }
 
-    /// Checks `goal` against the position limits of both axes; sends nothing. Call it only after
+    /// Checks `goal` against the position limits of both axes; sends nothing. An axis that is not to be steered may
+    /// stand outside its limits, and may come back. Call it only after
     /// [`StageEvent::Located`], since the limits of an axis may count from where it stands.
     ///
     /// # Errors
     /// The position limit that `goal` exceeds.
     pub fn check_goal(&self, goal: SetPoint) -> Result<(), String> {
-        let check = |axis| self.drives[axis].limits().check_position(goal.along(axis));
-        Axis::BOTH.into_iter().try_for_each(|axis| check(axis).map(drop))
+        Axis::BOTH.into_iter().try_for_each(|axis| self.drives[axis].check_goal(goal.along(axis)))
     }
 
     /// Permits or forbids to give the axes power; at first it is permitted. While it is forbidden, the drives

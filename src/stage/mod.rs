@@ -61,7 +61,7 @@ pub use drive::{DriveReport, may_have_power};
 pub use event::{Counters, DriveFlag, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};
 pub use homing::{HomingConfig, Reference};
 pub use limits::{AxisLimits, Commanded, LimitCheck};
-pub use machine::Stage;
+pub use machine::{AxisUse, Stage};
 pub use quick_stop::QuickStop;
 pub use scale::{CountsRatio, Scale, Sign, Unwrapper};
 pub use status::{AxisStatus, Reset, StatusReader};

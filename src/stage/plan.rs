@@ -3,7 +3,7 @@
 use super::bring_up::{FoundFault, Identity, Object, POLL_PERIOD, Script, optional};
 use super::config::unsigned_counts;
 use super::drive::may_have_power;
-use super::{AxisConfig, HomingConfig, Reference, Sign, StageEvent};
+use super::{AxisConfig, AxisUse, HomingConfig, Reference, Sign, StageEvent};
 use crate::canopen::cia402::{Controlword, Mode, Statusword, object as drive};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::object::communication::{
@@ -93,7 +93,10 @@ impl Script {
         let supported = self.read(drive::SUPPORTED_MODES).await?;
         let identity = Identity { vendor, product, revision, serial };
         self.sdo.emit(StageEvent::Identity(self.axis, identity));
-        let mode = if self.homing_mode { Mode::HOMING } else { Mode::CSP };
+        let mode = match self.purpose {
+            AxisUse::Home => Mode::HOMING,
+            _ => Mode::CSP,
+        };
         match supported.map(SdoValue::to_u32) {
             Some(supported) if !mode.is_in(supported) => Err(format!(
                 "{}: supported modes {supported:#010X} lack {mode} (bit {})",
@@ -264,7 +267,8 @@ impl Script {
 
     async fn check_homed(&self) -> Result<(), String> {
         let AxisConfig { homing, reference, .. } = self.drive();
-        let Some(homing) = homing.filter(|_| *reference == Reference::Homing && !self.homing_mode)
+        let must_be_homed = matches!(self.purpose, AxisUse::Steer | AxisUse::Move);
+        let Some(homing) = homing.filter(|_| *reference == Reference::Homing && must_be_homed)
         else {
             return Ok(());
         };
@@ -289,7 +293,7 @@ impl Script {
         self.write(drive::INTERPOLATION_PERIOD_EXPONENT, -3_i8).await?;
         self.write(drive::INTERPOLATION_PERIOD_VALUE, self.config.bus.sync_ms as u8).await?;
         match self.drive().homing {
-            Some(homing) if self.homing_mode => {
+            Some(homing) if self.purpose == AxisUse::Home => {
                 self.configure_homing(homing).await?;
                 self.set_mode(Mode::HOMING).await
             }
@@ -325,7 +329,7 @@ impl Script {
             // A wrapping axis needs no limits in the drive. Limits from an earlier use of the drive would stop it.
             self.write(optional(min), i32::MIN).await?;
             self.write(optional(max), i32::MAX).await?;
-        } else if !self.homing_mode {
+        } else if self.purpose != AxisUse::Home {
             let [lower, upper] = self.limit_counts(position);
             // In this order the upper limit is never under the lower one, whatever the drive had before.
             self.write(min, i32::MIN).await?;
@@ -336,14 +340,16 @@ impl Script {
         Ok(position)
     }
 
-    /// The drive's own limits, counts: the soft limits, widened by the following-error window. They stop the
-    /// axis if the bench fails to refuse a target.
+    /// The drive's own limits, counts: the soft limits and where the axis stands, widened by the following-error
+    /// window. They stop the axis if the bench fails to refuse a target.
     fn limit_counts(&self, position: i32) -> [i32; 2] {
         let config = self.drive();
         let AxisConfig { limits, sign, .. } = config;
         let margin = config.following_error_window();
         let scale = config.scale(self.axis, position.into());
-        let ends = [limits.min - margin, limits.max + margin].map(|end| scale.counts(end));
+        let here = scale.value(position.into());
+        let ends = [limits.min.min(here) - margin, limits.max.max(here) + margin];
+        let ends = ends.map(|end| scale.counts(end));
         let [lower, upper] = match sign {
             Sign::Positive => ends,
             Sign::Negative => [ends[1], ends[0]],

@@ -191,7 +191,7 @@ impl Stage {
             && let Some(flag) = drive.lost_flag()
         {
             lost_flag_fault(flag, statusword)
-        } else if drive.homing_mode {
+        } else if drive.in_homing_mode() {
             // The drive follows no target, and bit 13 means a homing error.
             return;
         } else if state == Some(S::OperationEnabled) && statusword.has(Statusword::FOLLOWING_ERROR)

@@ -55,8 +55,8 @@ pub struct TravelCheck {
     error: Option<String>,
 }
 
-/// Sums over the positions of a bin or a stretch: `Σ 1, Σ ℓ, Σ ℓ², Σ p, Σ ℓ p, Σ pᵀp`. Depth and position
-/// are counted from a common origin.
+/// Sums over the positions of a bin or a stretch: `Σ 1, Σ ℓ, Σ ℓ², Σ p, Σ ℓ p, Σ pᵀp`, and how many independent
+/// positions they are worth. Depth and position are counted from a common origin.
 #[derive(Debug, Clone, Copy, Default)]
 struct Sums {
     count: f64,
@@ -65,11 +65,12 @@ struct Sums {
     position_mm: Vector3<f64>,
     product_mm2: Vector3<f64>,
     square_mm2: f64,
+    independent: f64,
 }
 
 impl Sums {
     /// The sums of one position.
-    fn of(insertion_mm: f64, position_mm: &Vector3<f64>) -> Self {
+    fn of(insertion_mm: f64, position_mm: &Vector3<f64>, independent: f64) -> Self {
         Sums {
             count: 1.0,
             depth_mm: insertion_mm,
@@ -77,6 +78,7 @@ impl Sums {
             position_mm: *position_mm,
             product_mm2: insertion_mm * position_mm,
             square_mm2: position_mm.norm_squared(),
+            independent,
         }
     }
 
@@ -87,6 +89,7 @@ impl Sums {
         self.position_mm += other.position_mm;
         self.product_mm2 += other.product_mm2;
         self.square_mm2 += other.square_mm2;
+        self.independent += other.independent;
     }
 }
 
@@ -98,8 +101,9 @@ impl TravelCheck {
         TravelCheck { noise_sd_mm, curvature_per_mm, bins, newest_bin, error: None }
     }
 
-    /// Takes an accepted position, measured at this depth of the stage, mm.
-    pub fn take(&mut self, insertion_mm: f64, position_mm: &Vector3<f64>) {
+    /// Takes an accepted position, measured at this depth of the stage, mm. If the configured noise is correlated,
+    /// the position is worth only this part of an `independent` one.
+    pub fn take(&mut self, insertion_mm: f64, position_mm: &Vector3<f64>, independent: f64) {
         let bin = (insertion_mm / BIN_MM).floor() as i64;
         if self.bins.is_empty() || bin > self.newest_bin {
             self.check_stretches();
@@ -115,7 +119,7 @@ impl TravelCheck {
         }
         // After an encoder's step back the position still counts to the newest bin.
         if let Some(newest) = self.bins.back_mut() {
-            newest.add(&Sums::of(insertion_mm, position_mm));
+            newest.add(&Sums::of(insertion_mm, position_mm, independent));
         }
     }
 
@@ -173,7 +177,7 @@ impl TravelCheck {
         let scatter_mm2 = sums.square_mm2 - sums.position_mm.norm_squared() / n;
         let residual_mm2 = (scatter_mm2 - slope.norm_squared() * spread_mm2).max(0.0);
         let variance_mm2 = (residual_mm2 / (3.0 * (n - 2.0))).max(self.noise_sd_mm.powi(2));
-        let independent = n.min(INDEPENDENT_PER_MM * filled_mm);
+        let independent = sums.independent.max(1.0).min(INDEPENDENT_PER_MM * filled_mm);
         let sd = (variance_mm2 / (spread_mm2 * independent / n)).sqrt();
         let ratio = slope.norm();
         let bend_rad = CURVATURE_MARGIN * self.curvature_per_mm * stretch_mm;
@@ -201,6 +205,7 @@ impl TravelCheck {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+    use std::f64::consts::TAU;
 
     /// The depth, mm, at which the check contradicts a stream. The stream has a position each 0.05 mm of depth:
     /// `position(depth)`, with noise of ±`noise_mm`.
@@ -212,7 +217,7 @@ mod tests {
             let depth_mm = 0.05 * f64::from(k);
             let steps = [0.618_034, 0.414_214, 0.732_051];
             let off_mm = Vector3::from(steps.map(|step| noise_mm * noise(k * 7919 % 65_537, step)));
-            check.take(depth_mm, &(position(depth_mm) + off_mm));
+            check.take(depth_mm, &(position(depth_mm) + off_mm), 1.0);
             if check.check().is_err() {
                 return Some(depth_mm);
             }
@@ -250,7 +255,7 @@ mod tests {
     #[test]
     fn a_contradiction_is_reported_with_its_numbers() {
         let mut check = TravelCheck::new(0.6, 1.0 / 122.0);
-        (0..100).for_each(|k| check.take(0.05 * f64::from(k), &Vector3::zeros()));
+        (0..100).for_each(|k| check.take(0.05 * f64::from(k), &Vector3::zeros(), 1.0));
         let text = check.check().unwrap_err();
         assert!(
             text.contains(" mm the tip travelled 0.000 mm per mm inserted (expected 0."),
@@ -259,13 +264,28 @@ mod tests {
         assert!(text.len() < 200, "{}", text.len());
     }
 
+    /// Noise that changes slowly, 0.6 mm in 4 mm of depth and back, looks like travel.
+    #[test]
+    fn configured_correlated_noise_is_allowed_for() {
+        let is_contradicted = |independent| {
+            let mut check = TravelCheck::new(0.6, 1.0 / 122.0);
+            for k in 0..2000 {
+                let depth_mm = 0.05 * f64::from(k);
+                let off_mm = 0.9 * (depth_mm * TAU / 8.0).sin();
+                check.take(depth_mm, &(Vector3::z() * (depth_mm + off_mm)), independent);
+            }
+            check.check().is_err()
+        };
+        assert_eq!([1.0, 1.0 / 40.0].map(is_contradicted), [true, false]);
+    }
+
     proptest! {
         /// The depths may have gaps, go back, or all be equal.
         #[test]
         fn any_depths_are_taken_in_bounded_memory(depths in prop::collection::vec(-1e4..1e4f64, 0..200)) {
             let mut check = TravelCheck::new(0.6, 1.0 / 122.0);
             for depth_mm in depths {
-                check.take(depth_mm, &(Vector3::z() * depth_mm));
+                check.take(depth_mm, &(Vector3::z() * depth_mm), 1.0);
             }
             prop_assert!(check.bins.len() <= BINS_MAX);
         }

@@ -132,12 +132,12 @@ fn a_rehearsal_refuses_a_homing_that_does_not_suit_the_rig() {
     for method in [1, 2, 17, 18, 24, 33, 34, 35, 37] {
         // With sign -1 the switch at the withdrawn end is the drive's positive one.
         let sign =
-            format!("stage.insertion.sign={}", if [2, 18].contains(&method) { -1 } else { 1 });
+            format!("stage.insertion.sign={}", if [2, 18, 24].contains(&method) { -1 } else { 1 });
         let method = format!("stage.insertion.homing.method={method}");
         let said = rehearse(&scratch, &home, &[&method, &sign]);
         assert_eq!(said.status, 0, "{}", said.screen());
     }
-    let said = rehearse(&scratch, &home, &["stage.insertion.homing.method=23"]);
+    let said = rehearse(&scratch, &home, &["stage.insertion.homing.method=27"]);
     assert_eq!(said.status, 1, "{}", said.screen());
     let reason = said.stdout.lines().last().unwrap();
     assert!(reason.contains("0x6098"), "{reason}");

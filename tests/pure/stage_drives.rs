@@ -7,8 +7,8 @@ use needle_bench::config::Config;
 use needle_bench::emulator::drive::{Drive, DriveConfig};
 use needle_bench::emulator::fault::{Fault, FaultKind};
 use needle_bench::stage::{
-    Axis, AxisConfig, AxisLimits, CountsRatio, Feedback, HomingConfig, Output, PerAxis, Reference,
-    SetPoint, Sign, Stage, StageConfig, StageEvent,
+    Axis, AxisConfig, AxisLimits, AxisUse, CountsRatio, Feedback, HomingConfig, Output, PerAxis,
+    Reference, SetPoint, Sign, Stage, StageConfig, StageEvent,
 };
 use needle_bench::units::Time;
 use std::time::Duration;
@@ -279,8 +279,8 @@ fn both_axes_are_homed_by_their_drives_and_a_run_may_begin() {
     let fault = bench.fault();
     assert!(fault.contains("not homed"), "{fault}");
 
-    let both = PerAxis { insertion: true, rotation: true };
-    bench.stage = Stage::for_homing(config.clone(), both, bench.now).expect("valid");
+    let both = PerAxis::from_fn(|_| AxisUse::Home);
+    bench.stage = Stage::for_use(config.clone(), both, bench.now).expect("valid");
     bench.run_until(|event| matches!(event, StageEvent::Ready).then_some(()));
     for axis in Axis::BOTH {
         bench.stage.home(bench.now, axis).expect("ready");

@@ -209,6 +209,42 @@ fn home_homes_both_axes_and_other_commands_ask_for_it() {
     }
 }
 
+/// After a power cycle neither axis is homed; the other one is only held.
+#[test]
+fn one_axis_is_homed_while_the_other_is_not() {
+    let scratch = Scratch::new();
+    let needs = ["insertion", "rotation"].map(|axis| format!("stage.{axis}.reference=homing"));
+    let zero = "stage.rotation.zero=0";
+    let sets = ["--set", &needs[0], "--set", &needs[1], "--set", zero];
+    let said = stage(&scratch, &[&["home", "--axis", "rotation", "-q"][..], &sets].concat());
+    assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
+    assert_eq!(said.stdout.lines().next(), Some("rotation    home, at 0.000 deg"));
+}
+
+/// A stop at a limit may leave an axis a little outside. The way back is open for it and for the other axis, with
+/// the limits as they are.
+#[test]
+fn axes_outside_their_limits_come_back() {
+    let scratch = Scratch::new();
+    let outside =
+        ["--set", "emulator.insertion_start_mm=310.2", "--set", "stage.rotation.max_deg=1"];
+    let outside = [&outside[..], &["--set", "stage.rotation.zero=-100000"]].concat();
+    let moved = |arguments: &[&str]| {
+        let said = stage(&scratch, &[arguments, &["-q"], &outside].concat());
+        (said.status, said.stdout.lines().last().unwrap_or_default().to_owned() + &said.stderr)
+    };
+    assert_eq!(moved(&["withdraw"]), (0, "completed".to_owned()));
+    assert_eq!(moved(&["jog", "--axis", "insertion", "--by=-0.1mm"]), (0, "completed".to_owned()));
+    let (status, refused) = moved(&["jog", "--axis", "insertion", "--by=0.1mm"]);
+    assert!(
+        status == 1 && refused.contains("310.300 mm is over the limit of 310.000 mm"),
+        "{refused}"
+    );
+    assert_eq!(moved(&["jog", "--axis", "rotation", "--to=0deg"]), (0, "completed".to_owned()));
+    let (status, refused) = moved(&["prove"]);
+    assert!(status == 1 && refused.contains("stands outside its limits"), "{refused}");
+}
+
 #[test]
 fn prove_shows_that_both_drives_notice_a_silent_bench() {
     let scratch = Scratch::new();

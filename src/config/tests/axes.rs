@@ -57,8 +57,31 @@ fn a_homing_that_seeks_the_wrong_end_is_refused() {
         "bench.toml:4: stage.insertion.homing.method is 1, which with sign = 1 seeks the switch at \
          the withdrawn end: home is 0.000 mm, the limits of -310 to 1 mm go 310.0 mm beyond it; is it 2?"
     );
-    for text in [homing(17, 1, ""), homing(2, -1, ""), homing(18, 1, deep), homing(24, 1, "")] {
+    for text in [homing(17, 1, ""), homing(2, -1, ""), homing(18, 1, deep), homing(28, 1, "")] {
         loaded(&text, &[]);
+    }
+    // A home switch that is sought in the direction in which the counts grow, and its mirror image.
+    for (method, mirrored) in [(3, 5), (4, 6), (7, 11), (10, 14), (19, 21), (20, 22), (24, 28)] {
+        for (sought, other, sign) in [(method, mirrored, 1), (mirrored, method, -1)] {
+            let error = refusal(&homing(sought, sign, ""));
+            assert!(error.ends_with(&format!("beyond it; is it {other}?")), "{error}");
+            loaded(&homing(sought, -sign, ""), &[]);
+        }
+    }
+}
+
+/// The emulated drive has its own limit; a real one may have none.
+#[test]
+fn a_homing_speed_over_the_axis_limit_is_refused() {
+    for key in ["speed_switch_mm_per_s", "speed_zero_mm_per_s"] {
+        let homing = format!("method = 17, {key} = 10.5, timeout_s = 60.0, homed_bit = 12");
+        assert_eq!(
+            refusal(&format!("stage.insertion.homing = {{ {homing} }}\n")),
+            format!(
+                "bench.toml:1: stage.insertion.homing.{key} is 10.5, allowed: up to \
+                 stage.insertion.speed_max_mm_per_s, which is 10"
+            )
+        );
     }
 }
 

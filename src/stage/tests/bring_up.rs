@@ -107,12 +107,33 @@ fn an_axis_that_stands_outside_its_limits_is_not_enabled() {
     assert_eq!(
         bench.until_fault(),
         "cannot start: the axis stands outside its limits: insertion: -2.000 mm is under the \
-         limit of -1.000 mm (stage.insertion.min_mm); move it back, or correct its limits or zero"
+         limit of -1.000 mm (stage.insertion.min_mm); jog it back, or correct its limits or zero"
     );
     bench.until_stopped();
     let enabled =
         bench.sent.iter().any(|(_, f)| f.cob_id() == Some(0x201) && f.data()[0] & 0x08 != 0);
     assert!(!enabled);
+}
+
+/// The operator moves it back, over less than a count at the least. The drive's own limits let it stand there.
+#[test]
+fn an_axis_that_stands_outside_its_limits_can_be_moved_back() {
+    let mut config = config();
+    config.insertion.zero = Some(1000 + 2 * COUNTS_PER_MM);
+    let nodes = config.nodes();
+    let begun = Time::from_secs_f64(1.0);
+    let purpose = PerAxis::from_fn(|_| AxisUse::Move);
+    let mut bench = Bench::with(Stage::for_use(config, purpose, begun).expect("valid"), nodes);
+    let feedback = bench.until_feedback();
+    assert_eq!(feedback.measured.insertion_mm, -2.0);
+    let at = |insertion_mm| SetPoint { insertion_mm, ..feedback.commanded };
+    assert!(bench.stage.check_goal(at(-2.1)).is_err());
+    for goal_mm in [-2.0, -1.5, 0.0] {
+        bench.stage.check_goal(at(goal_mm)).expect("toward the inside");
+    }
+    let refused = bench.stage.command(at(-2.01)).expect_err("farther out");
+    assert!(refused.contains("under the limit of -1.000 mm"), "{refused}");
+    bench.stage.command(at(-1.99)).expect("back");
 }
 
 #[test]

@@ -4,7 +4,7 @@ use super::drive::Homing;
 use super::*;
 use crate::canopen::cia402::DriveState;
 
-const INSERTION: PerAxis<bool> = PerAxis { insertion: true, rotation: false };
+const INSERTION: PerAxis<AxisUse> = PerAxis { insertion: AxisUse::Home, rotation: AxisUse::Hold };
 
 fn homing_config() -> StageConfig {
     let mut config = config();
@@ -24,7 +24,7 @@ fn homing_config() -> StageConfig {
 fn ready_to_home(setup: impl FnOnce(&mut Bench)) -> Bench {
     let config = homing_config();
     let nodes = config.nodes();
-    let stage = Stage::for_homing(config, INSERTION, Time::from_secs_f64(1.0)).expect("valid");
+    let stage = Stage::for_use(config, INSERTION, Time::from_secs_f64(1.0)).expect("valid");
     let mut bench = Bench::with(stage, nodes);
     setup(&mut bench);
     bench.until_ready();
@@ -147,8 +147,8 @@ fn only_an_axis_in_homing_mode_is_homed() {
     let mut bench = ready_to_home(|_| ());
     let refused = bench.stage.home(bench.now, Axis::Rotation).expect_err("not in homing mode");
     assert_eq!(refused.to_string(), "the stage is not ready to home");
-    let both = PerAxis { insertion: true, rotation: true };
-    let refused = Stage::for_homing(homing_config(), both, bench.now).expect_err("no homing");
+    let both = PerAxis::from_fn(|_| AxisUse::Home);
+    let refused = Stage::for_use(homing_config(), both, bench.now).expect_err("no homing");
     assert!(refused.starts_with("rotation: ") && refused.ends_with("no homing is configured"));
 }
 

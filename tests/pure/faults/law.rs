@@ -54,13 +54,25 @@ fn a_depth_past_a_soft_limit() {
     documented(&[stop], "a_depth_past_a_soft_limit", 1000.0, reason);
 }
 
+/// The base would turn by 15 degrees while it brakes from the speed of the second run.
 #[test]
 fn a_soft_limit_of_the_rotation() {
-    let stop = Stop::of(Bench::new(configured(&["stage.rotation.min_deg=-20.0"])), |_| ());
-    let (_, end_rad) = stop.bench.stage.position_true(stop.bench.now);
-    assert!((-20.5..-19.0).contains(&end_rad.to_degrees()), "{}", end_rad.to_degrees());
-    let reason = stop.bench.reason();
-    assert!(reason.starts_with("stage: rotation: -2"), "{reason}");
-    let limit = "deg is under the limit of -20.000 deg (stage.rotation.min_deg)";
-    assert!(reason.ends_with(limit), "{reason}");
+    let fast = ["control.kind=\"nested-saturation\"", "insertion.speed_mm_per_s=2"];
+    for (more, limit) in [(&[][..], -20.0), (&fast, -60.0)] {
+        let limits = [
+            format!("stage.rotation.min_deg={limit:.1}"),
+            format!("stage.rotation.max_deg={:.1}", -limit),
+        ];
+        let sets = [more, &limits.each_ref().map(String::as_str)].concat();
+        let stop = Stop::of(Bench::new(configured(&sets)), |_| ());
+        let (_, end_rad) = stop.bench.stage.position_true(stop.bench.now);
+        let end_deg = end_rad.to_degrees().abs();
+        assert!((-limit - 1.0..-limit + 0.5).contains(&end_deg), "{end_deg}");
+        let reason = stop.bench.reason();
+        assert!(reason.starts_with("stage: rotation: "), "{reason}");
+        assert!(
+            reason.contains(&format!("the limit of {:.3} deg", limit.copysign(end_rad))),
+            "{reason}"
+        );
+    }
 }
