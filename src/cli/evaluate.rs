@@ -40,7 +40,7 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<()> {
         }
     }
     let mut observers = Vec::new();
-    for observer in config.observers() {
+    for observer in config.observer.observers() {
         let (mut scores, mut files) = (Vec::new(), Vec::new());
         for Insertion { path, recording, .. } in &insertions {
             let scored = score_once(&observer, recording).and_then(|score| {

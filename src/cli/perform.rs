@@ -261,10 +261,15 @@ pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
             GoalKind::Target => Some(config.to_plan(&mask_reader(None))?),
         },
         truth: config.is_emulated(),
-        shadows: config.observers().skip(1).map(|shadow| shadow.name().to_owned()).collect(),
+        shadows: config
+            .observer
+            .observers()
+            .skip(1)
+            .map(|shadow| shadow.name().to_owned())
+            .collect(),
         rotation_max_rad_per_mm: config.control.rotation_max_rad_per_mm(),
         tip_meas_age_max_s: config.tracker.hold.after.as_secs_f64(),
-        stage: config.stage.to_stage(&config.can)?,
+        stage: config.to_stage()?,
     })
 }
 

@@ -42,8 +42,7 @@ pub(super) fn stop(configured: &Configured, as_json: bool) -> Result<()> {
     let deadline = begun + settings.stage.power.stop_timeout;
     let trouble = talk_despite_errors(&mut quick_stop, bus.as_mut(), clock, deadline);
     let status = report(&quick_stop, &trouble, as_json);
-    let checked =
-        configured.load(None).and_then(|config| Ok(config.stage.to_stage(&config.can)?));
+    let checked = configured.load(None).and_then(|config| Ok(config.to_stage()?));
     if let Err(failure) = checked {
         print_stderr(format_args!(
             "warning: the stop was sent, but every other command would refuse this configuration:\n\

@@ -4,11 +4,10 @@ use super::needle::torsion;
 use super::{CanInterface, Config, ConfigError, ReadMask, TrackerSource, rehearsal};
 use crate::canopen::ObjectAddress;
 use crate::emulator::drive::DriveConfig;
-use crate::emulator::fault::Fault;
 use crate::emulator::{TargetModel, VirtualStageConfig};
 use crate::observer::{InvariantConfig, ObserverConfig};
-use crate::session::{InsertionConfig, SessionConfig};
-use crate::stage::{AxisConfig, Sign};
+use crate::session::SessionConfig;
+use crate::stage::{AxisConfig, Sign, StageConfig};
 use std::f64::consts::TAU;
 
 /// Identity of an emulated drive if the configuration accepts any; no vendor has this number.
@@ -54,11 +53,11 @@ impl Config {
     /// # Errors
     /// No registration; values that the needle, the stage or the observers refuse.
     pub fn session_without_goal(&self) -> Result<SessionConfig, ConfigError> {
-        let invariant = self.invariant();
-        let mut observers = self.observers();
+        let invariant = self.observer.invariant;
+        let mut observers = self.observer.observers();
         Ok(SessionConfig {
             x_wp: self.plane.to_pose(),
-            insertion: InsertionConfig { corrected_by: self.observer.samples, ..self.insertion },
+            insertion: self.insertion,
             needle: self.believed_needle()?,
             needle_torsion: self.believed_torsion()?,
             handedness: InvariantConfig {
@@ -71,9 +70,18 @@ impl Config {
             shadows: observers.collect(),
             control: self.control,
             goal: None,
-            stage: self.stage.to_stage(&self.can)?,
+            stage: self.to_stage()?,
             tracker: self.tracker.to_session()?,
         })
+    }
+
+    /// The settings of the stage's master, in mm, rad and counts.
+    ///
+    /// # Errors
+    /// The stage refuses the settings, for example a following-error window of less than a count.
+    pub fn to_stage(&self) -> Result<StageConfig, ConfigError> {
+        self.stage.validate().map_err(ConfigError::of)?;
+        Ok(self.stage.clone())
     }
 
     /// The settings of the virtual stage: the drives that the bench expects, and the emulator's needle.
@@ -95,8 +103,6 @@ impl Config {
             insertion.switches = rehearsal::switches(insertion.switches, along, per_mm);
             rotation.switches = rehearsal::switches(rotation.switches, about, per_turn / TAU);
         }
-        let bench = Some(self.can.bus.bench_node);
-        let faults = emulator.fault.iter().map(|fault| Fault { bench, ..fault.clone() });
         Ok(VirtualStageConfig {
             insertion: (insertion, per_mm),
             rotation: (rotation, per_turn),
@@ -109,7 +115,7 @@ impl Config {
             target: self.goal.tool.as_ref().and(self.goal.position_mm).map(|start_mm| {
                 TargetModel { start_mm, drift_mm_per_mm: emulator.target_drift_mm_per_mm }
             }),
-            faults: faults.collect(),
+            faults: emulator.fault.clone(),
         })
     }
 

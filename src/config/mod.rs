@@ -43,7 +43,6 @@ mod reader;
 mod record;
 mod registration;
 mod rehearsal;
-mod stage;
 mod stop;
 mod study;
 #[cfg(test)]
@@ -62,7 +61,6 @@ pub use observer::{ObserverKind, ObserverSection};
 pub use pose::PoseConfig;
 pub use record::{CalibrationConfig, EvaluationConfig, OnFailure, RecordConfig};
 pub use registration::RegistrationConfig;
-pub use stage::StageSection;
 pub use stop::StopConfig;
 pub use study::StudyConfig;
 pub use tracker::{TrackerMode, TrackerSection, TrackerSource};
@@ -70,6 +68,7 @@ pub use tracker::{TrackerMode, TrackerSection, TrackerSource};
 use crate::control::ControlConfig;
 use crate::keys::{self, Field, Rule, section};
 use crate::session::InsertionConfig;
+use crate::stage::StageConfig;
 use reader::{Reader, Tree};
 use std::path::Path;
 use toml::{Table, Value};
@@ -122,7 +121,7 @@ section! {
         /// The bus, and the times of CANopen on it.
         can: CanConfig;
         /// The two drives.
-        stage: StageSection;
+        stage: StageConfig;
         /// Where tip positions come from.
         tracker: TrackerSection;
         /// The emulated drives, needle and tracker: how they really are, whatever the bench assumes.
@@ -188,9 +187,21 @@ impl Config {
         Ok((config, reader.finish()?))
     }
 
-    /// The configuration in `toml`, which was checked and has all defaults.
+    /// The configuration in `toml`, which was checked and has all defaults. Each section is told here what it
+    /// needs of the others beside its own keys.
     fn of(toml: Value) -> Self {
-        Config { toml: toml.clone(), ..Config::take(Some(&toml)) }
+        let mut config = Config { toml: toml.clone(), ..Config::take(Some(&toml)) };
+        // Fiducials that determine no registration are refused by the checks.
+        let registration_sd_mm = config.registration_sd_mm().unwrap_or_default();
+        let Config { stage, can, observer, insertion, emulator, .. } = &mut config;
+        (stage.bus, stage.listen_first) = (can.bus, can.bus.heartbeat_timeout());
+        insertion.corrected_by = observer.samples;
+        observer.invariant.start = observer.start;
+        observer.invariant.registration_sd_mm = registration_sd_mm;
+        observer.coupled.start = observer.start;
+        observer.coupled.position_sd_mm = observer.invariant.position_sd_mm;
+        emulator.fault.iter_mut().for_each(|fault| fault.bench = Some(can.bus.bench_node));
+        config
     }
 
     /// The value at the dotted `key`.

@@ -1,8 +1,7 @@
 //! `[observer]`: which observer steers, which run alongside, and their settings. To add an observer, add its
-//! kind, its section, and its settings in [`Config::observers`]. The section has the name of the kind, with `_`
+//! kind, its section, and its settings in [`ObserverSection::observers`]. The section has the name of the kind, with `_`
 //! for `-`; its keys are declared beside the observer.
 
-use super::Config;
 use crate::geometry::FixedAngles;
 use crate::keys::{Rule, choice, section, within};
 use crate::observer::{CoupledConfig, FiniteDifferenceConfig, InvariantConfig, ObserverConfig};
@@ -54,30 +53,14 @@ impl ObserverSection {
         }
         kinds
     }
-}
-
-impl Config {
-    /// The settings of the invariant observer.
-    pub(super) fn invariant(&self) -> InvariantConfig {
-        InvariantConfig {
-            start: self.observer.start,
-            // A configuration whose fiducials determine no registration was refused.
-            registration_sd_mm: self.registration_sd_mm().unwrap_or_default(),
-            ..self.observer.invariant
-        }
-    }
 
     /// The observer that steers, then its shadows.
     pub fn observers(&self) -> impl Iterator<Item = ObserverConfig> + '_ {
-        self.observer.kinds().into_iter().map(|kind| match kind {
-            ObserverKind::Invariant => ObserverConfig::Invariant(self.invariant()),
-            ObserverKind::Coupled => ObserverConfig::Coupled(CoupledConfig {
-                start: self.observer.start,
-                position_sd_mm: self.observer.invariant.position_sd_mm,
-                ..self.observer.coupled
-            }),
+        self.kinds().into_iter().map(|kind| match kind {
+            ObserverKind::Invariant => ObserverConfig::Invariant(self.invariant),
+            ObserverKind::Coupled => ObserverConfig::Coupled(self.coupled),
             ObserverKind::FiniteDifference => {
-                ObserverConfig::FiniteDifference(self.observer.finite_difference)
+                ObserverConfig::FiniteDifference(self.finite_difference)
             }
         })
     }

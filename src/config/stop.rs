@@ -102,7 +102,7 @@ impl StopConfig {
             }
         }
         let valid = Config::of(Reader::new(tree).read(Config::KEYS));
-        let mut stage = valid.stage.to_unchecked_stage(&valid.can);
+        let mut stage = valid.stage;
         (stage.insertion.node, stage.rotation.node) = (insertion, rotation);
         // The coarser the scale, the longer it takes to see that an axis stands.
         let windows = stage::Axis::BOTH.map(|axis| 2 * stage.standstill_window(axis));

@@ -254,8 +254,11 @@ impl Config {
         };
         let deg2 = |range| variance(range) * 1f64.to_radians().powi(2);
         let curvature_per_mm = self.emulator.arc.curvature_per_mm();
-        let (start_sd, curvature_sd) =
-            self.observers().next().map_or_else(Default::default, |steers| steers.start_sd());
+        let (start_sd, curvature_sd) = self
+            .observer
+            .observers()
+            .next()
+            .map_or_else(Default::default, |steers| steers.start_sd());
         let configured_rad2 =
             Vector3::new(start_sd.yaw, start_sd.pitch, start_sd.roll).map(|sd| sd * sd);
         let angles_rad2 =

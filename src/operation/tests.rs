@@ -50,7 +50,7 @@ fn by(axis: Axis, distance: f64) -> Move {
 impl Bench {
     fn new(config: &Config, operation: Operation) -> Self {
         let now = Time::ZERO;
-        let stage = config.stage.to_stage(&config.can).unwrap();
+        let stage = config.to_stage().unwrap();
         let operation = OperationConfig { stage, operation }.begin(now).unwrap();
         let stage = VirtualStage::new(config.virtual_stage().unwrap(), now);
         let start = stage.position_true(now);
@@ -299,7 +299,7 @@ fn homing_finds_the_switch_and_ends_without_power() {
         "stage.insertion.homing.speed_zero_mm_per_s=0.5",
         "stage.insertion.homing.acceleration_mm_per_s2=10.0",
     ]);
-    let stage = config.stage.to_stage(&config.can).unwrap();
+    let stage = config.to_stage().unwrap();
     let mut bench = Bench::new(&config, Operation::home(&stage, None));
     assert_eq!(bench.run(), Outcome::Completed);
     let (insertion_mm, rotation_rad) = bench.travel();
@@ -313,7 +313,7 @@ fn homing_finds_the_switch_and_ends_without_power() {
     // The drive remembers that it is homed, so an axis that needs homing may be jogged now.
     let needs_homing = self::config(&["stage.insertion.reference=homing"]);
     let jog = Operation::Move(by(Axis::Insertion, 2.0));
-    let stage = needs_homing.stage.to_stage(&needs_homing.can).unwrap();
+    let stage = needs_homing.to_stage().unwrap();
     let operation = OperationConfig { stage, operation: jog }.begin(bench.now).unwrap();
     let mut bench = Bench { operation, ..bench };
     assert_eq!(bench.run(), Outcome::Completed);
@@ -382,7 +382,7 @@ fn a_home_outside_the_axis_limits_is_an_error() {
     let left = Frame::new(0x601, &[0x23, 0x7C, 0x60, 0, a, b, c, d]);
     bench.stage.handle_frame(bench.now, &left);
     drives.stage.rotation.homing = None;
-    let stage = drives.stage.to_stage(&drives.can).unwrap();
+    let stage = drives.to_stage().unwrap();
     let operation = Operation::home(&stage, None);
     let operation = OperationConfig { stage, operation }.begin(bench.now).unwrap();
     let mut bench = Bench { operation, ..bench };

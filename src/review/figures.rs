@@ -86,7 +86,7 @@ impl Figure {
 /// # Errors
 /// This version of the bench refuses the stage.
 pub(super) fn limits(config: &Config) -> Result<Limits, ConfigError> {
-    let stage = config.stage.to_stage(&config.can)?;
+    let stage = config.to_stage()?;
     let following = |axis| stage.axis(axis).following_error_limit(stage.bus.sync_period());
     let (insertion, tracker) = (&config.insertion, &config.tracker);
     let mut limits = Limits::from([

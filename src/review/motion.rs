@@ -33,7 +33,7 @@ impl Motion {
     /// read.
     pub fn new(frames: &[TimedFrame], folder: &Folder) -> Self {
         let config = folder.config().ok();
-        let stage = config.and_then(|config| config.stage.to_stage(&config.can).ok());
+        let stage = config.and_then(|config| config.to_stage().ok());
         let started_us = unix_us_of(&folder.manifest.started_utc);
         let Some((stage, started_us)) = stage.zip(started_us) else { return Motion::default() };
         let courses = |cob_id: fn(NodeId) -> u16| {

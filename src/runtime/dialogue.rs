@@ -197,7 +197,7 @@ mod tests {
 
     fn stage() -> (StageConfig, VirtualStage) {
         let config = Config::from_sources(&[], &[]).expect("valid");
-        let mut stage = config.stage.to_stage(&config.can).expect("valid");
+        let mut stage = config.to_stage().expect("valid");
         stage.power.stop_timeout = Duration::from_millis(600);
         stage.bus.sdo_timeout_ms = 50;
         let emulated = config.virtual_stage().expect("valid");

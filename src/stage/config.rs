@@ -294,20 +294,27 @@ section! {
     }
 }
 
-/// The whole stage.
-#[derive(Debug, Clone, PartialEq)]
-pub struct StageConfig {
-    /// SYNC, heartbeats, timeouts and attempts.
-    pub bus: BusConfig,
-    /// How power is switched on and off.
-    pub power: PowerConfig,
-    /// How long the stage listens for another master before it sends its first frame: the longest interval
-    /// between two heartbeats of a master that is alive.
-    pub listen_first: Duration,
-    /// The insertion axis.
-    pub insertion: AxisConfig,
-    /// The rotation axis.
-    pub rotation: AxisConfig,
+section! {
+    /// The whole stage.
+    pub struct StageConfig {
+        /// True for a real stage: it refuses buses made for tests, and its drives' node, identity, scale
+        /// and limits have no defaults. False is for "memory", "udp" and interfaces named vcan... or
+        /// vxcan... alone.
+        hardware: bool = false;
+        /// Timeouts of power on and stop.
+        power: PowerConfig, flat;
+        /// The axis that pushes the needle.
+        insertion: AxisConfig;
+        /// The axis that turns the needle about its shaft.
+        rotation: AxisConfig, table(AxisConfig::keys_of::<{ Axis::Rotation as usize }>());
+    }
+    beside {
+        /// SYNC, heartbeats, timeouts and attempts.
+        pub bus: BusConfig = BusConfig::take(None),
+        /// How long the stage listens for another master before it sends its first frame: the longest
+        /// interval between two heartbeats of a master that is alive.
+        pub listen_first: Duration = Duration::ZERO,
+    }
 }
 
 impl StageConfig {

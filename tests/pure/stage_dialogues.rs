@@ -48,7 +48,7 @@ impl Bench {
     fn moving() -> Self {
         let config = Config::from_sources(&[], &[]).unwrap();
         let now = Time::ZERO;
-        let stage = config.stage.to_stage(&config.can).unwrap();
+        let stage = config.to_stage().unwrap();
         let mut bench = Bench {
             now,
             master: Stage::new(stage.clone(), now).unwrap(),
@@ -299,7 +299,7 @@ fn a_drive_with_power_is_not_reset() {
 #[test]
 fn a_reset_clears_a_fault_whose_cause_is_gone() {
     let config = Config::from_sources(&[], &[]).unwrap();
-    let stage_config = config.stage.to_stage(&config.can).unwrap();
+    let stage_config = config.to_stage().unwrap();
     let mut stage = VirtualStage::new(config.virtual_stage().unwrap(), Time::ZERO);
     stage.change_drive(
         0,

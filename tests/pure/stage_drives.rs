@@ -63,7 +63,7 @@ fn config() -> StageConfig {
     StageConfig {
         insertion: axis(1, 4646, 10.0),
         rotation: axis(2, 75_766, 10.0),
-        ..config.stage.to_stage(&config.can).expect("valid")
+        ..config.to_stage().expect("valid")
     }
 }
 

@@ -228,7 +228,7 @@ impl Motion {
 
     /// The operation that this motion asks of the stage of `config`.
     pub(super) fn plan(&self, config: &Config) -> Result<OperationConfig> {
-        let stage = config.stage.to_stage(&config.can)?;
+        let stage = config.to_stage()?;
         let operation = match self {
             Motion::Home { axis, .. } => match Operation::home(&stage, *axis) {
                 Operation::Home(axes) if axes.all(|chosen| !chosen) => {
@@ -437,7 +437,7 @@ mod tests {
     #[test]
     fn a_speed_over_the_limit_is_refused_with_the_configured_limit() {
         let config = Config::from_sources(&[], &[]).unwrap();
-        let mut stage = config.stage.to_stage(&config.can).unwrap();
+        let mut stage = config.to_stage().unwrap();
         stage.rotation.limits.speed_max = 3_f64.to_radians();
         let jog = jog_move(&config, Axis::Rotation, Goal::By(1.0));
         let speed = |text| with_speed(jog, Some(Distance::parse_speed(text).unwrap()), &stage);

@@ -33,7 +33,7 @@ fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<()> {
 
 /// Resets the faults of both drives, then prints their status.
 pub(super) fn reset(config: &Config, as_json: bool) -> Result<()> {
-    let stage = config.stage.to_stage(&config.can)?;
+    let stage = config.to_stage()?;
     let mut reset = Reset::new(&stage, Time::ZERO);
     talk(config, &mut reset)?;
     let errors: Vec<String> =
@@ -66,7 +66,7 @@ pub(super) fn watch(config: &Config, as_json: bool) -> Result<()> {
 
 /// Reads the status of both drives.
 pub(in crate::cli) fn read_status(config: &Config) -> Result<StatusReader> {
-    let stage = config.stage.to_stage(&config.can)?;
+    let stage = config.to_stage()?;
     let mut reader = StatusReader::new(&stage, Time::ZERO);
     talk(config, &mut reader)?;
     Ok(reader)

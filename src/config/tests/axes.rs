@@ -149,7 +149,7 @@ fn the_stage_gets_the_homing_of_its_axes() {
     let text = "[stage.insertion]\nreference = \"homing\"\nzero = -500\n\
                 [stage.rotation.homing]\nspeed_zero_deg_per_s = 180.0\n";
     let config = loaded(text, &[]);
-    let stage = config.stage.to_stage(&config.can).expect("a stage");
+    let stage = config.to_stage().expect("a stage");
     assert_eq!(stage.insertion.reference, Reference::Homing);
     assert_eq!(stage.insertion.zero, Some(-500));
     let insertion = stage.insertion.homing.expect("homing");

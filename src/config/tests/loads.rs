@@ -17,7 +17,7 @@ fn every_shipped_configuration_loads_and_reads_back_the_same() {
             .unwrap_or_else(|error| panic!("{error}"));
         let again = config.to_toml().expect("TOML");
         assert_eq!(loaded(&again, &[]), config, "{name}");
-        config.stage.to_stage(&config.can).unwrap_or_else(|error| panic!("{name}: {error}"));
+        config.to_stage().unwrap_or_else(|error| panic!("{name}: {error}"));
     }
 }
 
@@ -235,7 +235,7 @@ fn the_stage_gets_counts_mm_and_radians() {
          read_back = false\n",
         &[],
     );
-    let stage = config.stage.to_stage(&config.can).expect("a stage");
+    let stage = config.to_stage().expect("a stage");
     let rotation = &stage.rotation;
     assert_eq!(rotation.limits.max, 7200f64.to_radians());
     assert_eq!(rotation.sign, crate::stage::Sign::Negative);
@@ -251,7 +251,7 @@ fn the_stage_gets_counts_mm_and_radians() {
     };
     assert_eq!(windows(&stage), [Some(0.7), Some(3.6f64.to_radians())]);
     let default = loaded("", &[]);
-    let default = default.stage.to_stage(&default.can).expect("a stage");
+    let default = default.to_stage().expect("a stage");
     assert_eq!(windows(&default), [None, None]);
     assert_eq!(stage.bus.heartbeat_timeout_ms, 100);
 }

@@ -31,6 +31,7 @@ impl StageConfig {
     pub(crate) fn new(insertion: AxisConfig, rotation: AxisConfig) -> Self {
         const BENCH: NodeId = NodeId::new(127).unwrap();
         StageConfig {
+            hardware: false,
             bus: BusConfig {
                 sync_ms: 10,
                 bench_node: BENCH,
