@@ -78,12 +78,8 @@ section! {
 section! {
     /// `[tracker.gates]`. A position that is not finite is always refused.
     pub struct GatesConfig {
-        /// Refuse an orientation that is not a rotation; false uses the position alone.
-        rotation: bool = true;
-        /// Refuse the exact zero or identity, which stands for "not seen".
-        zero: bool = true;
-        /// Refuse what the tracker itself calls invalid.
-        status: bool = true;
+        /// Checks of a sample by itself.
+        checks: ContentChecks, flat;
         /// End the run where the stream as a whole contradicts the insertion: travel, handedness. Set false
         /// only for a stream that was recorded with another needle; refused with hardware.
         stream: bool = true;
@@ -188,11 +184,7 @@ impl TrackerSection {
             tool: self.tool.clone(),
             registration: Registration::new(Pose::identity()),
             workspace: None,
-            checks: ContentChecks {
-                rotation: self.gates.rotation,
-                zero: self.gates.zero,
-                status: self.gates.status,
-            },
+            checks: self.gates.checks,
         }
     }
 

@@ -30,16 +30,17 @@ pub struct Gate {
     pub checks: ContentChecks,
 }
 
-/// Checks of a sample's content that can be switched off.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ContentChecks {
-    /// Refuse a sample whose orientation is not a rotation; without this check its position is used
-    /// alone.
-    pub rotation: bool,
-    /// Refuse the exact zero and identity.
-    pub zero: bool,
-    /// Refuse a sample that the tracker itself calls invalid.
-    pub status: bool,
+section! {
+    /// Checks of a sample's content that can be switched off.
+    #[derive(Copy, Eq)]
+    pub struct ContentChecks {
+        /// Refuse an orientation that is not a rotation; false uses the position alone.
+        rotation: bool = true;
+        /// Refuse the exact zero or identity, which stands for "not seen".
+        zero: bool = true;
+        /// Refuse what the tracker itself calls invalid.
+        status: bool = true;
+    }
 }
 
 const POSITION: Rule = within(-10_000.0, 10_000.0);
