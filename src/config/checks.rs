@@ -312,6 +312,6 @@ fn check_faults(config: &Config, reader: &mut Reader) {
         let table = format!("emulator.fault[{i}]");
         let what = format!("a fault of kind \"{}\"", fault.kind);
         let others = &Fault::KEYS[1..];
-        reader.check_own_keys(&table, &what, others, &fault.kind.keys(), fault.check());
+        reader.check_own_keys(&table, &what, others, &fault.kind.keys(), fault.check().err());
     }
 }

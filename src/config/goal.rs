@@ -3,6 +3,7 @@
 use super::pose::{POSITION, PoseConfig};
 use super::reader::{Reader, contradictions};
 use super::tracker::FILE;
+use super::value::join;
 use super::{Config, ConfigError, TrackerSource};
 use crate::control::ControlKind;
 use crate::keys::{Field, Rule, choice, find, not_blank, over, section, within};
@@ -133,43 +134,23 @@ impl ObstacleShape {
 pub type ReadMask<'a> = &'a dyn Fn(&str, Option<u32>, &PoseConfig) -> Result<Obstacle, String>;
 
 impl ObstacleConfig {
-    /// Builds the obstacle.
+    /// Builds the obstacle, which has all keys that its shape needs.
     ///
     /// # Errors
-    /// The key that is wrong, and why: a missing key, a shape without size, a mask that cannot be read.
-    fn to_obstacle(&self, read_mask: ReadMask<'_>) -> Result<Obstacle, (&'static str, String)> {
-        let shape = self.shape;
-        let needs = |key: &'static str| (key, format!("a {shape} needs {key}"));
-        Ok(match shape {
-            ObstacleShape::Sphere => Obstacle::Sphere {
-                centre_mm: self.centre_mm.ok_or_else(|| needs("centre_mm"))?,
-                radius_mm: self.radius_mm.ok_or_else(|| needs("radius_mm"))?,
-            },
-            ObstacleShape::Cylinder => {
-                let from_mm = self.from_mm.ok_or_else(|| needs("from_mm"))?;
-                let to_mm = self.to_mm.ok_or_else(|| needs("to_mm"))?;
-                if from_mm == to_mm {
-                    let message = "to_mm equals from_mm: a cylinder needs a length";
-                    return Err(("to_mm", message.to_owned()));
-                }
-                let radius_mm = self.radius_mm.ok_or_else(|| needs("radius_mm"))?;
-                Obstacle::Cylinder { from_mm, to_mm, radius_mm }
-            }
-            ObstacleShape::Box => {
-                let min_mm = self.min_mm.ok_or_else(|| needs("min_mm"))?;
-                let max_mm = self.max_mm.ok_or_else(|| needs("max_mm"))?;
-                if !is_box(&min_mm, &max_mm) {
-                    let message = "each coordinate of max_mm must be over that of min_mm";
-                    return Err(("max_mm", message.to_owned()));
-                }
-                Obstacle::Box { min_mm, max_mm }
-            }
-            ObstacleShape::Mask => {
-                let file = self.file.as_ref().ok_or_else(|| needs("file"))?;
-                let pose = self.pose.as_ref().ok_or_else(|| needs("pose"))?;
-                read_mask(file, self.crc32, pose).map_err(|message| ("file", message))?
-            }
-        })
+    /// A mask that cannot be read.
+    fn to_obstacle(&self, read_mask: ReadMask<'_>) -> Result<Obstacle, String> {
+        let [centre_mm, from_mm, to_mm, min_mm, max_mm] =
+            [self.centre_mm, self.from_mm, self.to_mm, self.min_mm, self.max_mm]
+                .map(Option::unwrap_or_default);
+        let radius_mm = self.radius_mm.unwrap_or_default();
+        let (file, pose) =
+            (self.file.as_deref().unwrap_or_default(), self.pose.unwrap_or_default());
+        match self.shape {
+            ObstacleShape::Sphere => Ok(Obstacle::Sphere { centre_mm, radius_mm }),
+            ObstacleShape::Cylinder => Ok(Obstacle::Cylinder { from_mm, to_mm, radius_mm }),
+            ObstacleShape::Box => Ok(Obstacle::Box { min_mm, max_mm }),
+            ObstacleShape::Mask => read_mask(file, self.crc32, &pose),
+        }
     }
 }
 
@@ -251,9 +232,8 @@ impl Config {
             ConfigError::of("goal.kind is \"plane\": a plan needs goal.kind = \"target\"")
         })?;
         let obstacles = goal.obstacle.iter().enumerate().map(|(i, obstacle)| {
-            obstacle.to_obstacle(read_mask).map_err(|(key, message)| {
-                ConfigError::of(format!("goal.obstacle[{i}].{key}: {message}"))
-            })
+            let named = |error| ConfigError::of(format!("goal.obstacle[{i}].file: {error}"));
+            obstacle.to_obstacle(read_mask).map_err(named)
         });
         let obstacles = obstacles.collect::<Result<_, _>>()?;
         let WorkspaceConfig { min: min_mm, max: max_mm } = goal.workspace_mm;
@@ -316,7 +296,7 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     let has_one_tool = config.tip_source() == TrackerSource::Csv;
     let law = config.control.kind;
     let WorkspaceConfig { min, max } = goal.workspace_mm;
-    let is_box = is_box(&min, &max);
+    let has_size = is_box(&min, &max);
     let has_plane = min.x <= 0.0 && max.x >= 0.0;
     let aside_mm = goal.position_mm.map_or(0.0, |target_mm| target_mm.x);
     contradictions! { reader;
@@ -329,22 +309,30 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
             "goal.tool needs a stream of two tools, and tracker.source = \"csv\" has one";
         ["control.kind", "goal.kind"] if is_target && law != ControlKind::NestedSaturation =>
             "control.kind is \"{law}\", allowed with goal.kind = \"target\": \"nested-saturation\"";
-        ["goal.workspace_mm"] if !is_box =>
+        ["goal.workspace_mm"] if !has_size =>
             "goal.workspace_mm: each coordinate of max must be over that of min";
-        ["goal.workspace_mm", "goal.in_plane"] if is_box && goal.in_plane && !has_plane =>
+        ["goal.workspace_mm", "goal.in_plane"] if has_size && goal.in_plane && !has_plane =>
             "goal.workspace_mm does not contain the plane x = 0, to which goal.in_plane keeps the path";
         ["goal.position_mm", "goal.in_plane"] if is_target && goal.in_plane && aside_mm != 0.0 =>
             "goal.position_mm is {aside_mm} mm off the plane, allowed with goal.in_plane: 0; steer in space \
              with goal.in_plane = false";
     }
-    // Files are not read here, so a sphere stands for every mask.
-    let placeholder = |_: &str, _: Option<u32>, _: &PoseConfig| {
-        Ok(Obstacle::Sphere { centre_mm: Vector3::zeros(), radius_mm: 0.0 })
-    };
     for (i, obstacle) in goal.obstacle.iter().enumerate() {
-        let (table, what) = (format!("goal.obstacle[{i}]"), format!("a {}", obstacle.shape));
+        let (table, shape) = (format!("goal.obstacle[{i}]"), obstacle.shape);
+        let is_missing = |key: &&&str| **key != "crc32" && !reader.is_present(&join(&table, key));
+        let size = obstacle.min_mm.zip(obstacle.max_mm);
+        let wrong = match (shape.keys().iter().find(is_missing), shape) {
+            (Some(&key), _) => Some((key, format!("a {shape} needs {key}"))),
+            (None, ObstacleShape::Cylinder) if obstacle.from_mm == obstacle.to_mm => {
+                Some(("to_mm", "to_mm equals from_mm: a cylinder needs a length".to_owned()))
+            }
+            (None, ObstacleShape::Box) if size.is_some_and(|(min, max)| !is_box(&min, &max)) => {
+                let message = "each coordinate of max_mm must be over that of min_mm";
+                Some(("max_mm", message.to_owned()))
+            }
+            _ => None,
+        };
         let others = &ObstacleConfig::KEYS[1..];
-        let made = obstacle.to_obstacle(&placeholder);
-        reader.check_own_keys(&table, &what, others, obstacle.shape.keys(), made);
+        reader.check_own_keys(&table, &format!("a {shape}"), others, shape.keys(), wrong);
     }
 }

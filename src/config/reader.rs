@@ -178,7 +178,7 @@ impl Reader {
     }
 
     /// True if the key `path` or a key inside it is present.
-    fn is_present(&self, path: &str) -> bool {
+    pub(super) fn is_present(&self, path: &str) -> bool {
         self.tree.contains_key(path) || self.tree.keys().any(|key| is_inside(key, path))
     }
 
@@ -208,14 +208,14 @@ impl Reader {
 
     /// Checks a table at `table_path` that may have only some of the keys in `all`, depending on its kind. `what` is
     /// its kind in words, and `known` are its keys. Reports given keys that are not among these; if there are
-    /// none, reports the key and the message in `made`, the attempt to use the table.
-    pub(super) fn check_own_keys<T>(
+    /// none, reports what else is `wrong` with the table: the key and the message.
+    pub(super) fn check_own_keys(
         &mut self,
         table_path: &str,
         what: &str,
         all: &[Key],
         known: &[&str],
-        made: Result<T, (&'static str, String)>,
+        wrong: Option<(&str, String)>,
     ) {
         if self.is_wrong(table_path) {
             return;
@@ -232,7 +232,7 @@ impl Reader {
                 self.fail(&key_path, &key_path, message);
             }
         }
-        if let (false, Err((key, message))) = (self.is_wrong(table_path), made) {
+        if let (false, Some((key, message))) = (self.is_wrong(table_path), wrong) {
             self.fail(table_path, &join(table_path, key), format!("{table_path}: {message}"));
         }
     }
