@@ -138,14 +138,10 @@ impl Checks<'_> {
         let [min, max, offset, sign] =
             [&low, &high, &offset_key, &sign_key].map(|key| self.config.number(key));
         let unit = self.which.unit();
-        let counts_per_unit = match self.which {
-            Axis::Insertion => {
-                self.number("counts_per_mm.counts") / self.number("counts_per_mm.mm")
-            }
-            Axis::Rotation => {
-                self.number("counts_per_turn.counts") / self.number("counts_per_turn.turns") / 360.0
-            }
-        };
+        let (scale, units) =
+            [("counts_per_mm", 1.0), ("counts_per_turn", 360.0)][self.which as usize];
+        let is_unknown = reader.is_wrong(&self.key(scale));
+        let counts_per_unit = if is_unknown { f64::NAN } else { self.axis.ratio.to_f64() / units };
         let zero_counts = self.axis.zero.map_or(f64::NAN, f64::from);
         // Not -offset, which would print as -0.000.
         let home_at = |offset: f64| 0.0 - offset - sign * zero_counts / counts_per_unit;
