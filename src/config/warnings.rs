@@ -20,32 +20,30 @@ pub(super) fn all(config: &Config, tree: &Tree) -> Vec<String> {
 /// A warning for each section of `tree` that is given and that `config` does not use. A configuration
 /// printed in full, as in a run folder, gives all sections: only `--set` gets a warning there.
 fn unused_sections(config: &Config, tree: &Tree) -> Vec<String> {
-    let (law, observer) = (config.control.kind.to_string(), config.observer.kind.to_string());
     // The check of handedness always uses the section of the invariant observer.
     let observers = config.observer.kinds().into_iter().chain([ObserverKind::Invariant]);
-    let observers: Vec<String> = observers.map(|kind| kind.to_string()).collect();
+    let observers = observers.map(|kind| kind.to_string()).collect();
     let mut warnings = Vec::new();
-    for (table, chosen, kinds, used) in [
-        ("control", &law, ControlKind::KIND, std::slice::from_ref(&law)),
-        ("observer", &observer, ObserverKind::KIND, &observers),
+    for (table, kinds, used, or_shadow) in [
+        ("control", ControlKind::KIND, vec![config.control.kind.to_string()], false),
+        ("observer", ObserverKind::KIND, observers, true),
     ] {
         let Kind::OneOf(kinds) = kinds else { continue };
         let mut in_table = tree.iter().filter(|(key, _)| is_inside(key, table));
         let is_printed_in_full = in_table.all(|(_, entry)| entry.layer > 0);
-        for (kind, _) in kinds {
+        for (kind, _) in kinds.iter().filter(|(kind, _)| used.iter().all(|used| used != kind)) {
             let section = format!("{table}.{}", section_name(kind));
             let given = tree.iter().find(|(key, entry)| {
                 let is_meant = !is_printed_in_full || entry.origin == Origin::Set;
                 is_meant && entry.layer > 0 && is_inside(key, &section) && !entry.value.is_table()
             });
             let Some((key, Entry { origin, .. })) = given else { continue };
-            if used.iter().any(|used| used == kind) {
-                continue;
-            }
+            let or = format!(", or add \"{kind}\" to observer.shadows");
             warnings.push(format!(
-                "{origin}{key} has no effect, since {table}.kind is \"{chosen}\": choose {table}.kind = \
+                "{origin}{key} has no effect, since {table}.kind is \"{}\": choose {table}.kind = \
                  \"{kind}\"{}",
-                if table == "observer" { format!(", or add \"{kind}\" to observer.shadows") } else { String::new() },
+                used[0],
+                if or_shadow { or.as_str() } else { "" },
             ));
         }
     }
