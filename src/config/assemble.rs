@@ -6,7 +6,7 @@ use crate::canopen::ObjectAddress;
 use crate::emulator::drive::DriveConfig;
 use crate::emulator::{TargetModel, VirtualStageConfig};
 use crate::observer::{InvariantConfig, ObserverConfig};
-use crate::session::SessionConfig;
+use crate::session::{SessionConfig, TrackerConfig};
 use crate::stage::{AxisConfig, Sign, StageConfig};
 use std::f64::consts::TAU;
 
@@ -71,7 +71,15 @@ impl Config {
             control: self.control,
             goal: None,
             stage: self.to_stage()?,
-            tracker: self.tracker.to_session()?,
+            tracker: TrackerConfig {
+                gate: self.tracker.to_gate()?,
+                judges_stream: self.tracker.gates.stream,
+                clock: self.tracker.to_clock(),
+                track: self.tracker.to_track(),
+                noise: self.tracker.noise,
+                timeout: self.tracker.timeout,
+                hold: self.tracker.hold,
+            },
         })
     }
 

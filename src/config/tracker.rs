@@ -9,7 +9,7 @@ use crate::calibration::TipRecord;
 use crate::geometry::{FixedAngles, Pose};
 use crate::keys::{Rule, choice, not_blank, section, within};
 use crate::observer::PositionNoise;
-use crate::session::{self, HoldConfig};
+use crate::session::HoldConfig;
 use crate::tracker::openigtlink::ToolStream;
 use crate::tracker::{
     AcquisitionClock, ContentChecks, CsvMapping, Gate, Protocol, Registration, StampPolicy,
@@ -125,22 +125,6 @@ choice! {
 }
 
 impl TrackerSection {
-    /// The tracker settings of a session.
-    ///
-    /// # Errors
-    /// Those of [`TrackerSection::to_registration`].
-    pub(super) fn to_session(&self) -> Result<session::TrackerConfig, ConfigError> {
-        Ok(session::TrackerConfig {
-            gate: self.to_gate()?,
-            judges_stream: self.gates.stream,
-            clock: self.to_clock(),
-            track: self.to_track(),
-            noise: self.noise,
-            timeout: self.timeout,
-            hold: self.hold,
-        })
-    }
-
     /// The poses of the tracker on the bench and of the tip on the sensor. Without them nothing moves.
     ///
     /// # Errors
