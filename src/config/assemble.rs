@@ -44,7 +44,7 @@ impl Config {
     /// No registration; values that the needle, the stage or the observers refuse; a target that cannot be
     /// reached.
     pub fn session_reading(&self, read_mask: ReadMask<'_>) -> Result<SessionConfig, ConfigError> {
-        let goal = self.to_goal(read_mask)?.map_err(ConfigError::of)?;
+        let goal = self.to_goal(read_mask)??;
         Ok(SessionConfig { goal, ..self.session_without_goal()? })
     }
 
@@ -88,7 +88,7 @@ impl Config {
     /// # Errors
     /// The stage refuses the settings, for example a following-error window of less than a count.
     pub fn to_stage(&self) -> Result<StageConfig, ConfigError> {
-        self.stage.validate().map_err(ConfigError::of)?;
+        self.stage.validate()?;
         Ok(self.stage.clone())
     }
 

@@ -38,14 +38,16 @@ impl ConfigError {
         if problems.is_empty() { Ok(()) } else { Err(ConfigError { problems }) }
     }
 
-    /// One problem without a place in a file.
-    pub(super) fn of(message: impl fmt::Display) -> Self {
-        ConfigError::at(None, message)
-    }
-
     /// One problem at `origin`.
     pub(super) fn at(origin: Option<Origin>, message: impl fmt::Display) -> Self {
         ConfigError { problems: vec![Problem::at(origin, message)] }
+    }
+}
+
+/// One problem without a place in a file.
+impl From<String> for ConfigError {
+    fn from(message: String) -> Self {
+        ConfigError::at(None, message)
     }
 }
 

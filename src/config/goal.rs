@@ -228,12 +228,11 @@ impl Config {
     pub fn to_plan(&self, read_mask: ReadMask<'_>) -> Result<(World, Problem), ConfigError> {
         let goal = &self.goal;
         let target_mm = goal.position_mm.filter(|_| goal.kind == GoalKind::Target);
-        let target_mm = target_mm.ok_or_else(|| {
-            ConfigError::of("goal.kind is \"plane\": a plan needs goal.kind = \"target\"")
-        })?;
+        let no_target = "goal.kind is \"plane\": a plan needs goal.kind = \"target\"";
+        let target_mm = target_mm.ok_or_else(|| no_target.to_owned())?;
         let obstacles = goal.obstacle.iter().enumerate().map(|(i, obstacle)| {
-            let named = |error| ConfigError::of(format!("goal.obstacle[{i}].file: {error}"));
-            obstacle.to_obstacle(read_mask).map_err(named)
+            let made = obstacle.to_obstacle(read_mask);
+            made.map_err(|error| format!("goal.obstacle[{i}].file: {error}"))
         });
         let obstacles = obstacles.collect::<Result<_, _>>()?;
         let WorkspaceConfig { min: min_mm, max: max_mm } = goal.workspace_mm;

@@ -45,16 +45,16 @@ impl Arc {
     }
 
     /// A needle that cuts this arc, with its tip `tip_ahead_mm` ahead. An error names the `section`.
-    pub(super) fn to_needle(self, tip_ahead_mm: f64, section: &str) -> Result<Needle, ConfigError> {
+    pub(super) fn to_needle(self, tip_ahead_mm: f64, section: &str) -> Result<Needle, String> {
         Needle::new(self.curvature_per_mm())
             .and_then(|needle| needle.with_tip_ahead(tip_ahead_mm))
-            .map_err(|error| ConfigError::of(format!("{section}: {error}")))
+            .map_err(|error| format!("{section}: {error}"))
     }
 }
 
 /// The torsion of `config`; an error names the `section`.
-pub(super) fn torsion(config: TorsionConfig, section: &str) -> Result<Torsion, ConfigError> {
-    Torsion::new(config).map_err(|error| ConfigError::of(format!("{section}.torsion: {error}")))
+pub(super) fn torsion(config: TorsionConfig, section: &str) -> Result<Torsion, String> {
+    Torsion::new(config).map_err(|error| format!("{section}.torsion: {error}"))
 }
 
 impl Config {
@@ -63,7 +63,7 @@ impl Config {
     /// # Errors
     /// Those of [`Needle::new`] and [`Needle::with_tip_ahead`].
     pub fn believed_needle(&self) -> Result<Needle, ConfigError> {
-        self.needle.arc.to_needle(self.needle.tip_ahead_mm, "needle")
+        Ok(self.needle.arc.to_needle(self.needle.tip_ahead_mm, "needle")?)
     }
 
     /// The bench's model of the torsion of the shaft.
@@ -71,7 +71,7 @@ impl Config {
     /// # Errors
     /// Those of [`Torsion::new`].
     pub fn believed_torsion(&self) -> Result<Torsion, ConfigError> {
-        torsion(self.needle.torsion, "needle")
+        Ok(torsion(self.needle.torsion, "needle")?)
     }
 
     /// The disturbance of a path by tracker and tissue, from the settings of the invariant observer.

@@ -63,9 +63,8 @@ impl Config {
     /// The two axes are parallel.
     pub fn scoring(&self) -> Result<Scoring, ConfigError> {
         let EvaluationConfig { axis, bend_axis, score_after_mm } = self.evaluation;
-        let r_sb = mount(axis.into(), bend_axis.into()).map_err(|error| {
-            ConfigError::of(format!("evaluation.axis and evaluation.bend_axis: {error}"))
-        })?;
+        let r_sb = mount(axis.into(), bend_axis.into())
+            .map_err(|error| format!("evaluation.axis and evaluation.bend_axis: {error}"))?;
         Ok(Scoring {
             r_sb,
             step_mm: self.insertion.step_mm,

@@ -62,9 +62,9 @@ impl Fiducials {
     ///
     /// # Errors
     /// They determine no registration.
-    pub fn fit(&self) -> Result<RegistrationFit, ConfigError> {
+    pub fn fit(&self) -> Result<RegistrationFit, String> {
         RegistrationFit::of(&self.fiducials, self.rms_max_mm)
-            .map_err(|error| ConfigError::of(format!("tracker.registration.fiducials: {error}")))
+            .map_err(|error| format!("tracker.registration.fiducials: {error}"))
     }
 }
 

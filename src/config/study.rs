@@ -136,7 +136,7 @@ impl Config {
     /// Checks that no relative error takes a value out of the range of its key: the record of such a run could
     /// not be read. This is not checked as the configuration is read, since a drawn one has both the error and
     /// what it was drawn to.
-    fn check_relative_errors(&self) -> Result<(), ConfigError> {
+    fn check_relative_errors(&self) -> Result<(), String> {
         let torsion = self.emulator.torsion;
         for (error, name, emulated) in [
             ("curvature_error", "curvature_per_mm", self.emulator.arc.curvature_per_mm()),
@@ -148,10 +148,10 @@ impl Config {
             let range = key.kind.range(&key.rule);
             for drawn in [low, high].map(|error| emulated * (1.0 + error)) {
                 if range.is_some_and(|range| !range.contains(drawn)) {
-                    return Err(ConfigError::of(format!(
+                    return Err(format!(
                         "study.{error} = [{low}, {high}] may draw emulator.{name} = {drawn}, allowed: {}",
                         Words::of_key(&key).allowed
-                    )));
+                    ));
                 }
             }
         }
@@ -174,7 +174,7 @@ impl Config {
     }
 
     /// Draws target and obstacles of the trial with this seed; returns the target, mm.
-    fn draw_goal(&self, seed: u64, goal: &mut Value) -> Result<Vector3<f64>, ConfigError> {
+    fn draw_goal(&self, seed: u64, goal: &mut Value) -> Result<Vector3<f64>, String> {
         let study = &self.study;
         let mut number = GOAL_DRAWS;
         let mut draw = |low: f64, high: f64| {
@@ -223,11 +223,11 @@ impl Config {
                 centre_mm.norm() >= room_mm && (centre_mm - target_mm).norm() >= room_mm
             };
             let (centre_mm, radius_mm) = tries.find(has_room).ok_or_else(|| {
-                ConfigError::of(format!(
+                format!(
                     "study.obstacle_radius_mm = [{low}, {high}]: of {TRIES_MAX} spheres drawn for obstacle \
                      {obstacle} of study.obstacles, each came within goal.clearance_mm and {ROOM_MM} mm of \
                      start or target; draw smaller ones"
-                ))
+                )
             })?;
             let shape = ("shape".to_owned(), Value::from("sphere"));
             let centre = ("centre_mm".to_owned(), array(&centre_mm));

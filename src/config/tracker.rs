@@ -131,12 +131,12 @@ impl TrackerSection {
     /// No registration is configured (the error names the key to set), or its fiducials determine none.
     pub fn to_registration(&self) -> Result<Registration, ConfigError> {
         let registration = self.registration.as_ref().ok_or_else(|| {
-            ConfigError::of(format!(
+            format!(
                 "tracker.registration is missing, and has no default for tracker.source = \"{}\": \
                  measure it by needle-bench calibrate registration, and name its file in \
                  tracker.registration_file",
                 self.source
-            ))
+            )
         })?;
         let x_wt = match registration {
             RegistrationConfig::Given(given) => given.x_wt.to_pose(),
