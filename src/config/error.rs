@@ -53,10 +53,8 @@ impl From<String> for ConfigError {
 
 impl fmt::Display for ConfigError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for (i, problem) in self.problems.iter().take(SHOWN_MAX).enumerate() {
-            let newline = if i == 0 { "" } else { "\n" };
-            write!(f, "{newline}{}", problem.message)?;
-        }
+        let shown = self.problems.iter().take(SHOWN_MAX).map(|problem| problem.message.as_str());
+        f.write_str(&shown.collect::<Vec<_>>().join("\n"))?;
         match self.problems.len().saturating_sub(SHOWN_MAX) {
             0 => Ok(()),
             more => write!(f, "\nand {more} more"),

@@ -347,12 +347,9 @@ fn scalar(kind: &Kind, rule: &Rule, value: &Value, words: &Words) -> Result<Valu
 
 /// An example of a table with these `keys`, for a message: `, { a = …, b = … }`.
 fn form(keys: &[Key]) -> String {
-    let mut fields: Vec<String> = keys.iter().map(|key| format!("{} = …", key.name)).collect();
-    if fields.len() > FORM_KEYS_MAX {
-        fields.truncate(FORM_KEYS_MAX);
-        fields.push("…".to_owned());
-    }
-    format!(", {{ {} }}", fields.join(", "))
+    let shown = keys.iter().take(FORM_KEYS_MAX).map(|key| format!("{} = …", key.name));
+    let more = if keys.len() > FORM_KEYS_MAX { ", …" } else { "" };
+    format!(", {{ {}{more} }}", shown.collect::<Vec<_>>().join(", "))
 }
 
 /// Merges the entries of all layers: a higher layer overrides a lower one. An array and a table that is

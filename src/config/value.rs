@@ -7,6 +7,7 @@ use toml::{Spanned, Table, Value};
 
 use super::error::{ConfigError, Problem};
 use super::reader::is_inside;
+use crate::text::clipped;
 
 /// Where a value was given.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -231,7 +232,7 @@ impl Flattener<'_> {
         }
     }
 
-    /// The value as the user wrote it, on one line and shortened to 60 characters.
+    /// The value as the user wrote it, on one line and shortened to 60 characters and `…`.
     fn source_text(&self, value: &Value, spanned: &Spanned<DeValue<'_>>) -> String {
         if value.is_table() {
             return "a table".to_owned();
@@ -241,12 +242,7 @@ impl Flattener<'_> {
         if text.starts_with("[[") && spanned.get_ref().as_array().is_some_and(tables) {
             return "an array of tables".to_owned();
         }
-        let mut line = text.split_whitespace().collect::<Vec<_>>().join(" ");
-        if let Some((cut, _)) = line.char_indices().nth(60) {
-            line.truncate(cut);
-            line.push('…');
-        }
-        line
+        clipped(&text.split_whitespace().collect::<Vec<_>>().join(" "), 61).into_owned()
     }
 }
 
