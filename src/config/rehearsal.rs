@@ -24,9 +24,8 @@ pub(super) fn layer(config: &Config) -> String {
     let curvature = needle.arc.curvature_per_mm();
     let depth_mm = config.insertion.depth_mm;
     let start_mm = (depth_mm * depth_mm * curvature * START_PART).min(START_MAX_MM);
-    let start = pose([start_mm, 0.0, 0.0, 1.0, 1.0, 30.0]);
-    let [x, y, z, yaw, pitch, roll] = coordinates(&tracker.x_sb().inverse());
-    let sensor = pose([x, y, z, yaw.to_degrees(), pitch.to_degrees(), roll.to_degrees()]);
+    let [x, y, z, angles @ ..] = coordinates(&tracker.x_sb().inverse());
+    let [yaw, pitch, roll] = angles.map(f64::to_degrees);
     let maxon = Some(MAXON_VENDOR_ID);
     let is_epos4 =
         config.stage.insertion.vendor_id == maxon || config.stage.rotation.vendor_id == maxon;
@@ -40,8 +39,9 @@ pub(super) fn layer(config: &Config) -> String {
          curvature_per_mm = {curvature:?}\n\
          tip_ahead_mm = {:?}\n\
          torsion = {torsion}\n\
-         start = {start}\n\
-         sensor = {sensor}\n",
+         start = {{ x_mm = {start_mm:?}, yaw_deg = 1.0, pitch_deg = 1.0 }}\n\
+         sensor = {{ x_mm = {x:?}, y_mm = {y:?}, z_mm = {z:?}, yaw_deg = {yaw:?}, \
+         pitch_deg = {pitch:?}, roll_deg = {roll:?} }}\n",
         needle.tip_ahead_mm,
     );
     if config.emulator.tracker == TrackerPreset::Plain {
@@ -57,14 +57,6 @@ pub(super) fn layer(config: &Config) -> String {
         );
     }
     keys
-}
-
-/// A pose, mm and degrees, as TOML.
-fn pose([x, y, z, yaw, pitch, roll]: [f64; 6]) -> String {
-    format!(
-        "{{ x_mm = {x:?}, y_mm = {y:?}, z_mm = {z:?}, yaw_deg = {yaw:?}, pitch_deg = {pitch:?}, \
-         roll_deg = {roll:?} }}"
-    )
 }
 
 /// The switches of an axis with `counts_per_unit` counts per mm or rad: those `given`, and the switch that its
