@@ -4,13 +4,11 @@ use super::axis_checks;
 use super::goal;
 use super::needle;
 use super::reader::{FIDUCIALS, REGISTRATION, Reader, contradictions};
-use super::registration::GivenRegistration;
 use super::study::StudyConfig;
 use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
 use super::warnings::section_name;
 use super::{CanInterface, Config};
 use crate::emulator::fault::Fault;
-use crate::keys::{Key, expanded};
 use crate::needle::TorsionConfig;
 use crate::session::rotation_peak;
 use nalgebra::Vector3;
@@ -250,19 +248,8 @@ fn check_tracker(config: &Config, reader: &mut Reader) {
     }
 }
 
-/// Fiducials determine a pose, and cannot be given beside one.
+/// Fiducials determine a pose.
 fn check_registration(config: &Config, reader: &mut Reader) {
-    if reader.is_given(FIDUCIALS) {
-        let mut pose = expanded(GivenRegistration::KEYS, &[]).into_iter();
-        let other = |key: &Key| reader.is_given(&format!("{REGISTRATION}.{}", key.name));
-        if let Some(other) = pose.find(other) {
-            let message = format!(
-                "{REGISTRATION}: fiducials are given along with {}: give one of the two",
-                other.name
-            );
-            reader.fail(REGISTRATION, FIDUCIALS, message);
-        }
-    }
     if let Err(error) = config.registration_sd_mm() {
         reader.refuse(&[FIDUCIALS, REGISTRATION], error.to_string());
     }

@@ -117,6 +117,14 @@ impl Reader {
                 table.insert(key.name.to_owned(), value);
             }
         }
+        if let Kind::Either(key, [_, others]) = *kind
+            && self.is_given(&join(path, key))
+            && let Some(Key { name, .. }) =
+                expanded(others, &[]).iter().find(|other| self.is_given(&join(path, other.name)))
+        {
+            let message = format!("{path}: {key} are given along with {name}: give one of the two");
+            self.fail(path, &join(path, key), message);
+        }
         Value::Table(table)
     }
 
