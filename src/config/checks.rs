@@ -5,13 +5,12 @@ use super::goal;
 use super::needle;
 use super::reader::{FIDUCIALS, REGISTRATION, Reader, contradictions};
 use super::study::StudyConfig;
-use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
+use super::tracker::{STANDARD_INPUT, TrackerSource};
 use super::warnings::section_name;
 use super::{CanInterface, Config};
 use crate::emulator::fault::Fault;
 use crate::needle::TorsionConfig;
 use crate::session::rotation_peak;
-use nalgebra::Vector3;
 
 pub(super) const ROTATION_ACCELERATION_MAX: &str = "stage.rotation.acceleration_max_deg_per_s2";
 
@@ -114,13 +113,9 @@ fn check_study(config: &Config, reader: &mut Reader) {
         }
     }
     let study = &config.study;
-    let is_drifting = config.emulator.target_drift_mm_per_mm != Vector3::zeros();
-    for (key, is_moving) in [
-        ("study.target_move_mm", study.target_move_mm.is_some()),
-        ("emulator.target_drift_mm_per_mm", is_drifting),
-    ] {
+    for key in ["study.target_move_mm", "emulator.target_drift_mm_per_mm"] {
         contradictions! { reader;
-            [key, "goal.tool"] if is_moving && config.goal.tool.is_none() =>
+            [key, "goal.tool"] if config.is_changed(key) && config.goal.tool.is_none() =>
                 "{key} has no effect without goal.tool: name the tool that is the target";
         }
     }
@@ -162,12 +157,10 @@ fn check_noise(config: &Config, reader: &mut Reader) {
              is an error of the registration, tracker.registration.sd_mm",
             rounded_down(run_s, 3);
     }
-    let noise = config.emulator.noise;
-    let sd = ("emulator.noise.correlated_sd_mm", noise.correlated_sd_mm.is_some());
-    let time = ("emulator.noise.correlation_time_s", noise.correlation_time.is_some());
-    for ((key, is_given), (other, other_is_given)) in [(sd, time), (time, sd)] {
+    let [sd, time] = ["emulator.noise.correlated_sd_mm", "emulator.noise.correlation_time_s"];
+    for (key, other) in [(sd, time), (time, sd)] {
         contradictions! { reader;
-            [key, other] if is_given && !other_is_given =>
+            [key, other] if config.is_changed(key) && !config.is_changed(other) =>
                 "{key} is given without {other}: give both";
         }
     }
@@ -261,20 +254,17 @@ fn check_source(config: &Config, reader: &mut Reader) {
     let source = tracker.source;
     let is_recorded = tracker.file.is_some();
     let file = tracker.file.as_deref().unwrap_or_default();
-    let is_ndjson = source == TrackerSource::Ndjson;
-    let is_csv = source == TrackerSource::Csv;
-    let is_openigtlink = source == TrackerSource::OpenIgtLink;
-    let is_asked = tracker.request != TrackerRequest::None;
-    let is_standard_input = tracker.address == STANDARD_INPUT;
+    let (is_ndjson, is_csv) = (source == TrackerSource::Ndjson, source == TrackerSource::Csv);
+    let is_asked = config.is_changed("tracker.request");
     contradictions! { reader;
         ["tracker.source", "tracker.file"] if is_csv && !is_recorded =>
             "tracker.source is \"csv\", and there is no tracker.file to read";
         ["tracker.file", "tracker.source"] if is_recorded && !is_ndjson && !is_csv =>
             "tracker.file is \"{file}\", allowed with tracker.source = \"ndjson\" or \"csv\", which is \
              \"{source}\"";
-        ["tracker.address", "tracker.source"] if is_standard_input && !is_ndjson =>
+        ["tracker.address", "tracker.source"] if tracker.address == STANDARD_INPUT && !is_ndjson =>
             "tracker.address is \"-\", allowed with tracker.source = \"ndjson\", which is \"{source}\"";
-        ["tracker.request", "tracker.source"] if is_asked && !is_openigtlink =>
+        ["tracker.request", "tracker.source"] if is_asked && source != TrackerSource::OpenIgtLink =>
             "tracker.request is given, allowed with tracker.source = \"openigtlink\", which is \
              \"{source}\"";
         ["tracker.file", "stage.hardware"] if is_recorded && config.stage.hardware =>

@@ -6,7 +6,7 @@ use super::tracker::FILE;
 use super::value::join;
 use super::{Config, ConfigError, TrackerSource};
 use crate::control::ControlKind;
-use crate::keys::{Field, Rule, choice, find, not_blank, over, section, within};
+use crate::keys::{Rule, choice, not_blank, over, section, within};
 use crate::plan::{Obstacle, Problem, Tip, Workspace, World};
 use crate::session::{Goal, TargetTool};
 use crate::tracker::{Gate, Registration};
@@ -274,19 +274,16 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
         ["goal.position_mm", "goal.kind"] if is_target && goal.position_mm.is_none() =>
             "goal.kind is \"target\", and goal.position_mm is not given: say where it is";
     }
-    // A printed configuration has the default.
-    let default = find(GoalConfig::KEYS, "workspace_mm").and_then(|key| key.default_value());
-    let given = [
-        ("goal.position_mm", goal.position_mm.is_some()),
-        ("goal.tool", goal.tool.is_some()),
-        ("goal.obstacle", !goal.obstacle.is_empty()),
-        ("goal.workspace_mm", goal.workspace_mm != WorkspaceConfig::take(default.as_ref())),
-        ("study.target_depth_mm", config.study.target_depth_mm.is_some()),
-        ("study.obstacles", is_drawn),
-    ];
-    for (key, is_given) in given {
+    for key in [
+        "goal.position_mm",
+        "goal.tool",
+        "goal.obstacle",
+        "goal.workspace_mm",
+        "study.target_depth_mm",
+        "study.obstacles",
+    ] {
         contradictions! { reader;
-            [key, "goal.kind"] if !is_target && is_given =>
+            [key, "goal.kind"] if !is_target && config.is_changed(key) =>
                 "{key} has no effect, since goal.kind is \"plane\": set goal.kind = \"target\"";
         }
     }

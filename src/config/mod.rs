@@ -209,6 +209,12 @@ impl Config {
         key.split('.').try_fold(&self.toml, |table, name| table.get(name))
     }
 
+    /// True if the dotted `key` has another value than its default. A printed configuration has all defaults.
+    fn is_changed(&self, key: &str) -> bool {
+        let default = keys::find(Self::KEYS, key).and_then(|key| key.default_value());
+        self.value_at(key) != default.as_ref()
+    }
+
     /// The number at the dotted `key`, in the key's own unit; NaN if it is not given.
     fn number(&self, key: &str) -> f64 {
         match self.value_at(key) {
