@@ -8,6 +8,7 @@ use crate::emulator::{TargetModel, VirtualStageConfig};
 use crate::observer::{InvariantConfig, ObserverConfig};
 use crate::session::{SessionConfig, TrackerConfig};
 use crate::stage::{AxisConfig, Sign, StageConfig};
+use crate::tracker::AcquisitionClock;
 use std::f64::consts::TAU;
 
 /// Identity of an emulated drive if the configuration accepts any; no vendor has this number.
@@ -74,7 +75,7 @@ impl Config {
             tracker: TrackerConfig {
                 gate: self.tracker.to_gate()?,
                 judges_stream: self.tracker.gates.stream,
-                clock: self.tracker.to_clock(),
+                clock: AcquisitionClock::new(self.tracker.stamp, self.tracker.latency),
                 track: self.tracker.to_track(),
                 noise: self.tracker.noise,
                 timeout: self.tracker.timeout,

@@ -12,8 +12,8 @@ use crate::observer::PositionNoise;
 use crate::session::HoldConfig;
 use crate::tracker::openigtlink::ToolStream;
 use crate::tracker::{
-    AcquisitionClock, ContentChecks, CsvMapping, Gate, Protocol, Registration, StampPolicy,
-    TrackSettings, TrackerKind, Workspace,
+    ContentChecks, CsvMapping, Gate, Protocol, Registration, StampPolicy, TrackSettings,
+    TrackerKind, Workspace,
 };
 
 pub(super) const FILE: Rule = not_blank("the path of a file");
@@ -201,11 +201,6 @@ impl TrackerSection {
     /// True if positions are read from standard input.
     pub fn is_standard_input(&self) -> bool {
         self.source == TrackerSource::Ndjson && self.address == STANDARD_INPUT
-    }
-
-    /// The clock that dates samples.
-    pub fn to_clock(&self) -> AcquisitionClock {
-        AcquisitionClock::new(self.stamp, self.latency)
     }
 }
 

@@ -53,7 +53,7 @@ impl Watch {
         Watch {
             gate,
             frame,
-            clock: tracker.to_clock(),
+            clock: AcquisitionClock::new(tracker.stamp, tracker.latency),
             counts: GateCounts::default(),
             last: None,
             repeats: 0,
