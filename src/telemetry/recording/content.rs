@@ -186,11 +186,6 @@ impl Content {
     fn line(&self, path: &str, level: &'static str, text: String) -> Logged {
         self.stream.log(path, &TextLog::new(text).with_level(level))
     }
-
-    /// Logs that the run is over.
-    pub(super) fn end(&self) -> Logged {
-        self.motion.end(&self.stream)
-    }
 }
 
 /// The greatest depth, µm, after `insertion_mm` was measured.

@@ -95,7 +95,6 @@ impl Recording {
     /// It cannot be written; an earlier `run.rrd` then stays.
     pub fn finish(self) -> Result<(), TelemetryError> {
         let finish = || -> Result<(), Box<dyn Error + Send + Sync>> {
-            self.content.end()?;
             self.content.stream.flush_blocking()?;
             let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
             let (mut encoder, _) = mem::replace(&mut *written, Err(EncodeError::AlreadyFinished))?;

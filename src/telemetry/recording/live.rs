@@ -62,7 +62,7 @@ impl Sink for Content {
 
     /// Gives viewers some time, before the stream is dropped, which would wait for frozen viewers.
     fn close(&mut self, manifest: &Manifest, _: &dyn Fn()) -> Result<(), String> {
-        let ended = self.end().and_then(|()| log_manifest(&self.stream, manifest));
+        let ended = log_manifest(&self.stream, manifest);
         let _ = self.stream.flush_with_timeout(FAREWELL);
         thread::sleep(FAREWELL);
         ended.map_err(|error| error.to_string())

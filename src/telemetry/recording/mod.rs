@@ -33,15 +33,18 @@ use rerun::{
 type Logged<T = ()> = RecordingStreamResult<T>;
 
 /// Logs a row of a table at the entity `path`: the name and the number of each of its columns, all at the current
-/// time. A name has the unit; the layout has the colours. An unknown value is NaN, which a viewer draws as a gap.
+/// time. A name has the unit; the layout has the colours. An angle comes in radians (`_rad` in its name) and is
+/// logged in degrees (`_deg`). An unknown value is NaN, which a viewer draws as a gap.
 fn log_row<N: AsRef<str>>(
     stream: &RecordingStream,
     path: &str,
     row: impl IntoIterator<Item = (N, f64)>,
 ) -> Logged {
     let cells = row.into_iter().filter_map(|(name, value)| {
+        let name = name.as_ref();
+        let value = if name.contains("_rad") { value.to_degrees() } else { value };
         // Only an empty name is refused.
-        let column = ComponentIdentifier::try_new(name.as_ref()).ok()?;
+        let column = ComponentIdentifier::try_new(name.replace("_rad", "_deg")).ok()?;
         let column = ComponentDescriptor::partial(column).with_component_type(Scalar::name());
         let value = if value.is_finite() { value } else { f64::NAN };
         Some([Scalar::from(value)].try_serialized(column))

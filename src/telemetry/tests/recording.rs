@@ -124,10 +124,10 @@ fn the_recording_holds_what_was_recorded() {
         .collect();
     assert_same(read.column("/steps", "x_high_mm"), &upper);
     assert_eq!(read.column("/shadows/finite-difference", "x_error_mm").len(), 30);
-    // Ten rows a second, and the limits once a second and at the end.
+    // Ten rows a second.
     assert_eq!(read.column("/motion", "insertion_lag_mm").len(), 149);
     let limits = read.column("/limits", "insertion_max_mm");
-    assert!(limits.len() == 31 && limits.iter().all(|(_, limit)| *limit == 150.0), "{limits:?}");
+    assert!(limits.len() == 149 && limits.iter().all(|(_, limit)| *limit == 150.0), "{limits:?}");
 }
 
 /// A view of states with its own axis does not grow after it was opened.
