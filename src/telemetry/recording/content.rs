@@ -1,11 +1,10 @@
 //! Logs a run for viewers: to its file, or to the live view.
 
 use super::motion::Motion;
-use super::now::{Now, drive_lane};
 use super::samples::{Samples, log_refused};
 use super::scene::Reach;
 use super::space::Space;
-use super::states::{Meaning, States};
+use super::states::{Meaning, States, drive_lane};
 use super::steps::Steps;
 use super::{Logged, can, document, layout, scene};
 use crate::archive::{Manifest, unix_us_of};
@@ -47,9 +46,8 @@ pub(super) struct Content {
     depth_um: i64,
     frames: can::Selection,
     states: States,
-    now: Now,
     /// Time of the newest page of states.
-    now_time: Time,
+    page_time: Time,
     motion: Motion,
     samples: Samples,
     steps: Steps,
@@ -78,8 +76,7 @@ impl Content {
             depth_um: 0,
             frames: can::Selection::new(&scene.stage),
             states: States::default(),
-            now: Now::default(),
-            now_time: Time::ZERO,
+            page_time: Time::ZERO,
             motion: Motion::new(scene),
             samples: Samples::default(),
             steps: Steps::default(),
@@ -105,10 +102,9 @@ impl Content {
                     let meaning = Meaning::of_drive(state);
                     self.enter(time, &drive_lane(axis), &state.to_string(), meaning)?;
                 }
-                if let Some((axis, emcy)) = self.frames.emergency(&frame)
-                    && self.now.emergency(time, axis, &emcy)
-                {
-                    self.log_now(time)?;
+                if let Some((axis, emcy)) = self.frames.emergency(&frame) {
+                    self.states.explain(time, &drive_lane(axis), &emcy.to_string());
+                    self.log_page(time)?;
                 }
                 self.set_time(time);
                 match self.frames.line(self.step, direction, &frame) {
@@ -149,10 +145,8 @@ impl Content {
                 self.set_time(time);
                 let (path, line) = (format!("events/{lane}"), format!("{lane}: {text}"));
                 self.line(&path, level(severity), line)?;
-                match self.now.explain(time, lane, severity, &text) {
-                    true => self.log_now(time),
-                    false => Ok(()),
-                }
+                self.states.event(time, lane, severity, &text);
+                self.log_page(time)
             }
         }
     }
@@ -160,17 +154,17 @@ impl Content {
     /// Logs that `lane` enters `state`.
     fn enter(&mut self, time: Time, lane: &str, state: &str, meaning: Meaning) -> Logged {
         self.set_time(time);
-        self.states.log(&self.stream, lane, state, meaning)?;
-        self.now.enter(time, lane, state, meaning);
-        self.log_now(time)
+        self.states.log_lane(&self.stream, lane, state, meaning)?;
+        self.states.enter(time, lane, state, meaning);
+        self.log_page(time)
     }
 
     /// Logs the page of states. If `time` is before the previous page, the change appears at the time of that
     /// page.
-    fn log_now(&mut self, time: Time) -> Logged {
-        self.now_time = self.now_time.max(time);
-        self.set_time(self.now_time);
-        self.now.log(&self.stream)
+    fn log_page(&mut self, time: Time) -> Logged {
+        self.page_time = self.page_time.max(time);
+        self.set_time(self.page_time);
+        self.states.log_page(&self.stream)
     }
 
     /// Moves the plane and the view to the needle, if it starts outside of them.

@@ -13,7 +13,6 @@ mod file;
 mod layout;
 pub(super) mod live;
 mod motion;
-mod now;
 mod palette;
 mod samples;
 mod scene;

@@ -46,7 +46,7 @@ impl Samples {
                 None => ("accepted".to_owned(), Meaning::Good),
                 Some(gate) => (format!("refused: {gate}"), Meaning::Fault),
             };
-            states.log(stream, "gate", &state, meaning)?;
+            states.log_lane(stream, "gate", &state, meaning)?;
         }
         let time = sample.received.receive_time;
         let begin = *self.window_begin.get_or_insert(time);
