@@ -2,13 +2,12 @@
 
 use super::motion::Motion;
 use super::samples::{Samples, log_refused};
-use super::scene::Reach;
 use super::space::Space;
 use super::states::{Meaning, States, drive_lane};
 use super::steps::Steps;
-use super::{Logged, can, document, layout, scene};
+use super::{Logged, can, document};
 use crate::archive::{Manifest, unix_us_of};
-use crate::session::{Record, Severity, StepRecord};
+use crate::session::{Record, Severity};
 use crate::telemetry::{Entry, Scene};
 use crate::units::Time;
 use rerun::time::TimeCell;
@@ -40,8 +39,6 @@ pub(super) fn builder(manifest: &Manifest) -> RecordingStreamBuilder {
 /// Logs the records of a run. Must stay on the thread that opened it, since time lines are thread-local.
 pub(super) struct Content {
     pub(super) stream: RecordingStream,
-    /// The scene, until the first step shows where the needle starts.
-    scene_until_start: Option<Scene>,
     step: u32,
     depth_um: i64,
     frames: can::Selection,
@@ -63,15 +60,13 @@ impl Content {
         scene: &Scene,
     ) -> Logged<Self> {
         stream.set_log_time_enabled(false);
-        layout::send(&stream, scene, &Reach::of(scene))?;
-        scene::log(&stream, scene)?;
+        let space = Space::open(&stream, scene)?;
         log_manifest(&stream, manifest)?;
         let config = TextDocument::from_markdown(format!(
             "# Configuration as used\n\n```toml\n{config_toml}\n```\n"
         ));
         stream.log_static("config", &config)?;
         Ok(Content {
-            scene_until_start: Some(scene.clone()),
             step: 0,
             depth_um: 0,
             frames: can::Selection::new(&scene.stage),
@@ -80,7 +75,7 @@ impl Content {
             motion: Motion::new(scene),
             samples: Samples::default(),
             steps: Steps::default(),
-            space: Space::open(&stream, scene)?,
+            space,
             stream,
         })
     }
@@ -129,7 +124,6 @@ impl Content {
                 self.step = step.step;
                 self.depth_um = deepest_um(self.depth_um, step.insertion_meas_mm);
                 self.set_time(step.time);
-                self.move_view_to_needle(&step)?;
                 self.steps.log(&self.stream, &step, truth.as_ref())?;
                 self.space.log(&self.stream, &step, truth.as_ref())
             }
@@ -165,16 +159,6 @@ impl Content {
         self.page_time = self.page_time.max(time);
         self.set_time(self.page_time);
         self.states.log_page(&self.stream)
-    }
-
-    /// Moves the plane and the view to the needle, if it starts outside of them.
-    fn move_view_to_needle(&mut self, step: &StepRecord) -> Logged {
-        let estimated_mm = step.decision.estimate.map(|estimate| estimate.x_pb.translation);
-        let Some(start_mm) = step.tip_meas_mm.or(estimated_mm) else { return Ok(()) };
-        let Some(scene) = self.scene_until_start.take() else { return Ok(()) };
-        let Some(reach) = Reach::of(&scene).moved_to(&start_mm) else { return Ok(()) };
-        layout::send(&self.stream, &scene, &reach)?;
-        scene::log_sheet(&self.stream, &reach)
     }
 
     fn line(&self, path: &str, level: &'static str, text: String) -> Logged {

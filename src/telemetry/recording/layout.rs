@@ -2,8 +2,7 @@
 //! which colours.
 
 use super::content::{APPLICATION, INSERTION_DEPTH, RUN_TIME, STEP};
-use super::scene::Reach;
-use super::space::TRAILS;
+use super::space::{Sheet, TRAILS};
 use super::{Logged, palette};
 use crate::telemetry::Scene;
 use crate::text::screen;
@@ -61,9 +60,9 @@ struct Series {
     width: Option<f32>,
 }
 
-/// The layout for `scene`, with a view of the needle within `reach`.
-fn parts(scene: &Scene, reach: &Reach) -> Result<Part, Box<dyn Error>> {
-    let [across, middle] = reach.middle_mm();
+/// The layout for `scene`, with a view of the needle around `sheet`.
+fn parts(scene: &Scene, sheet: &Sheet) -> Result<Part, Box<dyn Error>> {
+    let [across, middle] = sheet.middle_mm();
     let limits = scene.stage.rotation.limits;
     let [min, max] = [limits.min, limits.max].map(f64::to_degrees);
     let values = context! {
@@ -71,7 +70,7 @@ fn parts(scene: &Scene, reach: &Reach) -> Result<Part, Box<dyn Error>> {
         goal => scene.goal.is_some(),
         shadows => scene.shadows.clone(),
         rotation_limits => format!("{min:.0} to {max:.0}"),
-        length => reach.z_mm[1] - reach.z_mm[0],
+        length => sheet.z_mm[1] - sheet.z_mm[0],
         across,
         middle,
     };
@@ -80,9 +79,9 @@ fn parts(scene: &Scene, reach: &Reach) -> Result<Part, Box<dyn Error>> {
 
 /// Embeds the layout in the recording and activates it. Otherwise the viewer would use the layout that it
 /// kept from another recording.
-pub(super) fn send(stream: &RecordingStream, scene: &Scene, reach: &Reach) -> Logged {
+pub(super) fn send(stream: &RecordingStream, scene: &Scene, sheet: &Sheet) -> Logged {
     let failed = |error| tracing::error!("layout.toml: {error}; the recording has no layout");
-    let Ok(parts) = parts(scene, reach).map_err(failed) else { return Ok(()) };
+    let Ok(parts) = parts(scene, sheet).map_err(failed) else { return Ok(()) };
     let builder = RecordingStreamBuilder::new(APPLICATION).blueprint().enabled(true);
     let (layout, storage) = builder.memory()?;
     let logged = log(&layout, &parts);
@@ -262,7 +261,7 @@ mod tests {
         }
         for truth in [true, false] {
             let scene = Scene { truth, ..tests::scene() };
-            let parts = parts(&scene, &Reach::of(&scene)).expect("a layout");
+            let parts = parts(&scene, &Sheet::of(&scene)).expect("a layout");
             let mut colours = colours(&parts);
             assert!(!colours.is_empty());
             colours.retain(|colour| palette::named(colour) == palette::NEUTRAL);

@@ -15,7 +15,6 @@ pub(super) mod live;
 mod motion;
 mod palette;
 mod samples;
-mod scene;
 mod space;
 mod states;
 mod steps;

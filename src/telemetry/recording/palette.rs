@@ -29,7 +29,7 @@ pub(super) const NEUTRAL: Color = opaque(0x8A8A8A);
 /// Behind everything in the 3-D view.
 pub(super) const BACKGROUND: Color = opaque(0x14171B);
 /// The plane.
-pub(super) const PLANE: Color = translucent(0x8A8A8A, 0x28);
+pub(super) const PLANE_SHEET: Color = translucent(0x8A8A8A, 0x28);
 /// The lines on it.
 pub(super) const PLANE_LINES: Color = opaque(0x4A4A4A);
 
