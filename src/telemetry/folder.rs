@@ -46,7 +46,7 @@ pub(super) fn create(
 const RESERVE_BYTES: usize = 16 << 10;
 
 /// Writes the manifest of the run folder `dir` atomically: a reader sees the old one or the new one, also if
-/// the bench is killed meanwhile.
+/// the bench is killed meanwhile. While the record is open, reserves the space that the final manifest needs.
 ///
 /// # Errors
 /// [`TelemetryError::File`].
@@ -54,13 +54,16 @@ pub fn write_manifest(dir: &Path, manifest: &Manifest) -> Result<(), TelemetryEr
     let path = dir.join(file::MANIFEST);
     let write = || -> io::Result<()> {
         let text = manifest.to_text()?;
-        // Writes into the reserved space.
         let new = dir.join(file::NEW_MANIFEST);
+        // Writes into the reserved space.
         let mut file = OpenOptions::new().write(true).create(true).truncate(false).open(&new)?;
         file.write_all(text.as_bytes())?;
         file.set_len(text.len() as u64)?;
         file.sync_all()?;
         fs::rename(&new, &path)?;
+        if manifest.outcome.is_none() {
+            fs::write(&new, vec![b' '; text.len() + RESERVE_BYTES])?;
+        }
         // The rename reaches the disk when the folder is synced, which some file systems do not support.
         match File::open(dir)?.sync_all() {
             Err(error) if matches!(error.kind(), InvalidInput | Unsupported) => Ok(()),
@@ -68,19 +71,6 @@ pub fn write_manifest(dir: &Path, manifest: &Manifest) -> Result<(), TelemetryEr
         }
     };
     write().map_err(TelemetryError::file(&path))
-}
-
-/// Reserves the space that the final manifest of `dir` needs.
-///
-/// # Errors
-/// [`TelemetryError::File`].
-pub(super) fn reserve_manifest(dir: &Path) -> Result<(), TelemetryError> {
-    let path = dir.join(file::NEW_MANIFEST);
-    let reserve = || -> io::Result<()> {
-        let written = fs::metadata(dir.join(file::MANIFEST)).map_or(0, |written| written.len());
-        fs::write(&path, vec![b' '; written as usize + RESERVE_BYTES])
-    };
-    reserve().map_err(TelemetryError::file(&path))
 }
 
 /// A write lock on a whole file. It belongs to the file as it was opened (F_OFD_SETLK), and unlike that of
@@ -184,6 +174,7 @@ fn free_bytes(path: &Path) -> io::Result<Option<u64>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::session::Outcome;
     use crate::telemetry::tests::Scratch;
     use std::sync::atomic::AtomicBool;
     use std::sync::atomic::Ordering::Relaxed;
@@ -206,8 +197,12 @@ mod tests {
         let scratch = Scratch::new("manifest");
         let path = scratch.0.join("manifest.json");
         fs::write(&path, "the manifest of the start").unwrap();
-        let manifest = Manifest::new("virtual", String::new());
-        reserve_manifest(&scratch.0).unwrap();
+        let mut manifest = Manifest::new("virtual", String::new());
+        write_manifest(&scratch.0, &manifest).unwrap();
+        let reserved = scratch.0.join(file::NEW_MANIFEST);
+        let bytes = fs::metadata(&path).unwrap().len() + RESERVE_BYTES as u64;
+        assert_eq!(fs::metadata(reserved).unwrap().len(), bytes);
+        manifest.set_outcome(&Outcome::Completed);
         write_manifest(&scratch.0, &manifest).unwrap();
         let text = fs::read_to_string(&path).unwrap();
         assert_eq!(Manifest::from_text(&text).unwrap(), manifest);

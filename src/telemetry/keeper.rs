@@ -14,7 +14,7 @@ use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io;
 use std::os::unix::fs::MetadataExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// The keeper's name in messages.
@@ -24,19 +24,18 @@ const QUEUE_MANIFESTS: usize = 8;
 const QUEUE_PROBLEMS: usize = 64;
 
 /// A path, and the file or folder that was opened there.
-pub(super) type OpenPath = (PathBuf, File);
+type OpenPath = (PathBuf, File);
 
-/// Starts the thread that checks the run folder `dir` and `files` in it, the text files first, and that writes
+/// Starts the thread that checks the run folder `dir`, its text files and its configuration, and that writes
 /// each manifest that it is given. The consumer gets each problem with the folder once.
 ///
 /// # Errors
-/// The folder cannot be opened, or no thread can be started.
+/// The folder or a file cannot be opened, or no thread can be started.
 pub(super) fn keep(
-    dir: PathBuf,
-    files: Vec<OpenPath>,
+    dir: &Path,
 ) -> Result<(Worker<Box<Manifest>>, Consumer<String>), TelemetryError> {
     let (reports, problems) = RingBuffer::new(QUEUE_PROBLEMS);
-    let folder = Folder::open(dir, files, reports)?;
+    let folder = Folder::open(dir, reports)?;
     let worker = Worker::start(KEEPER, QUEUE_MANIFESTS, Backpressure::DropAndCount, || Ok(folder))?;
     Ok((worker, problems))
 }
@@ -44,6 +43,7 @@ pub(super) fn keep(
 /// A run folder and the files in it that are checked.
 struct Folder {
     dir: OpenPath,
+    /// The text files, then the configuration.
     files: Vec<OpenPath>,
     /// The number of checks so far.
     checks: usize,
@@ -53,13 +53,15 @@ struct Folder {
 }
 
 impl Folder {
-    fn open(
-        dir: PathBuf,
-        files: Vec<OpenPath>,
-        reports: Producer<String>,
-    ) -> Result<Self, TelemetryError> {
-        let opened = File::open(&dir).map_err(TelemetryError::file(&dir))?;
-        Ok(Folder { dir: (dir, opened), files, checks: 0, known: BTreeSet::new(), reports })
+    fn open(dir: &Path, reports: Producer<String>) -> Result<Self, TelemetryError> {
+        let open = |path: PathBuf| match File::open(&path) {
+            Ok(file) => Ok((path, file)),
+            Err(error) => Err(TelemetryError::file(&path)(error)),
+        };
+        let names = file::TEXT_FILES.into_iter().chain([file::CONFIG]);
+        let files = names.map(|name| open(dir.join(name))).collect::<Result<_, _>>()?;
+        let (dir, known) = (open(dir.to_path_buf())?, BTreeSet::new());
+        Ok(Folder { dir, files, checks: 0, known, reports })
     }
 
     /// Syncs one of the text files in turn, and checks the folder, its files and the free space. Returns the
@@ -88,24 +90,21 @@ impl Folder {
         }
     }
 
-    /// Writes `manifest`, and reserves room for the next one.
+    /// Writes `manifest`, unless another folder has taken this one's place.
     fn write_manifest(&self, manifest: &Manifest) -> Result<(), TelemetryError> {
         check_in_place(&self.dir)?;
-        folder::write_manifest(&self.dir.0, manifest)?;
-        folder::reserve_manifest(&self.dir.0)
+        folder::write_manifest(&self.dir.0, manifest)
     }
 
-    /// Writes the final manifest, with all problems so far and those of a last check. Writes nothing if another
-    /// folder has taken this one's place.
+    /// Writes the final manifest, with all problems so far and those of a last check.
     fn write_last(&mut self, mut manifest: Manifest) -> Result<(), TelemetryError> {
-        check_in_place(&self.dir)?;
         let lost: Vec<_> =
             self.files.iter().filter_map(|file| check_in_place(file).err()).collect();
         self.report(lost);
         let added = self.known.iter().filter(|problem| !manifest.faults.contains(problem));
         let added: Vec<String> = added.cloned().collect();
         manifest.faults.extend(added);
-        folder::write_manifest(&self.dir.0, &manifest)
+        self.write_manifest(&manifest)
     }
 }
 
@@ -148,14 +147,18 @@ impl Sink for Folder {
 mod tests {
     use super::*;
     use crate::telemetry::tests::Scratch;
-    use std::path::Path;
     use std::thread;
     use std::time::Instant;
 
+    fn create_files(dir: &Path) {
+        for name in file::TEXT_FILES.into_iter().chain([file::CONFIG]) {
+            File::create(dir.join(name)).unwrap();
+        }
+    }
+
     fn folder(dir: &Path) -> Folder {
-        let path = dir.join(file::STEPS);
-        let file = File::create(&path).unwrap();
-        Folder::open(dir.to_path_buf(), vec![(path, file)], RingBuffer::new(1).0).unwrap()
+        create_files(dir);
+        Folder::open(dir, RingBuffer::new(1).0).unwrap()
     }
 
     fn faults(folder: &mut Folder) -> Vec<String> {
@@ -210,7 +213,8 @@ mod tests {
     #[test]
     fn dropped_manifests_are_reported_as_manifests() {
         let scratch = Scratch::new("keeper-dropped");
-        let (mut keeper, _) = keep(scratch.0.clone(), Vec::new()).unwrap();
+        create_files(&scratch.0);
+        let (mut keeper, _) = keep(&scratch.0).unwrap();
         while keeper.dropped == 0 {
             keeper.give(Box::default());
         }
@@ -227,9 +231,8 @@ mod tests {
         let scratch = Scratch::new("keeper-problems");
         let dir = scratch.0.join("run");
         fs::create_dir(&dir).unwrap();
-        let path = dir.join(file::STEPS);
-        let file = File::create(&path).unwrap();
-        let (keeper, mut problems) = keep(dir.clone(), vec![(path, file)]).unwrap();
+        create_files(&dir);
+        let (keeper, mut problems) = keep(&dir).unwrap();
         let mut next = || {
             let end = Instant::now() + Duration::from_secs(60);
             loop {

@@ -56,12 +56,9 @@ impl Recorder {
             fs::write(&path, &config_toml).map_err(TelemetryError::file(&path))?;
             let lock = folder::lock(&run_dir)?;
             folder::write_manifest(&run_dir, &manifest)?;
-            folder::reserve_manifest(&run_dir)?;
-            let (files, mut for_keeper) = TextFiles::create(&run_dir, &manifest)?;
-            let config = File::open(&path).map_err(TelemetryError::file(&path))?;
-            for_keeper.push((path, config));
+            let files = TextFiles::create(&run_dir, &manifest)?;
             let text = Worker::start(WRITER, QUEUE_ENTRIES, backpressure, || Ok(files))?;
-            let (keeper, problems) = keep(run_dir.clone(), for_keeper)?;
+            let (keeper, problems) = keep(&run_dir)?;
             let live = None;
             Ok(Recorder { run_dir, config_toml, manifest, text, live, keeper, problems, lock })
         };
@@ -133,12 +130,12 @@ impl Recorder {
         mut self,
         sum_up: impl FnOnce(&mut Manifest),
     ) -> Result<Manifest, TelemetryError> {
+        let closed = self.text.close(&self.manifest, CLOSING_LIMIT);
         // Collects the failures since the last call.
         while self.news().is_some() {}
         let mut manifest = self.manifest.clone();
         sum_up(&mut manifest);
         manifest.ended_utc = Some(utc_text(SystemTime::now()));
-        let closed = self.text.close(&manifest, CLOSING_LIMIT);
         if let Some(live) = &mut self.live {
             live.close_within(&manifest, live::FAREWELL_MAX);
         }
@@ -147,24 +144,21 @@ impl Recorder {
             recording: 0,
             live: self.live.as_ref().map_or(0, |live| live.dropped),
         };
-        let fault = match &closed {
-            Ok((written, fault)) => {
+        match &closed {
+            Ok((written, _)) => {
                 // An entry that is not in the files is lost, for whatever reason.
                 dropped.text_files = self.text.given.saturating_sub(written.entries);
                 manifest.counts = Some(written.counts);
                 manifest.files.clone_from(&written.files);
                 let config = FileSeal::of(self.config_toml.as_bytes());
                 manifest.files.insert(file::CONFIG.to_owned(), config);
-                fault.as_ref()
             }
             Err(silent) => {
                 // The record stays open if the content of the text files is unknown.
                 manifest = self.manifest;
-                Some(silent)
+                manifest.faults.push(silent.to_string());
             }
-        };
-        let fault = fault.map(ToString::to_string).filter(|fault| !manifest.faults.contains(fault));
-        manifest.faults.extend(fault);
+        }
         manifest.dropped = Some(dropped);
         match (closed, self.keeper.close(&manifest, MANIFEST_LIMIT)) {
             (Ok(_), Ok((_, None))) => {

@@ -194,7 +194,6 @@ mod tests {
         let mut manifest = Manifest::new("x", "2023-11-14T22:13:20.000000Z".to_owned());
         manifest.config_sha256 = sha256_hex(b"name = \"x\"\n");
         write_manifest(dir, &manifest).unwrap();
-        folder::reserve_manifest(dir).unwrap();
         scratch
     }
 

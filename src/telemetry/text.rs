@@ -1,7 +1,6 @@
 //! The writer of the text files of a run: `steps.csv`, `can.log`, `tracker.ndjson`, `inputs.log` and
 //! `events.log`. It writes whole lines only.
 
-use super::keeper::OpenPath;
 use super::worker::{Sink, WriterResult};
 use super::{Entry, TelemetryError};
 use crate::archive::{
@@ -11,7 +10,7 @@ use crate::archive::{
 use crate::session::Record;
 use sha2::{Digest, Sha256};
 use std::fs::File;
-use std::io::{self, ErrorKind, Write};
+use std::io::{self, Seek as _, Write as _};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -21,33 +20,23 @@ pub(super) const WRITER: &str = "text files";
 /// Collects lines, passes them to the system at every tick, and syncs them to the disk at the end.
 pub(super) struct TextFiles {
     /// In the order of [`file::TEXT_FILES`]: if the bench is killed between two files, every input has its frame.
-    files: Vec<TextFile<File>>,
+    files: Vec<TextFile>,
     interface: String,
     started_unix_us: i64,
 }
 
 impl TextFiles {
-    /// Creates the files in `dir`. Returns the writer, and a second handle of each file for the keeper.
-    pub(super) fn create(
-        dir: &Path,
-        manifest: &Manifest,
-    ) -> Result<(Self, Vec<OpenPath>), TelemetryError> {
-        let (mut files, mut for_keeper) = (Vec::new(), Vec::new());
-        for name in file::TEXT_FILES {
-            let path = dir.join(name);
-            let storage = File::create_new(&path).map_err(TelemetryError::file(&path))?;
-            let second_handle = storage.try_clone().map_err(TelemetryError::file(&path))?;
-            for_keeper.push((path.clone(), second_handle));
-            files.push(TextFile::new(name, path, storage));
-        }
+    /// Creates the files in `dir`.
+    pub(super) fn create(dir: &Path, manifest: &Manifest) -> Result<Self, TelemetryError> {
+        let files = file::TEXT_FILES.map(|name| TextFile::create(name, dir.join(name)));
         let mut files = TextFiles {
-            files,
+            files: files.into_iter().collect::<Result<_, _>>()?,
             interface: interface_name(&manifest.bus),
             started_unix_us: unix_us_of(&manifest.started_utc).unwrap_or_default(),
         };
         files.line(file::STEPS, &steps_csv_header());
         files.tick().map_err(|reason| TelemetryError::writer_failed(WRITER, reason))?;
-        Ok((files, for_keeper))
+        Ok(files)
     }
 
     /// True if `record` becomes a line of a text file.
@@ -102,7 +91,7 @@ impl Sink for TextFiles {
         self.tick()?;
         for file in &self.files {
             alive();
-            file.storage.sync_all().map_err(|error| file.explain(&error))?;
+            file.file.sync_all().map_err(|error| file.explain(&error))?;
         }
         Ok(())
     }
@@ -118,23 +107,11 @@ impl Sink for TextFiles {
     }
 }
 
-/// What a text file is written to.
-trait Storage: Write {
-    /// Truncates to the first `bytes`.
-    fn truncate(&self, bytes: u64) -> io::Result<()>;
-}
-
-impl Storage for File {
-    fn truncate(&self, bytes: u64) -> io::Result<()> {
-        self.set_len(bytes)
-    }
-}
-
 /// A file whose lines are collected, written together, and hashed.
-struct TextFile<S> {
+struct TextFile {
     name: &'static str,
     path: PathBuf,
-    storage: S,
+    file: File,
     /// Whole lines that were not written yet.
     pending: String,
     hash: Sha256,
@@ -143,11 +120,12 @@ struct TextFile<S> {
     lines: u64,
 }
 
-impl<S: Storage> TextFile<S> {
-    /// The file `name` at `path`, with an empty `storage`.
-    fn new(name: &'static str, path: PathBuf, storage: S) -> Self {
+impl TextFile {
+    /// Creates the file `name` at `path`.
+    fn create(name: &'static str, path: PathBuf) -> Result<Self, TelemetryError> {
+        let file = File::create_new(&path).map_err(TelemetryError::file(&path))?;
         let (pending, hash) = (String::new(), Sha256::new());
-        TextFile { name, path, storage, pending, hash, bytes: 0, lines: 0 }
+        Ok(TextFile { name, path, file, pending, hash, bytes: 0, lines: 0 })
     }
 
     /// Adds a line, to be written by [`TextFile::write_pending`].
@@ -162,12 +140,14 @@ impl<S: Storage> TextFile<S> {
     /// # Errors
     /// The system's error, with the file's path. Lines that were not written are lost.
     fn write_pending(&mut self) -> Result<(), String> {
-        let bytes = self.pending.as_bytes();
-        let (taken, result) = write_until_error(&mut self.storage, bytes);
-        let mut kept = &bytes[..taken];
-        if result.is_err() {
+        let written = self.file.write_all(self.pending.as_bytes());
+        let mut kept = self.pending.as_bytes();
+        if written.is_err() {
+            // The position shows how much was written before the error.
+            let end = self.file.stream_position().unwrap_or(self.bytes);
+            kept = &kept[..(end.saturating_sub(self.bytes) as usize).min(kept.len())];
             let whole = kept.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
-            if self.storage.truncate(self.bytes + whole as u64).is_ok() {
+            if self.file.set_len(self.bytes + whole as u64).is_ok() {
                 kept = &kept[..whole];
             }
         }
@@ -175,7 +155,7 @@ impl<S: Storage> TextFile<S> {
         self.bytes += kept.len() as u64;
         self.lines += kept.iter().filter(|byte| **byte == b'\n').count() as u64;
         self.pending.clear();
-        result.map_err(|error| self.explain(&error))
+        written.map_err(|error| self.explain(&error))
     }
 
     /// The seal of the bytes that were written.
@@ -188,76 +168,43 @@ impl<S: Storage> TextFile<S> {
     }
 }
 
-/// Writes `bytes`. Returns how many were written, and the error that stopped it.
-fn write_until_error(storage: &mut impl Write, bytes: &[u8]) -> (usize, io::Result<()>) {
-    let mut taken = 0;
-    while taken < bytes.len() {
-        match storage.write(&bytes[taken..]) {
-            Ok(0) => return (taken, Err(ErrorKind::WriteZero.into())),
-            Ok(n) => taken += n,
-            Err(e) if e.kind() == ErrorKind::Interrupted => {}
-            Err(e) => return (taken, Err(e)),
-        }
-    }
-    (taken, Ok(()))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::archive::sha256_hex;
-    use std::sync::{Arc, Mutex};
+    use nix::fcntl::{FcntlArg, SealFlag, fcntl};
+    use nix::sys::memfd::{MFdFlags, memfd_create};
+    use std::io::{Read as _, SeekFrom};
 
-    /// A disk with room for `room` bytes.
-    #[derive(Clone)]
-    struct SmallDisk {
-        content: Arc<Mutex<Vec<u8>>>,
-        room: usize,
-        can_cut: bool,
-    }
-
-    impl SmallDisk {
-        fn new(room: usize) -> Self {
-            SmallDisk { content: Arc::default(), room, can_cut: true }
-        }
-    }
-
-    impl Write for SmallDisk {
-        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-            let mut content = self.content.lock().unwrap();
-            let taken = bytes.len().min(self.room - content.len());
-            content.extend(&bytes[..taken]);
-            if taken > 0 { Ok(taken) } else { Err(ErrorKind::StorageFull.into()) }
-        }
-        fn flush(&mut self) -> io::Result<()> {
-            Ok(())
-        }
-    }
-
-    impl Storage for SmallDisk {
-        fn truncate(&self, bytes: u64) -> io::Result<()> {
-            if !self.can_cut {
-                return Err(ErrorKind::ReadOnlyFilesystem.into());
-            }
-            self.content.lock().unwrap().truncate(bytes as usize);
-            Ok(())
-        }
+    /// A file in memory that cannot grow beyond 4096 bytes, as on a full disk.
+    fn full_disk(can_cut: bool) -> TextFile {
+        let flags = MFdFlags::MFD_CLOEXEC | MFdFlags::MFD_ALLOW_SEALING;
+        let file = File::from(memfd_create("full-disk", flags).unwrap());
+        file.set_len(4096).unwrap();
+        let shrink = if can_cut { SealFlag::empty() } else { SealFlag::F_SEAL_SHRINK };
+        fcntl(&file, FcntlArg::F_ADD_SEALS(SealFlag::F_SEAL_GROW | shrink)).unwrap();
+        let (name, path) = (file::STEPS, "run/steps.csv".into());
+        let (pending, hash) = (String::new(), Sha256::new());
+        TextFile { name, path, file, pending, hash, bytes: 0, lines: 0 }
     }
 
     #[test]
     fn a_full_disk_keeps_whole_lines_and_the_seal_covers_what_is_left() {
-        for (can_cut, left) in [(true, "first\nsecond\n"), (false, "first\nsecond\nthi")] {
-            let disk = SmallDisk { can_cut, ..SmallDisk::new(16) };
-            let mut file = TextFile::new(file::STEPS, "run/steps.csv".into(), disk.clone());
-            file.line("first");
+        let lines = ["first".to_owned(), "second".to_owned(), "third".repeat(1000)];
+        for (can_cut, left_bytes) in [(true, 13), (false, 4096)] {
+            let mut file = full_disk(can_cut);
+            file.line(&lines[0]);
             file.write_pending().unwrap();
-            file.line("second");
-            file.line("third");
-            assert_eq!(file.write_pending().unwrap_err(), "run/steps.csv: no storage space");
-            assert_eq!(*disk.content.lock().unwrap(), left.as_bytes());
+            file.line(&lines[1]);
+            file.line(&lines[2]);
+            let error = file.write_pending().unwrap_err();
+            assert_eq!(error, "run/steps.csv: Operation not permitted (os error 1)");
+            let left = &lines.join("\n")[..left_bytes];
+            let mut content = String::new();
+            file.file.seek(SeekFrom::Start(0)).unwrap();
+            file.file.read_to_string(&mut content).unwrap();
+            assert_eq!(content, left);
             assert_eq!(file.lines, 2);
-            let seal = FileSeal { bytes: left.len() as u64, sha256: sha256_hex(left.as_bytes()) };
-            assert_eq!(file.seal(), seal);
+            assert_eq!(file.seal(), FileSeal::of(left.as_bytes()));
         }
     }
 }
