@@ -130,12 +130,11 @@ impl<'a> Sink<'a> {
                     format!("{error}; the run goes on (record.on_failure)")
                 }
                 RecordNews::Failed(error) if reason.is_none() && !is_ending => {
-                    self.operator.record_trouble(&error.to_string());
+                    self.operator.record_trouble(&error);
                     reason = Some(format!("record: {error}"));
                     continue;
                 }
-                RecordNews::Failed(error) => error.to_string(),
-                RecordNews::Warning(text) => text,
+                RecordNews::Failed(text) | RecordNews::Warning(text) => text,
             };
             self.operator.record_trouble(&trouble);
             let text = format!("record: {trouble}");

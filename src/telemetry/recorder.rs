@@ -105,10 +105,10 @@ impl Recorder {
         let now = Instant::now();
         let news = self.text.news(now).or_else(|| self.keeper.news(now)).or_else(|| {
             let problem = self.problems.pop().ok()?;
-            Some(RecordNews::Failed(TelemetryError::Recording(problem)))
+            Some(RecordNews::Failed(problem))
         })?;
         if let RecordNews::Failed(error) = &news {
-            self.manifest.faults.push(error.to_string());
+            self.manifest.faults.push(error.clone());
         }
         Some(news)
     }

@@ -52,20 +52,22 @@ pub(super) struct Silence {
     beats: u64,
     last_look: Instant,
     /// The time without a sign of life up to the last look.
-    pub(super) lasted: Duration,
+    lasted: Duration,
 }
 
 impl Silence {
-    /// Starts at `now` for a thread that has shown `beats` signs of life.
-    pub(super) fn new(beats: u64, now: Instant) -> Self {
-        Silence { beats, last_look: now, lasted: Duration::ZERO }
+    /// Starts at `now`.
+    pub(super) fn new(now: Instant) -> Self {
+        Silence { beats: 0, last_look: now, lasted: Duration::ZERO }
     }
 
-    /// Looks at the thread at `now`, when it has shown `beats` signs of life.
-    pub(super) fn look(&mut self, beats: u64, now: Instant) {
+    /// Looks at the thread at `now`. Returns how long it has shown no sign of life.
+    pub(super) fn look(&mut self, vitals: &Vitals, now: Instant) -> Duration {
         let elapsed = now.saturating_duration_since(mem::replace(&mut self.last_look, now));
+        let beats = vitals.beats();
         let is_alive = mem::replace(&mut self.beats, beats) != beats;
         self.lasted = if is_alive { Duration::ZERO } else { self.lasted + elapsed.min(LOOK_MAX) };
+        self.lasted
     }
 }
 
@@ -75,7 +77,7 @@ pub enum RecordNews {
     /// A warning to the operator: nothing is lost yet, or the loss is counted.
     Warning(String),
     /// From now on records are lost.
-    Failed(TelemetryError),
+    Failed(String),
 }
 
 /// The health of a thread, from good to bad.
@@ -104,7 +106,7 @@ pub(super) struct Watch {
 impl Watch {
     /// Watches `writer`, which takes `items`, from `now` on.
     pub(super) fn new(writer: &'static str, items: &'static str, now: Instant) -> Self {
-        let (silence, health) = (Silence::new(0, now), Health::Alive);
+        let (silence, health) = (Silence::new(now), Health::Alive);
         Watch { writer, items, silence, health, reported_drops: 0, drops_reported: None }
     }
 
@@ -121,8 +123,7 @@ impl Watch {
 
     fn health_news(&mut self, vitals: &Vitals, now: Instant) -> Option<RecordNews> {
         let before_s = self.silence.lasted.as_secs_f64();
-        self.silence.look(vitals.beats(), now);
-        let (writer, lasted) = (self.writer, self.silence.lasted);
+        let (writer, lasted) = (self.writer, self.silence.look(vitals, now));
         let health = match vitals.fault() {
             Some(_) => Health::Failed,
             None if lasted > SILENCE_LIMIT => Health::GivenUp,
@@ -138,10 +139,10 @@ impl Watch {
                 RecordNews::Warning(format!("{writer}: alive again after {before_s:.1} s"))
             }
             Health::Silent => RecordNews::Warning(silent.to_string()),
-            Health::GivenUp => RecordNews::Failed(silent),
+            Health::GivenUp => RecordNews::Failed(silent.to_string()),
             Health::Failed => {
                 let reason = vitals.fault().unwrap_or_default();
-                RecordNews::Failed(TelemetryError::writer_failed(writer, reason))
+                RecordNews::Failed(TelemetryError::writer_failed(writer, reason).to_string())
             }
         })
     }
@@ -156,9 +157,9 @@ impl Watch {
         let is_first = self.drops_reported.replace(now).is_none();
         let (writer, items) = (self.writer, self.items);
         if is_first && self.health < Health::GivenUp {
-            return Some(RecordNews::Failed(TelemetryError::Recording(format!(
+            return Some(RecordNews::Failed(format!(
                 "{writer}: {items} lost: {dropped}, its queue is full; is the disk too slow for this run?"
-            ))));
+            )));
         }
         let text = format!("{writer}: {items} lost: {more} more, {dropped} in all");
         Some(RecordNews::Warning(text))
@@ -298,13 +299,12 @@ mod tests {
     fn a_silence_counts_only_the_time_that_the_watcher_ran() {
         let ms = Duration::from_millis;
         let begin = Instant::now();
-        let mut silence = Silence::new(7, begin);
-        silence.look(7, begin + ms(30));
-        assert_eq!(silence.lasted, ms(30));
+        let vitals = Vitals::default();
+        let mut silence = Silence::new(begin);
+        assert_eq!(silence.look(&vitals, begin + ms(30)), ms(30));
         // The watcher was suspended for ten seconds.
-        silence.look(7, begin + ms(10_030));
-        assert_eq!(silence.lasted, ms(80));
-        silence.look(8, begin + ms(10_040));
-        assert_eq!(silence.lasted, ms(0));
+        assert_eq!(silence.look(&vitals, begin + ms(10_030)), ms(80));
+        vitals.beat();
+        assert_eq!(silence.look(&vitals, begin + ms(10_040)), ms(0));
     }
 }

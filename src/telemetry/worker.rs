@@ -156,13 +156,12 @@ impl<T: Send + 'static> Worker<T> {
 
     /// Waits for room in the queue while the writer makes progress. Returns false if the message is lost.
     fn wait_and_push(&mut self, mut message: Message<T>) -> bool {
-        let mut silence = Silence::new(self.vitals.beats(), Instant::now());
+        let mut silence = Silence::new(Instant::now());
         while let Err(unsent) = self.push(message) {
             if self.queue.is_abandoned() || self.vitals.fault().is_some() {
                 return false;
             }
-            silence.look(self.vitals.beats(), Instant::now());
-            if silence.lasted > SILENCE_LIMIT {
+            if silence.look(&self.vitals, Instant::now()) > SILENCE_LIMIT {
                 let limit_s = SILENCE_LIMIT.as_secs_f64();
                 self.vitals.fail(format!("took nothing for {limit_s:.1} s; is the disk stalled?"));
                 return false;
@@ -191,7 +190,7 @@ impl<T: Send + 'static> Worker<T> {
         limit: Duration,
     ) -> Result<(WriterResult, Option<TelemetryError>), TelemetryError> {
         let (mut is_told, mut is_close_sent) = (false, false);
-        let mut silence = Silence::new(self.vitals.beats(), Instant::now());
+        let mut silence = Silence::new(Instant::now());
         let writer = self.writer;
         loop {
             is_close_sent =
@@ -200,8 +199,7 @@ impl<T: Send + 'static> Worker<T> {
                 let failed = |reason| TelemetryError::writer_failed(writer, reason);
                 return Ok((result, self.vitals.fault().map(failed)));
             }
-            silence.look(self.vitals.beats(), Instant::now());
-            let silent = silence.lasted;
+            let silent = silence.look(&self.vitals, Instant::now());
             if silent > WARN_AFTER && !std::mem::replace(&mut is_told, true) {
                 let limit_s = limit.as_secs();
                 tracing::warn!(
