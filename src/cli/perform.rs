@@ -244,7 +244,7 @@ impl Job<'_> {
     /// Serves the run to viewers if an address is given, and prints the command that shows it.
     fn serve(&self, recorder: &mut Recorder) -> Result<()> {
         let Some(address) = self.options.live else { return Ok(()) };
-        recorder.serve(address, scene(self.config)?).map_err(Failure::environment)?;
+        recorder.serve(address, &scene(self.config)?).map_err(Failure::environment)?;
         print_stderr(format_args!("live        rerun rerun+http://{address}/proxy"));
         Ok(())
     }

@@ -36,7 +36,7 @@ pub(super) fn keep(
 ) -> Result<(Worker<Box<Manifest>>, Consumer<String>), TelemetryError> {
     let (reports, problems) = RingBuffer::new(QUEUE_PROBLEMS);
     let folder = Folder::open(dir, reports)?;
-    let worker = Worker::start(KEEPER, QUEUE_MANIFESTS, Backpressure::DropAndCount, || Ok(folder))?;
+    let worker = Worker::start(KEEPER, QUEUE_MANIFESTS, Backpressure::DropAndCount, folder)?;
     Ok((worker, problems))
 }
 

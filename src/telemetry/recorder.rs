@@ -57,7 +57,7 @@ impl Recorder {
             let lock = folder::lock(&run_dir)?;
             folder::write_manifest(&run_dir, &manifest)?;
             let files = TextFiles::create(&run_dir, &manifest)?;
-            let text = Worker::start(WRITER, QUEUE_ENTRIES, backpressure, || Ok(files))?;
+            let text = Worker::start(WRITER, QUEUE_ENTRIES, backpressure, files)?;
             let (keeper, problems) = keep(&run_dir)?;
             let live = None;
             Ok(Recorder { run_dir, config_toml, manifest, text, live, keeper, problems, lock })
@@ -71,9 +71,8 @@ impl Recorder {
     ///
     /// # Errors
     /// The bench cannot listen at the address.
-    pub fn serve(&mut self, address: SocketAddr, scene: Scene) -> Result<(), TelemetryError> {
-        let (manifest, config_toml) = (self.manifest.clone(), self.config_toml.clone());
-        self.live = Some(live::serve(address, manifest, config_toml, scene)?);
+    pub fn serve(&mut self, address: SocketAddr, scene: &Scene) -> Result<(), TelemetryError> {
+        self.live = Some(live::serve(address, &self.manifest, &self.config_toml, scene)?);
         Ok(())
     }
 

@@ -27,7 +27,7 @@ const RETRY: Duration = Duration::from_millis(1);
 const WARN_AFTER: Duration = Duration::from_secs(3);
 
 /// The work of the thread.
-pub(super) trait Sink: 'static {
+pub(super) trait Sink: Send + 'static {
     /// The items that it takes.
     type Item: Send + 'static;
     /// Those items in messages.
@@ -92,27 +92,22 @@ impl Drop for Waker {
 }
 
 impl<T: Send + 'static> Worker<T> {
-    /// Starts the thread `writer` with a queue of `capacity` items and the sink that `open` makes there.
+    /// Starts the thread `writer` with a queue of `capacity` items for `sink`.
     ///
     /// # Errors
-    /// The thread cannot be started, or `open` fails.
+    /// The thread cannot be started.
     pub(super) fn start<S: Sink<Item = T>>(
         writer: &'static str,
         capacity: usize,
         backpressure: Backpressure,
-        open: impl FnOnce() -> Result<S, String> + Send + 'static,
+        mut sink: S,
     ) -> Result<Self, TelemetryError> {
-        let failed = |reason: String| TelemetryError::writer_failed(writer, reason);
         let (queue, items) = RingBuffer::new(capacity);
-        let (opened_tx, opened) = channel();
         let (done_tx, done) = channel();
         let vitals = Arc::new(Vitals::default());
         let watch = Watch::new(writer, S::ITEMS, Instant::now());
         let of_thread = Arc::clone(&vitals);
         let run = move || {
-            let sink = open();
-            let _ = opened_tx.send(sink.as_ref().map(drop).map_err(String::clone));
-            let Ok(mut sink) = sink else { return };
             let run = AssertUnwindSafe(|| serve(&mut sink, items, &of_thread));
             let result =
                 catch_unwind(run).unwrap_or_else(|_| Err("the writer panicked".to_owned()));
@@ -123,8 +118,8 @@ impl<T: Send + 'static> Worker<T> {
             let _ = done_tx.send(sink.result());
         };
         let thread = thread::Builder::new().name(writer.replace(' ', "-")).spawn(run);
-        let waker = Waker(thread.map_err(|e| failed(e.to_string()))?.thread().clone());
-        opened.recv().unwrap_or_else(|_| Err("its thread panicked".to_owned())).map_err(failed)?;
+        let failed = |error| TelemetryError::writer_failed(writer, error);
+        let waker = Waker(thread.map_err(failed)?.thread().clone());
         let (given, dropped) = (0, 0);
         Ok(Worker { writer, queue, waker, backpressure, given, dropped, vitals, watch, done })
     }
@@ -280,7 +275,7 @@ mod tests {
         let (begun_tx, begun) = sync_channel(100);
         let (permit, permission) = sync_channel(100);
         let sink = Gated { begun: begun_tx, permission, taken: 0, fail_at };
-        (Worker::start("gated", 4, backpressure, || Ok(sink)).unwrap(), begun, permit)
+        (Worker::start("gated", 4, backpressure, sink).unwrap(), begun, permit)
     }
 
     fn entry() -> Entry {
@@ -369,8 +364,7 @@ mod tests {
     fn an_entry_and_the_drop_of_the_worker_wake_a_sleeping_writer() {
         let (said, heard) = sync_channel(10);
         let backpressure = Backpressure::DropAndCount;
-        let mut worker =
-            Worker::start("slow-tick", 4, backpressure, || Ok(SlowTick(said))).unwrap();
+        let mut worker = Worker::start("slow-tick", 4, backpressure, SlowTick(said)).unwrap();
         for _ in 0..3 {
             // Meanwhile the writer falls asleep.
             thread::sleep(Duration::from_millis(20));

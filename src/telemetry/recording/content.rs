@@ -36,7 +36,7 @@ pub(super) fn builder(manifest: &Manifest) -> RecordingStreamBuilder {
         .enabled(true)
 }
 
-/// Logs the records of a run. Must stay on the thread that opened it, since time lines are thread-local.
+/// Logs the records of a run. Takes all of them on one thread, since time lines are thread-local.
 pub(super) struct Content {
     pub(super) stream: RecordingStream,
     step: u32,

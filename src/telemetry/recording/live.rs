@@ -27,26 +27,22 @@ pub(in crate::telemetry) const FAREWELL_MAX: Duration = Duration::from_secs(2);
 /// The bench cannot listen at the address.
 pub(in crate::telemetry) fn serve(
     address: SocketAddr,
-    manifest: Manifest,
-    config_toml: String,
-    scene: Scene,
+    manifest: &Manifest,
+    config_toml: &str,
+    scene: &Scene,
 ) -> Result<Worker<Entry>, TelemetryError> {
     let failed = |reason: String| {
         TelemetryError::Recording(format!("--live: {address}: {reason}; is the port free?"))
     };
     // The server would report a used port only on its own thread.
     TcpListener::bind(address).map_err(|e| failed(e.to_string()))?;
-    let open = move || {
-        let memory_limit = MemoryLimit::from_bytes(HISTORY_BYTES);
-        let options = ServerOptions { memory_limit, ..ServerOptions::default() };
-        let (ip, port) = (address.ip().to_string(), address.port());
-        let served = builder(&manifest).serve_grpc_opts(ip, port, options);
-        let content =
-            served.and_then(|stream| Content::open(stream, &manifest, &config_toml, &scene));
-        content.map_err(|error| error.to_string())
-    };
-    Worker::start("live view", QUEUE_ENTRIES, Backpressure::DropAndCount, open)
-        .map_err(|error| failed(error.to_string()))
+    let memory_limit = MemoryLimit::from_bytes(HISTORY_BYTES);
+    let options = ServerOptions { memory_limit, ..ServerOptions::default() };
+    let (ip, port) = (address.ip().to_string(), address.port());
+    let served = builder(manifest).serve_grpc_opts(ip, port, options);
+    let content = served.and_then(|stream| Content::open(stream, manifest, config_toml, scene));
+    let content = content.map_err(|error| failed(error.to_string()))?;
+    Worker::start("live view", QUEUE_ENTRIES, Backpressure::DropAndCount, content)
 }
 
 impl Sink for Content {
