@@ -4,7 +4,7 @@
 //! Both log the same content. Angles are in degrees here: people read this, programs read `steps.csv`.
 //!
 //! The layout takes 1.2 MB of a file. At 10 ms SYNC, with two observers alongside, each metre of insertion takes
-//! 3 to 4 MB at 2 mm/s, and 6 MB at 1 mm/s.
+//! 4 MB at 2 mm/s, and 6 MB at 1 mm/s.
 
 mod can;
 mod content;

@@ -113,7 +113,7 @@ impl Sheet {
             format!("{PLANE}/target/lines_10_mm"),
             &LineStrips3D::new(across.chain(along))
                 .with_colors([PLANE_LINES])
-                .with_radii([rerun::Radius::new_ui_points(0.5)]),
+                .with_radii([Radius::new_ui_points(0.5)]),
         )?;
         let (start_mm, tick_mm) = (near + Self::MARGIN_MM, self.tick_mm());
         let is_labelled = |z: &f64| *z > start_mm && z % tick_mm == 0.0;
