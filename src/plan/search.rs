@@ -4,7 +4,7 @@ use super::arc::{Arc, Tip};
 use super::field::Field;
 use super::lattice::{LEVELS, Lattice, Place, Resolution, STRAIGHT};
 use super::nearest::path_to_nearest;
-use super::obstacle::World;
+use super::obstacle::{Obstacle, World};
 use super::path::Path;
 use super::route::Route;
 use derive_more::Display;
@@ -257,7 +257,7 @@ impl Search<'_, '_> {
         }
         let distance_mm = world.distance_mm(at);
         (distance_mm < *clearance_mm).then(|| {
-            let place = describe_distance(distance_mm);
+            let place = describe_distance(world, distance_mm);
             format!("the start is {place}, goal.clearance_mm is {clearance_mm}; start elsewhere")
         })
     }
@@ -435,7 +435,7 @@ impl Search<'_, '_> {
         }
         let distance_mm = world.distance_mm(target_mm);
         if distance_mm < clearance_mm - tolerance_mm {
-            let place = describe_distance(distance_mm);
+            let place = describe_distance(world, distance_mm);
             let reason = format!("the target is {place}, goal.clearance_mm is {clearance_mm}");
             return (reason, false);
         }
@@ -472,10 +472,12 @@ impl Search<'_, '_> {
     }
 }
 
-/// Describes the distance of a point from an obstacle.
-fn describe_distance(distance_mm: f64) -> String {
+/// Describes the distance of a point from an obstacle. That from a mask is a lower bound.
+fn describe_distance(world: &World, distance_mm: f64) -> String {
+    let has_mask = world.obstacles.iter().any(|it| matches!(it, Obstacle::Mask(_)));
     match distance_mm < 0.0 {
         true => format!("{:.1} mm inside an obstacle", -distance_mm),
+        false if has_mask => format!("{distance_mm:.1} mm or more from an obstacle"),
         false => format!("{distance_mm:.1} mm from an obstacle"),
     }
 }

@@ -12,6 +12,8 @@ use serde::Serialize;
 
 /// How far ahead predictions are scored, mm.
 const AHEAD_MM: f64 = 5.0;
+/// No prediction is scored against a position farther ahead than this, mm.
+const AHEAD_MAX_MM: f64 = 6.0;
 
 /// The score of one observer on one recording.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -130,11 +132,14 @@ fn steps(recording: &Recording, r_sb: &Rotation3<f64>) -> Result<Vec<Step>, Stri
 }
 
 /// The prediction of `observer` at step `at` for the tip [`AHEAD_MM`] deeper, minus the recorded
-/// position there, mm; `None` if the recording ends before.
+/// position there, mm; `None` if no position was recorded from there to [`AHEAD_MAX_MM`] deeper.
 fn prediction_error_mm(observer: &dyn Observer, steps: &[Step], at: usize) -> Option<f64> {
     let (passed, ahead) = steps.split_at(at + 1);
-    let reach_mm = passed.last()?.depth_mm + AHEAD_MM;
-    let there = ahead.iter().position(|step| step.depth_mm >= reach_mm)?;
+    let ahead_mm = |step: &Step| step.depth_mm - passed[at].depth_mm;
+    let there = ahead.iter().position(|step| ahead_mm(step) >= AHEAD_MM)?;
+    if ahead_mm(&ahead[there]) > AHEAD_MAX_MM {
+        return None;
+    }
     let way: Vec<Increment> = ahead[..=there].iter().map(|step| step.increment).collect();
     let predicted = observer.estimate_after(&way)?;
     Some((predicted.x_pb.translation - ahead[there].tip_meas.mm()).norm())

@@ -7,7 +7,7 @@
 //! all insertions is summed, and the nearest bicycle model is fitted to it: `S = a (K_y, −K_x)`.
 
 use super::insertion::RecordedInsertion;
-use super::{CalibrationError, needle_error, sandwich_covariance};
+use super::{CalibrationError, Part, jackknife_covariance, needle_error};
 use crate::geometry::{Pose, Twist};
 use crate::math;
 use nalgebra::{Matrix3, Matrix4, Rotation3, SMatrix, SVector, Vector2, Vector3, Vector4, Vector6};
@@ -171,12 +171,11 @@ impl BendFit {
             p += hessian.try_inverse().ok_or_else(no_bend)? * gradient;
         }
         let (model, jacobian) = bicycle(&p);
-        let gradients: Vec<Vector3<f64>> = information
-            .iter()
-            .map(|part| jacobian.transpose() * (part.vector - part.matrix * model))
-            .collect();
-        let hessian = jacobian.transpose() * matrix * jacobian;
-        let covariance = sandwich_covariance(&hessian, &gradients).ok_or_else(no_bend)?;
+        let parts = information.iter().map(|part| Part {
+            hessian: jacobian.transpose() * part.matrix * jacobian,
+            gradient: jacobian.transpose() * (part.vector - part.matrix * model),
+        });
+        let covariance = jackknife_covariance(&parts.collect::<Vec<_>>()).ok_or_else(no_bend)?;
         let curvature_per_mm = math::hypot(p.x, p.y);
         let along = Vector2::new(p.x, p.y) / curvature_per_mm;
         let across = Vector2::new(-along.y, along.x);

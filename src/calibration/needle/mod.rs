@@ -66,34 +66,38 @@ impl NeedleFit {
     }
 }
 
-/// Covariance of the parameters of a least-squares fit with residuals that are correlated within
-/// each insertion and independent between insertions: `H⁻¹ (Σᵢ gᵢ gᵢᵀ) H⁻¹ n / (n − 1)`, the
-/// sandwich estimator (Liang and Zeger 1986).
+/// The part of one insertion in a least-squares fit, linearised there: `JᵀJ` and `Jᵀr`.
+struct Part<const N: usize> {
+    hessian: SMatrix<f64, N, N>,
+    gradient: SVector<f64, N>,
+}
+
+/// Covariance of the parameters of a least-squares fit with residuals that are correlated within each insertion
+/// and independent between insertions. The jackknife: without insertion i the parameters would change by
+/// `dᵢ = (H − Hᵢ)⁻¹ gᵢ`, and the covariance is `(n − 1)/n Σᵢ dᵢ dᵢᵀ`.
 ///
-/// `hessian` is `H = JᵀJ` over all n insertions, `gradients` holds `gᵢ = Jᵢᵀ rᵢ` of each insertion
-/// at the fit. `None` if H has no inverse: the insertions do not determine the parameters.
-fn sandwich_covariance<const N: usize>(
-    hessian: &SMatrix<f64, N, N>,
-    gradients: &[SVector<f64, N>],
-) -> Option<SMatrix<f64, N, N>> {
+/// `None` if all insertions together do not determine the parameters. If those without insertion i do not, its change
+/// is that of a step of the whole fit, `H⁻¹ gᵢ`, which is too small.
+fn jackknife_covariance<const N: usize>(parts: &[Part<N>]) -> Option<SMatrix<f64, N, N>> {
+    let hessian: SMatrix<f64, N, N> = parts.iter().map(|part| part.hessian).sum();
     // Scaled to a unit diagonal first, so that the test for singularity does not depend on units.
     let scale = SVector::<f64, N>::from_fn(|i, _| hessian[(i, i)].sqrt());
     if !scale.iter().all(|s| s.is_finite() && *s > 0.0) {
         return None;
     }
-    let scaled = SMatrix::<f64, N, N>::from_fn(|i, j| hessian[(i, j)] / (scale[i] * scale[j]));
-    let inverse = scaled.try_inverse()?;
-    if inverse.amax() > CONDITION_MAX {
-        return None;
+    let inverse = |matrix: &SMatrix<f64, N, N>| {
+        let scaled = SMatrix::<f64, N, N>::from_fn(|i, j| matrix[(i, j)] / (scale[i] * scale[j]));
+        scaled.try_inverse().filter(|inverse| inverse.amax() <= CONDITION_MAX)
+    };
+    let of_all = inverse(&hessian)?;
+    let n = parts.len() as f64;
+    let mut covariance = SMatrix::<f64, N, N>::zeros();
+    for part in parts {
+        let without = inverse(&(hessian - part.hessian)).unwrap_or(of_all);
+        let change = (without * part.gradient.component_div(&scale)).component_div(&scale);
+        covariance += change * change.transpose() * ((n - 1.0) / n);
     }
-    let n = gradients.len() as f64;
-    let mut meat = SMatrix::<f64, N, N>::zeros();
-    for gradient in gradients {
-        let gradient = gradient.component_div(&scale);
-        meat += gradient * gradient.transpose();
-    }
-    let covariance = inverse * meat * inverse * (n / (n - 1.0));
-    Some(SMatrix::from_fn(|i, j| covariance[(i, j)] / (scale[i] * scale[j])))
+    Some(covariance)
 }
 
 #[cfg(test)]

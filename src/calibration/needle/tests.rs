@@ -137,25 +137,46 @@ fn insertions_that_determine_no_needle_are_refused() {
 
 /// Each insertion has one residual from the mean.
 #[test]
-fn the_sandwich_covariance_of_a_mean_is_its_standard_error() {
+fn the_jackknife_covariance_of_a_mean_is_its_standard_error() {
     let values = [1.0, 2.0, 4.0, 9.0];
-    let gradients = values.map(|value| SVector::<f64, 1>::new(value - 4.0));
-    let squares: f64 = gradients.iter().map(|g| g.x * g.x).sum();
-    let found = sandwich_covariance(&SMatrix::<f64, 1, 1>::new(4.0), &gradients).unwrap();
+    let parts = values.map(|value| Part::<1> {
+        hessian: SMatrix::identity(),
+        gradient: SVector::<f64, 1>::new(value - 4.0),
+    });
+    let squares: f64 = parts.iter().map(|part| part.gradient.x * part.gradient.x).sum();
+    let found = jackknife_covariance(&parts).unwrap();
     assert!((found.x - squares / (4.0 * 3.0)).abs() < 1e-12);
 }
 
 #[test]
 fn parameters_that_cannot_be_separated_have_no_covariance() {
-    let gradients = [SVector::<f64, 2>::new(1.0, 1.0); 3];
-    assert_eq!(
-        sandwich_covariance(&SMatrix::<f64, 2, 2>::new(1.0, 1.0, 1.0, 1.0), &gradients),
-        None
-    );
-    assert_eq!(
-        sandwich_covariance(&SMatrix::<f64, 2, 2>::new(1.0, 0.0, 0.0, 0.0), &gradients),
-        None
-    );
+    let part = |corner: f64| Part::<2> {
+        hessian: SMatrix::<f64, 2, 2>::new(1.0, corner, corner, corner),
+        gradient: SVector::<f64, 2>::new(1.0, 1.0),
+    };
+    assert!(jackknife_covariance(&[0.9; 3].map(part)).is_some());
+    assert_eq!(jackknife_covariance(&[1.0; 3].map(part)), None);
+    assert_eq!(jackknife_covariance(&[0.0; 3].map(part)), None);
+}
+
+/// A line through three insertions, each measured at one depth with an error of 1. The farthest one pulls the slope
+/// towards itself: its residual is smaller than its error.
+#[test]
+fn few_insertions_do_not_look_more_alike_than_they_are() {
+    let depths = [1.0, 2.0, 6.0_f64];
+    let squares: f64 = depths.iter().map(|depth| depth * depth).sum();
+    let mut mean_variance = 0.0;
+    for signs in 0..8_u8 {
+        let errors = [0, 1, 2].map(|bit| if signs >> bit & 1 == 1 { 1.0 } else { -1.0 });
+        let slope =
+            depths.iter().zip(errors).map(|(depth, error)| depth * error).sum::<f64>() / squares;
+        let parts = [0, 1, 2].map(|k| Part::<1> {
+            hessian: SMatrix::<f64, 1, 1>::new(depths[k] * depths[k]),
+            gradient: SVector::<f64, 1>::new(depths[k] * (errors[k] - slope * depths[k])),
+        });
+        mean_variance += jackknife_covariance(&parts).unwrap().x / 8.0;
+    }
+    assert!(mean_variance > 1.0 / squares, "{mean_variance} < {}", 1.0 / squares);
 }
 
 #[test]

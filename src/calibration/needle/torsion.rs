@@ -1,7 +1,7 @@
 //! Fits the torsion from the recorded rotations of base and tip.
 
 use super::insertion::{ENTRY_MM, RecordedInsertion};
-use super::{CalibrationError, needle_error, sandwich_covariance};
+use super::{CalibrationError, Part, jackknife_covariance, needle_error};
 use crate::keys::Range;
 use crate::needle::{NeedleError, Play, Torsion, TorsionConfig};
 use nalgebra::{SMatrix, SVector};
@@ -200,13 +200,16 @@ impl TorsionFit {
         if !settled {
             return Err(undetermined());
         }
-        let mut hessian: Hessian = parts.iter().map(|part| part.hessian).sum();
-        let mut gradients: Vec<Parameters> = parts.iter().map(|part| part.gradient).collect();
-        if !has_band {
-            (0..OFFSET).for_each(|k| exclude(&mut hessian, k));
-            gradients.iter_mut().for_each(|g| g.fixed_rows_mut::<OFFSET>(0).fill(0.0));
-        }
-        let covariance = sandwich_covariance(&hessian, &gradients).ok_or_else(undetermined)?;
+        let fitted = parts.iter().map(|part| {
+            let Linearised { mut hessian, mut gradient, .. } = *part;
+            if !has_band {
+                (0..OFFSET).for_each(|k| exclude(&mut hessian, k));
+                gradient.fixed_rows_mut::<OFFSET>(0).fill(0.0);
+            }
+            Part { hessian, gradient }
+        });
+        let covariance =
+            jackknife_covariance(&fitted.collect::<Vec<_>>()).ok_or_else(undetermined)?;
         // Each insertion's own offset, by one Newton step with the other parameters kept.
         let offsets =
             parts.iter().map(|part| part.gradient[OFFSET] / part.hessian[(OFFSET, OFFSET)]);

@@ -45,6 +45,23 @@ fn spikes_of_one_and_of_two_samples() {
     }
 }
 
+/// Noise that changes slowly looks like travel. Once it is configured, the travel check allows for it.
+#[test]
+fn noise_that_is_configured_as_slow_stops_no_run() {
+    for seed in 11..15 {
+        let mut bench = Bench::new(configured(&[
+            "insertion={depth_mm=60.0, speed_mm_per_s=2.0, plane_out_of_reach=\"insert\"}",
+            &format!("emulator.seed={seed}"),
+            "emulator.noise={sd_mm=0.4, correlated_sd_mm=0.5, correlation_time_s=1.0}",
+            "tracker.noise={white_sd_mm=0.4, correlated_sd_mm=0.5, correlation_time_s=1.0}",
+            "tracker.gates.noise_sd_mm=0.64",
+            "observer.invariant.position_sd_mm=0.64",
+        ]));
+        bench.run_to_end();
+        assert!(bench.completed(), "seed {seed}: {}", bench.reason());
+    }
+}
+
 #[test]
 fn every_other_position_infinite_costs_only_those_samples() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
