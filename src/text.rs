@@ -6,6 +6,7 @@ use minijinja::value::Serde;
 use minijinja::{Environment, Error, UndefinedBehavior, Value, context};
 use serde::Serialize;
 use std::borrow::Cow;
+use std::fmt::Display;
 
 /// True for a character that a terminal acts upon or that hides what follows it: control characters
 /// (C0, DEL and C1), line and paragraph separators, and the marks, embeddings, overrides and isolates
@@ -30,6 +31,16 @@ pub fn escaped(text: &str) -> Cow<'_, str> {
         }
     }
     Cow::Owned(shown)
+}
+
+/// `word`, such as a path, as a shell takes it.
+pub fn shell_word(word: impl Display) -> String {
+    let word = word.to_string();
+    let is_bare = |c: char| c.is_ascii_alphanumeric() || "_-./=:,+%".contains(c);
+    match !word.is_empty() && word.chars().all(is_bare) {
+        true => word,
+        false => format!("'{}'", word.replace('\'', r"'\''")),
+    }
 }
 
 /// The first `max` characters of `text`, the last of them `…` where there are more.
@@ -139,6 +150,12 @@ mod tests {
             "a\\nb\\r\\t\\u{1b}[2J\\u{7f}\\u{9b}1m\\u{202e}x\\u{2066}y\\u{2028}é\u{1F600}\\"
         );
         assert!(matches!(escaped("NeedleToTracker \"é\""), Cow::Borrowed(_)));
+    }
+
+    #[test]
+    fn a_path_is_one_word_for_a_shell() {
+        let words = ["runs/a-1.toml", "my runs/a", "it's", ""].map(shell_word);
+        assert_eq!(words, ["runs/a-1.toml", "'my runs/a'", r"'it'\''s'", "''"]);
     }
 
     #[test]

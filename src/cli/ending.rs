@@ -9,7 +9,7 @@ use crate::runtime::RunReport;
 use crate::session::{Outcome, StageAtEnd};
 use crate::stage::{Axis, DriveReport};
 use crate::study::{OFF_PLANE_LIMIT_MM, PlanStatus};
-use crate::text::fixed;
+use crate::text::{fixed, shell_word};
 use std::fmt;
 use std::fs;
 use std::path::Path;
@@ -29,19 +29,19 @@ pub(super) fn status(config: &Config, report: &RunReport) -> u8 {
 
 /// The last lines of a summary: the record, and how the run ended.
 pub(super) fn ending(config: &Config, report: &RunReport) -> String {
-    let dir = report.run_dir.display();
+    let (dir, word) = (report.run_dir.display(), shell_word(report.run_dir.display()));
     let recording = report.run_dir.join(file::RECORDING);
     let mut lines = Vec::new();
     match &report.record {
         Err(error) => lines.push(format!(
-            "record      {dir}, left open: {error}; close it: needle-bench review {dir} --repair"
+            "record      {dir}, left open: {error}; close it: needle-bench review {word} --repair"
         )),
         Ok(finished) => {
             let incomplete = |fault| format!("record      incomplete: {fault}");
             lines.extend(finished.faults.iter().map(incomplete));
             let look = match recording.exists() {
-                true => format!("look at it: rerun {}", recording.display()),
-                false => format!("make its run.rrd: needle-bench review {dir} --repair"),
+                true => format!("look at it: rerun {}", shell_word(recording.display())),
+                false => format!("make its run.rrd: needle-bench review {word} --repair"),
             };
             let megabytes = folder_bytes(&report.run_dir) as f64 * 1e-6;
             lines.push(format!("record      {dir} ({megabytes:.1} MB); {look}"));
@@ -154,13 +154,13 @@ pub(super) fn after_operation(
 
 /// The line with the next command, a review of the run.
 fn next_review(report: &RunReport) -> String {
-    format!("next        needle-bench review {}", report.run_dir.display())
+    format!("next        needle-bench review {}", shell_word(report.run_dir.display()))
 }
 
 /// The line with the next command, an `operation` of the stage.
 fn next_stage(operation: &str, path: Option<&Path>, report: &RunReport) -> String {
     let path = path.map_or_else(|| report.run_dir.join(file::CONFIG), Path::to_path_buf);
-    format!("next        needle-bench stage {operation} {}", path.display())
+    format!("next        needle-bench stage {operation} {}", shell_word(path.display()))
 }
 
 /// An operation of the stage that is required before any other.

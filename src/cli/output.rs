@@ -74,15 +74,6 @@ fn already_exists(path: &Path) -> Failure {
     Failure::bad_input(path, "exists, and is not overwritten; name another file, or remove it")
 }
 
-/// `word` as a shell takes it.
-pub(super) fn shell_word(word: &str) -> String {
-    let is_bare = |c: char| c.is_ascii_alphanumeric() || "_-./=:,+%".contains(c);
-    match word.chars().all(is_bare) {
-        true => word.to_owned(),
-        false => format!("'{}'", word.replace('\'', r"'\''")),
-    }
-}
-
 /// Writes `text`, made [`plain`], its long lines broken, and a line end to stderr; errors are ignored.
 pub(super) fn print_stderr(text: impl Display) {
     let _ = writeln!(io::stderr().lock(), "{}", wrapped(&plain(text, "\n\t")));

@@ -17,6 +17,7 @@ use crate::session::{Record, SampleRecord};
 use crate::stage::SetPoint;
 use crate::study::{RecordedRow, Recording};
 use crate::telemetry::RunFolder;
+use crate::text::shell_word;
 use crate::tracker::{Registration, Sample};
 use crate::units::Time;
 use clap::Args;
@@ -61,7 +62,7 @@ pub(super) fn last_run_on_a_bus(command: &str) -> String {
         .map(|run| run.dir().join(file::CONFIG))
         .find(|config| config.is_file())
         .map_or(String::new(), |config| {
-            format!("\nthe last run on a bus: {command}--config {}", config.display())
+            format!("\nthe last run on a bus: {command}--config {}", shell_word(config.display()))
         })
 }
 

@@ -2,14 +2,14 @@
 
 use super::arguments::{Configured, parse_seed};
 use super::mask::mask_reader;
-use super::output::{print_result, refuse_existing, shell_word, write_new};
+use super::output::{print_result, refuse_existing, write_new};
 use super::{Failure, Result};
 use crate::config::Config;
 use crate::geometry::coordinates;
 use crate::runtime::Study;
 use crate::session::PlaneOutOfReach;
 use crate::study::{StudySummary, TipError, TrialResult, trial_seed};
-use crate::text::screen;
+use crate::text::{screen, shell_word};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use minijinja::context;
@@ -112,7 +112,7 @@ fn repeat_command(configured: &Configured, plane_out_of_reach: PlaneOutOfReach) 
     let inserts_anyway = is_refused.then(|| "insertion.plane_out_of_reach=insert".to_owned());
     let sets = configured.set.iter().cloned().chain(inserts_anyway);
     let words = path.into_iter().chain(sets.flat_map(|set| ["--set".to_owned(), set]));
-    words.fold("needle-bench run".to_owned(), |line, word| line + " " + &shell_word(&word))
+    words.fold("needle-bench run".to_owned(), |line, word| line + " " + &shell_word(word))
 }
 
 /// The summary, and how fast this computer made the trials.

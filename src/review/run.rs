@@ -7,7 +7,7 @@ use crate::archive::{EventKind, EventLine, Manifest, RunOutcome, StepsTable, Tra
 use crate::config::{CanInterface, Config, Source};
 use crate::session::{Lane, Severity, State};
 use crate::study::{FigureReport, PlanStatus};
-use crate::text::escaped;
+use crate::text::{escaped, shell_word};
 use serde::Serialize;
 use std::borrow::Cow;
 use std::fmt::Display;
@@ -180,7 +180,7 @@ impl Folder {
 
     /// A reason for caution with the record; `None` for a whole one.
     pub(super) fn caution(&self) -> Option<String> {
-        let dir = &self.dir;
+        let dir = shell_word(&self.dir);
         match &self.condition {
             Condition::Whole => None,
             Condition::BeingWritten => {

@@ -11,7 +11,7 @@ use crate::review::{
 };
 use crate::runtime::make_recording;
 use crate::telemetry::{RunFolder, is_being_written, lock, repair, utc_text, write_manifest};
-use crate::text::escaped;
+use crate::text::{escaped, shell_word};
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use minijinja::Error as TemplateError;
@@ -148,7 +148,7 @@ fn open_viewer(path: &Path) -> Result<()> {
     if !recording.is_file() {
         return Err(Failure::configuration(format_args!(
             "{shown} is not there; make it: needle-bench review {} --repair",
-            path.display()
+            shell_word(path.display())
         )));
     }
     let started = Command::new("rerun").arg(&recording).stdout(Stdio::null()).spawn();
@@ -158,7 +158,8 @@ fn open_viewer(path: &Path) -> Result<()> {
             _ => format!("did not start: {error}"),
         };
         Failure::environment(format!(
-            "the viewer, the program rerun, {why}; install it: pip install rerun-sdk==0.36.3, then: rerun {shown}"
+            "the viewer, the program rerun, {why}; install it: pip install rerun-sdk==0.36.3, then: rerun {}",
+            shell_word(shown)
         ))
     })
 }
@@ -264,7 +265,8 @@ fn add_verdict(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> R
         Condition::Whole => None,
         // This program has the lock, so no bench is writing the record.
         Condition::Open | Condition::BeingWritten => Some(format!(
-            "a verdict needs a closed record; close it: needle-bench review {dir} --repair"
+            "a verdict needs a closed record; close it: needle-bench review {} --repair",
+            shell_word(&dir)
         )),
         Condition::Changed(what) => Some(format!("{what}; a verdict needs the unchanged record")),
     };

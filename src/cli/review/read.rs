@@ -7,6 +7,7 @@ use crate::review::{
     Condition, Folder, Line, Motion, Run, figures_of_steps, parse_event, parse_frame,
 };
 use crate::telemetry::{RunFolder, TelemetryError, is_being_written};
+use crate::text::shell_word;
 use std::io;
 use std::path::Path;
 
@@ -29,7 +30,7 @@ pub(super) fn run(path: &Path) -> Result<Run> {
     // A record that is not closed has no `run.rrd` yet.
     let is_closed = !matches!(folder.condition, Condition::BeingWritten | Condition::Open);
     if let Some(change) = record.recording_change()?.filter(|_| is_closed) {
-        let dir = path.display();
+        let dir = shell_word(path.display());
         unreadable.push(format!("{change}; make it: needle-bench review {dir} --repair"));
     }
     Ok(Run { folder, steps, samples, motion, events, unreadable })
