@@ -105,7 +105,7 @@ impl AxisStop {
             // Another master may enable a drive again after the command.
             if command.is_some() || !obeys {
                 if let Some(word) = command.filter(|_| !obeys) {
-                    self.command(word).await?;
+                    self.command(word, self.give_up).await?;
                 }
                 trouble = self.disobedience().await;
                 obeys = trouble.is_none();
@@ -159,7 +159,8 @@ impl AxisStop {
     /// Takes power off until it is seen to be off. `stood` is the result of [`AxisStop::come_to_stand`].
     async fn take_power_off(&mut self, stood: Result<i32, String>) -> Result<i32, String> {
         loop {
-            if let Err(error) = self.command(Controlword::DISABLE_VOLTAGE).await {
+            let command = self.command(Controlword::DISABLE_VOLTAGE, self.give_up_power_off);
+            if let Err(error) = command.await {
                 let trouble = stood.err().unwrap_or(error);
                 return Err(format!("{trouble}; power off was not confirmed"));
             }
@@ -179,8 +180,8 @@ impl AxisStop {
         }
     }
 
-    /// Gives a command, and repeats it until it is confirmed.
-    async fn command(&mut self, word: Controlword) -> Result<(), String> {
+    /// Gives a command, and repeats it until it is confirmed, or until `give_up`.
+    async fn command(&mut self, word: Controlword, give_up: Time) -> Result<(), String> {
         let (object, value) = (object::CONTROLWORD, SdoValue::from(word.0));
         loop {
             // After an unanswered request the SDO client first reads another object, and sends the command only
@@ -191,7 +192,7 @@ impl AxisStop {
             }
             let Err(error) = self.sdo.write(object, value).await else { return Ok(()) };
             self.request_failed = true;
-            if self.sdo.now() >= self.give_up {
+            if self.sdo.now() >= give_up {
                 return Err(error);
             }
             self.sdo.pause(READ_PERIOD).await;

@@ -186,6 +186,16 @@ fn a_drive_that_ignores_quick_stop_gets_it_again_and_is_an_error() {
     );
 }
 
+/// It hears nothing as long as the bench waits for the axis to stand, and a little longer.
+#[test]
+fn power_off_is_commanded_again_until_it_is_confirmed() {
+    let deaf = config().power.stop_timeout.mul_f64(1.6);
+    let quick_stop = QuickStop::new(&config(), BEGUN);
+    let (result, drive, _) = result_of(quick_stop, |time, drive| drive.off = time < deaf);
+    assert!(result.is_err(), "{result:?}");
+    assert_eq!(drive.state, DriveState::SwitchOnDisabled);
+}
+
 #[test]
 fn a_short_answer_is_neither_statusword_nor_position() {
     let result_after = |answers: [&str; 3]| {
