@@ -132,8 +132,13 @@ fn check_study(config: &Config, reader: &mut Reader) {
     let [low, high] = or_emulated(offset, "offset_deg");
     let [half_width, _] = or_emulated(half_width, "half_width_deg");
     let offset = low.abs().max(high.abs());
-    let has_creep = config.emulator.torsion.creep_mm != 0.0;
+    let TorsionConfig { creep_mm, creep_mm_per_mm, .. } = config.emulator.torsion;
+    let has_creep = creep_mm != 0.0;
+    let is_error_of_nothing = study.creep_error.is_some() && !has_creep && creep_mm_per_mm == 0.0;
     contradictions! { reader;
+        ["study.creep_error", "emulator.torsion.creep_mm", "emulator.torsion.creep_mm_per_mm"]
+            if is_error_of_nothing =>
+            "study.creep_error has no effect: emulator.torsion.creep_mm and creep_mm_per_mm are 0";
         ["study.target_move_mm", "study.target_depth_mm", "goal.position_mm"] if move_mm > least_mm =>
             "study.target_move_mm reaches {move_mm}, allowed: up to the least distance of the target from \
              the start, {least_mm} mm; it would move faster than the needle";

@@ -320,9 +320,17 @@ pub(super) fn load_stage(
     match (config.bus(), emulated) {
         // An operator who forgot to name the rig must not take the emulated stage for the rig.
         (CanInterface::Memory, false) => {
+            let (what, next) = match configured.path() {
+                None => {
+                    ("no stage is named".to_owned(), "give its configuration, --config my-rig.toml")
+                }
+                Some(path) => (
+                    format!("{}: can.interface is \"memory\", not a rig's", path.display()),
+                    "name the rig's interface",
+                ),
+            };
             return Err(Failure::configuration(format_args!(
-                "no stage is named: give its configuration, --config my-rig.toml, or rehearse on the \
-                 emulated stage with --rehearse{}",
+                "{what}: {next}, or rehearse on the emulated stage with --rehearse{}",
                 last_run_on_a_bus("")
             )));
         }
@@ -330,7 +338,7 @@ pub(super) fn load_stage(
         (interface, true) => {
             return Err(Failure::configuration(format_args!(
                 "--virtual moves the emulated stage in memory, but can.interface is \"{interface}\": \
-                 leave one of the two out"
+                 leave one of the two out, or rehearse this rig on the emulated stage with --rehearse"
             )));
         }
     }

@@ -215,6 +215,16 @@ fn noise_that_lasts_longer_than_the_insertion_is_refused() {
 }
 
 #[test]
+fn an_error_of_a_creep_that_is_not_there_is_refused() {
+    let error = "study.creep_error=[-0.3, 0.3]";
+    assert_eq!(
+        set_refusal(&[error]),
+        "--set study.creep_error has no effect: emulator.torsion.creep_mm and creep_mm_per_mm are 0"
+    );
+    assert!(load("", &[error, "emulator.torsion.creep_mm=0.75"]).is_ok());
+}
+
+#[test]
 fn a_target_move_without_a_tool_or_faster_than_the_needle_is_refused() {
     let moves = "study.target_move_mm=[1, 30]";
     assert_eq!(
