@@ -156,13 +156,11 @@ impl Checks<'_> {
             return;
         };
         let method = homing.method;
-        // The direction in which each method seeks its switch, and the method that seeks it in the other one. 33
-        // and 34 turn the motor by at most one turn; 35 and 37 do not move it.
+        // The direction in which each method seeks its switch, and the method that seeks it in the other one. 3 to 6
+        // and 19 to 22 move as the switch says; 33 and 34 move by at most one turn of the motor, 35 and 37 do not.
         let (direction, other_method) = match method {
             1 | 17 => (-sign, method + 1),
             2 | 18 => (sign, method - 1),
-            3 | 4 | 19 | 20 => (sign, method + 2),
-            5 | 6 | 21 | 22 => (-sign, method - 2),
             7..=10 | 23..=26 => (sign, method + 4),
             11..=14 | 27..=30 => (-sign, method - 4),
             _ => return,

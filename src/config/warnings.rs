@@ -13,7 +13,6 @@ pub(super) fn all(config: &Config, tree: &Tree) -> Vec<String> {
     let mut warnings = unused_sections(config, tree);
     warnings.extend(missing_registration(config, tree));
     warnings.extend(unsuitable_pair(config));
-    warnings.extend(unknown_homing_direction(config));
     warnings
 }
 
@@ -53,17 +52,6 @@ fn unused_sections(config: &Config, tree: &Tree) -> Vec<String> {
 /// The name of the section with the keys of an observer or a control law of this `kind`.
 pub(super) fn section_name(kind: &str) -> String {
     kind.replace('-', "_")
-}
-
-/// A warning for a method of the drive's maker that homes the insertion axis: it may seek the deep end.
-fn unknown_homing_direction(config: &Config) -> Option<String> {
-    let method = config.stage.insertion.homing?.method;
-    (method < 0).then(|| {
-        format!(
-            "stage.insertion.homing.method is {method}, a method of the drive's maker: only its manual says in \
-             which direction it moves; take the needle off before the first homing"
-        )
-    })
 }
 
 /// A warning for a rehearsal without a registration, which uses the tracker's frame as the bench's. A run

@@ -70,17 +70,21 @@ pub struct Run {
 }
 
 impl Run {
-    /// The depth, mm, at a time in s, from the measured positions of the insertion axis; `None` before the first
-    /// step, or without recorded positions.
-    pub(super) fn depth_over_time(&self) -> impl Fn(f64) -> Option<f64> {
-        let course = &self.motion.measured.insertion;
+    /// The depth, mm, at a time in s, from the measured positions of the insertion axis, or without them from the
+    /// steps; `None` before the first step.
+    pub(super) fn depth_over_time(&self) -> impl Fn(f64) -> Option<f64> + use<> {
         let (times, depths) = (self.steps.column("time_s"), self.steps.column("insertion_mm"));
-        let first_step = times.into_iter().zip(depths).find_map(|(s, mm)| s.zip(mm));
-        let start = first_step
-            .and_then(|(time_s, depth_mm)| Some((time_s, position_mm(course, time_s)? - depth_mm)));
+        let steps: Course = times.into_iter().zip(depths).filter_map(|(s, mm)| s.zip(mm)).collect();
+        let recorded = &self.motion.measured.insertion;
+        let last_s = |course: &Course| course.last().map(|(time_s, _)| *time_s);
+        // Positions that end before the last step were cut off.
+        let course = if last_s(recorded) >= last_s(&steps) { recorded } else { &steps }.clone();
+        let start = steps.first().and_then(|(time_s, depth_mm)| {
+            Some((*time_s, position_mm(&course, *time_s)? - depth_mm))
+        });
         move |time_s| {
             let (_, start_mm) = start.filter(|(begun_s, _)| time_s >= *begun_s)?;
-            Some(position_mm(course, time_s)? - start_mm)
+            Some(position_mm(&course, time_s)? - start_mm)
         }
     }
 
@@ -347,15 +351,18 @@ pub(super) mod tests {
     #[test]
     fn the_depth_at_a_time_is_the_measured_one() {
         let mut run = run();
-        run.motion.measured.insertion = vec![(1.0, 9.5), (2.5, 10.5), (3.0, 10.5), (4.0, 12.5)];
-        let depth_mm = |time_s| run.depth_over_time()(time_s);
+        run.motion.measured.insertion = vec![(1.0, 9.5), (2.5, 10.5), (3.0, 10.5), (5.0, 14.5)];
+        let depth_mm = run.depth_over_time();
         assert_eq!(depth_mm(1.9), None);
         let at_begin_mm = 9.5 + 1.0 / 1.5;
-        for (time_s, stage_mm) in [(2.0, at_begin_mm), (2.75, 10.5), (3.5, 11.5), (60.0, 12.5)] {
+        for (time_s, stage_mm) in [(2.0, at_begin_mm), (2.75, 10.5), (3.5, 11.5), (60.0, 14.5)] {
             let off_mm = depth_mm(time_s).unwrap() - (stage_mm - at_begin_mm);
             assert!(off_mm.abs() < 1e-9, "{time_s} s: {off_mm} mm off");
         }
-        run.motion = Motion::default();
+        run.motion.measured.insertion.pop();
+        // Without positions up to the last step, at 5 s in 3 mm, the steps have to do.
+        assert_eq!(run.depth_over_time()(4.5), Some(2.5));
+        run.steps = StepsTable::default();
         assert_eq!(run.depth_over_time()(3.0), None);
     }
 }

@@ -120,7 +120,8 @@ mod tests {
         /// A move that brakes at most as hard as a quick stop may end at the limit itself.
         #[test]
         fn a_profile_to_the_limit_could_stop_before_it(
-            goal in 0.05..20.0f64,
+            start in -20.0..20.0f64,
+            distance in -20.0..20.0f64,
             speed in 0.1..10.0f64,
             acceleration in 0.5..200.0f64,
             counts in 50..20_000u32,
@@ -129,16 +130,22 @@ mod tests {
             let period = Duration::from_millis(period_ms);
             let ratio = CountsRatio::new(counts, 1).expect("not zero");
             let scale = Scale::new(Axis::Insertion, ratio, Sign::Positive, 0);
-            let limits = AxisLimits { min: 0.0, max: goal, speed_max: 10.0, acceleration_max: None };
+            let goal = start + distance;
+            let (min, max) = (start.min(goal), start.max(goal));
+            let limits = AxisLimits { min, max, speed_max: 10.0, acceleration_max: None };
             let check = LimitCheck::new(Axis::Insertion, scale, limits, period, false)
                 .with_quick_stop(Some(acceleration));
-            let mut limited = Limited { check, last: Commanded { counts: 0, step_counts: 0 } };
+            let standing = scale.counts(start).expect("within");
+            let mut limited = Limited { check, last: Commanded { counts: standing, step_counts: 0 } };
             let mut profile = Profile::new(speed, acceleration);
-            profile.go_to(goal);
+            profile.go_to(distance.abs());
             while profile.position_mm() < profile.goal_mm() {
-                let target = profile.advance(period);
+                let gone = profile.advance(period);
+                let target = if gone < distance.abs() { start + gone.copysign(distance) } else { start + distance };
                 prop_assert_eq!(limited.command(target), Ok(()));
             }
+            // Held there.
+            prop_assert_eq!(limited.command(goal), Ok(()));
         }
     }
 

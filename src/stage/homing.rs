@@ -54,6 +54,12 @@ impl HomingConfig {
     /// Bit 12 in homing mode: homing attained.
     pub const ATTAINED_BIT: u8 = 12;
 
+    /// True if the direction of the first move does not follow from the method: it depends on the home switch, or is
+    /// that of the drive's maker.
+    pub fn may_move_either_way(&self) -> bool {
+        matches!(self.method, ..0 | 3..=6 | 19..=22)
+    }
+
     /// True if `statusword` has the [homed bit](Self::homed_bit) set.
     pub(super) fn says_homed(&self, statusword: Statusword) -> bool {
         u32::from(statusword.0) >> self.homed_bit.min(31) & 1 != 0

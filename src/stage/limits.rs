@@ -15,11 +15,13 @@ section! {
     /// How far, how fast and how hard an axis may be commanded, in mm or rad and seconds.
     #[derive(Copy)]
     pub struct AxisLimits of AXIS {
-        /// Lower soft limit, measured from zero. The drive enforces it too (607D:1), a little wider.
+        /// Lower soft limit, measured from zero. The drive enforces it too (607D:1), a little wider, and as wide as
+        /// the axis stands.
         min as (["min_mm", "min_deg"][AXIS]): f64
             [[within(-1000.0, 0.0), within(-360_000.0, 0.0)][AXIS]] => ["-1.0", "-7200.0"][AXIS],
             hardware_must_give;
-        /// Upper soft limit, measured from zero. The drive enforces it too (607D:2), a little wider.
+        /// Upper soft limit, measured from zero. The drive enforces it too (607D:2), a little wider, and as wide as
+        /// the axis stands.
         max as (["max_mm", "max_deg"][AXIS]): f64
             [[over(0.0, 1000.0), within(0.0, 360_000.0)][AXIS]] => ["310.0", "7200.0"][AXIS],
             hardware_must_give;
@@ -158,18 +160,19 @@ impl LimitCheck {
     /// allowed: a set-point has the mean speed of its step, and the axis may be slowing down to the limit.
     fn check_stop(&self, target: f64, counts: i64, last: Commanded) -> Result<(), String> {
         let Some(deceleration) = self.quick_stop_deceleration else { return Ok(()) };
-        let step = target - self.scale.value(last.counts);
+        let (axis, per_unit) = (self.axis, self.scale.counts_per_unit());
+        let step_counts = counts.saturating_sub(last.counts);
         // Rounding to whole counts changes a step by up to 1 count.
-        let step_counts = counts.saturating_sub(last.counts).unsigned_abs().saturating_sub(1);
-        let speed = step_counts as f64 / (self.scale.counts_per_unit() * self.period_s);
-        let beyond = speed * speed / (2.0 * deceleration) - step.abs();
-        let ahead = match step > 0.0 {
-            true => AxisLimits { min: f64::NEG_INFINITY, ..self.limits },
-            false => AxisLimits { max: f64::INFINITY, ..self.limits },
-        };
-        let end = target + beyond.max(0.0).copysign(step);
-        ahead.check_range(self.axis, end).map_err(|error| {
-            let [target, speed] = [target, speed].map(|value| self.axis.shown(value));
+        let moved_counts = step_counts.unsigned_abs().saturating_sub(1) as f64;
+        let speed = moved_counts / (per_unit * self.period_s);
+        let beyond_counts = speed * speed / (2.0 * deceleration) * per_unit - moved_counts;
+        if beyond_counts <= 1.0 {
+            return Ok(());
+        }
+        let end_counts = counts.saturating_add(beyond_counts as i64 * step_counts.signum());
+        let end = self.check_position_from(self.scale.value(end_counts), last.counts);
+        end.map(drop).map_err(|error| {
+            let [target, speed] = [target, speed].map(|value| axis.shown(value));
             format!("{error}: there a quick stop from {target} at {speed}/s would end")
         })
     }
@@ -260,7 +263,7 @@ mod tests {
 
     #[test]
     fn the_limit_itself_and_its_last_bit_are_allowed() {
-        let check = check(Sign::Positive, 0);
+        let check = check(Sign::Positive, 0).with_quick_stop(Some(500.0));
         let last = at(149.95);
         assert_eq!(check.check(150.0, last), Ok(150_000));
         assert_eq!(check.check(150.000_000_000_000_03, last), Ok(150_000));
@@ -297,7 +300,7 @@ mod tests {
     /// An axis that stands outside may be held and may come back, but goes no farther out, and not back out again.
     #[test]
     fn an_axis_outside_its_limits_may_only_come_back() {
-        let check = check(Sign::Negative, 0);
+        let check = check(Sign::Negative, 0).with_quick_stop(Some(5.0));
         let held = |mm: f64| Commanded { counts: -(mm * 1000.0).round() as i64, step_counts: 0 };
         for mm in [150.002, -1.002] {
             let outward = mm + 0.001_f64.copysign(mm);
@@ -307,6 +310,10 @@ mod tests {
             assert!(refused.contains("the limit of"), "{refused}");
             assert!(check.check(mm, held(mm - 0.001_f64.copysign(mm))).is_err(), "{mm}");
         }
+        // A target between two counts is no step outwards.
+        let held_between = held(-1.25);
+        assert_eq!(check.check(-1.250_4, held_between), Ok(1250));
+        assert_eq!(check.check(-1.249_6, held_between), Ok(1250));
         let across = check.check_position_from(-1.001, held(150.1).counts);
         assert!(text(across).contains("is under the limit of -1.000 mm"));
     }
@@ -320,7 +327,7 @@ mod tests {
         assert_eq!(check.with_quick_stop(Some(200.0)).check(149.9, last), Ok(149_900));
         assert_eq!(
             text(check.with_quick_stop(Some(50.0)).check(149.9, last)),
-            "insertion: 150.090 mm is over the limit of 150.000 mm (stage.insertion.max_mm): there a quick \
+            "insertion: 150.091 mm is over the limit of 150.000 mm (stage.insertion.max_mm): there a quick \
              stop from 149.900 mm at 4.900 mm/s would end"
         );
         // Away from the limit it may be as fast.

@@ -8,7 +8,7 @@ use crate::observer::ObserverError;
 use crate::session::{
     Decision, MovingMean, Outcome, SessionConfig, Steering, StepRecord, TargetTool,
 };
-use crate::stage::Axis;
+use crate::stage::{Axis, AxisConfig};
 use crate::units::Time;
 use nalgebra::Vector3;
 
@@ -88,8 +88,11 @@ pub fn insert(
             needle.insert_to(due.command_mm);
         }
         let rotation_rad = needle.base.rotation_at(due.command_mm);
-        let limits = &session.stage.rotation.limits;
-        if let Err(error) = limits.check_range(Axis::Rotation, rotation_rad) {
+        let AxisConfig { limits, quick_stop_deceleration, .. } = &session.stage.rotation;
+        let speed = command.unwrap_or(0.0) * session.insertion.speed_mm_per_s;
+        let braking_rad =
+            quick_stop_deceleration.map_or(0.0, |by| speed * speed.abs() / (2.0 * by));
+        if let Err(error) = limits.check_range(Axis::Rotation, rotation_rad + braking_rad) {
             return Ok(Outcome::Stopped(format!("stage: {error}")));
         }
         if command.is_none() {

@@ -209,6 +209,30 @@ fn home_homes_both_axes_and_other_commands_ask_for_it() {
     }
 }
 
+/// The emulated drive has none of these methods and refuses them.
+#[test]
+fn a_homing_in_an_unknown_direction_is_a_warning() {
+    let scratch = Scratch::new();
+    for (axis, method, warns) in [
+        ("insertion", -3, true),
+        ("insertion", 3, true),
+        ("insertion", 27, false),
+        ("rotation", -3, false),
+    ] {
+        let method = format!("stage.{axis}.homing.method={method}");
+        let said = stage(
+            &scratch,
+            &["home", "--axis", axis, "-q", "--set", &method, "--set", "stage.insertion.sign=1"],
+        );
+        assert_eq!(
+            said.stderr.contains("in which direction the axis moves"),
+            warns,
+            "{}",
+            said.stderr
+        );
+    }
+}
+
 /// After a power cycle neither axis is homed; the other one is only held.
 #[test]
 fn one_axis_is_homed_while_the_other_is_not() {
@@ -222,27 +246,51 @@ fn one_axis_is_homed_while_the_other_is_not() {
 }
 
 /// A stop at a limit may leave an axis a little outside. The way back is open for it and for the other axis, with
-/// the limits as they are.
+/// the limits as they are, also where a SYNC moves it by less than a count.
 #[test]
 fn axes_outside_their_limits_come_back() {
     let scratch = Scratch::new();
-    let outside =
-        ["--set", "emulator.insertion_start_mm=310.2", "--set", "stage.rotation.max_deg=1"];
-    let outside = [&outside[..], &["--set", "stage.rotation.zero=-100000"]].concat();
-    let moved = |arguments: &[&str]| {
-        let said = stage(&scratch, &[arguments, &["-q"], &outside].concat());
-        (said.status, said.stdout.lines().last().unwrap_or_default().to_owned() + &said.stderr)
-    };
-    assert_eq!(moved(&["withdraw"]), (0, "completed".to_owned()));
-    assert_eq!(moved(&["jog", "--axis", "insertion", "--by=-0.1mm"]), (0, "completed".to_owned()));
-    let (status, refused) = moved(&["jog", "--axis", "insertion", "--by=0.1mm"]);
-    assert!(
-        status == 1 && refused.contains("310.300 mm is over the limit of 310.000 mm"),
-        "{refused}"
-    );
-    assert_eq!(moved(&["jog", "--axis", "rotation", "--to=0deg"]), (0, "completed".to_owned()));
-    let (status, refused) = moved(&["prove"]);
-    assert!(status == 1 && refused.contains("stands outside its limits"), "{refused}");
+    for (start_mm, back, out) in [(310.2, "-0.1mm", "0.1mm"), (-1.2, "0.1mm", "-0.1mm")] {
+        let start = format!("emulator.insertion_start_mm={start_mm}");
+        let moved = |arguments: &[&str], sync_ms: u32| {
+            let sync = format!("can.sync_ms={sync_ms}");
+            let sets = ["-q", "--set", &start, "--set", &sync];
+            let said = stage(&scratch, &[arguments, &sets].concat());
+            let last = said.stdout.lines().last().unwrap_or_default().to_owned();
+            (said.status, last + &said.stderr)
+        };
+        let completed = (0, "completed".to_owned());
+        for sync_ms in [1, 10] {
+            let by =
+                |by: &str| moved(&["jog", "--axis", "insertion", &format!("--by={by}")], sync_ms);
+            assert_eq!(by(back), completed, "{start_mm} mm, {sync_ms} ms");
+            let (status, refused) = by(out);
+            assert!(status == 1 && refused.contains("the limit of"), "{refused}");
+            // The insertion is held outside.
+            assert_eq!(moved(&["jog", "--axis", "rotation", "--by=10deg"], sync_ms), completed);
+        }
+        if start_mm > 0.0 {
+            assert_eq!(moved(&["withdraw"], 10), completed);
+        }
+        let (status, refused) = moved(&["prove"], 10);
+        assert!(status == 1 && refused.contains("stands outside its limits"), "{refused}");
+    }
+}
+
+/// The last set-point of a move may be a bit past its goal, as a sum of floating-point numbers is.
+#[test]
+fn a_move_may_end_at_the_limit_itself() {
+    let scratch = Scratch::new();
+    for (start_mm, goal, limits) in [
+        ("1.001", "--to=-1mm", "stage.insertion.min_mm=-1"),
+        ("0.1", "--by=30mm", "stage.insertion.max_mm=30.1"),
+        ("-0.1", "--by=20mm", "stage.insertion.min_mm=-0.1"),
+    ] {
+        let start = format!("emulator.insertion_start_mm={start_mm}");
+        let sets = ["-q", "--set", &start, "--set", limits, "--set", "insertion.depth_mm=20"];
+        let said = stage(&scratch, &[&["jog", "--axis", "insertion", goal][..], &sets].concat());
+        assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
+    }
 }
 
 #[test]

@@ -9,6 +9,7 @@ use crate::cli::{Failure, Result, finish_with};
 use crate::config::Config;
 use crate::runtime::RunReport;
 use crate::session::AxisMove;
+use crate::stage::Axis;
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -19,6 +20,16 @@ pub(super) fn operate(
     motion: &Motion,
     arguments: &Arguments,
 ) -> Result<()> {
+    if let (Motion::Home { axis, .. }, Some(homing)) = (motion, config.stage.insertion.homing)
+        && *axis != Some(Axis::Rotation)
+        && homing.may_move_either_way()
+    {
+        print_stderr(format_args!(
+            "warning: stage.insertion.homing.method is {}: the bench cannot know in which direction the axis moves, \
+             see the drive's manual and its home switch; the needle must be off",
+            homing.method
+        ));
+    }
     let options = Options {
         about: motion.common().about.clone(),
         realtime: arguments.realtime,

@@ -120,6 +120,7 @@ fn an_axis_that_stands_outside_its_limits_is_not_enabled() {
 fn an_axis_that_stands_outside_its_limits_can_be_moved_back() {
     let mut config = config();
     config.insertion.zero = Some(1000 + 2 * COUNTS_PER_MM);
+    config.insertion.quick_stop_deceleration = Some(20.0);
     let nodes = config.nodes();
     let begun = Time::from_secs_f64(1.0);
     let purpose = PerAxis::from_fn(|_| AxisUse::Move);
@@ -133,6 +134,9 @@ fn an_axis_that_stands_outside_its_limits_can_be_moved_back() {
     }
     let refused = bench.stage.command(at(-2.01)).expect_err("farther out");
     assert!(refused.contains("under the limit of -1.000 mm"), "{refused}");
+    bench.stage.command(at(-2.0)).expect("held");
+    let feedback = bench.until_feedback();
+    assert_eq!(feedback.commanded.insertion_mm, -2.0);
     bench.stage.command(at(-1.99)).expect("back");
 }
 
