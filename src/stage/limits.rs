@@ -156,7 +156,7 @@ impl LimitCheck {
         Ok(counts)
     }
 
-    /// Checks that a quick stop that begins at `target` ends within the limit ahead. A step more than that is
+    /// Checks that a quick stop that begins at `target` ends within the limit ahead. Half a step more than that is
     /// allowed: a set-point has the mean speed of its step, and the axis may be slowing down to the limit.
     fn check_stop(&self, target: f64, counts: i64, last: Commanded) -> Result<(), String> {
         let Some(deceleration) = self.quick_stop_deceleration else { return Ok(()) };
@@ -165,7 +165,7 @@ impl LimitCheck {
         // Rounding to whole counts changes a step by up to 1 count.
         let moved_counts = step_counts.unsigned_abs().saturating_sub(1) as f64;
         let speed = moved_counts / (per_unit * self.period_s);
-        let beyond_counts = speed * speed / (2.0 * deceleration) * per_unit - moved_counts;
+        let beyond_counts = speed * speed / (2.0 * deceleration) * per_unit - 0.5 * moved_counts;
         if beyond_counts <= 1.0 {
             return Ok(());
         }
@@ -327,7 +327,7 @@ mod tests {
         assert_eq!(check.with_quick_stop(Some(200.0)).check(149.9, last), Ok(149_900));
         assert_eq!(
             text(check.with_quick_stop(Some(50.0)).check(149.9, last)),
-            "insertion: 150.091 mm is over the limit of 150.000 mm (stage.insertion.max_mm): there a quick \
+            "insertion: 150.115 mm is over the limit of 150.000 mm (stage.insertion.max_mm): there a quick \
              stop from 149.900 mm at 4.900 mm/s would end"
         );
         // Away from the limit it may be as fast.
