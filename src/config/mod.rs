@@ -187,8 +187,8 @@ impl Config {
         Ok((config, reader.finish()?))
     }
 
-    /// The configuration in `toml`, which was checked and has all defaults. Each section is told here what it
-    /// needs of the others beside its own keys.
+    /// The configuration in `toml`, which was checked and has all defaults. Some sections need values of others
+    /// beside their own keys: this function copies them.
     fn of(toml: Value) -> Self {
         let mut config = Config { toml: toml.clone(), ..Config::take(Some(&toml)) };
         // Fiducials that determine no registration are refused by the checks.

@@ -40,8 +40,8 @@ impl PositionNoise {
         math::hypot(self.white_sd_mm, self.correlated_sd_mm)
     }
 
-    /// The variance of the mean of many positions that are `spacing_s` apart, relative to that of independent
-    /// positions: so many positions carry as much information as one independent one. At least 1.
+    /// How many positions that are `spacing_s` apart carry as much information as one independent position: the
+    /// variance of their mean, relative to that of as many independent positions. At least 1.
     pub fn inflation(&self, spacing_s: f64) -> f64 {
         (self.long_mean_variance_mm2(spacing_s) / self.sd_mm().powi(2)).max(1.0)
     }
@@ -149,6 +149,27 @@ mod tests {
         let mut whiteness = Whiteness::new((1.0f64 / 3.0).sqrt());
         std::iter::repeat_with(noise).take(count).for_each(|noise| whiteness.take(noise));
         whiteness.inflation(SPACING_S)
+    }
+
+    /// Positions with φ = e⁻¹ between neighbours, and noise without a size or without a time.
+    #[test]
+    fn positions_of_slow_noise_count_for_less() {
+        let inflation = |white_sd_mm, correlated_sd_mm, time_s, spacing_s| {
+            let correlation_time = Duration::from_secs_f64(time_s);
+            PositionNoise { white_sd_mm, correlated_sd_mm, correlation_time }.inflation(spacing_s)
+        };
+        let half = 0.5 * (1.0 + (1.0 + (-1f64).exp()) / (1.0 - (-1f64).exp()));
+        assert!((inflation(0.3, 0.3, 0.1, 0.1) - half).abs() < 1e-9);
+        for (white, correlated, time_s, spacing_s) in [
+            (0.3, 0.0, 1.0, 0.025),
+            (0.3, 0.3, 0.0, 0.025),
+            (0.0, 0.0, 0.0, 0.0),
+            (0.3, 0.3, 1.0, f64::INFINITY),
+        ] {
+            let one = inflation(white, correlated, time_s, spacing_s);
+            assert!((one - 1.0).abs() < 1e-9, "{one}");
+        }
+        assert!(inflation(0.3, 0.3, 1.0, -1.0).is_finite());
     }
 
     #[test]

@@ -1,15 +1,15 @@
 //! The SYNC cycle: sends set-points, takes positions, enables and stops the axes.
 
-use super::drive::{Drive, Reading};
+use super::drive::Drive;
 use super::machine::Phase;
 use super::supervision::refused_to_switch_on;
 use super::{Axis, Feedback, PerAxis, Progress, SetPoint, Stage, StageEvent};
-use crate::canopen::Frame;
 use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};
 use crate::canopen::nmt::NmtState;
 use crate::canopen::sdo::codec::ServerFrame;
 use crate::canopen::sdo::{SdoReply, SdoRequest};
 use crate::canopen::sync::sync_frame;
+use crate::canopen::{Frame, ObjectAddress};
 use crate::units::Time;
 use std::time::Duration;
 
@@ -17,6 +17,21 @@ use std::time::Duration;
 const REPEAT_PERIOD: Duration = Duration::from_millis(100);
 /// Least interval of the requests by SDO to a drive that sends no TPDO.
 const READ_PERIOD: Duration = Duration::from_millis(30);
+
+/// The last request by SDO to a drive that stops.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Reading {
+    pub(super) object: ObjectAddress,
+    pub(super) sent: Time,
+    pub(super) is_answered: bool,
+}
+
+impl Reading {
+    /// The state at the beginning of a stop: the statusword is read next.
+    pub(super) fn begun(now: Time) -> Self {
+        Reading { object: object::POSITION_ACTUAL, sent: now, is_answered: true }
+    }
+}
 
 impl Stage {
     /// Checks the answers to the last SYNC, then sends the RPDOs that were not sent ahead, and the next SYNC.

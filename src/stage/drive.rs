@@ -2,13 +2,14 @@
 
 use std::time::Duration;
 
+use super::cycle::Reading;
 use super::standstill::Standstill;
 use super::{
     Axis, AxisConfig, AxisUse, Commanded, DriveFlag, FoundFault, LimitCheck, StageConfig, Unwrapper,
 };
-use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword, object};
+use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
 use crate::canopen::emcy::{Emcy, EmcyCode};
-use crate::canopen::{Frame, ObjectAddress, cob};
+use crate::canopen::{Frame, cob};
 use crate::units::Time;
 
 /// Longest time from Fault Reset to the end of the fault.
@@ -49,7 +50,7 @@ pub(super) struct Drive {
     axis: Axis,
     config: AxisConfig,
     sync_period: Duration,
-    purpose: AxisUse,
+    pub(super) purpose: AxisUse,
     /// Scale and limits, once the drive is [armed](Self::arm).
     armed: Option<LimitCheck>,
     commanded: Commanded,
@@ -100,21 +101,6 @@ pub(super) struct Drive {
     standstill: Standstill,
 }
 
-/// The last request by SDO to a drive that stops.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Reading {
-    pub(super) object: ObjectAddress,
-    pub(super) sent: Time,
-    pub(super) is_answered: bool,
-}
-
-impl Reading {
-    /// The state at the beginning of a stop: the statusword is read next.
-    pub(super) fn begun(now: Time) -> Self {
-        Reading { object: object::POSITION_ACTUAL, sent: now, is_answered: true }
-    }
-}
-
 impl Drive {
     /// The drive of an axis that is used for this `purpose`.
     pub(super) fn new(config: &StageConfig, axis: Axis, purpose: AxisUse) -> Self {
@@ -152,10 +138,6 @@ impl Drive {
             controlword: Controlword::DISABLE_VOLTAGE,
             standstill: config.standstill(axis),
         }
-    }
-
-    pub(super) fn purpose(&self) -> AxisUse {
-        self.purpose
     }
 
     /// True in homing mode: the drive follows no target, and its position is not known.

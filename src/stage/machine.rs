@@ -9,7 +9,7 @@ use super::drive::{Drive, DriveReport};
 use super::flood::FloodWatch;
 use super::homing::Homing;
 use super::{
-    Axis, Counters, Ignored, Output, PerAxis, Progress, SetPoint, StageConfig, StageEvent,
+    Axis, AxisUse, Counters, Ignored, Output, PerAxis, Progress, SetPoint, StageConfig, StageEvent,
 };
 use crate::canopen::cia402::{Controlword, object};
 use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatProducer};
@@ -79,19 +79,6 @@ pub struct Stage {
     /// The most SYNC periods that were skipped at once.
     longest_skip: u64,
     outputs: VecDeque<Output>,
-}
-
-/// What an axis is used for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum AxisUse {
-    /// It steers a needle, or is put to a test: it must be homed, and stand within its soft limits.
-    Steer,
-    /// It is moved by the operator: it must be homed. If it stands outside its soft limits, it may come back.
-    Move,
-    /// It is held while the other axis is homed.
-    Hold,
-    /// It is homed.
-    Home,
 }
 
 impl Stage {
@@ -179,7 +166,7 @@ impl Stage {
         {
             self.phase = Phase::BringUp;
             self.bring_ups = PerAxis::from_fn(|axis| {
-                Some(BringUp::new(&self.config, axis, self.drives[axis].purpose(), now))
+                Some(BringUp::new(&self.config, axis, self.drives[axis].purpose, now))
             });
         }
         for axis in Axis::BOTH {

@@ -35,6 +35,7 @@
 //! there is a second sender, which is a fault. A drive whose every answer is late by a whole period cannot be
 //! distinguished from one that is on time.
 
+mod axis;
 mod bring_up;
 mod config;
 mod cycle;
@@ -54,14 +55,15 @@ mod supervision;
 #[cfg(test)]
 mod tests;
 
+pub use axis::{Axis, AxisUse, PerAxis};
 pub use bring_up::{FoundFault, Identity};
-pub use config::{Axis, AxisConfig, BusConfig, PerAxis, PowerConfig, RawSdo, StageConfig};
+pub use config::{AxisConfig, BusConfig, PowerConfig, RawSdo, StageConfig};
 pub use dialogue::Dialogue;
 pub use drive::{DriveReport, may_have_power};
 pub use event::{Counters, DriveFlag, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};
 pub use homing::{HomingConfig, Reference};
 pub use limits::{AxisLimits, Commanded, LimitCheck};
-pub use machine::{AxisUse, Stage};
+pub use machine::Stage;
 pub use quick_stop::QuickStop;
 pub use scale::{CountsRatio, Scale, Sign, Unwrapper};
 pub use status::{AxisStatus, Reset, StatusReader};

@@ -351,6 +351,20 @@ mod tests {
         assert_eq!((counter.corrections, score.steps), (5, 5));
     }
 
+    /// The counter predicts the origin, so its error is the depth itself.
+    #[test]
+    fn a_prediction_is_scored_5_to_6_mm_ahead() {
+        let r_sb = mount(Vector3::z(), Vector3::x()).unwrap();
+        let error_mm = |depths_mm: &[f64]| {
+            let mut counter = Counter { corrections: 0 };
+            let scoring = scoring(r_sb, 1.0, 0.0);
+            let score = evaluate(&mut counter, &straight(depths_mm), &scoring).unwrap();
+            score.prediction_5mm_rms_mm
+        };
+        assert_eq!(error_mm(&[0.0, 4.0, 5.5]), Some(5.5));
+        assert_eq!(error_mm(&[0.0, 4.0, 8.0]), None, "8 mm ahead, and 4");
+    }
+
     #[test]
     fn a_row_beyond_any_needle_is_refused_by_its_line() {
         let r_sb = mount(Vector3::z(), Vector3::x()).unwrap();

@@ -250,7 +250,7 @@ fn one_axis_is_homed_while_the_other_is_not() {
 #[test]
 fn axes_outside_their_limits_come_back() {
     let scratch = Scratch::new();
-    for (start_mm, back, out) in [(310.2, "-0.1mm", "0.1mm"), (-1.2, "0.1mm", "-0.1mm")] {
+    for (start_mm, back, out) in [(315.0, "-0.1mm", "0.1mm"), (-4.0, "0.1mm", "-0.1mm")] {
         let start = format!("emulator.insertion_start_mm={start_mm}");
         let moved = |arguments: &[&str], sync_ms: u32| {
             let sync = format!("can.sync_ms={sync_ms}");

@@ -67,6 +67,21 @@ fn least_distance_mm(scratch: &Scratch, said: &Said) -> f64 {
     lines.map(distance_mm).fold(f64::INFINITY, f64::min)
 }
 
+/// A ball of 0.5 mm that the tip passes between two steps of 10 mm, where it is more than 5 mm away.
+#[test]
+fn the_clearance_counts_between_the_steps() {
+    let scratch = Scratch::new();
+    let ball = "goal.obstacle=[{shape=\"sphere\", centre_mm=[0.0, 3.0, 45.0], radius_mm=0.5}]";
+    let said = run(&scratch, &[ball, "insertion.step_mm=10"]);
+    let clearance_mm = number(&said.json(), "clearance_mm_min");
+    assert!((1.5..4.0).contains(&clearance_mm), "{clearance_mm}");
+
+    let sets = ["--set", ball, "--set", "insertion.step_mm=10", "--trials", "1", "--json"];
+    let study = needle_bench(&scratch, &[&["study", "goal.toml"][..], &sets].concat()).json();
+    let clearance_mm = number(&study["clearance_mm_min"], "min");
+    assert!((1.5..4.0).contains(&clearance_mm), "{clearance_mm}");
+}
+
 #[test]
 fn the_configuration_of_the_study_also_runs() {
     let scratch = Scratch::new();

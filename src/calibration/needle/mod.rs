@@ -66,7 +66,7 @@ impl NeedleFit {
     }
 }
 
-/// The part of one insertion in a least-squares fit, linearised there: `JᵀJ` and `Jᵀr`.
+/// What one insertion adds to a least-squares fit, linearised at its result: `JᵀJ` and `Jᵀr`.
 struct Part<const N: usize> {
     hessian: SMatrix<f64, N, N>,
     gradient: SVector<f64, N>,

@@ -20,16 +20,6 @@ pub(super) fn operate(
     motion: &Motion,
     arguments: &Arguments,
 ) -> Result<()> {
-    if let (Motion::Home { axis, .. }, Some(homing)) = (motion, config.stage.insertion.homing)
-        && *axis != Some(Axis::Rotation)
-        && homing.may_move_either_way()
-    {
-        print_stderr(format_args!(
-            "warning: stage.insertion.homing.method is {}: the bench cannot know in which direction the axis moves, \
-             see the drive's manual and its home switch; the needle must be off",
-            homing.method
-        ));
-    }
     let options = Options {
         about: motion.common().about.clone(),
         realtime: arguments.realtime,
@@ -53,6 +43,16 @@ pub(in crate::cli) fn perform(config: &Config, line: &str, options: Options) -> 
 }
 
 fn job<'a>(config: &'a Config, motion: &'a Motion, options: Options) -> Result<Job<'a>> {
+    if let (Motion::Home { axis, .. }, Some(homing)) = (motion, config.stage.insertion.homing)
+        && *axis != Some(Axis::Rotation)
+        && homing.may_move_either_way()
+    {
+        print_stderr(format_args!(
+            "warning: stage.insertion.homing.method is {}: the bench cannot know in which direction the axis moves, \
+             see the drive's manual and its home switch; the needle must be off",
+            homing.method
+        ));
+    }
     let run_config = motion.plan(config)?.into();
     Ok(Job { config, run_config, motion: Some(motion), options })
 }
