@@ -25,8 +25,6 @@ const REMEMBER_SD_MAX_MM: f64 = 0.3;
 const HEADING_UNKNOWN_SD_RAD: f64 = 0.01;
 /// … even if it is farther off than the position's deviation by this much, mm: whole turns shake the path.
 const ON_PATH_MM: f64 = 0.1;
-/// When the target has moved this far, the lengths around the obstacles are computed again, mm.
-const ROUTE_MOVED_MM: f64 = 1.0;
 /// A tip has arrived if the target is no farther ahead than this, mm.
 const ARRIVED_MM: f64 = 0.02;
 /// Without a path the needle is bent toward the target for this depth, mm, since a later estimate may give a path.
@@ -149,13 +147,14 @@ impl Replanner {
         self.path.as_ref()
     }
 
-    /// Checks that a path that is not too long leads from `start` to the target, with the curvature of the
-    /// problem: the known path, or one that a search finds.
+    /// Checks, before the first step, that a path that is not too long leads from `start` to the target, with at
+    /// most `curvature_per_mm`: the known path, or one that a search finds.
     ///
     /// # Errors
     /// Why no path is found, in words.
-    pub fn check_start(&mut self, start: Tip) -> Result<(), String> {
+    pub fn check_start(&mut self, start: Tip, curvature_per_mm: f64) -> Result<(), String> {
         self.problem.start = start;
+        self.problem.curvature_per_mm = curvature_per_mm;
         let last = self.path.as_ref().map(|path| rest_of(path, 0.0, start));
         let length_max_mm = self.problem.length_max_mm;
         if self.known(last.as_ref()).is_some_and(|path| path.length_mm() <= length_max_mm) {
@@ -306,11 +305,6 @@ impl Replanner {
 
     fn search(&mut self) -> Option<Path> {
         let clearance_mm = self.field.clearance_mm;
-        if self.route.moved_mm(&self.problem.target_mm) > ROUTE_MOVED_MM {
-            self.field.clearance_mm = self.problem.clearance_mm;
-            self.route = Route::new(&mut self.field, &self.problem.target_mm);
-            self.field.clearance_mm = clearance_mm;
-        }
         let expansions_max = self.expansions_left.div_ceil(2);
         let problem = Problem { clearance_mm, expansions_max, ..self.problem.clone() };
         let answer = search_only(&mut self.field, &problem, &self.route);

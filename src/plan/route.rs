@@ -62,9 +62,19 @@ impl Route {
         Route { grid, lengths_mm, longer, target_mm: *target_mm }
     }
 
-    /// Distance of `target_mm` from the target of this route, mm. Ways to `target_mm` may be shorter by this much.
+    /// By how much the ways to `target_mm` may be shorter than those to the target of this route, mm: the way between
+    /// the two, which may lead around obstacles. Infinite if there is none.
     pub(super) fn moved_mm(&self, target_mm: &Vector3<f64>) -> f64 {
-        (target_mm - self.target_mm).norm()
+        if *target_mm == self.target_mm {
+            return 0.0;
+        }
+        // A way over the nodes may end at any open corner around the target.
+        let from_corner = |at: [usize; 3]| {
+            let away_mm = (self.grid.position_mm(at) - target_mm).norm();
+            f64::from(self.lengths_mm[self.grid.node(at)]) - away_mm
+        };
+        let open = corners(&self.grid, target_mm).map(from_corner).filter(|mm| mm.is_finite());
+        open.reduce(f64::max).map_or(f64::INFINITY, |longest_mm| longest_mm / self.longer)
     }
 
     /// The length of the shortest way from `point_mm`, in the workspace; infinite if there is none.
@@ -108,4 +118,44 @@ fn steps(reach: i32, counts: [usize; 3]) -> Vec<([i32; 3], f64)> {
         }
     }
     steps
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::Obstacle;
+    use crate::plan::search::tests::{problem, world};
+    use std::borrow::Cow;
+
+    /// The ways to a target that has moved are at least as long as the bounds of the route to where it was, also
+    /// where it has moved to the other side of an obstacle.
+    #[test]
+    fn a_route_bounds_the_ways_to_a_target_that_has_moved() {
+        let wall = Obstacle::Box {
+            min_mm: Vector3::new(-40.0, -12.0, 90.0),
+            max_mm: Vector3::new(40.0, 60.0, 94.0),
+        };
+        let world = world(vec![wall]);
+        for in_plane in [true, false] {
+            let problem = problem([0.0, 5.0, 99.3], in_plane);
+            let mut field = Field::new(Cow::Borrowed(&world), problem.clearance_mm, in_plane);
+            let route = Route::new(&mut field, &problem.target_mm);
+            for moved_mm in [[0.0, 0.4, 0.0], [0.0, -3.0, 2.0], [0.0, 8.0, 4.0], [0.0, 2.0, -17.0]]
+            {
+                let target_mm = problem.target_mm + Vector3::from(moved_mm);
+                let anew = Route::new(&mut field, &target_mm);
+                let mut bounded = 0;
+                for at in 0..20_u32 {
+                    let tip_mm = Vector3::new(0.0, -20.0 + 2.0 * f64::from(at), 60.0);
+                    let bound_mm = route.length_mm(&tip_mm) - route.moved_mm(&target_mm);
+                    // Lengths are rounded down to whole ticks.
+                    let most_mm = anew.length_mm(&tip_mm) + 0.1;
+                    assert!(bound_mm <= most_mm, "{moved_mm:?} {at}: {bound_mm} over {most_mm}");
+                    bounded += u32::from(bound_mm > 0.0);
+                }
+                assert!(bounded > 0, "no bound says anything");
+            }
+            assert_eq!(route.moved_mm(&problem.target_mm), 0.0);
+        }
+    }
 }

@@ -137,6 +137,7 @@ pub(super) fn search_only(field: &mut Field<'_>, problem: &Problem, route: &Rout
             field,
             problem,
             route,
+            moved_mm: route.moved_mm(&problem.target_mm),
             lattice,
             nodes: Vec::new(),
             buckets: Vec::new(),
@@ -186,6 +187,8 @@ struct Search<'a, 'w> {
     field: &'a mut Field<'w>,
     problem: &'a Problem,
     route: &'a Route,
+    /// By how much the ways to the target may be shorter than the route says, mm.
+    moved_mm: f64,
     lattice: Lattice,
     nodes: Vec<Node>,
     /// The queue: nodes by the lower bound of a whole path through them.
@@ -267,12 +270,12 @@ impl Search<'_, '_> {
         let Problem { target_mm, curvature_per_mm, tolerance_mm, in_plane, .. } = self.problem;
         let unobstructed_mm =
             tip.shortest_mm(target_mm, *curvature_per_mm, *tolerance_mm, *in_plane);
-        let moved_mm = self.route.moved_mm(target_mm);
-        let route_mm = self.route.length_mm(&tip.position_mm) - moved_mm;
+        let route_mm = self.route.length_mm(&tip.position_mm) - self.moved_mm;
         match route_mm.is_finite() {
             true => (unobstructed_mm.max(route_mm), unobstructed_mm > route_mm - DETOUR_MM),
-            // The search goes on, to find the point nearest to the target.
-            false => (unobstructed_mm, false),
+            // The search goes on, to find the point nearest to the target. The route does not know the ways to a
+            // target that has moved to where none of its ways begins.
+            false => (unobstructed_mm, self.moved_mm.is_infinite()),
         }
     }
 
@@ -439,7 +442,7 @@ impl Search<'_, '_> {
             let reason = format!("the target is {place}, goal.clearance_mm is {clearance_mm}");
             return (reason, false);
         }
-        if self.route.length_mm(&start.position_mm).is_infinite() {
+        if self.route.length_mm(&start.position_mm).is_infinite() && self.moved_mm.is_finite() {
             let reason =
                 "the obstacles close every way to the target, even for a needle that bends at will";
             return (reason.to_owned(), false);

@@ -69,22 +69,34 @@ impl Goal {
         self.problem.target_mm = Vector3::new(x_mm, target_mm.y, target_mm.z);
     }
 
+    /// A replanner that begins with the path planned before the run.
+    fn replanner(&self) -> Replanner {
+        let (world, problem) = (self.world.clone(), self.problem.clone());
+        Replanner::new(world, problem, self.curvature_margin, Some(self.path.clone()))
+    }
+
     /// Checks that a path leads to the target from a tip that is seen at `tip_mm`, with the assumed heading.
     ///
     /// # Errors
     /// The reason, in words.
     pub(super) fn check_start(&self, tip_mm: &Vector3<f64>) -> Result<(), String> {
-        let mut problem = self.problem.clone();
-        problem.curvature_per_mm /= 1.0 - self.curvature_margin;
-        problem.start.position_mm = *tip_mm;
-        if problem.in_plane {
-            problem.start.position_mm.x = 0.0;
+        self.check_start_with(&mut self.replanner(), tip_mm)
+    }
+
+    /// As [`Goal::check_start`], with a replanner that has not made a step yet.
+    fn check_start_with(
+        &self,
+        replanner: &mut Replanner,
+        tip_mm: &Vector3<f64>,
+    ) -> Result<(), String> {
+        let Problem { mut start, clearance_mm, curvature_per_mm, in_plane, .. } = self.problem;
+        start.position_mm = *tip_mm;
+        if in_plane {
+            start.position_mm.x = 0.0;
         }
-        let Problem { start, clearance_mm, .. } = problem;
-        let (world, path) = (self.world.clone(), Some(self.path.clone()));
-        let mut replanner = Replanner::new(world, problem, self.curvature_margin, path);
+        let whole_per_mm = curvature_per_mm / (1.0 - self.curvature_margin);
         let seen = shown(tip_mm);
-        replanner.check_start(start).map_err(|reason| {
+        replanner.check_start(start, whole_per_mm).map_err(|reason| {
             format!("no path to the target from {seen}, where the tip is seen: {reason}")
         })?;
         // The path begins in the plane, but the tip may be off the plane.
@@ -139,9 +151,8 @@ impl Pursuit {
         if control.kind != ControlKind::NestedSaturation {
             return None;
         }
-        let (world, problem, path) = (goal.world.clone(), goal.problem.clone(), goal.path.clone());
         Some(Pursuit {
-            replanner: Replanner::new(world, problem, goal.curvature_margin, Some(path)),
+            replanner: goal.replanner(),
             law: BendLaw::new(needle, control.nested_saturation),
             target_mm: goal.problem.target_mm,
             goal,
@@ -158,21 +169,30 @@ impl Pursuit {
         self.replanner.set_target(self.goal.problem.target_mm);
     }
 
+    /// Checks, before the first step, that the target is where a path may end, and that one leads there from a
+    /// tip that is seen at `tip_mm`.
+    ///
+    /// # Errors
+    /// The reason, in words.
+    pub(super) fn check_start(&mut self, tip_mm: &Vector3<f64>) -> Result<(), String> {
+        self.check_target()?;
+        self.goal.check_start_with(&mut self.replanner, tip_mm)
+    }
+
     /// Checks that the target has not moved to where no path may end.
     fn check_target(&self) -> Result<(), String> {
         let Problem { target_mm, tolerance_mm, clearance_mm, .. } = self.goal.problem;
         let off_mm = (self.target_mm - target_mm).norm();
         if off_mm > tolerance_mm {
             return Err(format!(
-                "goal: the target is {off_mm:.1} mm off the plane (limit goal.tolerance_mm, \
-                 {tolerance_mm})"
+                "the target is {off_mm:.1} mm off the plane (limit goal.tolerance_mm, {tolerance_mm})"
             ));
         }
         let slack_mm = self.goal.world.slack_mm(&target_mm, clearance_mm) + tolerance_mm;
         if slack_mm < 0.0 {
             return Err(format!(
-                "goal: the target has moved {:.1} mm too far: out of goal.workspace_mm, or into the \
-                 clearance of an obstacle",
+                "the target has moved {:.1} mm too far: out of goal.workspace_mm, or into the clearance \
+                 of an obstacle",
                 -slack_mm
             ));
         }
@@ -210,7 +230,7 @@ impl Pursuit {
         self.planned_at_mm = depth_mm;
         let end = self.end(estimate);
         if let Err(error) = self.check_target() {
-            return (end, Err(error));
+            return (end, Err(format!("goal: {error}")));
         }
         match self.replanner.step(&known, inserted_mm, step_mm) {
             Step::Steer(steer) => {

@@ -134,6 +134,15 @@ impl Steering {
         }
     }
 
+    /// Checks, before the first step, that a path leads to the target from a tip that is seen at `tip_mm`, plane
+    /// frame. Without a target every start is good.
+    ///
+    /// # Errors
+    /// The reason, in words.
+    pub fn check_start(&mut self, tip_mm: &Vector3<f64>) -> Result<(), String> {
+        self.pursuit.as_mut().map_or(Ok(()), |pursuit| pursuit.check_start(tip_mm))
+    }
+
     /// The estimate that steers, at the depth of the observers' states; `None` while there is none.
     pub fn estimate(&self) -> Option<Estimate> {
         self.observer.estimate()

@@ -308,16 +308,18 @@ fn stage_command(scratch: &Scratch, settings: &[&str]) -> Command {
     command
 }
 
+/// What a machine that stops a process for half a second keeps.
+const SLOW_MACHINE: [&str; 2] = ["can.missed_feedback_max=30", "can.heartbeat_timeout_ms=1000"];
+
 /// Without a tracker the jog succeeds all the same.
 #[test]
 fn a_jog_records_the_samples_of_a_tracker_that_answers() {
     let _machine = beside_others();
     let stage = Stage::start(&[]);
-    let slow = ["can.missed_feedback_max=30", "can.heartbeat_timeout_ms=1000"];
     let absent = ["tracker.address=\"127.0.0.1:1\""];
     for (name, tracker, has_samples) in [("there", &[][..], true), ("absent", &absent, false)] {
         let scratch = Scratch::new(&format!("udp-jog-{name}"));
-        let mut jog = stage_command(&scratch, &stage.settings(&[&slow, tracker].concat()));
+        let mut jog = stage_command(&scratch, &stage.settings(&[&SLOW_MACHINE, tracker].concat()));
         jog.args(["jog", "--axis", "rotation", "--by", "30deg"]);
         let ended = Program::start(&mut jog).end();
         ended.assert_status(0);
@@ -363,7 +365,8 @@ fn a_sensor_3_mm_off_the_axis_proves_or_refutes_handedness() {
     });
     let scratch = Scratch::new("udp-hand");
     // The proof does not depend on the period, and a busy machine can keep a long one.
-    let settings = stage.settings(&["tracker.source=\"ndjson\"", "can.sync_ms=50", &address]);
+    let tracker = ["tracker.source=\"ndjson\"", "can.sync_ms=50", &address];
+    let settings = stage.settings(&[&SLOW_MACHINE[..], &tracker].concat());
     let prove = || {
         let mut prove = stage_command(&scratch, &settings);
         Program::start(prove.args(["prove", "--handedness"])).end()

@@ -256,7 +256,8 @@ fn a_start_from_which_the_path_is_too_long_is_refused() {
     let check = |length_max_mm: f64| {
         let problem = Problem { length_max_mm, ..problem.clone() };
         let path = plan(&world(vec![]), &self::problem([0.0, 0.0, 120.0], true)).path;
-        Replanner::new(world(vec![]), problem.clone(), 0.0, path).check_start(problem.start)
+        let Problem { start, curvature_per_mm, .. } = problem;
+        Replanner::new(world(vec![]), problem, 0.0, path).check_start(start, curvature_per_mm)
     };
     assert_eq!(check(120.0), Ok(()));
     assert_eq!(check(119.5), Ok(()), "within the tolerance");

@@ -1,19 +1,20 @@
 //! The task that steers: one insertion, from the first tip seen to the full depth.
 
 mod hold;
+mod start;
 #[cfg(test)]
 mod tests;
 
 use self::hold::{EndedHold, Hold};
-use super::config::{PlaneOutOfReach, SessionConfig};
+use self::start::Start;
+use super::config::SessionConfig;
 use super::estimation::{Estimation, Measurement};
 use super::insertion::{DueStep, Insertion};
-use super::reach::check_reach;
-use super::record::{Lane, Record, Severity, StepRecord};
+use super::record::{Lane, Record, StepRecord};
 use super::shell::{Power, Shell};
 use super::state::State;
 use super::steering::Decision;
-use super::target::{MovingMean, TargetTracking};
+use super::target::TargetTracking;
 use super::task::Task;
 use super::tracking::{Tracking, Trouble};
 use super::{OperatorCommand, Progress, tracker_news};
@@ -23,13 +24,10 @@ use crate::stage::{Feedback, SetPoint, StageEvent};
 use crate::text::clipped;
 use crate::tracker::{Event, GateCounts, StageHistory, StagePoint};
 use crate::units::Time;
-use nalgebra::Vector3;
 use std::time::Duration;
 
 /// The stage's positions are kept this much longer than a measurement can be old.
 const HISTORY_MARGIN: Duration = Duration::from_secs(1);
-/// A start is refused only by the mean of the positions over this time, because of their noise.
-const START_AVERAGE: Duration = Duration::from_millis(500);
 
 /// An insertion, with the tracking and the estimation that steer it.
 ///
@@ -37,10 +35,8 @@ const START_AVERAGE: Duration = Duration::from_millis(500);
 pub(super) struct InsertTask {
     config: SessionConfig,
     begun: Time,
-    /// At the last input the tip was seen, and the start from there was good.
-    is_start_accepted: bool,
-    /// Since when the start is in doubt, and the mean of the positions since then.
-    start_in_doubt: Option<(Time, MovingMean)>,
+    /// What is thought of the start, until the insertion begins.
+    start: Start,
     tracking: Tracking,
     /// The track of the target, if the target is a tool of its own.
     target: Option<TargetTracking>,
@@ -65,8 +61,7 @@ impl InsertTask {
     pub(super) fn new(config: SessionConfig, now: Time) -> Result<Self, ObserverError> {
         Ok(InsertTask {
             begun: now,
-            is_start_accepted: false,
-            start_in_doubt: None,
+            start: Start::Unknown,
             tracking: Tracking::new(&config),
             target: config
                 .goal
@@ -115,7 +110,7 @@ impl InsertTask {
         let measurements = self.tracking.judge(shell.now, &self.history, &self.estimation);
         self.drain_tracking(shell);
         if self.insertion.is_none() && shell.is_running() {
-            self.begin_if_ready(shell, feedback);
+            self.begin_if_ready(shell, feedback)?;
         }
         let Some(mut insertion) = self.insertion.take() else { return Ok(()) };
         let at = insertion.measured(feedback.measured);
@@ -134,30 +129,11 @@ impl InsertTask {
         inserted
     }
 
-    /// Checks that the plane, and the target if there is one, can be reached from a tip at `tip_mm`.
-    fn check_start(&mut self, shell: &mut Shell, tip_mm: &Vector3<f64>) -> Result<(), String> {
-        let target_mm = self.target.as_ref().and_then(TargetTracking::position_mm);
-        if let Some(goal) = &mut self.config.goal {
-            target_mm.into_iter().for_each(|target_mm| goal.set_target(target_mm));
-            goal.check_start(tip_mm).map_err(|why| format!("goal: {why}"))?;
-        }
-        let Err(why) = check_reach(&self.config, tip_mm) else { return Ok(()) };
-        match self.config.insertion.plane_out_of_reach {
-            PlaneOutOfReach::Insert => {
-                shell.report(Lane::Session, Severity::Warning, why);
-                Ok(())
-            }
-            PlaneOutOfReach::Refuse => {
-                Err(format!("insertion: {why}; see insertion.plane_out_of_reach"))
-            }
-        }
-    }
-
-    /// Starts the insertion once the stage is enabled and the tip is seen.
-    fn begin_if_ready(&mut self, shell: &mut Shell, feedback: &Feedback) {
+    /// Starts the insertion once the stage is enabled and the tip is seen at a good start.
+    fn begin_if_ready(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
         let is_on = matches!(shell.power(), Power::On(_));
-        if !is_on || !self.is_seen(shell.now) {
-            return;
+        if !is_on || !self.accepts_start(shell)? {
+            return Ok(());
         }
         let (measured, held) = (feedback.measured, feedback.commanded);
         let mut insertion = Insertion::new(self.config.insertion, measured, held);
@@ -169,6 +145,7 @@ impl InsertTask {
             }
         }
         self.insertion = Some(insertion);
+        Ok(())
     }
 
     /// Corrects the observers with what was measured until `time`. An error is the reason to stop the run.
@@ -284,11 +261,10 @@ impl InsertTask {
         let waiting_since = match power {
             Power::Off | Power::ComingOn => last_seen,
             // The start is accepted; power comes on at the next SYNC.
-            Power::Awaited(_) if self.is_start_accepted => last_seen,
+            Power::Awaited(_) if matches!(self.start, Start::Accepted(_)) => last_seen,
             Power::Awaited(since) | Power::On(since) => since.min(last_seen),
         };
-        let due = waiting_since + self.config.tracker.timeout;
-        self.start_in_doubt.as_ref().map_or(due, |(doubted, _)| due.max(*doubted + START_AVERAGE))
+        self.start.decided_by(waiting_since + self.config.tracker.timeout)
     }
 
     /// Why there is no tip to start from.
@@ -325,28 +301,7 @@ impl Task for InsertTask {
     /// The axes get power only while the tip is seen at a start from which the plane, or the target, can be
     /// reached.
     fn permits_power(&mut self, shell: &mut Shell) -> Result<bool, String> {
-        let newest =
-            self.tracking.track.last_believed().copied().filter(|_| self.is_seen(shell.now));
-        let Some(newest) = newest else {
-            (self.is_start_accepted, self.start_in_doubt) = (false, None);
-            return Ok(false);
-        };
-        if self.is_start_accepted {
-            return Ok(true);
-        }
-        if let Some((since, mean)) = &mut self.start_in_doubt {
-            mean.take(newest.acquisition_time, newest.position_mm);
-            if shell.now.since(*since) < START_AVERAGE {
-                return Ok(false);
-            }
-            let tip_mm = mean.mean_mm().unwrap_or(newest.position_mm);
-            self.check_start(shell, &tip_mm)?;
-        } else if self.check_start(shell, &newest.position_mm).is_err() {
-            self.start_in_doubt = Some((shell.now, MovingMean::new(START_AVERAGE)));
-            return Ok(false);
-        }
-        self.is_start_accepted = true;
-        Ok(true)
+        self.accepts_start(shell)
     }
 
     /// A set-point between two steps does not depend on the observers. It is sent first, because correcting

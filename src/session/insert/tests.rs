@@ -16,6 +16,8 @@ struct Bench {
     tool: String,
     /// Measured tip position, 40 times a second from `next_sample` on.
     tip_mm: Vector3<f64>,
+    /// Measured position of the target's tool, as often.
+    target_mm: Option<Vector3<f64>>,
     next_sample: Time,
     samples: u32,
     /// Each position is received together with an earlier one, which is this far behind, mm.
@@ -37,6 +39,7 @@ impl Bench {
             stage: VirtualStage::new(config.virtual_stage().unwrap(), now),
             tool: config.tracker.tool,
             tip_mm: Vector3::zeros(),
+            target_mm: None,
             next_sample: Time::NEVER,
             samples: 0,
             behind_mm: None,
@@ -81,21 +84,25 @@ impl Bench {
         } else {
             self.next_sample = self.now + Duration::from_millis(25);
             for behind_mm in self.behind_mm.into_iter().chain([0.0]) {
-                let sample = self.sample(behind_mm);
+                let sample = self.sample(self.tip_mm - Vector3::z() * behind_mm);
+                self.session.handle(self.now, Input::Tracker(Event::Sample(sample)));
+            }
+            if let Some(target_mm) = self.target_mm {
+                let sample = Sample { tool: TARGET.to_owned(), ..self.sample(target_mm) };
                 self.session.handle(self.now, Input::Tracker(Event::Sample(sample)));
             }
         }
         self.settle();
     }
 
-    fn sample(&mut self, behind_mm: f64) -> Sample {
+    fn sample(&mut self, at_mm: Vector3<f64>) -> Sample {
         self.samples += 1;
-        let ahead_mm = 1e-3 * f64::from(self.samples % 7) - behind_mm;
+        let ahead_mm = 1e-3 * f64::from(self.samples % 7);
         Sample {
             tool: self.tool.clone(),
             receive_time: self.now,
             source_unix_ns: None,
-            position_mm: self.tip_mm + Vector3::z() * ahead_mm,
+            position_mm: at_mm + Vector3::z() * ahead_mm,
             orientation: None,
             validity: Validity::Valid,
         }
@@ -136,6 +143,8 @@ impl Bench {
 }
 
 const CONFIGURED: &str = "both drives are configured";
+const ENABLING: &str = "enabling both axes";
+const TARGET: &str = "TargetToTracker";
 
 /// The mean that decides takes 0.5 s. The tip times out after 0.3 s.
 #[test]
@@ -161,7 +170,7 @@ fn a_start_whose_mean_is_within_reach_begins_although_the_tip_times_out() {
         bench.run_for(Duration::from_millis(phase_ms + 130));
         bench.tip_mm.x = then_mm;
         while bench.session.outcome().is_none() {
-            if bench.events.iter().any(|text| text.contains("enabling both axes")) {
+            if bench.events.iter().any(|text| text.contains(ENABLING)) {
                 return Ok(bench.now);
             }
             bench.step();
@@ -177,6 +186,72 @@ fn a_start_whose_mean_is_within_reach_begins_although_the_tip_times_out() {
         let begun = seen_at(refused_mm, refused_mm - 2.0, phase_ms);
         assert!(begun.is_ok(), "{phase_ms} ms: {begun:?}");
     }
+}
+
+/// The tip leaves before the drives are configured, or when power is coming on. The plane is out of reach from there.
+#[test]
+fn a_start_that_has_moved_out_of_reach_begins_no_insertion() {
+    for is_powered in [false, true] {
+        let mut bench = Bench::new(&["insertion.depth_mm=150"]);
+        bench.next_sample = Time::ZERO;
+        match is_powered {
+            true => bench.run_until(ENABLING),
+            false => {
+                bench.is_deaf = true;
+                bench.run_for(Duration::from_millis(300));
+                bench.is_deaf = false;
+            }
+        }
+        bench.tip_mm.x = -100.0;
+        let reason = bench.reason();
+        assert!(reason.starts_with("insertion: the plane is out of reach"), "{reason}");
+        assert!(bench.steps.is_empty());
+        let had_power = bench.events.iter().any(|text| text.contains(ENABLING));
+        assert_eq!(had_power, is_powered, "{:?}", bench.events);
+    }
+}
+
+/// The mean of the positions is within reach, but the tip is not: it has gone on since.
+#[test]
+fn a_good_mean_of_a_tip_that_has_left_begins_no_insertion() {
+    let sets = ["insertion.depth_mm=150", "tracker.gates.step_sds=30"];
+    let config = Config::from_sources(&[], &sets.map(str::to_owned)).unwrap().session().unwrap();
+    let is_refused = |x_mm: &f64| config.check_reach(&Vector3::new(*x_mm, 0.0, 0.0)).is_err();
+    let refused_mm = (40..100).map(f64::from).find(is_refused).expect("a plane out of reach");
+    let begins = |end_mm: f64| {
+        let mut bench = Bench::new(&sets);
+        bench.tip_mm.x = refused_mm;
+        bench.run_until(CONFIGURED);
+        bench.next_sample = bench.now;
+        bench.run_for(Duration::from_millis(150));
+        bench.tip_mm.x = refused_mm - 14.0;
+        bench.run_for(Duration::from_millis(300));
+        bench.tip_mm.x = end_mm;
+        loop {
+            match bench.session.outcome() {
+                Some(_) => return false,
+                None if bench.events.iter().any(|text| text.contains(ENABLING)) => return true,
+                None => bench.step(),
+            }
+        }
+    };
+    assert!(begins(refused_mm - 13.0));
+    assert!(!begins(refused_mm));
+}
+
+/// It leaves the plane by more than its tolerance after power has come on.
+#[test]
+fn a_target_that_has_moved_off_the_plane_begins_no_insertion() {
+    let tool = format!("goal.tool=\"{TARGET}\"");
+    let sets = ["goal.kind=\"target\"", "goal.position_mm=[0.0, 4.0, 60.0]", &tool];
+    let mut bench = Bench::new(&[&sets[..], &["goal.tool_average_s=0.1"]].concat());
+    bench.target_mm = Some(Vector3::new(0.0, 4.0, 60.0));
+    bench.next_sample = Time::ZERO;
+    bench.run_until(ENABLING);
+    bench.target_mm = Some(Vector3::new(8.0, 4.0, 60.0));
+    let reason = bench.reason();
+    assert!(reason.starts_with("goal: the target is 8.0 mm off the plane"), "{reason}");
+    assert!(bench.steps.is_empty());
 }
 
 /// The time of receipt fits only the last of them. For the others it is too late.

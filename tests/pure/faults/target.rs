@@ -125,6 +125,8 @@ fn a_target_that_is_seen_where_no_path_leads() {
     never_begins(&far, |sample| sample.position_mm.z -= 70.0, behind);
     let beside = ["no path to the target", "the target is out of reach"];
     never_begins(&far, |sample| sample.position_mm.y += 50.0, beside);
+    let off_plane = ["goal: the target is 3.", "mm off the plane (limit goal.tolerance_mm"];
+    never_begins(&[], |sample| sample.position_mm.x += 3.4, off_plane);
 }
 
 #[test]
