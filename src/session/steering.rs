@@ -159,7 +159,10 @@ impl Steering {
         let unturned = Command { rotation_rad_per_mm: 0.0, saturated: false };
         let ahead_mm: f64 = ahead.iter().map(|increment| increment.insertion_mm()).sum();
         let (approach, command) = match (self.check(), &estimate) {
-            (Err(error), _) => (None, Err(error)),
+            (Err(error), estimate) => {
+                let pursuit = self.pursuit.as_mut().zip(estimate.as_ref());
+                (pursuit.map(|(pursuit, estimate)| pursuit.end(estimate)), Err(error))
+            }
             (Ok(()), None) => (None, Ok((!is_last).then_some(unturned))),
             (Ok(()), Some(estimate)) => self.command(estimate, self.depth_mm + ahead_mm, is_last),
         };
@@ -216,19 +219,20 @@ mod tests {
     use super::*;
     use crate::config::Config;
     use crate::control::ControlError;
+    use crate::geometry::Pose;
     use crate::observer::{Divergence, PositionNoise};
     use rand::{RngExt, SeedableRng};
     use rand_pcg::Pcg64;
     use std::time::Duration;
 
-    /// An observer that has lost every hypothesis.
-    struct Lost;
+    /// An observer that refuses to go on. Without an estimate it has lost every hypothesis.
+    struct Lost(Option<Estimate>);
 
     impl Observer for Lost {
         fn predict(&mut self, _: Increment) {}
         fn correct(&mut self, _: &TipPosition, _: f64) {}
         fn estimate_after(&self, _: &[Increment]) -> Option<Estimate> {
-            None
+            self.0
         }
         fn check(&self) -> Result<(), Divergence> {
             Err(Divergence::NotSound { depth_mm: 12.0 })
@@ -248,7 +252,7 @@ mod tests {
     fn a_lost_observer_ends_the_run() {
         let config = Config::from_sources(&[], &[]).unwrap().session().unwrap();
         let mut steering = Steering {
-            observer: Box::new(Lost),
+            observer: Box::new(Lost(None)),
             control: Box::new(Still),
             ..Steering::new(&config).unwrap()
         };
@@ -258,6 +262,23 @@ mod tests {
             let reason = decision.refused.unwrap().to_string();
             assert!(reason.starts_with("observer: the estimate is no longer finite"), "{reason}");
         }
+    }
+
+    /// The figures at the end of a run are those of its last row.
+    #[test]
+    fn a_refused_step_has_its_distance_from_the_target() {
+        let sets = ["goal.kind=\"target\"", "goal.position_mm=[0.0, 0.0, 120.0]"];
+        let config = Config::from_sources(&[], &sets.map(str::to_owned)).unwrap();
+        let config = config.session().unwrap();
+        let translation = Vector3::new(0.0, 0.0, 110.0);
+        let estimate = Estimate::of_pose(Pose { translation, ..Pose::identity() });
+        let mut steering = Steering {
+            observer: Box::new(Lost(Some(estimate))),
+            ..Steering::new(&config).unwrap()
+        };
+        let decision = steering.decide(&[], false);
+        assert!(decision.refused.is_some());
+        assert_eq!(decision.approach.expect("an approach").distance_mm, 10.0);
     }
 
     /// Standard deviation of x after an arc of 60 mm with `per_mm` positions a mm, each sent `times` times.
