@@ -87,13 +87,14 @@ pub struct HeartbeatProducer {
     node: NodeId,
     period: Duration,
     deadline: Time,
+    last_sent: Option<Time>,
 }
 
 impl HeartbeatProducer {
     /// Heartbeats of `node` every `period`, the first at `first`; none if `period` is zero.
     pub fn new(node: NodeId, period: Duration, first: Time) -> Self {
         let deadline = if period.is_zero() { Time::NEVER } else { first };
-        HeartbeatProducer { node, period, deadline }
+        HeartbeatProducer { node, period, deadline, last_sent: None }
     }
 
     /// When [`handle_timeout`](Self::handle_timeout) is due.
@@ -111,7 +112,14 @@ impl HeartbeatProducer {
         if self.deadline <= now {
             self.deadline = now + self.period;
         }
+        self.last_sent = Some(now);
         Some(heartbeat_frame(self.node, state))
+    }
+
+    /// Sends no heartbeat any more. Returns when the last one was sent; `None` if there was none.
+    pub fn stop(&mut self) -> Option<Time> {
+        (self.period, self.deadline) = (Duration::ZERO, Time::NEVER);
+        self.last_sent
     }
 }
 

@@ -14,6 +14,7 @@ const MARGIN: Duration = Duration::from_millis(200);
 /// Operational, and then sends no PDO.
 #[derive(Debug)]
 struct Silence {
+    /// When the last heartbeat was sent.
     since: Time,
     /// Within this time a drive must notice.
     within: Duration,
@@ -22,10 +23,10 @@ struct Silence {
 }
 
 impl Silence {
-    /// A silence from `since` on. The last heartbeat may have been sent at that moment.
-    fn new(config: &StageConfig, since: Time) -> Self {
+    /// A silence that begins at `now`, after the last heartbeat at `since`.
+    fn new(config: &StageConfig, now: Time, since: Time) -> Self {
         let within = config.bus.heartbeat_timeout() + MARGIN;
-        let watch = QuickStop::watch(config, since, since + within + config.power.stop_timeout);
+        let watch = QuickStop::watch(config, now, since + within + config.power.stop_timeout);
         Silence { since, within, noticed_after: PerAxis::default(), watch }
     }
 
@@ -100,8 +101,8 @@ impl Task for Prove {
         match event {
             StageEvent::Ready => {
                 shell.enter(State::Silent);
-                shell.fall_silent();
-                self.silence = Some(Silence::new(&self.config, shell.now));
+                let since = shell.fall_silent();
+                self.silence = Some(Silence::new(&self.config, shell.now, since));
             }
             StageEvent::Emergency(axis, emcy) if emcy.code == EmcyCode::HEARTBEAT => {
                 if let Some(silence) = &mut self.silence {

@@ -8,7 +8,7 @@ use crate::canopen::cia402::DriveState;
 use crate::config::Config;
 use crate::emulator::fault::{Fault, FaultKind};
 use crate::emulator::{StageOutput, VirtualStage};
-use crate::session::{Input, Machine, Outcome, Output, Session, State};
+use crate::session::{Input, Machine, Outcome, Output, Record, Session, State};
 use crate::tracker::{Event, Sample, Validity};
 use crate::units::Time;
 use nalgebra::Vector3;
@@ -35,6 +35,7 @@ struct Bench {
     samples: u32,
     /// When the bench last sent on each identifier.
     last_sent: BTreeMap<Option<u16>, Time>,
+    events: Vec<String>,
 }
 
 fn config(sets: &[&str]) -> Config {
@@ -65,6 +66,7 @@ impl Bench {
             sensor: None,
             samples: 0,
             last_sent: BTreeMap::new(),
+            events: Vec::new(),
         }
     }
 
@@ -81,7 +83,14 @@ impl Bench {
             let mut quiet = true;
             while let Some(output) = self.operation.poll() {
                 quiet = false;
-                let Output::Transmit { frame, .. } = output else { continue };
+                let frame = match output {
+                    Output::Transmit { frame, .. } => frame,
+                    Output::Record(Record::Event { text, .. }) => {
+                        self.events.push(text);
+                        continue;
+                    }
+                    Output::Record(_) => continue,
+                };
                 self.last_sent.insert(frame.cob_id(), self.now);
                 if !self.is_lost(&frame) {
                     self.stage.handle_frame(self.now, &frame);
@@ -346,6 +355,21 @@ fn prove_completes_when_both_drives_miss_the_silent_bench() {
     assert!([0x080, 0x201, 0x202].iter().all(goes_on), "SYNC and set-points");
     assert_eq!(bench.run(), Outcome::Completed);
     assert_eq!(bench.travel(), (0.0, 0.0));
+}
+
+/// The axes are enabled between two heartbeats, and the drives' timeout runs from the last one.
+#[test]
+fn prove_counts_from_the_last_heartbeat() {
+    let mut bench = Bench::new(&config(&[]), Operation::Prove);
+    while bench.operation.progress().state != State::Silent {
+        bench.step();
+    }
+    let last_sent = bench.last_sent[&Some(0x77f)];
+    assert!(bench.now > last_sent);
+    assert_eq!(bench.run(), Outcome::Completed);
+    let said = "proved: both drives notice a silent bench and stand: insertion after 100 ms, rotation \
+                after 100 ms (limit 300 ms)";
+    assert!(bench.events.iter().any(|text| text == said), "{:?}", bench.events);
 }
 
 /// Before the bring-up the drive reports twice that it missed the heartbeat of an earlier bench.

@@ -160,10 +160,10 @@ impl Shell {
         self.stage.home(self.now, axis).map_err(|error| format!("stage: {error}"))
     }
 
-    /// Stops the bench's heartbeat. SYNC and set-points go on.
-    pub(crate) fn fall_silent(&mut self) {
+    /// Stops the bench's heartbeat, and returns when the last one was sent. SYNC and set-points go on.
+    pub(crate) fn fall_silent(&mut self) -> Time {
         self.is_silent = true;
-        self.stage.fall_silent();
+        self.stage.fall_silent().unwrap_or(self.now)
     }
 
     /// The drives' heartbeat timeout; `None` while they would not notice a stall: before they are enabled,

@@ -295,13 +295,13 @@ impl Stage {
 
     /// Sends no more heartbeats, while SYNC and set-points go on: drives that monitor them stop by themselves and
     /// send emergency messages. From here on the stage reports no fault, and does not stop the axes by itself.
-    pub fn fall_silent(&mut self) {
+    /// Returns when the last heartbeat was sent; `None` if there was none.
+    pub fn fall_silent(&mut self) -> Option<Time> {
         self.faulted = true;
         for axis in Axis::BOTH {
             self.drives[axis].restart_emcy_count();
         }
-        self.heartbeat =
-            HeartbeatProducer::new(self.config.bus.bench_node, Duration::ZERO, Time::NEVER);
+        self.heartbeat.stop()
     }
 
     /// Frames without effect, missed answers and skipped SYNCs.
