@@ -97,6 +97,8 @@ pub struct Progress {
     pub tip_age_s: Option<f64>,
     /// SYNC periods skipped because the bench was late.
     pub syncs_skipped: u64,
+    /// The latest SYNC: how long after it was due.
+    pub sync_late_max: Duration,
 }
 
 /// The move of one axis in an operation.
@@ -307,8 +309,8 @@ impl Machine for Session {
 
     fn progress(&self) -> Progress {
         let (time, state) = (self.shell.now, self.shell.session_state());
-        let syncs_skipped = self.stage_counters().syncs_skipped;
-        Progress { time, state, syncs_skipped, ..self.task.progress(time) }
+        let Counters { syncs_skipped, sync_late_max, .. } = self.stage_counters();
+        Progress { time, state, syncs_skipped, sync_late_max, ..self.task.progress(time) }
     }
 
     fn stage_counters(&self) -> Counters {

@@ -5,6 +5,7 @@ use crate::canopen::cia402::Statusword;
 use crate::canopen::emcy::Emcy;
 use crate::canopen::{Frame, ObjectAddress};
 use crate::units::Time;
+use std::time::Duration;
 
 /// Where both axes are to be at the next SYNC.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -115,6 +116,8 @@ pub struct Counters {
     pub feedback_missed: u64,
     /// SYNC periods skipped because the bench was late.
     pub syncs_skipped: u64,
+    /// The latest SYNC: how long after it was due.
+    pub sync_late_max: Duration,
 }
 
 /// An event of the stage.

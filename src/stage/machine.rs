@@ -178,9 +178,12 @@ impl Stage {
             }
         }
         self.drain_bring_ups(now);
+        let sync_due = self.sync_due();
         if self.sync_runs()
             && let Some(periods) = self.sync.handle_timeout(now).map(u64::from)
         {
+            let late = now.since(sync_due);
+            self.counters.sync_late_max = self.counters.sync_late_max.max(late);
             self.note_skipped(periods);
             self.cycle(now);
         }
@@ -304,7 +307,7 @@ impl Stage {
         self.heartbeat.stop()
     }
 
-    /// Frames without effect, missed answers and skipped SYNCs.
+    /// Frames without effect, missed answers, skipped and late SYNCs.
     pub fn counters(&self) -> Counters {
         self.counters
     }

@@ -2,7 +2,7 @@
 
 use crate::canopen::cia402::{DriveState, Statusword};
 use crate::canopen::emcy::{Emcy, parse_emcy};
-use crate::canopen::{Frame, NodeId, cob};
+use crate::canopen::{Frame, NodeId};
 use crate::config::Config;
 use crate::geometry::coordinates;
 use crate::session::{
@@ -30,7 +30,6 @@ const FRAME_BITS: u64 = 47;
 pub(super) struct Setup {
     /// Nodes of the insertion and of the rotation drive.
     pub(super) nodes: [u8; 2],
-    pub(super) sync_period: Duration,
     /// Age at which a tip is too old to steer by, s.
     pub(super) tip_age_max_s: f64,
     /// Configured noise of a coordinate, mm.
@@ -42,10 +41,9 @@ pub(super) struct Setup {
 
 impl Setup {
     pub(super) fn of(config: &Config) -> Self {
-        let Config { can, insertion, stage, tracker, .. } = config;
+        let Config { insertion, stage, tracker, .. } = config;
         Setup {
             nodes: [stage.insertion.node, stage.rotation.node].map(NodeId::get),
-            sync_period: can.bus.sync_period(),
             tip_age_max_s: tracker.hold.after.as_secs_f64(),
             noise_sd_mm: tracker.gates.track.noise_sd_mm,
             step_mm: insertion.step_mm,
@@ -91,8 +89,6 @@ pub(super) struct Screen {
     innovations: VecDeque<f64>,
     pub(super) drives: [Drive; 2],
     frames: VecDeque<(Time, u64)>,
-    synced: Option<Time>,
-    pub(super) sync_late_max: Duration,
     /// Where the run is recorded.
     pub(super) folder: Option<PathBuf>,
     pub(super) record_bytes: u64,
@@ -174,13 +170,6 @@ impl Screen {
         let bits = FRAME_BITS + 8 * data.len() as u64;
         push_recent(&mut self.frames, time, bits);
         let Some(id) = frame.cob_id() else { return };
-        if (direction, id) == (Direction::Sent, cob::SYNC) {
-            let period = self.setup.sync_period;
-            let since = self.synced.replace(time).map_or(period, |before| time.since(before));
-            let periods = (since.as_secs_f64() / period.as_secs_f64()).floor().max(1.0);
-            let late = since.saturating_sub(period.mul_f64(periods));
-            self.sync_late_max = self.sync_late_max.max(late);
-        }
         let emergency = parse_emcy(frame).filter(|_| direction == Direction::Received);
         for (drive, node) in self.drives.iter_mut().zip(self.setup.nodes) {
             if let Some((_, emcy)) = emergency.filter(|(sender, _)| sender.get() == node) {

@@ -26,7 +26,6 @@ const SIZES: [(u16, u16); 4] = [(80, 24), (120, 40), (40, 12), (1, 1)];
 fn setup() -> Setup {
     Setup {
         nodes: [1, 2],
-        sync_period: Duration::from_millis(10),
         tip_age_max_s: 0.5,
         noise_sd_mm: 1.0,
         step_mm: 1.0,

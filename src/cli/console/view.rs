@@ -224,7 +224,7 @@ fn short_name(state: DriveState) -> &'static str {
 
 fn bus_lines(screen: &Screen) -> [String; 3] {
     let (frames, bits) = screen.bus_load();
-    let late_ms = screen.sync_late_max.as_secs_f64() * 1e3;
+    let late_ms = screen.progress.sync_late_max.as_secs_f64() * 1e3;
     let record = match (&screen.record_trouble, screen.dropped) {
         (Some(trouble), _) => trouble.clone(),
         (None, 0) => "ok".to_owned(),

@@ -96,7 +96,8 @@ fn a_late_bench_skips_whole_periods_and_never_bursts() {
     };
     assert_eq!(syncs(&bench).len(), 1);
     assert!(bench.events.contains(&StageEvent::SyncSkipped { periods: 3, total: 3 }));
-    assert_eq!(bench.stage.counters().syncs_skipped, 3);
+    let Counters { syncs_skipped, sync_late_max, .. } = bench.stage.counters();
+    assert_eq!((syncs_skipped, sync_late_max), (3, Duration::from_millis(35)));
     bench.run_for(Duration::from_millis(5));
     assert_eq!(
         syncs(&bench)[1],

@@ -85,7 +85,8 @@ fn figures_are_not_read_from_the_text_of_events() {
         assert!(before.contains(figure), "{before}");
     }
     screen.progress.syncs_skipped = 24;
-    assert!(panels(&screen).contains(", skip 24 "));
+    screen.progress.sync_late_max = Duration::from_millis(35);
+    assert!(panels(&screen).contains("SYNC 35.0 ms, skip 24 "));
     let shared = Shared::new(setup(), Interrupt::default());
     let (mut sender, mut queue) = RingBuffer::new(1);
     sender.push(Message::RecordTrouble("the disk is full".to_owned())).expect("a queue");
