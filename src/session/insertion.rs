@@ -42,6 +42,8 @@ pub(crate) struct Insertion {
     /// The configured depth. A target may end the insertion sooner, never deeper.
     depth_max_mm: f64,
     step_phase: StepPhase,
+    /// How long the samples of the last step took; zero before that is known.
+    sampling: Duration,
     /// The newest position, which the next step uses.
     newest: Option<Measurement>,
     /// The tip was seen since the insertion began.
@@ -74,6 +76,7 @@ impl Insertion {
             last_step: last_step(&config),
             depth_max_mm: config.depth_mm,
             step_phase: StepPhase::Moving,
+            sampling: Duration::ZERO,
             newest: None,
             is_seen: false,
             short_since: None,
@@ -140,15 +143,20 @@ impl Insertion {
         Ok(())
     }
 
-    /// Remaining time at this speed, s. A stepwise insertion adds the time to settle at each step, but not the
-    /// time to take samples.
+    /// Remaining time at this speed, s. A stepwise insertion stands at each step, to settle and to take samples,
+    /// and speeds up and brakes between two steps. The samples are assumed to take as long as those of the last
+    /// step.
     pub(crate) fn remaining_s(&self) -> f64 {
-        let stops = match self.config.mode {
-            InsertionMode::Continuous => 0,
-            InsertionMode::Stepwise => (self.last_step + 1).saturating_sub(self.next_step),
-        };
-        self.remaining_mm() / self.profile.speed_max_mm_per_s
-            + f64::from(stops) * self.config.settle.as_secs_f64()
+        if self.config.mode == InsertionMode::Continuous {
+            return self.remaining_mm() / self.profile.speed_max_mm_per_s;
+        }
+        let motions = f64::from(self.last_step.saturating_sub(self.next_step));
+        let step_mm = self.step_depth_mm(self.next_step) - self.profile.position_mm();
+        let motion_mm = (self.remaining_mm() - step_mm) / motions.max(1.0);
+        let stops = f64::from((self.last_step + 1).saturating_sub(self.next_step));
+        self.profile.motion_s(step_mm)
+            + motions * self.profile.motion_s(motion_mm)
+            + stops * (self.config.settle + self.sampling).as_secs_f64()
     }
 
     /// True when the needle stands where a hold has brought its set-points to rest.
@@ -245,10 +253,11 @@ impl Insertion {
                 self.step_phase =
                     StepPhase::Sampling { from: time, sum_mm: Vector3::zeros(), count: 0 };
             }
-            StepPhase::Sampling { sum_mm, count, .. } if count >= self.config.samples => {
+            StepPhase::Sampling { from, sum_mm, count } if count >= self.config.samples => {
                 let newest = self.newest.take()?;
                 let tip_meas = TipPosition::new(sum_mm / f64::from(count))?;
                 self.step_phase = StepPhase::Moving;
+                self.sampling = time.since(from);
                 return Some(Measurement { tip_meas, positions: count, ..newest });
             }
             _ => {}
@@ -310,6 +319,45 @@ fn from_origin(origin: SetPoint, at: SetPoint) -> SetPoint {
 mod tests {
     use super::*;
     use crate::config::Config;
+
+    /// At 1 mm a step the needle stands for longer than it moves at full speed.
+    #[test]
+    fn the_time_to_go_of_a_stepwise_insertion_counts_its_standstills() {
+        let sets =
+            ["insertion.mode=\"stepwise\"", "insertion.depth_mm=20.5", "insertion.samples=10"];
+        let config = Config::from_sources(&[], &sets.map(str::to_owned)).unwrap();
+        let config = config.session().unwrap().insertion;
+        let at = SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 };
+        let mut insertion = Insertion::new(config, at, at);
+        let period = Duration::from_millis(10);
+        let mut promised = Vec::new();
+        let taken_s = (0_u32..).find_map(|k| {
+            let time = Time::ZERO + period * k;
+            let depth_mm = insertion.profile.position_mm();
+            if k % 3 == 0 {
+                insertion.take_measurement(Measurement {
+                    acquisition_time: time,
+                    stage_insertion_meas_mm: depth_mm,
+                    tip_meas: TipPosition::new(Vector3::zeros()).unwrap(),
+                    positions: 1,
+                });
+            }
+            let due = insertion.take_due_step(time, depth_mm);
+            if due.is_some_and(|due| due.is_last) {
+                return Some(time.as_secs_f64());
+            }
+            if due.is_some() {
+                insertion.steer(0.0);
+                promised.push(time.as_secs_f64() + insertion.remaining_s());
+            }
+            insertion.advance(period);
+            None
+        });
+        let taken_s = taken_s.expect("the last step");
+        assert_eq!(promised.len(), 21);
+        let is_kept = |end_s: &f64| (end_s - taken_s).abs() < 0.05 * taken_s;
+        assert!(promised.iter().all(is_kept), "{taken_s} s: {promised:?}");
+    }
 
     /// Depths at every other SYNC: at the end of the step, and away from it.
     #[test]

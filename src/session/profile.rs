@@ -56,6 +56,13 @@ impl Profile {
         self.step_end_mm.is_some_and(|end_mm| self.position_mm >= end_mm)
     }
 
+    /// How long a motion of `distance_mm` from rest to rest takes, s.
+    pub(crate) fn motion_s(&self, distance_mm: f64) -> f64 {
+        let (speed, a) = (self.speed_max_mm_per_s, self.acceleration_mm_per_s2);
+        let ramps_mm = (speed * speed / a).min(distance_mm.max(0.0));
+        2.0 * (ramps_mm / a).sqrt() + (distance_mm - ramps_mm) / speed
+    }
+
     /// Depth at which the present motion ends, mm: the goal, or the end of a single step.
     fn end_mm(&self) -> f64 {
         self.step_end_mm.map_or(self.goal_mm, |end_mm| end_mm.min(self.goal_mm))
@@ -135,9 +142,7 @@ mod tests {
                 (last, last_speed, periods) = (at, now, periods + 1);
                 prop_assert!(periods < 400_000);
             }
-            let ramp = (speed * speed / acceleration).min(goal);
-            let ideal_s = 2.0 * (ramp / acceleration).sqrt() + (goal - ramp) / speed;
-            prop_assert!((f64::from(periods) * 0.01) < 1.1 * ideal_s + 0.1);
+            prop_assert!((f64::from(periods) * 0.01) < 1.1 * profile.motion_s(goal) + 0.1);
             prop_assert_eq!(profile.advance(period), goal);
         }
 
