@@ -52,7 +52,7 @@ fn tip(run: &Run, name: &str, title: &'static str, y: &'static str) -> Chart {
     let (estimate, jump) = (of("est"), jump(name));
     let layers = vec![
         band("estimate ± 2 σ", &depth, &estimate, &of("sd"), jump),
-        dots("measured", MEASURED, points(&depth, &of("meas"))),
+        dots("measured", MEASURED, points(&measured_depth(run), &of("meas"))),
         Layer::new("estimate", ESTIMATE, Shape::Broad, pieces(&depth, &estimate, jump)),
         Layer::new("truth", TRUTH, Shape::Line, pieces(&depth, &of("true"), jump)),
     ];
@@ -119,11 +119,15 @@ fn errors(run: &Run, title: &'static str, y: &'static str, names: [&'static str;
     chart
 }
 
-/// The residuals after the correction; the innovations are in `run.rrd`.
+/// The residuals after the correction, at the depths at which the positions were acquired; the innovations are
+/// in `run.rrd`.
 fn residuals(run: &Run) -> Chart {
     let layers = ["x", "y", "z"].into_iter().zip(COORDINATES).map(|(name, colour)| {
-        let residual = difference(&coordinate(run, name, "meas"), &coordinate(run, name, "est"));
-        dots(name, colour, points(&depth(run), &residual))
+        let measured = points(&measured_depth(run), &coordinate(run, name, "meas"));
+        let estimate = points(&depth(run), &coordinate(run, name, "est"));
+        let residuals = measured.into_iter();
+        let residuals = residuals.filter_map(|(mm, y)| Some((mm, y - at_depth(&estimate, mm)?)));
+        dots(name, colour, residuals.collect())
     });
     let (title, y) = ("Measured tip less the estimate", "measured − estimate (mm)");
     Chart::new(title, DEPTH, y, layers.collect())
@@ -248,6 +252,22 @@ fn depth(run: &Run) -> Column {
     column(run, "insertion_mm")
 }
 
+/// The depth at which the position of each step was acquired: that of the step in an older record, which lacks it.
+fn measured_depth(run: &Run) -> Column {
+    let acquired = column(run, "tip_meas_insertion_mm");
+    acquired.into_iter().zip(depth(run)).map(|(acquired, depth)| acquired.or(depth)).collect()
+}
+
+/// The value at `depth_mm`, linear between two points; `None` outside them.
+fn at_depth(points: &Points, depth_mm: f64) -> Option<f64> {
+    let (from_mm, from) = *points.iter().rfind(|(mm, _)| *mm <= depth_mm)?;
+    let (to_mm, to) = *points.iter().find(|(mm, _)| *mm >= depth_mm)?;
+    match to_mm > from_mm {
+        true => Some(from + (to - from) * (depth_mm - from_mm) / (to_mm - from_mm)),
+        false => Some(from),
+    }
+}
+
 /// The column of this name, without values too large for an axis.
 fn column(run: &Run, name: &str) -> Column {
     scaled(run.steps.column(name), |value| value)
@@ -295,7 +315,7 @@ fn pieces(xs: &Column, ys: &Column, jump: f64) -> Vec<Points> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::archive::TrackerTimes;
+    use crate::archive::{StepsTable, TrackerTimes};
     use crate::review::run::tests::run;
     use crate::session::Outcome;
 
@@ -326,6 +346,24 @@ mod tests {
         let (low, high) = (outline[1], outline[6]);
         assert_eq!((low.0, high.0), (1.0, 1.0));
         assert!((low.1 - 0.35).abs() < 1e-12 && (high.1 - 1.15).abs() < 1e-12, "{outline:?}");
+    }
+
+    /// The position of each step was acquired 0.25 mm before it, where z is as estimated. An older record does not
+    /// say so.
+    #[test]
+    fn a_measured_tip_is_compared_with_the_estimate_at_its_own_depth() {
+        let residual_z = |acquired: fn(f64) -> String| {
+            let mut run = run();
+            let mut csv = "insertion_mm,z_meas_mm,z_est_mm,tip_meas_insertion_mm\n".to_owned();
+            for mm in [1.0, 2.0, 3.0] {
+                csv += &format!("{mm},{},{mm},{}\n", mm - 0.25, acquired(mm));
+            }
+            run.steps = StepsTable::parse(&csv).unwrap();
+            residuals(&run).layers[2].pieces.clone()
+        };
+        let known = residual_z(|mm| format!("{}", mm - 0.25));
+        assert_eq!(known, [[(1.75, 0.0), (2.75, 0.0)]], "no estimate is known at 0.75 mm");
+        assert_eq!(residual_z(|_| String::new()), [[(1.0, -0.25), (2.0, -0.25), (3.0, -0.25)]]);
     }
 
     /// Samples are acquired at 0, 1 and 2 s and received 0.1 s later; the one in between is
