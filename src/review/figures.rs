@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 const FIGURES: [(&str, &str, &str, usize); 14] = [
     (DEPTH, "depth", "mm", 2),
     (OFF_PLANE, "off plane", "mm", 3),
-    ("target_error_mm", "distance from the target at the last step", "mm", 3),
+    ("target_error_mm", "distance from the target at the last step, true", "mm", 3),
     ("target_error_est_mm", "distance from the target at the last step, estimated", "mm", 3),
     ("clearance_mm_min", "distance from an obstacle, min, estimated", "mm", 2),
     ("settling_mm", "within 1 mm of the plane from", "mm", 1),
@@ -122,8 +122,9 @@ fn figures(folder: &Folder, report: Option<&FigureReport>, limits: &Limits) -> V
         limit: limits.get(key).copied().filter(|_| is_insertion || key != DEPTH),
     };
     let mut all: Vec<Figure> = FIGURES.iter().map(of_report).collect();
-    // An open record's manifest may not name the bus.
-    let has_truth = folder.is_emulated() || report.is_some_and(|it| it.final_error.is_some());
+    // An open record's manifest may not name the bus. The last step may have no estimate.
+    let has_error = report.is_some_and(|it| it.final_error.or(it.estimate_rms).is_some());
+    let has_truth = folder.is_emulated() || has_error;
     let provenance = if has_truth { "true" } else { "estimated" };
     for figure in all.iter_mut().filter(|figure| figure.key == OFF_PLANE) {
         figure.label = format!("off plane ({provenance}), RMS over {}", last_third(folder, report));
@@ -236,7 +237,7 @@ impl Run {
 #[cfg(test)]
 mod tests {
     use super::super::run::tests::{run, steps_csv};
-    use super::{figures_of_steps, limits};
+    use super::{Run, figures_of_steps, limits};
     use crate::config::Config;
     use crate::session::Outcome;
 
@@ -304,9 +305,19 @@ mod tests {
 
     #[test]
     fn a_distance_from_the_plane_is_named_true_where_the_truth_is_recorded() {
-        let mut run = run();
-        run.folder.manifest.bus = "memory".to_owned();
-        let labels: Vec<String> = run.limited_figures().into_iter().map(|f| f.label).collect();
-        assert!(labels.iter().any(|label| label.starts_with("off plane (true), ")), "{labels:?}");
+        let is_true = |run: &Run| {
+            let mut figures = run.limited_figures().into_iter();
+            figures.any(|figure| figure.label.starts_with("off plane (true), "))
+        };
+        let mut closed = run();
+        assert!(!is_true(&closed));
+        closed.folder.manifest.bus = "memory".to_owned();
+        assert!(is_true(&closed));
+        let mut open = run();
+        open.folder.manifest.figures.clear();
+        let mut steps = figures_of_steps(&steps_csv()).unwrap();
+        steps.final_error = None;
+        open.folder.figures_of_steps = Some(steps);
+        assert!(is_true(&open), "the last step has no estimate");
     }
 }

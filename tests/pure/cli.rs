@@ -86,6 +86,17 @@ fn run_json_has_its_documented_keys() {
     assert!(said.run_dir(&scratch).is_dir());
 }
 
+/// The run is shorter than the baseline of its observer. Where the true tip is, the emulator knows all the same.
+#[test]
+fn the_distance_of_an_emulated_run_without_an_estimate_is_called_true() {
+    let sets = ["observer.kind=finite-difference", "insertion.depth_mm=5"];
+    let sets = sets.into_iter().chain(["insertion.plane_out_of_reach=insert"]);
+    let arguments = ["run", "--quiet"].into_iter().chain(sets.flat_map(|set| ["--set", set]));
+    let said = needle_bench(&Scratch::new(), &arguments.collect::<Vec<_>>());
+    assert!(said.stdout.contains(" mm RMS over the last third (true); "), "{}", said.stdout);
+    assert!(!said.stdout.contains("last step"), "no estimate: {}", said.stdout);
+}
+
 /// The refusal comes before power and names the key that allows the run, which then ends with the distance from
 /// the plane.
 #[test]

@@ -214,12 +214,16 @@ fn a_missed_target_is_reported_as_missed() {
     assert_eq!(review(&["--json"]).json()["plan_status"], "missed");
     let text = review(&[]).stdout;
     assert!(text.ends_with("completed, not at the target\n"), "{text}");
+    assert!(text.contains("distance from the target at the last step, true  "), "{text}");
     let without_json = ["run", "goal.toml", "--quiet", "--set", "goal.tolerance_mm=0.0001"];
     let text = needle_bench(&scratch, &without_json).stdout;
     let last = text.lines().last().unwrap();
     let off_mm = number(&json, "target_error_est_mm");
     let missed = format!("completed, not at the target: {off_mm:.3} mm from it by the estimate");
     assert!(last.starts_with(&missed), "{last}");
+    let true_mm = number(&json, "target_error_mm");
+    let labelled = format!("{true_mm:.3} mm from it (true), {off_mm:.3} mm (estimated); nearest");
+    assert!(text.contains(&labelled), "{text}");
 }
 
 /// The path in the plane is clear, but the tip is not on it.
