@@ -191,9 +191,9 @@ impl Reader {
     }
 
     /// Reports `message` at the one of `keys` from the source of highest precedence. Reports nothing if one of
-    /// them was found wrong before.
+    /// them [is wrong](Self::is_wrong) by itself: its value is not known.
     pub(super) fn refuse(&mut self, keys: &[&str], message: String) {
-        if keys.iter().any(|&key| self.failed.contains(key)) {
+        if keys.iter().any(|&key| self.is_wrong(key)) {
             return;
         }
         let entries = keys.iter().filter_map(|&key| Some((key, self.tree.get(key)?)));

@@ -31,6 +31,22 @@ fn two_alternatives_in_one_source_are_refused() {
     assert_eq!(radius.number("needle.radius_mm"), 120.0);
 }
 
+/// Each has one element or one key that is wrong. What is read without it would contradict other keys.
+#[test]
+fn a_key_that_is_wrong_by_itself_contradicts_no_other() {
+    for set in [
+        "goal.position_mm=[0, 1e6, 90]",
+        "goal.workspace_mm.min=1",
+        "goal.obstacle=[1]",
+        "emulator.target_drift_mm_per_mm=[2, 0, 0]",
+        "tracker.csv.time.s=1",
+        "tracker.registration.fiducials=[1]",
+    ] {
+        let error = set_refusal(&[set]);
+        assert_eq!(error.lines().count(), 1, "{error}");
+    }
+}
+
 #[test]
 fn contradictory_keys_are_refused_with_both_values() {
     assert_eq!(
