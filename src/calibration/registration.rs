@@ -184,20 +184,23 @@ impl RegistrationFit {
         self.rms_mm / (1.0 - 2.0 / self.points as f64).sqrt()
     }
 
-    /// Standard deviation of each coordinate of a point at `p_w_mm` on the bench due to the
-    /// registration's error, mm: `TRE² = FLE²/N (1 + ⅓ Σ d_k²/f_k²)` (Fitzpatrick, West and Maurer
-    /// 1998). d_k is the distance of the point from the fiducials' principal axis k, f_k the RMS
-    /// distance of the fiducials from it. Each coordinate has a third of TRE².
+    /// Standard deviation in the worst direction, mm, of a point at `p_w_mm` on the bench, due to the
+    /// registration's error: the root of the largest eigenvalue of
+    /// `FLE²/3N (I + Σ (e_k × d)(e_k × d)ᵀ/f_k²)`. d is the point from the fiducials' centroid, e_k their
+    /// principal axis k, f_k their RMS distance from it. The trace is TRE² of Fitzpatrick, West and Maurer
+    /// (1998).
     ///
     /// It is the same for all samples of a run; averaging does not reduce it.
     pub fn target_sd_mm(&self, p_w_mm: &Vector3<f64>) -> f64 {
         let along = self.axes.tr_mul(&(p_w_mm - self.centre_bench));
-        let spread2 = self.spread_mm.map(|spread| spread * spread);
-        let ratios = [(1, 2), (0, 2), (0, 1)]
-            .map(|(i, j)| (along[i] * along[i] + along[j] * along[j]) / (spread2[i] + spread2[j]));
-        let fle2 = self.localisation_error_mm().powi(2);
-        let tre2 = fle2 / self.points as f64 * (1.0 + ratios.iter().sum::<f64>() / 3.0);
-        (tre2 / 3.0).sqrt()
+        let mut spread = Matrix3::identity();
+        for (k, i, j) in [(0, 1, 2), (1, 0, 2), (2, 0, 1)] {
+            let moved = Vector3::ith(k, 1.0).cross(&along);
+            let distance2 = self.spread_mm[i].powi(2) + self.spread_mm[j].powi(2);
+            spread += moved * moved.transpose() / distance2;
+        }
+        let variance = self.localisation_error_mm().powi(2) / (3 * self.points) as f64;
+        (variance * spread.symmetric_eigenvalues().max()).sqrt()
     }
 }
 

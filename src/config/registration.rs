@@ -22,7 +22,7 @@ section! {
     pub struct GivenRegistration {
         /// `X_WT`.
         x_wt: PoseConfig, flat;
-        /// Standard deviation of each coordinate of the tip due to the error of this pose, mm.
+        /// Standard deviation of the tip in the worst direction, due to the error of this pose, mm.
         sd_mm: f64 [within(0.0, 100.0)] = 0.0, everywhere;
         /// How it was computed, as `needle-bench calibrate registration` wrote it.
         fit: Option<RegistrationRecord>;
@@ -69,7 +69,7 @@ impl Fiducials {
 }
 
 impl Config {
-    /// Standard deviation, mm, of each coordinate of a tip on the planned path, due to the error of the
+    /// Standard deviation in the worst direction, mm, of a tip on the planned path, due to the error of the
     /// registration: as configured, or computed from the fiducials at both ends of the path, whichever is
     /// larger; in between it is never larger. Zero if it is unknown.
     ///

@@ -55,9 +55,9 @@ section! {
     beside {
         /// Angles assumed at the start.
         pub start: FixedAngles = FixedAngles::default(),
-        /// Standard deviation of each coordinate due to the registration, mm. This error is the
-        /// same in every position, so averaging does not reduce it. It is added to the covariance
-        /// of the estimate.
+        /// Standard deviation in the worst direction due to the registration, mm. This error is
+        /// the same in every position, so averaging does not reduce it. It is added to the
+        /// covariance of the estimate, to every coordinate.
         pub registration_sd_mm: f64 = 0.0,
         /// Share of the bank that searches for a torsion if none is configured; the rigid shaft has
         /// the rest.
