@@ -105,7 +105,8 @@ impl Config {
         let (mut rotation, per_turn) = self.emulated_drive(about, turns_per_s);
         let [zero, zero_turned] = [along.zero, about.zero].map(|zero| zero.unwrap_or(0).into());
         insertion.start_counts = zero + (emulator.insertion_start_mm * per_mm).round() as i64;
-        rotation.start_counts = zero_turned;
+        let start_turns = emulator.rotation_start_deg / 360.0;
+        rotation.start_counts = zero_turned + (start_turns * per_turn).round() as i64;
         insertion.switches = emulator.insertion_switches_mm.to_counts(zero, per_mm);
         rotation.switches = emulator.rotation_switches_deg.to_counts(zero_turned, per_turn / 360.0);
         if emulator.rehearse {

@@ -56,6 +56,8 @@ section! {
         drives: Model = "generic";
         /// Reading of the insertion axis when the stage is switched on, mm.
         insertion_start_mm: f64 [within(-1000.0, 1000.0)] = 0.0;
+        /// Reading of the rotation axis when the stage is switched on, degrees.
+        rotation_start_deg: f64 [within(-360.0, 360.0)] = 0.0;
         /// Where the switches of the insertion axis close, mm, as the axis reads before it is homed.
         insertion_switches_mm: SwitchesConfig => "{}";
         /// Where the switches of the rotation axis close, degrees, likewise.

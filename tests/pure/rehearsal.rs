@@ -208,6 +208,22 @@ fn a_turn_of_the_base_calibrates_the_tip() {
         said.stderr
     );
     assert!(!scratch.path().join("short.csv").exists());
+    // From elsewhere a turn is within these limits, and so is the way back from its end.
+    let limits = [
+        "--set",
+        "stage.rotation.min_deg=-100",
+        "--set",
+        "stage.rotation.max_deg=300",
+        "--set",
+        "emulator.rotation_start_deg=-90",
+        "--set",
+        MEASURED[1],
+    ];
+    let words = [&["calibrate", "tip", "short.csv", "--run", "--rehearse"], &limits[..]].concat();
+    let said = needle_bench(&scratch, &[&words[..], &["--config", &config]].concat());
+    assert_eq!(said.status, 0, "{}", said.screen());
+    assert!(said.stderr.contains("from -90.000 to 270."), "{}", said.stderr);
+    assert!(said.stderr.contains("from 270."), "{}", said.stderr);
     // Without a stage in the configuration nothing turns.
     let said = needle_bench(&scratch, &["calibrate", "tip", "short.csv", "--run"]);
     assert_eq!(said.status, 2, "{}", said.screen());

@@ -195,6 +195,25 @@ fn home_homes_both_axes_and_other_commands_ask_for_it() {
     let lines: Vec<&str> = said.stdout.lines().collect();
     assert_eq!(lines[..2], ["insertion   home, at 0.000 mm", "rotation    home, at 0.000 deg"]);
 
+    // The switch is 30 degrees before the start, and the axis reads 0 there.
+    let said = stage(
+        &scratch,
+        &[
+            "home",
+            "--axis",
+            "rotation",
+            "-q",
+            "--set",
+            "stage.rotation.homing.method=24",
+            "--set",
+            "emulator.rotation_switches_deg.home=0",
+            "--set",
+            "emulator.rotation_start_deg=30",
+        ],
+    );
+    assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
+    assert_eq!(said.stdout.lines().next(), Some("rotation    home, at 0.000 deg"));
+
     let needs = "stage.insertion.reference=homing";
     for arguments in [
         &["run", "-q", "--set", needs][..],

@@ -223,12 +223,16 @@ pub(super) fn record_turn(
     // A rehearsal does not write it.
     refuse_existing(Some(path).filter(|_| !rehearse))?;
     let configured = configured.clone().rehearsed(rehearse);
-    let (config, _) = load_stage(configured, rehearse, sensor_off_axis)?;
+    let (mut config, _) = load_stage(configured, rehearse, sensor_off_axis)?;
     let mut rows = Vec::new();
     for by in TURNS {
         let line = format!("jog --axis rotation --by {by}");
         let report = perform(&config, &line, Options::default())?;
         finish_with(status(&config, &report))?;
+        if let Some(position) = report.stage_at_end.position {
+            // The turn back has a new emulated stage: it starts where this one ended.
+            config.emulator.rotation_start_deg = position.rotation_rad.to_degrees();
+        }
         rows.extend(rows_of(replay_run(&report.run_dir)?));
     }
     let has_orientation = rows.iter().all(|row| row.len() == COLUMNS.len());
