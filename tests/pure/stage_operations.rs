@@ -228,7 +228,7 @@ fn home_homes_both_axes_and_other_commands_ask_for_it() {
     }
 }
 
-/// The emulated drive has none of these methods and refuses them.
+/// The emulated drives have none of these methods.
 #[test]
 fn a_homing_in_an_unknown_direction_is_a_warning() {
     let scratch = Scratch::new();

@@ -7,9 +7,11 @@ use crate::cli::output::{merged, print_result, print_stderr};
 use crate::cli::perform::{Job, Options, Performed, end_json};
 use crate::cli::{Failure, Result, finish_with};
 use crate::config::Config;
+use crate::emulator::drive::HOMING_METHODS;
+use crate::operation::Operation;
 use crate::runtime::RunReport;
 use crate::session::AxisMove;
-use crate::stage::Axis;
+use crate::stage::{Axis, HomingConfig};
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -53,8 +55,30 @@ fn job<'a>(config: &'a Config, motion: &'a Motion, options: Options) -> Result<J
             homing.method
         ));
     }
-    let run_config = motion.plan(config)?.into();
-    Ok(Job { config, run_config, motion: Some(motion), options })
+    let planned = motion.plan(config)?;
+    if let Operation::Home(axes) = &planned.operation
+        && config.is_emulated()
+    {
+        for axis in Axis::BOTH.into_iter().filter(|axis| axes[*axis]) {
+            check_emulated_homing(axis, config.stage.axis(axis).homing)?;
+        }
+    }
+    Ok(Job { config, run_config: planned.into(), motion: Some(motion), options })
+}
+
+/// Refuses a homing method of `axis` that no emulated drive has.
+fn check_emulated_homing(axis: Axis, homing: Option<HomingConfig>) -> Result<()> {
+    match homing {
+        Some(HomingConfig { method, .. }) if !HOMING_METHODS.contains(&method) => {
+            let methods = HOMING_METHODS.map(|method| method.to_string()).join(", ");
+            let key = format!("stage.{axis}.homing.method");
+            Err(Failure::configuration(format_args!(
+                "{key} is {method}, which the emulated drives lack; they have {methods}: rehearse with \
+                 one of these (--set {key}=N)"
+            )))
+        }
+        _ => Ok(()),
+    }
 }
 
 fn to_json(name: &str, performed: &Performed, proof: &Option<String>) -> Value {

@@ -14,6 +14,9 @@ use crate::units::Time;
 /// Counts between two index pulses of the encoder.
 const INDEX_COUNTS: i64 = 2000;
 
+/// The homing methods (0x6098) of an emulated drive that has the switch which the method seeks.
+pub const HOMING_METHODS: [i8; 9] = [1, 2, 17, 18, 24, 33, 34, 35, 37];
+
 /// One move of a homing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Leg {
@@ -211,7 +214,7 @@ mod tests {
 
     #[test]
     fn a_method_needs_its_switch() {
-        let all = [1, 2, 17, 18, 24, 33, 34, 35, 37];
+        let all = HOMING_METHODS.map(i64::from);
         let [negative, positive, home] = [&[1, 17][..], &[2, 18], &[24]];
         for (switches, lacking) in [
             (SWITCHES, vec![]),

@@ -22,6 +22,7 @@ mod state_machine;
 #[cfg(test)]
 mod tests;
 
+pub use self::homing::HOMING_METHODS;
 pub use self::inputs::Switches;
 pub use self::node::Drive;
 
