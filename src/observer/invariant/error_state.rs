@@ -138,22 +138,24 @@ impl Covariance {
     /// error η becomes `J_r(δ) η` with the right Jacobian of SE(3),
     /// `Exp(−δ) Exp(δ + η) ≈ Exp(J_r(δ) η)` and `J_r(δ) ≈ I − ad_δ/2 + ad_δ²/6`.
     pub(super) fn shift(&mut self, delta: &Twist) {
-        let states = self.extent.states();
-        // Each pass replaces P by J Pᵀ; two passes give J P Jᵀ.
-        for _ in 0..2 {
-            let mut shifted = [[0.0; STATES]; STATES];
-            for (i, row) in self.p.iter().enumerate().take(states) {
-                let pose = std::array::from_fn(|k| row[k]);
-                let once = bracket(delta, &pose);
-                let twice = bracket(delta, &once);
-                for k in 0..states {
-                    shifted[k][i] = row[k];
-                    if k < 6 {
-                        shifted[k][i] += twice[k] / 6.0 - 0.5 * once[k];
-                    }
-                }
+        self.transform(self.extent.states(), |error| {
+            let once = bracket(delta, &std::array::from_fn(|k| error[k]));
+            let twice = bracket(delta, &once);
+            for k in 0..6 {
+                error[k] += twice[k] / 6.0 - 0.5 * once[k];
             }
-            self.p = shifted;
+        });
+    }
+
+    /// Replaces P, which has so many states, by J P Jᵀ: `apply` replaces an error vector by J times it.
+    fn transform(&mut self, states: usize, apply: impl Fn(&mut ErrorState)) {
+        self.p[..states].iter_mut().for_each(&apply);
+        for i in 0..states {
+            let mut column = self.p.map(|row| row[i]);
+            apply(&mut column);
+            for (row, value) in self.p.iter_mut().zip(column) {
+                row[i] = value;
+            }
         }
     }
 
@@ -202,17 +204,7 @@ impl Covariance {
     }
 
     fn propagate_states<const N: usize>(&mut self, t: &Transition) {
-        // Each pass replaces P by F Pᵀ; two passes give F P Fᵀ.
-        for _ in 0..2 {
-            let mut carried = [[0.0; STATES]; STATES];
-            for (i, column) in self.p.iter().take(N).enumerate() {
-                let moved = t.apply::<N>(column);
-                for (j, value) in moved.into_iter().enumerate().take(N) {
-                    carried[j][i] = value;
-                }
-            }
-            self.p = carried;
-        }
+        self.transform(N, |error| t.apply::<N>(error));
         if t.push_variance > 0.0 {
             // A tip that creeps takes up the push later; any other turns at once.
             let tip = if t.backlog_kept < 1.0 { BACKLOG } else { ROLL };
@@ -277,11 +269,9 @@ impl Transition {
         }
     }
 
-    /// F times an error vector, for its first N states.
-    fn apply<const N: usize>(&self, error: &ErrorState) -> ErrorState {
-        let pose: [f64; 6] = std::array::from_fn(|i| error[i]);
-        let mut pose = adjoint_inverse(&self.motion, &pose);
-        let mut moved = *error;
+    /// Replaces an error vector, of which the first N states count, by F times it.
+    fn apply<const N: usize>(&self, error: &mut ErrorState) {
+        let mut pose = adjoint_inverse(&self.motion, &std::array::from_fn(|i| error[i]));
         for (p, by) in pose.iter_mut().zip(&self.by_curvature) {
             *p += by * error[CURVATURE];
         }
@@ -289,27 +279,26 @@ impl Transition {
             for (p, by) in pose.iter_mut().zip(&self.by_backlog) {
                 *p += by * error[BACKLOG];
             }
-            moved[BACKLOG] = self.backlog_kept * error[BACKLOG];
+            error[BACKLOG] *= self.backlog_kept;
         }
         if N > LAG {
             let edge = error[self.push_edge] - error[ANCHOR];
-            for (by, error) in [(&self.by_edge, edge), (&self.by_growth, error[GROWTH])] {
+            for (by, cause) in [(&self.by_edge, edge), (&self.by_growth, error[GROWTH])] {
                 for (p, by) in pose.iter_mut().zip(&by.pose) {
-                    *p += by * error;
+                    *p += by * cause;
                 }
-                moved[BACKLOG] += by.backlog * error;
-                moved[LAG] += by.lag * error;
+                error[BACKLOG] += by.backlog * cause;
+                error[LAG] += by.lag * cause;
             }
         }
-        moved[..6].copy_from_slice(&pose);
-        moved
+        error[..6].copy_from_slice(&pose);
     }
 }
 
 #[cfg(test)]
 impl Transition {
     /// F times a whole error vector.
-    pub(super) fn apply_all(&self, error: &ErrorState) -> ErrorState {
-        self.apply::<STATES>(error)
+    pub(super) fn apply_all(&self, error: &mut ErrorState) {
+        self.apply::<STATES>(error);
     }
 }

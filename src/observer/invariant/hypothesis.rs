@@ -361,7 +361,7 @@ impl Hypothesis {
     pub(super) fn transition_column(&self, state: usize) -> [f64; 6] {
         let mut error = [0.0; super::error_state::STATES];
         error[state] = 1.0;
-        let moved = self.transition().apply_all(&error);
-        std::array::from_fn(|i| moved[i])
+        self.transition().apply_all(&mut error);
+        std::array::from_fn(|i| error[i])
     }
 }
