@@ -83,7 +83,7 @@ impl Eds {
     /// The objects, with their values at power-on, of a device with the node number `node`.
     pub fn objects(&self, node: NodeId) -> ObjectDictionary {
         let entry = |section: &Section| Some((section.object()?, section.entry(node)?));
-        ObjectDictionary { entries: self.sections.iter().filter_map(entry).collect() }
+        self.sections.iter().filter_map(entry).collect()
     }
 }
 

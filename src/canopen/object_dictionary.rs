@@ -128,19 +128,34 @@ impl Entry {
 /// [`integer`](Self::integer) and [`set`](Self::set), which check nothing.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct ObjectDictionary {
-    pub(super) entries: BTreeMap<ObjectAddress, Entry>,
+    /// Each object once, sorted. A drive looks its objects up at every frame of the bus, and this takes less
+    /// time than a `BTreeMap`.
+    entries: Vec<(ObjectAddress, Entry)>,
+}
+
+/// Of objects with the same address the last one counts.
+impl FromIterator<(ObjectAddress, Entry)> for ObjectDictionary {
+    fn from_iter<T: IntoIterator<Item = (ObjectAddress, Entry)>>(entries: T) -> Self {
+        ObjectDictionary { entries: BTreeMap::from_iter(entries).into_iter().collect() }
+    }
 }
 
 impl ObjectDictionary {
+    fn find(&self, object: ObjectAddress) -> Option<usize> {
+        let key = |object: ObjectAddress| u32::from(object.index) << 8 | u32::from(object.subindex);
+        self.entries.binary_search_by_key(&key(object), |(object, _)| key(*object)).ok()
+    }
+
     /// The number in `object`; 0 when there is no such object. For the device's own program.
     pub fn integer(&self, object: ObjectAddress) -> i64 {
-        self.entries.get(&object).map_or(0, |entry| entry.value)
+        self.find(object).map_or(0, |n| self.entries[n].1.value)
     }
 
     /// Sets `object`, truncated to its type. Access and limits are not checked: this is for the
     /// device's own program. It has no effect when there is no such object.
     pub fn set(&mut self, object: ObjectAddress, value: i64) {
-        if let Some(entry) = self.entries.get_mut(&object) {
+        if let Some(n) = self.find(object) {
+            let entry = &mut self.entries[n].1;
             entry.value = entry.data_type.integer(value as u64);
         }
     }
@@ -201,18 +216,15 @@ impl ObjectDictionary {
 
     /// Gives every object in this range of indices its power-on value.
     pub fn reset(&mut self, indices: RangeInclusive<u16>) {
-        let range =
-            ObjectAddress::new(*indices.start(), 0)..=ObjectAddress::new(*indices.end(), 255);
-        for (_, entry) in self.entries.range_mut(range) {
+        for (_, entry) in self.entries.iter_mut().filter(|(o, _)| indices.contains(&o.index)) {
             entry.value = entry.default;
         }
     }
 
     fn entry(&self, object: ObjectAddress) -> Result<&Entry, AbortCode> {
-        let siblings = ObjectAddress::new(object.index, 0)..=ObjectAddress::new(object.index, 255);
-        match self.entries.get(&object) {
-            Some(entry) => Ok(entry),
-            None if self.entries.range(siblings).next().is_some() => {
+        match self.find(object) {
+            Some(n) => Ok(&self.entries[n].1),
+            None if self.entries.iter().any(|(other, _)| other.index == object.index) => {
                 Err(AbortCode::NO_SUCH_SUBINDEX)
             }
             None => Err(AbortCode::NO_SUCH_OBJECT),
@@ -245,7 +257,7 @@ mod tests {
             (LIMITED, limited),
             (NAME, Entry::text("drive")),
         ];
-        ObjectDictionary { entries: entries.into() }
+        entries.into_iter().collect()
     }
 
     #[test]
