@@ -1,6 +1,6 @@
 //! Reads obstacles from masks: the NIfTI-1 images that `[goal]` names.
 
-use crate::config::PoseConfig;
+use crate::geometry::Pose;
 use crate::plan::{Mask, Obstacle};
 use flate2::CrcReader;
 use flate2::read::MultiGzDecoder;
@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 /// A reader of the masks that the configuration in `file` names. Their paths are relative to its folder.
 pub(super) fn mask_reader(
     file: Option<&Path>,
-) -> impl Fn(&str, Option<u32>, &PoseConfig) -> Result<Obstacle, String> + Sync {
+) -> impl Fn(&str, Option<u32>, &Pose) -> Result<Obstacle, String> + Sync {
     move |name, crc32, pose| {
         let path = file.map_or_else(|| PathBuf::from(name), |file| file.with_file_name(name));
         read_mask(&path, crc32, pose).map_err(|error| format!("{}: {error}", path.display()))
@@ -21,7 +21,7 @@ pub(super) fn mask_reader(
 }
 
 /// The image in `path`, as an obstacle.
-fn read_mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, String> {
+fn read_mask(path: &Path, crc32: Option<u32>, pose: &Pose) -> Result<Obstacle, String> {
     check_regular(path).map_err(|error| error.to_string())?;
     check_name(path)?;
     let header = NiftiHeader::from_file(path).map_err(|error| reason(&error))?;
@@ -81,7 +81,7 @@ fn read_mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obsta
             "all of its voxels are 0, so it is no obstacle: is it the right label?".to_owned()
         );
     }
-    Mask::new(size, spacing_mm, &occupied, &pose.to_pose()).map(Obstacle::Mask)
+    Mask::new(size, spacing_mm, &occupied, pose).map(Obstacle::Mask)
 }
 
 /// The size of a NIfTI-1 header, and of the four bytes after it that say whether extensions follow.
@@ -226,8 +226,7 @@ mod tests {
         nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRUSR).expect("a pipe");
         for path in [Path::new("/dev/zero"), &pipe] {
             assert_eq!(file_crc32(path).unwrap_err().to_string(), "not a regular file");
-            let read =
-                mask_reader(None)(path.to_str().expect("text"), None, &PoseConfig::default());
+            let read = mask_reader(None)(path.to_str().expect("text"), None, &Pose::identity());
             let error = read.expect_err("it is refused");
             assert!(error.ends_with(": not a regular file"), "{error}");
         }

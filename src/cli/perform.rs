@@ -253,7 +253,7 @@ impl Job<'_> {
 /// What the viewer shows for a run of `config` besides its records.
 pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
     Ok(Scene {
-        x_wp: config.plane.to_pose(),
+        x_wp: config.plane,
         insertion_mm: config.insertion.depth_mm,
         curvature_per_mm: config.needle.arc.curvature_per_mm(),
         goal: match config.goal.kind {

@@ -57,7 +57,7 @@ impl Config {
         let invariant = self.observer.invariant;
         let mut observers = self.observer.observers();
         Ok(SessionConfig {
-            x_wp: self.plane.to_pose(),
+            x_wp: self.plane,
             insertion: self.insertion,
             needle: self.believed_needle()?,
             needle_torsion: self.believed_torsion()?,
@@ -118,9 +118,9 @@ impl Config {
             rotation: (rotation, per_turn),
             needle: emulator.arc.to_needle(emulator.tip_ahead_mm, "emulator")?,
             torsion: torsion(emulator.torsion, "emulator")?,
-            start: emulator.start.to_pose(),
-            x_tp: self.tracker.to_registration()?.x_wt().inverse() * self.plane.to_pose(),
-            x_bs: emulator.sensor.to_pose(),
+            start: emulator.start,
+            x_tp: self.tracker.to_registration()?.x_wt().inverse() * self.plane,
+            x_bs: emulator.sensor,
             tracker: emulator.to_tracker(),
             target: self.goal.tool.as_ref().and(self.goal.position_mm).map(|start_mm| {
                 TargetModel { start_mm, drift_mm_per_mm: emulator.target_drift_mm_per_mm }

@@ -2,11 +2,12 @@
 
 use std::time::Duration;
 
+use super::IDENTITY;
 use super::needle::{Arc, TIP_AHEAD};
-use super::pose::{IDENTITY, PoseConfig, TIP_PITCH};
 use crate::emulator::drive::{Model, Switches};
 use crate::emulator::fault::Fault;
 use crate::emulator::{self, CorrelatedNoise, TrackerModel};
+use crate::geometry::Pose;
 use crate::keys::{Rule, choice, over, section, within};
 use crate::needle::TorsionConfig;
 use nalgebra::Vector3;
@@ -14,6 +15,8 @@ use nalgebra::Vector3;
 /// The largest seed that every JSON reader represents exactly.
 pub const SEED_MAX: u64 = (1 << 53) - 1;
 
+/// Pitch of a needle's tip, short of ±90°, where yaw and roll are the same rotation.
+pub(super) const TIP_PITCH: Rule = within(-85.0, 85.0);
 const SWITCH: Rule = within(-1e6, 1e6);
 const NOISE: Rule = within(0.0, 100.0);
 
@@ -36,7 +39,7 @@ section! {
         /// How often each position is repeated, stamped as if it were new.
         tracker_repeats: u32 [within(0.0, 1000.0)] = 0;
         /// The tip's true pose at the start, in the plane frame.
-        start: PoseConfig => "{ x_mm = 5.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 5.0, pitch_deg = 5.0, \
+        start: Pose => "{ x_mm = 5.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 5.0, pitch_deg = 5.0, \
             roll_deg = 30.0 }", narrowed(&[("pitch_deg", TIP_PITCH)]);
         /// How far the target moves with each millimetre that is inserted, mm. With `goal.tool` the emulated
         /// tracker sees it; before the insertion it is at `goal.position_mm`.
@@ -49,7 +52,7 @@ section! {
         /// memory, whatever `can.interface` and `tracker.source` say.
         rehearse: bool = false;
         /// The pose of the tracked sensor in the frame of the tip.
-        sensor: PoseConfig => IDENTITY;
+        sensor: Pose => IDENTITY;
         /// True if both drives were homed before the start.
         homed: bool = false;
         /// The make of drive that is emulated.

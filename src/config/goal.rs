@@ -1,11 +1,11 @@
 //! `[goal]`: where the needle is steered: into the plane, or to a target around obstacles.
 
-use super::pose::{POSITION, PoseConfig};
 use super::reader::{Reader, contradictions};
 use super::tracker::FILE;
 use super::value::join;
 use super::{Config, ConfigError, TrackerSource};
 use crate::control::ControlKind;
+use crate::geometry::{POSITION, Pose};
 use crate::keys::{Rule, choice, not_blank, over, section, within};
 use crate::plan::{Obstacle, Problem, Tip, Workspace, World};
 use crate::session::{Goal, TargetTool};
@@ -38,7 +38,7 @@ section! {
         /// turn of the needle may leave no path.
         reserve_mm: f64 [within(0.0, 100.0)] = 0.5;
         /// Only with a target: the box that the tip must not leave, without a clearance to its walls, mm.
-        workspace_mm: WorkspaceConfig =>
+        workspace_mm: Workspace =>
             "{ min = [-50.0, -75.0, 0.0], max = [50.0, 75.0, 150.0] }";
         /// The share of the needle's curvature that a plan leaves unused, as a reserve for what the model does
         /// not know. If it is not given, it is 0.15 with obstacles and 0 without.
@@ -49,17 +49,6 @@ section! {
         step_expansions_max: u32 [within(1.0, 1e8)] = 2000;
         /// An obstacle that the path avoids; repeat the table for each.
         obstacle: Vec<ObstacleConfig> [Rule::Fields("shape and its measures")] = [];
-    }
-}
-
-section! {
-    /// A box along the axes.
-    #[derive(Copy)]
-    pub struct WorkspaceConfig {
-        /// The corner with the smallest coordinates.
-        min: Vector3<f64> [POSITION];
-        /// The corner with the largest coordinates.
-        max: Vector3<f64> [POSITION];
     }
 }
 
@@ -89,7 +78,7 @@ section! {
         crc32: Option<u32> [CRC32];
         /// Pose of the mask's voxels. Voxel (i, j, k) has its centre at i, j, k times the spacing
         /// in the image's header; the header's own origin is not used.
-        pose: Option<PoseConfig>;
+        pose: Option<Pose>;
     }
 }
 
@@ -131,7 +120,7 @@ impl ObstacleShape {
 
 /// Reads the mask in a file, which must have this CRC-32 if one is given, and places it by a pose. The error
 /// says in words what went wrong.
-pub type ReadMask<'a> = &'a dyn Fn(&str, Option<u32>, &PoseConfig) -> Result<Obstacle, String>;
+pub type ReadMask<'a> = &'a dyn Fn(&str, Option<u32>, &Pose) -> Result<Obstacle, String>;
 
 impl ObstacleConfig {
     /// Builds the obstacle, which has all keys that its shape needs.
@@ -143,13 +132,14 @@ impl ObstacleConfig {
             [self.centre_mm, self.from_mm, self.to_mm, self.min_mm, self.max_mm]
                 .map(Option::unwrap_or_default);
         let radius_mm = self.radius_mm.unwrap_or_default();
-        let (file, pose) =
-            (self.file.as_deref().unwrap_or_default(), self.pose.unwrap_or_default());
+        let file = self.file.as_deref().unwrap_or_default();
         match self.shape {
             ObstacleShape::Sphere => Ok(Obstacle::Sphere { centre_mm, radius_mm }),
             ObstacleShape::Cylinder => Ok(Obstacle::Cylinder { from_mm, to_mm, radius_mm }),
             ObstacleShape::Box => Ok(Obstacle::Box { min_mm, max_mm }),
-            ObstacleShape::Mask => read_mask(file, self.crc32, &pose),
+            ObstacleShape::Mask => {
+                read_mask(file, self.crc32, &self.pose.unwrap_or(Pose::identity()))
+            }
         }
     }
 }
@@ -235,11 +225,10 @@ impl Config {
             made.map_err(|error| format!("goal.obstacle[{i}].file: {error}"))
         });
         let obstacles = obstacles.collect::<Result<_, _>>()?;
-        let WorkspaceConfig { min: min_mm, max: max_mm } = goal.workspace_mm;
-        let world = World { obstacles, workspace: Workspace { min_mm, max_mm, start_mm: None } };
+        let world = World { obstacles, workspace: goal.workspace_mm };
         let mut angles = self.observer.start;
         let mut position_mm = match self.tip_source() {
-            TrackerSource::Emulated => self.emulator.start.to_pose().translation,
+            TrackerSource::Emulated => self.emulator.start.translation,
             _ => Vector3::zeros(),
         };
         if goal.in_plane {
@@ -291,7 +280,7 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     let is_too_near = (is_drawn || !goal.obstacle.is_empty()) && clearance_mm < CLEARANCE_MIN_MM;
     let has_one_tool = config.tip_source() == TrackerSource::Csv;
     let law = config.control.kind;
-    let WorkspaceConfig { min, max } = goal.workspace_mm;
+    let Workspace { min_mm: min, max_mm: max, .. } = goal.workspace_mm;
     let has_size = is_box(&min, &max);
     let has_plane = min.x <= 0.0 && max.x >= 0.0;
     let aside_mm = goal.position_mm.map_or(0.0, |target_mm| target_mm.x);

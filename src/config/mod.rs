@@ -38,7 +38,6 @@ mod goal;
 mod include;
 mod needle;
 mod observer;
-mod pose;
 mod reader;
 mod record;
 mod registration;
@@ -54,11 +53,10 @@ mod warnings;
 pub use can::{CanConfig, CanInterface, Listen};
 pub use emulator::{EmulatorConfig, SEED_MAX, TrackerPreset};
 pub use error::{ConfigError, nearest_key};
-pub use goal::{GoalConfig, GoalKind, ReadMask, WorkspaceConfig};
+pub use goal::{GoalConfig, GoalKind, ReadMask};
 pub use include::ReadFile;
 pub use needle::NeedleConfig;
 pub use observer::{ObserverKind, ObserverSection};
-pub use pose::PoseConfig;
 pub use record::{CalibrationConfig, EvaluationConfig, OnFailure, RecordConfig};
 pub use registration::RegistrationConfig;
 pub use stop::StopConfig;
@@ -66,6 +64,7 @@ pub use study::StudyConfig;
 pub use tracker::{TrackerMode, TrackerSection, TrackerSource};
 
 use crate::control::ControlConfig;
+use crate::geometry::Pose;
 use crate::keys::{self, Field, Rule, section};
 use crate::session::InsertionConfig;
 use crate::stage::StageConfig;
@@ -78,6 +77,9 @@ use value::Entries;
 #[cfg(test)]
 pub(crate) const DEFAULT_TOML: &str = include_str!("../../bench-config/virtual.toml");
 
+/// No displacement and no rotation, as a default.
+const IDENTITY: &str =
+    "{ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }";
 /// The number of the layer below the files.
 const PRESET: usize = 1;
 
@@ -107,7 +109,7 @@ section! {
         /// Name of the run folder: `runs/<UTC>-<name>`.
         name: String [Rule::Text("1 to 64 letters, digits, '.', '_' or '-'", is_run_name)] = "virtual";
         /// Pose of the plane frame P in the bench frame W. The needle is steered into P's y-z plane, x = 0.
-        plane: PoseConfig => pose::IDENTITY;
+        plane: Pose => IDENTITY;
         /// Where the needle is steered: into the plane, or to a target around obstacles.
         goal: GoalConfig;
         /// How far the needle is inserted, and how.

@@ -2,8 +2,8 @@
 
 use super::Config;
 use super::error::ConfigError;
-use super::pose::PoseConfig;
 use crate::calibration::{FiducialPair, RegistrationFit, RegistrationRecord};
+use crate::geometry::Pose;
 use crate::keys::{Field, Kind, Rule, find, over, section, within};
 use nalgebra::Vector3;
 use toml::{Table, Value};
@@ -21,7 +21,7 @@ section! {
     /// The tracker's pose on the bench and how well it is known.
     pub struct GivenRegistration {
         /// `X_WT`.
-        x_wt: PoseConfig, flat;
+        x_wt: Pose, flat;
         /// Standard deviation of the tip in the worst direction, due to the error of this pose, mm.
         sd_mm: f64 [within(0.0, 100.0)] = 0.0, everywhere;
         /// How it was computed, as `needle-bench calibrate registration` wrote it.
@@ -87,9 +87,8 @@ impl Config {
 
     /// That standard deviation, mm, for the registration `fit`.
     pub fn registration_sd_of_mm(&self, fit: &RegistrationFit) -> f64 {
-        let x_wp = self.plane.to_pose();
         let ends = [0.0, self.insertion.depth_mm].map(|depth_mm| Vector3::z() * depth_mm);
-        ends.map(|p_p_mm| fit.target_sd_mm(&x_wp.transform(&p_p_mm)))
+        ends.map(|p_p_mm| fit.target_sd_mm(&self.plane.transform(&p_p_mm)))
             .into_iter()
             .fold(0.0, f64::max)
     }

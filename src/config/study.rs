@@ -1,12 +1,13 @@
 //! `[study]`: the ranges from which the trials of a study are drawn.
 
-use super::pose::{POSITION, TIP_PITCH};
-use super::{Config, ConfigError, EmulatorConfig, GoalKind, WorkspaceConfig};
+use super::emulator::TIP_PITCH;
+use super::{Config, ConfigError, EmulatorConfig, GoalKind};
 use crate::emulator::split_mix64;
-use crate::geometry::TURN;
+use crate::geometry::{POSITION, TURN};
 use crate::keys::{Field, Words, find, over, section, within};
 use crate::math;
 use crate::needle::{HALF_WIDTH, HALF_WIDTH_PER_MM, OFFSET};
+use crate::plan::Workspace;
 use crate::study::Prior;
 use nalgebra::{Vector3, Vector4};
 use std::f64::consts::TAU;
@@ -181,7 +182,7 @@ impl Config {
             number += 1;
             low + (high - low) * fraction(seed, number)
         };
-        let WorkspaceConfig { min, max } = self.goal.workspace_mm;
+        let Workspace { min_mm: min, max_mm: max, .. } = self.goal.workspace_mm;
         let mut target_mm = self.goal.position_mm.unwrap_or_default();
         if let Some([low, high]) = study.target_depth_mm {
             let depth_mm = draw(low, high);

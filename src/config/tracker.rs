@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
+use super::IDENTITY;
 use super::error::ConfigError;
-use super::pose::IDENTITY;
 use super::registration::RegistrationConfig;
 use crate::calibration::TipRecord;
 use crate::geometry::{FixedAngles, Pose};
@@ -139,7 +139,7 @@ impl TrackerSection {
             )
         })?;
         let x_wt = match registration {
-            RegistrationConfig::Given(given) => given.x_wt.to_pose(),
+            RegistrationConfig::Given(given) => given.x_wt,
             RegistrationConfig::Fiducials(fiducials) => fiducials.fit()?.x_wt,
         };
         Ok(Registration::new(x_wt).with_tip(self.x_sb()))

@@ -1,13 +1,16 @@
 //! The paper's fixed-axis angles.
 
 use super::Pose;
-use crate::keys::{Rule, section, within};
+use crate::keys::{Field, Key, Kind, Rule, section, within};
 use crate::math;
 use nalgebra::{Rotation3, Vector3};
+use toml::Value;
 
 /// A full turn in either direction.
 pub(crate) const TURN: Rule = within(-360.0, 360.0);
 const PITCH: Rule = within(-90.0, 90.0);
+/// A coordinate of a position, mm.
+pub(crate) const POSITION: Rule = within(-10_000.0, 10_000.0);
 
 section! {
     /// Fixed-axis angles of the tip, `R = Rx(yaw) Ry(pitch) Rz(roll)`, rad.
@@ -50,6 +53,25 @@ impl FixedAngles {
             pitch,
             roll: math::atan2(-r[(0, 1)], r[(0, 0)]),
         }
+    }
+}
+
+/// In the configuration a pose is a position, and [`FixedAngles`] beside it.
+impl Field for Pose {
+    const KIND: Kind = Kind::Table(
+        const {
+            &[
+                Key::new::<f64>("x_mm", "Position, mm.").rule(POSITION),
+                Key::new::<f64>("y_mm", "Position, mm.").rule(POSITION),
+                Key::new::<f64>("z_mm", "Position, mm.").rule(POSITION),
+                Key::new::<FixedAngles>("angles", "Orientation.").flat(),
+            ]
+        },
+    );
+    fn take(table: Option<&Value>) -> Self {
+        let mm = |key: &str| f64::take(table.and_then(|table| table.get(key)));
+        let translation = Vector3::new(mm("x_mm"), mm("y_mm"), mm("z_mm"));
+        Pose { rotation: FixedAngles::take(table).to_rotation(), translation }
     }
 }
 

@@ -7,6 +7,6 @@ mod angles;
 mod se3;
 pub mod so3;
 
-pub(crate) use angles::TURN;
 pub use angles::{FixedAngles, coordinates};
+pub(crate) use angles::{POSITION, TURN};
 pub use se3::{Pose, Twist};

@@ -1,7 +1,8 @@
 //! Obstacles and the distance to them.
 
 use super::mask::Mask;
-use crate::geometry::{Pose, Twist};
+use crate::geometry::{POSITION, Pose, Twist};
+use crate::keys::section;
 use nalgebra::Vector3;
 
 /// A way between two poses is judged at points at most this far apart, mm …
@@ -78,15 +79,19 @@ fn signed_distance<const N: usize>(over: [f64; N]) -> f64 {
 /// about the start, which may lie on a wall.
 const START_ROOM_MM: f64 = 3.0;
 
-/// A box that the tip never leaves, except near the start of a run.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Workspace {
-    /// The corner with the smallest coordinates, mm.
-    pub min_mm: Vector3<f64>,
-    /// The corner with the largest coordinates, mm.
-    pub max_mm: Vector3<f64>,
-    /// Where a run starts, mm: a ball around it counts as inside.
-    pub start_mm: Option<Vector3<f64>>,
+section! {
+    /// A box that the tip never leaves, except near the start of a run. Lengths are in mm.
+    #[derive(Copy)]
+    pub struct Workspace {
+        /// The corner with the smallest coordinates.
+        min_mm as "min": Vector3<f64> [POSITION];
+        /// The corner with the largest coordinates.
+        max_mm as "max": Vector3<f64> [POSITION];
+    }
+    beside {
+        /// Where a run starts, mm: a ball around it counts as inside.
+        pub start_mm: Option<Vector3<f64>> = None,
+    }
 }
 
 impl Workspace {

@@ -4,7 +4,8 @@ use super::openigtlink::DEVICE_NAME_LEN;
 use super::refusal::{GateName, Refusal, short};
 use super::registration::Registration;
 use super::sample::{Sample, Validity};
-use crate::keys::{Rule, section, within};
+use crate::geometry::POSITION;
+use crate::keys::section;
 use crate::text::clipped;
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 
@@ -42,8 +43,6 @@ section! {
         status: bool = true;
     }
 }
-
-const POSITION: Rule = within(-10_000.0, 10_000.0);
 
 section! {
     /// A box in the bench's frame W, its sides along the axes, its faces within it.

@@ -255,7 +255,7 @@ impl Motion {
                 let turn = Goal::By(HANDEDNESS_TURN_DEG.to_radians());
                 Operation::Answer(Box::new(AnswerSettings {
                     gate: Gate { registration, workspace: None, ..gate },
-                    axis: config.plane.to_pose().rotation * Vector3::z(),
+                    axis: config.plane.rotation * Vector3::z(),
                     turn: jog_move(config, Axis::Rotation, turn),
                 }))
             }
@@ -361,7 +361,7 @@ const SENSOR_OFF_AXIS_MM: f64 = 5.0;
 
 /// The configuration key that an emulated sensor on the axis needs to show how the base turns.
 pub(super) fn sensor_off_axis(config: &Config) -> Option<String> {
-    let is_on_axis = config.emulator.sensor.to_pose().translation.xy().norm() == 0.0;
+    let is_on_axis = config.emulator.sensor.translation.xy().norm() == 0.0;
     (config.is_emulated() && is_on_axis)
         .then(|| format!("emulator.sensor.x_mm={SENSOR_OFF_AXIS_MM}"))
 }

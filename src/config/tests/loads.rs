@@ -5,6 +5,7 @@ use crate::config::needle::Arc;
 use crate::config::warnings::section_name;
 use crate::control::ControlKind;
 use crate::emulator::{self, CorrelatedNoise};
+use crate::geometry::coordinates;
 use crate::keys::{Kind, find};
 use crate::stage::{RawSdo, StageConfig};
 
@@ -310,9 +311,9 @@ fn a_trial_is_drawn_within_its_ranges_by_its_seed() {
         assert_eq!((drawn.emulator.seed, &drawn.needle), (seed, &wide.needle));
         let start = drawn.emulator.start;
         assert!(
-            start.x_mm.abs() <= 8.0
-                && start.angles.pitch.abs() <= 11.5f64.to_radians()
-                && start.z_mm == 0.0
+            start.translation.x.abs() <= 8.0
+                && coordinates(&start)[4].abs() <= 11.5f64.to_radians() + 1e-12
+                && start.translation.z == 0.0
         );
         let error = drawn.emulator.arc.curvature_per_mm() * 122.0 - 1.0;
         assert!(error.abs() <= 0.3 && error != 0.0, "{error}");
