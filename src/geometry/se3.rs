@@ -44,7 +44,8 @@ impl Pose {
 
     /// The motion reached by following the constant body twist `xi` for one unit.
     pub fn exp(xi: &Twist) -> Self {
-        Pose { rotation: so3::exp(&xi.w), translation: so3::left_jacobian(&xi.w) * xi.v }
+        let (rotation, jacobian) = so3::exp_and_left_jacobian(&xi.w);
+        Pose { rotation, translation: jacobian * xi.v }
     }
 
     /// The twist with `exp(log(g)) = g`, rotation part of length 0 to π.

@@ -31,9 +31,16 @@ fn coefficients(theta: f64) -> (f64, f64, f64) {
 
 /// The rotation by `|w|` about `w`: Rodrigues' formula, `I + a ŵ + b ŵ²` with the first two coefficients.
 pub fn exp(w: &Vector3<f64>) -> Rotation3<f64> {
-    let (a, b, _) = coefficients(w.norm());
+    exp_and_left_jacobian(w).0
+}
+
+/// [`exp`] and [`left_jacobian`], which share their coefficients.
+pub(super) fn exp_and_left_jacobian(w: &Vector3<f64>) -> (Rotation3<f64>, Matrix3<f64>) {
+    let (a, b, c) = coefficients(w.norm());
     let w_hat = hat(w);
-    Rotation3::from_matrix_unchecked(Matrix3::identity() + w_hat * a + w_hat * w_hat * b)
+    let (one, square) = (Matrix3::identity(), w_hat * w_hat);
+    let rotation = Rotation3::from_matrix_unchecked(one + w_hat * a + square * b);
+    (rotation, one + w_hat * b + square * c)
 }
 
 /// The rotation vector of `rotation`, of length 0 to π.
@@ -55,9 +62,7 @@ pub fn quaternion(rotation: &Rotation3<f64>) -> UnitQuaternion<f64> {
 /// The left Jacobian of SO(3), `Exp(w + d) ≈ Exp(J_l(w) d) Exp(w)`. It is also the translation part of SE(3)'s
 /// exponential.
 pub fn left_jacobian(w: &Vector3<f64>) -> Matrix3<f64> {
-    let (_, b, c) = coefficients(w.norm());
-    let w_hat = hat(w);
-    Matrix3::identity() + w_hat * b + w_hat * w_hat * c
+    exp_and_left_jacobian(w).1
 }
 
 /// The inverse of [`left_jacobian`], for |w| < 2π.
