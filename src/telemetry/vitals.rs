@@ -99,15 +99,14 @@ pub(super) struct Watch {
     /// The last health that was reported.
     health: Health,
     /// The number of lost items in the last report, and its time.
-    reported_drops: u64,
-    drops_reported: Option<Instant>,
+    reported_drops: Option<(u64, Instant)>,
 }
 
 impl Watch {
     /// Watches `writer`, which takes `items`, from `now` on.
     pub(super) fn new(writer: &'static str, items: &'static str, now: Instant) -> Self {
         let (silence, health) = (Silence::new(now), Health::Alive);
-        Watch { writer, items, silence, health, reported_drops: 0, drops_reported: None }
+        Watch { writer, items, silence, health, reported_drops: None }
     }
 
     /// The next change at `now`, if `dropped` items were lost so far because the queue was full. Call this
@@ -133,36 +132,32 @@ impl Watch {
         if mem::replace(&mut self.health, health) == health {
             return None;
         }
-        let silent = TelemetryError::writer_silent(writer, lasted, SILENCE_LIMIT);
-        Some(match health {
-            Health::Alive => {
-                RecordNews::Warning(format!("{writer}: alive again after {before_s:.1} s"))
-            }
-            Health::Silent => RecordNews::Warning(silent.to_string()),
-            Health::GivenUp => RecordNews::Failed(silent.to_string()),
-            Health::Failed => {
-                let reason = vitals.fault().unwrap_or_default();
-                RecordNews::Failed(TelemetryError::writer_failed(writer, reason).to_string())
-            }
-        })
+        let text = match (health, vitals.fault()) {
+            (Health::Alive, _) => format!("{writer}: alive again after {before_s:.1} s"),
+            (_, Some(reason)) => TelemetryError::writer_failed(writer, reason).to_string(),
+            _ => TelemetryError::writer_silent(writer, lasted, SILENCE_LIMIT).to_string(),
+        };
+        let is_failed = health >= Health::GivenUp;
+        Some(if is_failed { RecordNews::Failed(text) } else { RecordNews::Warning(text) })
     }
 
     fn drop_news(&mut self, dropped: u64, now: Instant) -> Option<RecordNews> {
-        let is_recent =
-            |reported: Instant| now.saturating_duration_since(reported) < DROP_WARNING_INTERVAL;
-        if dropped == self.reported_drops || self.drops_reported.is_some_and(is_recent) {
+        let (before, is_recent) = self.reported_drops.map_or((0, false), |(drops, time)| {
+            (drops, now.saturating_duration_since(time) < DROP_WARNING_INTERVAL)
+        });
+        if dropped == before || is_recent {
             return None;
         }
-        let more = dropped - mem::replace(&mut self.reported_drops, dropped);
-        let is_first = self.drops_reported.replace(now).is_none();
-        let (writer, items) = (self.writer, self.items);
-        if is_first && self.health < Health::GivenUp {
-            return Some(RecordNews::Failed(format!(
+        let is_first = self.reported_drops.replace((dropped, now)).is_none();
+        let (writer, items, more) = (self.writer, self.items, dropped - before);
+        Some(match is_first && self.health < Health::GivenUp {
+            true => RecordNews::Failed(format!(
                 "{writer}: {items} lost: {dropped}, its queue is full; is the disk too slow for this run?"
-            )));
-        }
-        let text = format!("{writer}: {items} lost: {more} more, {dropped} in all");
-        Some(RecordNews::Warning(text))
+            )),
+            false => RecordNews::Warning(format!(
+                "{writer}: {items} lost: {more} more, {dropped} in all"
+            )),
+        })
     }
 }
 

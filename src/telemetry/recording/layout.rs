@@ -122,9 +122,7 @@ fn log(layout: &RecordingStream, parts: &Part) -> Logged {
 /// Logs a part under `id`, and the parts inside it; returns its path.
 fn log_part(layout: &RecordingStream, part: &Part, id: Uuid) -> Logged<String> {
     let class = match part.class.as_str() {
-        "horizontal" => return log_container(layout, part, ContainerKind::Horizontal, id),
-        "vertical" => return log_container(layout, part, ContainerKind::Vertical, id),
-        "tabs" => return log_container(layout, part, ContainerKind::Tabs, id),
+        "horizontal" | "vertical" | "tabs" => return log_container(layout, part, id),
         "" => PLOT,
         class => class,
     };
@@ -163,12 +161,12 @@ fn log_part(layout: &RecordingStream, part: &Part, id: Uuid) -> Logged<String> {
     Ok(path)
 }
 
-fn log_container(
-    layout: &RecordingStream,
-    part: &Part,
-    kind: ContainerKind,
-    id: Uuid,
-) -> Logged<String> {
+fn log_container(layout: &RecordingStream, part: &Part, id: Uuid) -> Logged<String> {
+    let kind = match part.class.as_str() {
+        "horizontal" => ContainerKind::Horizontal,
+        "vertical" => ContainerKind::Vertical,
+        _ => ContainerKind::Tabs,
+    };
     let inside = part.inside.iter().map(|part| log_part(layout, part, Uuid::random()));
     let inside = inside.collect::<Logged<Vec<_>>>()?;
     let mut container = blueprint::ContainerBlueprint::new(kind).with_contents(inside);

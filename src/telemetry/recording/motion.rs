@@ -75,9 +75,8 @@ impl Motion {
 /// The columns of `limits` with their values.
 fn limits(scene: &Scene) -> Vec<(&'static str, f64)> {
     let (insertion, rotation) = (&scene.stage.insertion, &scene.stage.rotation);
-    let sync_period = scene.stage.bus.sync_period();
-    let insertion_lag_max = insertion.following_error_limit(sync_period);
-    let rotation_lag_max = rotation.following_error_limit(sync_period);
+    let [insertion_lag_max, rotation_lag_max] =
+        [insertion, rotation].map(|axis| axis.following_error_limit(scene.stage.bus.sync_period()));
     vec![
         ("insertion_min_mm", insertion.limits.min),
         ("insertion_max_mm", insertion.limits.max),

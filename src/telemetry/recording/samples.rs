@@ -15,8 +15,8 @@ const RATE_INTERVAL: Duration = Duration::from_millis(500);
 #[derive(Default)]
 pub(super) struct Samples {
     window_begin: Option<Time>,
-    accepted: u32,
-    refused: u32,
+    /// How many were accepted and refused since then.
+    counts: [u32; 2],
     /// The gate that refused the last sample; the inner `None` if it was accepted.
     last_gate: Option<Option<GateName>>,
 }
@@ -37,10 +37,7 @@ impl Samples {
             return Ok(());
         }
         log_refused(stream, sample)?;
-        match gate {
-            None => self.accepted += 1,
-            Some(_) => self.refused += 1,
-        }
+        self.counts[usize::from(gate.is_some())] += 1;
         if self.last_gate.replace(gate) != Some(gate) {
             let (state, meaning) = match gate {
                 None => ("accepted".to_owned(), Meaning::Good),
@@ -54,11 +51,9 @@ impl Samples {
             return Ok(());
         }
         let interval_s = time.seconds_after(begin);
-        let rates = [("accepted_per_s", self.accepted), ("refused_per_s", self.refused)];
-        let rates = rates.map(|(name, n)| (name, f64::from(n) / interval_s));
-        (self.accepted, self.refused) = (0, 0);
         self.window_begin = Some(time);
-        log_row(stream, "sample_rates", rates)
+        let rates = std::mem::take(&mut self.counts).map(|n| f64::from(n) / interval_s);
+        log_row(stream, "sample_rates", ["accepted_per_s", "refused_per_s"].into_iter().zip(rates))
     }
 }
 

@@ -155,11 +155,10 @@ impl Space {
         if let Some((world, problem)) = &scene.goal {
             log_goal(stream, world, problem)?;
         }
-        let estimate = Tip::new("estimate", ESTIMATE);
-        estimate.log_style(stream)?;
-        let truth = Tip::new("true", TRUTH);
+        let [estimate, truth] = ["estimate", "true"].map(Tip::new);
+        estimate.log_style(stream, ESTIMATE)?;
         if scene.truth {
-            truth.log_style(stream)?;
+            truth.log_style(stream, TRUTH)?;
         }
         let measured = Points3D::update_fields()
             .with_colors([MEASURED])
@@ -236,9 +235,9 @@ impl Space {
             Reach::Obstructed => LIMIT,
             Reach::OutOfReach => OUT_OF_REACH,
         });
-        let colours: Vec<Color> = colours.collect();
-        let points = points.iter().map(|(point_mm, _)| point(point_mm));
-        let points = Points3D::new(points).with_colors(colours).with_radii([0.4]);
+        let points = Points3D::new(points.iter().map(|(point_mm, _)| point(point_mm)))
+            .with_colors(colours)
+            .with_radii([0.4]);
         stream.log("bench/plane/goal/reach", &points)
     }
 }
@@ -300,19 +299,15 @@ fn log_goal(stream: &RecordingStream, world: &World, problem: &Problem) -> Logge
 struct Tip {
     tip_path: String,
     trail_path: String,
-    colour: Color,
     /// The present end of the trail.
     last_point_mm: Option<[f32; 3]>,
 }
 
 impl Tip {
-    fn new(provenance: &str, colour: Color) -> Self {
-        Tip {
-            tip_path: format!("{PLANE}/tip/{provenance}"),
-            trail_path: format!("{PLANE}/path/{provenance}"),
-            colour,
-            last_point_mm: None,
-        }
+    fn new(provenance: &str) -> Self {
+        let [tip_path, trail_path] =
+            ["tip", "path"].map(|part| format!("{PLANE}/{part}/{provenance}"));
+        Tip { tip_path, trail_path, last_point_mm: None }
     }
 
     fn log(&mut self, stream: &RecordingStream, x_pb: &Pose) -> Logged {
@@ -323,17 +318,16 @@ impl Tip {
     }
 
     /// The bevel bends the tip towards −y of its own frame (paper Eq. 1: `p'' = −κ R e₂`).
-    fn log_style(&self, stream: &RecordingStream) -> Logged {
-        let arrows = [Vector3::z(), -Vector3::y() * 0.7]
-            .map(|direction: Vector3<f32>| <[f32; 3]>::from(direction * ARROW_MM));
+    fn log_style(&self, stream: &RecordingStream, colour: Color) -> Logged {
+        let arrows = [[0.0, 0.0, ARROW_MM], [0.0, -0.7 * ARROW_MM, 0.0]];
         let arrows = Arrows3D::from_vectors(arrows)
-            .with_colors([self.colour])
+            .with_colors([colour])
             .with_radii([Radius::new_ui_points(1.5)])
             .with_labels(["", "bevel"])
             .with_show_labels(false);
         stream.log_static(self.tip_path.as_str(), &arrows)?;
         let style = LineStrips3D::update_fields()
-            .with_colors([self.colour])
+            .with_colors([colour])
             .with_radii([Radius::new_ui_points(1.2)]);
         stream.log_static(self.trail_path.as_str(), &style)
     }

@@ -50,9 +50,12 @@ impl Steps {
         self.unwrap_roll(&mut estimate);
         self.unwrap_roll(&mut truth);
         let has_truth = known_truth.is_some();
+        // Estimate minus truth, mm and rad, angles in (−π, π].
         let errors = |estimate: [f64; 6]| {
-            let error = error(estimate, truth);
-            (0..6).filter(move |_| has_truth).map(move |n| (column(n, "error"), error[n]))
+            (0..6).filter(move |_| has_truth).map(move |n| {
+                let difference = estimate[n] - truth[n];
+                (column(n, "error"), if n < 3 { difference } else { wrap_angle(difference) })
+            })
         };
         for (name, shadow) in &step.decision.shadows {
             let mut shadow = of(shadow);
@@ -110,12 +113,4 @@ fn target_band(step: &StepRecord) -> Option<[(String, f64); 2]> {
 /// `angle_rad` plus or minus whole turns, within half a turn of `reference_rad`.
 fn nearest_turn(angle_rad: f64, reference_rad: f64) -> f64 {
     reference_rad + wrap_angle(angle_rad - reference_rad)
-}
-
-/// Estimate minus truth, mm and rad, angles in (−π, π].
-fn error(estimate: [f64; 6], truth: [f64; 6]) -> [f64; 6] {
-    std::array::from_fn(|n| {
-        let difference = estimate[n] - truth[n];
-        if n < 3 { difference } else { wrap_angle(difference) }
-    })
 }
