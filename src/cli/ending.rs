@@ -29,10 +29,12 @@ pub(super) fn status(config: &Config, report: &RunReport) -> u8 {
 
 /// The last lines of a summary: the record, and how the run ended.
 pub(super) fn ending(config: &Config, report: &RunReport) -> String {
-    let (dir, word) = (report.run_dir.display(), shell_word(report.run_dir.display()));
-    let recording = report.run_dir.join(file::RECORDING);
+    let run_dir = report.run_dir.as_deref().unwrap_or(Path::new(""));
+    let (dir, word) = (run_dir.display(), shell_word(run_dir.display()));
+    let recording = run_dir.join(file::RECORDING);
     let mut lines = Vec::new();
     match &report.record {
+        Err(error) if report.run_dir.is_none() => lines.push(format!("record      none: {error}")),
         Err(error) => lines.push(format!(
             "record      {dir}, left open: {error}; close it: needle-bench review {word} --repair"
         )),
@@ -43,7 +45,7 @@ pub(super) fn ending(config: &Config, report: &RunReport) -> String {
                 true => format!("look at it: rerun {}", shell_word(recording.display())),
                 false => format!("make its run.rrd: needle-bench review {word} --repair"),
             };
-            let megabytes = folder_bytes(&report.run_dir) as f64 * 1e-6;
+            let megabytes = folder_bytes(run_dir) as f64 * 1e-6;
             lines.push(format!("record      {dir} ({megabytes:.1} MB); {look}"));
         }
     }
@@ -90,14 +92,14 @@ pub(super) fn after_insertion(
     report: &RunReport,
 ) -> Option<String> {
     if config.is_emulated() {
-        return report.outcome.stop_reason().map(|_| next_review(report));
+        return report.outcome.stop_reason().and_then(|_| next_review(report));
     }
     let depth_mm = depth_mm(config, report);
     let next = match (required(config, &report.stage_at_end), possible_withdrawal(config, report)) {
-        (Some(required), _) => next_stage(required.operation(), path, report),
-        (None, Err(_)) if depth_mm.is_none() => next_stage("status", path, report),
-        (None, Err(_)) => next_review(report),
-        (None, Ok(withdrawal)) => next_stage("withdraw", path, report) + &withdrawal.options(),
+        (Some(required), _) => next_stage(required.operation(), "", path, report),
+        (None, Err(_)) if depth_mm.is_none() => next_stage("status", "", path, report),
+        (None, Err(_)) => next_review(report)?,
+        (None, Ok(withdrawal)) => next_stage("withdraw", &withdrawal.options(), path, report),
     };
     let needle = needle_at(config, depth_mm);
     Some(format!("needle      {needle}; {}\n{next}", drives(&report.stage_at_end)))
@@ -131,7 +133,7 @@ pub(super) fn after_operation(
 ) -> Option<String> {
     let is_stopped = report.outcome.stop_reason().is_some();
     if config.is_emulated() {
-        return is_stopped.then(|| next_review(report));
+        return next_review(report).filter(|_| is_stopped);
     }
     let required = required(config, &report.stage_at_end);
     if !is_stopped && required.is_none() {
@@ -145,22 +147,31 @@ pub(super) fn after_operation(
         None => "not known where the axes stand".to_owned(),
     };
     let next = match (required, remaining) {
-        (Some(required), _) => next_stage(required.operation(), path, report),
-        (None, Some(remaining)) => next_stage("withdraw", path, report) + remaining,
-        (None, None) => next_stage("status", path, report),
+        (Some(required), _) => next_stage(required.operation(), "", path, report),
+        (None, Some(remaining)) => next_stage("withdraw", remaining, path, report),
+        (None, None) => next_stage("status", "", path, report),
     };
     Some(format!("stage       {positions}; {}\n{next}", drives(&report.stage_at_end)))
 }
 
-/// The line with the next command, a review of the run.
-fn next_review(report: &RunReport) -> String {
-    format!("next        needle-bench review {}", shell_word(report.run_dir.display()))
+/// The line with the next command, a review of the run; `None` without a record.
+fn next_review(report: &RunReport) -> Option<String> {
+    let run_dir = report.run_dir.as_ref()?;
+    Some(format!("next        needle-bench review {}", shell_word(run_dir.display())))
 }
 
-/// The line with the next command, an `operation` of the stage.
-fn next_stage(operation: &str, path: Option<&Path>, report: &RunReport) -> String {
-    let path = path.map_or_else(|| report.run_dir.join(file::CONFIG), Path::to_path_buf);
-    format!("next        needle-bench stage {operation} {}", shell_word(path.display()))
+/// The line with the next command, an `operation` of the stage with `options`.
+fn next_stage(operation: &str, options: &str, path: Option<&Path>, report: &RunReport) -> String {
+    let recorded = report.run_dir.as_ref().map(|dir| dir.join(file::CONFIG));
+    match path.map(Path::to_path_buf).or(recorded) {
+        Some(path) => {
+            let path = shell_word(path.display());
+            format!("next        needle-bench stage {operation} {path}{options}")
+        }
+        None => format!(
+            "next        needle-bench stage {operation} CONFIG{options}, CONFIG and its --set as before"
+        ),
+    }
 }
 
 /// An operation of the stage that is required before any other.

@@ -22,7 +22,7 @@ use crate::runtime::{
     Sink, TipSource, complete_record, run_live, run_virtual,
 };
 use crate::session::AxisMove;
-use crate::telemetry::{Backpressure, Recorder, Scene, check_room, utc_text};
+use crate::telemetry::{Backpressure, Recorder, Scene, TelemetryError, check_room, utc_text};
 use crate::transport::can::CanBus;
 use crate::transport::link::Link;
 use crate::transport::socketcan::{SocketCan, has_device};
@@ -117,7 +117,12 @@ impl Job<'_> {
         interrupt: &Interrupt,
     ) -> Result<Performed> {
         let config = self.config;
-        let stops_on_record_failure = config.record.on_failure == OnFailure::Stop;
+        // A needle in tissue comes out, whatever happens to the record.
+        let without_record = match config.record.on_failure {
+            _ if self.is_withdrawal() => Some("the withdrawal goes on"),
+            OnFailure::GoOn => Some("the run goes on (record.on_failure)"),
+            OnFailure::Stop => None,
+        };
         let begin = |now| self.run_config.clone().begin(now).map_err(Failure::configuration);
         let Options { realtime, live, paced, .. } = self.options;
         live.map_or(Ok(()), check_live_address)?;
@@ -136,7 +141,7 @@ impl Job<'_> {
                 }),
             };
             let (recorder, _) = self.start_recording(SystemTime::now(), Backpressure::Block)?;
-            let sink = Sink::new(recorder, stops_on_record_failure, operator, interrupt);
+            let sink = Sink::new(recorder, without_record, operator, interrupt);
             session = begin(Time::ZERO)?;
             run_virtual(&mut session, stage, tips, paced.then(Pace::begin), sink)
         } else {
@@ -146,7 +151,7 @@ impl Job<'_> {
             let mut tracker = self.open_tracker(runtime, clock)?;
             let (recorder, realtime) =
                 self.start_recording(clock.origin_utc(), Backpressure::DropAndCount)?;
-            let sink = Sink::new(recorder, stops_on_record_failure, operator, interrupt);
+            let sink = Sink::new(recorder, without_record, operator, interrupt);
             // Last: the session's deadlines start to run here.
             session = begin(clock.now())?;
             run_live(&mut session, bus.as_mut(), tracker.as_mut(), clock, realtime, sink)
@@ -186,32 +191,79 @@ impl Job<'_> {
         }
     }
 
+    fn is_withdrawal(&self) -> bool {
+        matches!(self.motion, Some(Motion::Withdraw { .. }))
+    }
+
     /// Creates the run folder if the disk has room, serves the run to viewers, and gives this thread its
-    /// real-time priority.
+    /// real-time priority. Only a withdrawal goes on without a recorder.
     fn start_recording(
         &self,
         started_utc: SystemTime,
         backpressure: Backpressure,
-    ) -> Result<(Recorder, Option<RealTime>)> {
+    ) -> Result<(Result<Recorder, TelemetryError>, Option<RealTime>)> {
+        let mut recorder = if self.is_withdrawal() {
+            self.record_if_possible(started_utc, backpressure)
+        } else {
+            self.check_record_dir()?;
+            Ok(self.create_recorder(started_utc, backpressure)?)
+        };
+        let served = recorder.as_mut().map_or(Ok(()), |recorder| self.serve(recorder));
+        match served.and_then(|()| self.options.realtime.enter()) {
+            Ok(realtime) => Ok((recorder, realtime)),
+            Err(failure) => {
+                if let Ok(recorder) = recorder {
+                    recorder.discard();
+                }
+                Err(failure)
+            }
+        }
+    }
+
+    /// As for any run, but warns where that is refused.
+    fn record_if_possible(
+        &self,
+        started_utc: SystemTime,
+        backpressure: Backpressure,
+    ) -> Result<Recorder, TelemetryError> {
+        let checked = self.check_record_dir();
+        let created = self.create_recorder(started_utc, backpressure);
+        match created {
+            Ok(recorder) => {
+                if let Err(failure) = checked {
+                    print_stderr(format_args!("warning: {failure}; the withdrawal goes on"));
+                }
+                Ok(recorder)
+            }
+            Err(failure) => {
+                let failure = checked.err().unwrap_or(failure);
+                print_stderr(format_args!("warning: {failure}; the withdrawal is not recorded"));
+                Err(TelemetryError::Recording(failure.to_string()))
+            }
+        }
+    }
+
+    /// Checks that `record.dir` can be a folder, and that its disk has room.
+    fn check_record_dir(&self) -> Result<()> {
         let dir = Path::new(&self.config.record.dir);
-        let manifest = self.manifest(started_utc)?;
         if dir.is_file() {
             return Err(Failure::environment(format_args!(
                 "record.dir {}: is a file, not a folder; name a folder, as in --set record.dir=runs",
                 dir.display()
             )));
         }
-        check_room(dir, self.config.record.free_mb_min).map_err(Failure::environment)?;
+        check_room(dir, self.config.record.free_mb_min).map_err(Failure::environment)
+    }
+
+    fn create_recorder(
+        &self,
+        started_utc: SystemTime,
+        backpressure: Backpressure,
+    ) -> Result<Recorder> {
+        let manifest = self.manifest(started_utc)?;
         let config_toml = self.config.to_toml().map_err(Failure::environment)?;
-        let mut recorder = Recorder::create(dir, manifest, config_toml, backpressure)
-            .map_err(Failure::environment)?;
-        match self.serve(&mut recorder).and_then(|()| self.options.realtime.enter()) {
-            Ok(realtime) => Ok((recorder, realtime)),
-            Err(failure) => {
-                recorder.discard();
-                Err(failure)
-            }
-        }
+        let dir = Path::new(&self.config.record.dir);
+        Recorder::create(dir, manifest, config_toml, backpressure).map_err(Failure::environment)
     }
 
     fn manifest(&self, started_utc: SystemTime) -> Result<Manifest> {
@@ -327,7 +379,7 @@ pub(super) fn end_json(report: &RunReport) -> Value {
         "outcome": RunOutcome::from(&report.outcome),
         "stop_reason": report.outcome.stop_reason(),
         "duration_s": report.end.as_secs_f64(),
-        "run_dir": report.run_dir.display().to_string(),
+        "run_dir": report.run_dir.as_ref().map(|dir| dir.display().to_string()),
         "record_error": match &report.record {
             Ok(manifest) => manifest.faults.first().cloned(),
             Err(error) => Some(error.to_string()),

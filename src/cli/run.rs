@@ -102,7 +102,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<()> {
     let Performed { report, wants_withdrawal, .. } = job.perform()?;
     let object = to_json(&config, &report, &preflight);
     let more = screen_values(&config, configured.whole_path(), &report);
-    print_result(arguments.json, &object, || screen(include_str!("run.txt"), &object, more))?;
+    let printed =
+        print_result(arguments.json, &object, || screen(include_str!("run.txt"), &object, more));
     let mut worst = status(&config, &report);
     if wants_withdrawal && let Ok(withdrawal) = possible_withdrawal(&config, &report) {
         let config = withdrawal.configuration(config, &report);
@@ -110,6 +111,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<()> {
         let report = stage::perform(&config, &command, withdrawal_options)?;
         worst = worst.max(status(&config, &report));
     }
+    // Last: stdout may be a file on a full disk.
+    printed?;
     finish_with(worst)
 }
 

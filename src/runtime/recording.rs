@@ -43,9 +43,9 @@ fn not_made(why: &dyn Display) -> Option<String> {
 
 /// Completes the record of a run that has ended with its `run.rrd`.
 pub fn complete_record(report: &mut RunReport, describe: Describe, operator: &mut dyn Operator) {
-    let Ok(manifest) = &mut report.record else { return };
+    let (Ok(manifest), Some(run_dir)) = (&mut report.record, &report.run_dir) else { return };
     let end = report.end;
-    let fault = make_recording(&report.run_dir, describe, &mut |made| {
+    let fault = make_recording(run_dir, describe, &mut |made| {
         let (made_s, end_s) = (made.as_secs_f64(), end.as_secs_f64());
         let text = format!("making run.rrd: {made_s:.0} s of {end_s:.0} s done");
         operator.event(end, Lane::Session, Severity::Info, &text);

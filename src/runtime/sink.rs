@@ -52,10 +52,11 @@ pub struct Holds {
 
 /// Takes the records of a run.
 pub struct Sink<'a> {
-    recorder: Recorder,
+    /// The recorder, or why there is none.
+    recorder: Result<Recorder, TelemetryError>,
     figures: RunFigures,
     holds: Holds,
-    stops_on_failure: bool,
+    without_record: Option<&'static str>,
     /// How long it took to hand each record to the recorder, ns.
     record_times: DurationHistogram,
     operator: &'a mut dyn Operator,
@@ -79,9 +80,9 @@ pub struct RunReport {
     pub end: Time,
     /// How punctual the run was; `None` in virtual time.
     pub timing: Option<TimingReport>,
-    /// The run folder.
-    pub run_dir: PathBuf,
-    /// The manifest of the closed record, or why it could not be closed.
+    /// The run folder; `None` for a withdrawal without a record.
+    pub run_dir: Option<PathBuf>,
+    /// The manifest of the closed record, or why there is none or it could not be closed.
     pub record: Result<Manifest, TelemetryError>,
     /// What is known only in an emulated run; `None` in any other.
     pub emulated: Option<EmulationReport>,
@@ -89,20 +90,22 @@ pub struct RunReport {
 
 impl<'a> Sink<'a> {
     /// Passes records to `recorder` and news to `operator`; stops the run once `interrupt` is raised. If
-    /// recording fails, the run is stopped if `stops_on_failure`; otherwise it continues, and lost records are
+    /// recording fails, the run is stopped, unless `without_record` says what goes on; lost records are then
     /// reported and counted.
     pub fn new(
-        recorder: Recorder,
-        stops_on_failure: bool,
+        recorder: Result<Recorder, TelemetryError>,
+        without_record: Option<&'static str>,
         operator: &'a mut dyn Operator,
         interrupt: &Interrupt,
     ) -> Self {
-        operator.recorded_to(recorder.run_dir());
+        if let Ok(recorder) = &recorder {
+            operator.recorded_to(recorder.run_dir());
+        }
         Sink {
             recorder,
             figures: RunFigures::default(),
             holds: Holds::default(),
-            stops_on_failure,
+            without_record,
             record_times: DurationHistogram::default(),
             operator,
             interrupt: interrupt.clone(),
@@ -110,7 +113,8 @@ impl<'a> Sink<'a> {
     }
 
     fn identify(&mut self, axis: Axis, node: NodeId, identity: &Identity) {
-        self.recorder.identify_drive(DriveIdentity {
+        let Ok(recorder) = &mut self.recorder else { return };
+        recorder.identify_drive(DriveIdentity {
             axis: axis.to_string(),
             node: node.get(),
             vendor_id: identity.vendor,
@@ -124,17 +128,15 @@ impl<'a> Sink<'a> {
     /// recording has failed, unless the run continues without a record or `is_ending` anyway.
     fn look_after_record(&mut self, now: Time, is_ending: bool) -> Option<String> {
         let mut reason = None;
-        while let Some(news) = self.recorder.news() {
-            let trouble = match news {
-                RecordNews::Failed(error) if !self.stops_on_failure => {
-                    format!("{error}; the run goes on (record.on_failure)")
-                }
-                RecordNews::Failed(error) if reason.is_none() && !is_ending => {
+        while let Some(news) = self.recorder.as_mut().ok().and_then(Recorder::news) {
+            let trouble = match (news, self.without_record) {
+                (RecordNews::Failed(error), Some(goes_on)) => format!("{error}; {goes_on}"),
+                (RecordNews::Failed(error), None) if reason.is_none() && !is_ending => {
                     self.operator.record_trouble(&error);
                     reason = Some(format!("record: {error}"));
                     continue;
                 }
-                RecordNews::Failed(text) | RecordNews::Warning(text) => text,
+                (RecordNews::Failed(text) | RecordNews::Warning(text), _) => text,
             };
             self.operator.record_trouble(&trouble);
             let text = format!("record: {trouble}");
@@ -153,14 +155,15 @@ impl<'a> Sink<'a> {
         timing: Option<TimingReport>,
     ) -> RunReport {
         let timing = timing.map(|timing| timing.with_record_times(&self.record_times));
-        let run_dir = self.recorder.run_dir().to_path_buf();
-        let record = self.recorder.finish(|manifest| {
+        let run_dir = self.recorder.as_ref().ok().map(|recorder| recorder.run_dir().to_path_buf());
+        let sum_up = |manifest: &mut Manifest| {
             manifest.set_outcome(&outcome);
             manifest.duration_s = Some(end.as_nanos() as f64 / 1e9);
             manifest.gates = gates_to_json(&gates);
             manifest.figures = json_keys(&self.figures.report());
             manifest.timing = json_keys(&timing);
-        });
+        };
+        let record = self.recorder.and_then(|recorder| recorder.finish(sum_up));
         let (figures, holds) = (self.figures, self.holds);
         let (stage_at_end, emulated) = (StageAtEnd::default(), None);
         RunReport {
@@ -195,8 +198,9 @@ impl Witness for Sink<'_> {
             _ => {}
         }
         let truth = truth.filter(|_| matches!(record, Record::Step(_)));
+        let Ok(recorder) = &mut self.recorder else { return };
         let begun = Instant::now();
-        self.recorder.record(Entry { record, truth });
+        recorder.record(Entry { record, truth });
         self.record_times.add_ns(begun.elapsed());
     }
 

@@ -8,6 +8,7 @@ use crate::support::replays::assert_it_replays;
 use crate::support::terminal::OnTerminal;
 use crate::support::udp_stage::Stage;
 use crate::support::witness::Witness;
+use std::fs;
 use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -154,6 +155,24 @@ fn the_needle_is_withdrawn_after_the_run() {
     bench.press_to_the_end(&["w", "y"]);
     let ended = bench.program.end();
     ended.assert_status(0);
+    assert!(ended.stdout.contains("from 0.000 to -3.0"), "{}", ended.stdout);
+    assert!(stage.assert_it_stands().abs() < 0.1);
+}
+
+/// The folder of the runs has become a file meanwhile, so that no record can be made, as on a full disk.
+#[test]
+fn the_needle_is_withdrawn_although_nothing_can_be_recorded() {
+    let _machine = beside_others();
+    let scratch = Scratch::new("console-no-record");
+    let stage = Stage::start(&[]);
+    let Some(mut bench) = on_terminal(&scratch, &stage, [24, 80], 3) else { return };
+    scratch.wait_for_event("completed");
+    fs::rename(scratch.path("runs"), scratch.path("before")).unwrap();
+    fs::write(scratch.path("runs"), "").unwrap();
+    bench.press_to_the_end(&["w", "y"]);
+    let ended = bench.program.end();
+    ended.assert_status(3);
+    assert!(ended.stdout.contains("; the withdrawal is not recorded"), "{}", ended.stdout);
     assert!(ended.stdout.contains("from 0.000 to -3.0"), "{}", ended.stdout);
     assert!(stage.assert_it_stands().abs() < 0.1);
 }

@@ -1,6 +1,7 @@
 //! The command `needle-bench stage`, on the virtual stage.
 
 use crate::support::program::{Said, Scratch, needle_bench, refusals};
+use std::process::Command;
 
 fn stage(scratch: &Scratch, arguments: &[&str]) -> Said {
     needle_bench(scratch, &[&["stage", "--virtual"], arguments].concat())
@@ -185,6 +186,71 @@ fn withdraw_comes_back_to_where_the_axis_reads_zero() {
     assert_eq!(said.stdout.lines().next(), Some("insertion   from 30.000 to 0.000 mm"));
     let said = stage(&scratch, &[&["withdraw", "--by", "5mm", "-q"][..], &deep].concat());
     assert_eq!(said.stdout.lines().next(), Some("insertion   from 30.000 to 25.000 mm"));
+}
+
+/// A needle must not stay in because a disk is full. Every other operation is refused.
+#[test]
+fn a_withdrawal_goes_on_without_a_record() {
+    let scratch = Scratch::new();
+    let file = scratch.write("file", "");
+    let in_file = format!("record.dir={}", file.display());
+    // No user can create a folder there, not even root.
+    for dir in ["record.dir=/proc/runs", &in_file] {
+        let set = ["--set", "emulator.insertion_start_mm=30", "--set", dir, "-q"];
+        let jog = ["jog", "--axis", "insertion", "--by", "-2mm"];
+        let refused = stage(&scratch, &[&jog[..], &set].concat());
+        assert_eq!((refused.status, refused.stdout.as_str()), (3, ""), "{}", refused.stderr);
+        let said = stage(&scratch, &[&["withdraw"], &set[..]].concat());
+        let why = refused.stderr.trim().trim_start_matches("error: ");
+        let warning = format!("warning: {why}; the withdrawal is not recorded\n");
+        assert_eq!((said.status, said.stderr.as_str()), (3, warning.as_str()));
+        let lines: Vec<&str> = said.stdout.lines().collect();
+        assert_eq!(lines[0], "insertion   from 30.000 to 0.000 mm");
+        assert!(lines[1].starts_with("record      none: "), "{}", said.stdout);
+        assert_eq!(lines.last(), Some(&"completed"));
+        let json = stage(&scratch, &[&["withdraw", "--json"], &set[..]].concat()).json();
+        assert!(json["run_dir"].is_null() && json["record_error"].is_string(), "{json}");
+    }
+    let set = ["--set", "emulator.insertion_start_mm=3", "--set", "record.free_mb_min=4294967295"];
+    let said = stage(&scratch, &[&["withdraw", "--json", "-q"], &set[..]].concat());
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    let warning = "free some, or set another record.dir; the withdrawal goes on\n";
+    assert!(said.stderr.ends_with(warning), "{}", said.stderr);
+    assert!(said.run_dir(&scratch).join("can.log").exists());
+}
+
+/// The record fails at 100 kB a file, as on a disk that fills.
+#[test]
+fn a_withdrawal_goes_on_when_its_record_fails() {
+    for (operation, outcome) in [
+        ("withdraw", "completed"),
+        ("jog --axis insertion --by -30mm --speed 1mm/s", "stopped: record: "),
+    ] {
+        let scratch = Scratch::new();
+        // POSIX counts blocks of 512 bytes.
+        let script = format!(
+            "ulimit -f 200 && exec \"$0\" stage --virtual {operation} --set emulator.insertion_start_mm=30"
+        );
+        let mut limited = Command::new("sh");
+        limited.args(["-c", &script, env!("CARGO_BIN_EXE_needle-bench")]);
+        let ended = limited.current_dir(scratch.path()).output().expect("the program starts");
+        let [stdout, stderr] =
+            [&ended.stdout, &ended.stderr].map(|bytes| String::from_utf8_lossy(bytes));
+        let last = stdout.lines().last().unwrap_or_default();
+        assert!(last.starts_with(outcome), "{stdout}{stderr}");
+        let is_withdrawal = operation == "withdraw";
+        assert_eq!(
+            stderr.contains("not recorded; the withdrawal goes on"),
+            is_withdrawal,
+            "{stderr}"
+        );
+        assert_eq!(stdout.starts_with("insertion   from 30.000 to 0.000 mm"), is_withdrawal);
+        assert_eq!(
+            ended.status.code(),
+            Some(if is_withdrawal { 3 } else { 1 }),
+            "{stdout}{stderr}"
+        );
+    }
 }
 
 #[test]

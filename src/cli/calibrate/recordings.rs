@@ -233,7 +233,9 @@ pub(super) fn record_turn(
             // The turn back has a new emulated stage: it starts where this one ended.
             config.emulator.rotation_start_deg = position.rotation_rad.to_degrees();
         }
-        rows.extend(rows_of(replay_run(&report.run_dir)?));
+        if let Some(run_dir) = &report.run_dir {
+            rows.extend(rows_of(replay_run(run_dir)?));
+        }
     }
     let has_orientation = rows.iter().all(|row| row.len() == COLUMNS.len());
     let cells = if has_orientation { COLUMNS.len() } else { CELLS_MIN };

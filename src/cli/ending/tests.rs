@@ -22,7 +22,7 @@ fn report(outcome: Outcome, faults: &[&str]) -> RunReport {
         gates: GateCounts::default(),
         end: Time::ZERO,
         timing: None,
-        run_dir: PathBuf::from("runs/a"),
+        run_dir: Some(PathBuf::from("runs/a")),
         record: Ok(Manifest { faults, ..Manifest::default() }),
         emulated: None,
     }
@@ -38,6 +38,26 @@ fn a_record_left_open_is_named_with_what_closes_it() {
     assert!(lines[0].starts_with("record      runs/a, left open: "), "{text}");
     assert!(lines[0].ends_with("; close it: needle-bench review runs/a --repair"), "{text}");
     assert_eq!(lines[1], "completed");
+}
+
+/// A withdrawal goes on without a record, and the command that finishes it has no recorded configuration to name.
+#[test]
+fn a_withdrawal_without_a_record_says_how_to_finish_it() {
+    let config = config(&[]);
+    let error = TelemetryError::Recording("run folder runs: No space left on device".to_owned());
+    let report = RunReport { run_dir: None, record: Err(error), ..stopped(stood()) };
+    assert_eq!(
+        ending(&config, &report),
+        "record      none: run folder runs: No space left on device\nstopped: operator: interrupted"
+    );
+    let after = after_operation(&config, None, Some(" --by 5.0mm"), &report).unwrap();
+    let next =
+        "next        needle-bench stage withdraw CONFIG --by 5.0mm, CONFIG and its --set as before";
+    assert_eq!(after.lines().last(), Some(next));
+    let after = after_operation(&config, Some(Path::new(RIG)), Some(""), &report).unwrap();
+    assert_eq!(after.lines().last(), Some("next        needle-bench stage withdraw rig.toml"));
+    let emulated = Config::from_sources(&[], &[]).unwrap();
+    assert_eq!(after_operation(&emulated, None, None, &report), None);
 }
 
 /// With `record.on_failure = "stop"` a run without a complete record does not succeed.

@@ -100,7 +100,7 @@ fn to_json(name: &str, performed: &Performed, proof: &Option<String>) -> Value {
 
 /// What the motion has proved, from its record.
 fn proof_of(report: &RunReport) -> Option<String> {
-    proof(&std::fs::read_to_string(report.run_dir.join(file::EVENTS)).ok()?)
+    proof(&std::fs::read_to_string(report.run_dir.as_ref()?.join(file::EVENTS)).ok()?)
 }
 
 /// The summary, the stop reason last.

@@ -283,7 +283,7 @@ fn live(
     let bus = MemoryBus::new();
     let (mut drives, mut bench) = (bus.endpoint(), bus.endpoint());
     frames.iter().for_each(|frame| drives.send(frame).unwrap());
-    let sink = Sink::new(recorder, true, &mut operator, &Interrupt::default());
+    let sink = Sink::new(Ok(recorder), None, &mut operator, &Interrupt::default());
     run_live(machine, &mut bench, tracker, clock, None, sink);
     let sent = std::iter::from_fn(|| drives.receive(Duration::ZERO).unwrap());
     let frame = |event| match event {
@@ -422,7 +422,7 @@ fn behind_a_refused_frame_only_the_stop_is_sent() {
     let recorder =
         Recorder::create(&scratch.0, manifest, CONFIG_TOML.to_owned(), Backpressure::Block)
             .unwrap();
-    let sink = Sink::new(recorder, true, &mut operator, &Interrupt::default());
+    let sink = Sink::new(Ok(recorder), None, &mut operator, &Interrupt::default());
     let mut session = Session::new(config.session().unwrap(), clock.now()).unwrap();
     let mut bus = Refusing::default();
     let report = run_ticking(&mut session, &mut bus, clock, sink);
@@ -430,7 +430,7 @@ fn behind_a_refused_frame_only_the_stop_is_sent() {
     assert_eq!(bus.accepted.iter().find(stale), None, "{:?}", bus.accepted);
     let outcome = &report.outcome;
     assert!(matches!(outcome, Outcome::Stopped(reason) if reason.starts_with("can: ")));
-    let log = report.run_dir.join("can.log");
+    let log = report.run_dir.unwrap().join("can.log");
     let log = std::fs::read_to_string(log).unwrap();
     let sent: Vec<&str> = log.lines().filter_map(|l| l.split(' ').nth(2)).collect();
     assert_eq!(sent, bus.accepted);
