@@ -6,34 +6,46 @@ use crate::session::OperatorCommand;
 use rtrb::Producer;
 use std::mem;
 use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
 
 const CTRL_C: u8 = 3;
 const ESCAPE: u8 = 27;
 /// Longest escape sequence of a key.
 const SEQUENCE_MAX: usize = 16;
+/// A terminal sends a sequence at once; later bytes are keys that the operator pressed.
+const SEQUENCE_TIME_MAX: Duration = Duration::from_millis(100);
 
 /// Turns the bytes of the keyboard into commands.
 #[derive(Debug, Default)]
 pub(super) struct Keys {
     /// The start of an escape sequence whose end has not come yet.
     pending: Vec<u8>,
+    /// When its first byte was read.
+    pending_since: Option<Instant>,
     /// Between the markers of a paste: only the keys that hold or stop act.
     is_pasting: bool,
 }
 
 impl Keys {
-    /// Takes what was read from the terminal, and does what its keys say.
+    /// Takes what was read from the terminal at `now`, and does what its keys say.
     pub(super) fn take(
         &mut self,
+        now: Instant,
         pressed: &[u8],
         shared: &Shared,
         commands: &mut Producer<OperatorCommand>,
     ) {
+        let mut since = self.pending_since.unwrap_or(now);
+        if now.saturating_duration_since(since) > SEQUENCE_TIME_MAX {
+            self.pending.clear();
+            since = now;
+        }
         self.pending.extend(pressed);
         // The speed asked for so far by the `+` and `-` of this read.
         let mut speed_mm_per_s = None;
         while let Some(len) = first_len(&self.pending) {
             let sequence: Vec<u8> = self.pending.drain(..len).collect();
+            since = now;
             match &sequence[..] {
                 [key] => self.press(*key, shared, commands, &mut speed_mm_per_s),
                 // The markers of a bracketed paste.
@@ -42,6 +54,7 @@ impl Keys {
                 _ => {}
             }
         }
+        self.pending_since = (!self.pending.is_empty()).then_some(since);
     }
 
     fn press(

@@ -39,7 +39,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use thread_priority::{
     NormalThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy,
     set_thread_priority_and_policy, thread_native_id,
@@ -319,7 +319,9 @@ fn serve_keys(
         let is_ready = poll(&mut ready, PollTimeout::from(GATHER_MS)).is_ok_and(|count| count > 0);
         if is_ready {
             match keys.read(&mut pressed) {
-                Ok(count) if count > 0 => parser.take(&pressed[..count], shared, commands),
+                Ok(count) if count > 0 => {
+                    parser.take(Instant::now(), &pressed[..count], shared, commands);
+                }
                 // The terminal is gone, and with it the operator's way to hold or stop.
                 _ => {
                     shared.interrupt.raise();

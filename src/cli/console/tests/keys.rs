@@ -7,9 +7,9 @@ fn keys_are_commands_and_escape_sequences_are_none() {
     let shared = Shared::new(setup(), Interrupt::default());
     let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
     lock(&shared.screen).progress.speed_mm_per_s = 1.0;
-    let mut keyboard = Keys::default();
+    let (now, mut keyboard) = (Instant::now(), Keys::default());
     let mut asked = |keys: &[u8]| {
-        keyboard.take(keys, &shared, &mut orders);
+        keyboard.take(now, keys, &shared, &mut orders);
         std::iter::from_fn(|| commands.pop().ok())
             .map(|command| command.to_string())
             .collect::<Vec<_>>()
@@ -39,14 +39,36 @@ fn keys_are_commands_and_escape_sequences_are_none() {
     assert!(shared.interrupt.is_raised());
 }
 
+/// An operator who has hit Escape and `[` must still be able to stop.
+#[test]
+fn half_an_escape_sequence_does_not_swallow_a_later_key() {
+    let begun = Instant::now();
+    let is_stopped = |reads: &[(u64, &[u8])]| {
+        let shared = Shared::new(setup(), Interrupt::default());
+        let (mut orders, _commands) = RingBuffer::new(COMMANDS);
+        let mut keyboard = Keys::default();
+        for (ms, keys) in reads {
+            keyboard.take(begun + Duration::from_millis(*ms), keys, &shared, &mut orders);
+        }
+        shared.interrupt.is_raised()
+    };
+    for half in [&b"\x1b["[..], b"\x1bO", b"\x1b[15;2", b"\x1b[Ar\x1b["] {
+        assert!(is_stopped(&[(0, half), (101, b"q")]), "{half:?}");
+        assert!(!is_stopped(&[(0, half), (100, b"q")]), "the end of the sequence: {half:?}");
+        // The time counts from the first byte of this sequence.
+        assert!(is_stopped(&[(0, half), (90, b"1"), (101, b"q")]));
+        assert!(!is_stopped(&[(0, b"\x1b["), (90, &[b"A", half].concat()), (180, b"q")]));
+    }
+}
+
 /// The paste may be a mistake, so only keys that hold or stop are obeyed.
 #[test]
 fn a_paste_can_hold_or_stop_but_resumes_nothing() {
     let shared = Shared::new(setup(), Interrupt::default());
     let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
-    let mut keyboard = Keys::default();
+    let (now, mut keyboard) = (Instant::now(), Keys::default());
     let mut asked = |keys: &[u8]| {
-        keyboard.take(keys, &shared, &mut orders);
+        keyboard.take(now, keys, &shared, &mut orders);
         let is_held = shared.hold.swap(false, Ordering::Relaxed);
         (std::iter::from_fn(|| commands.pop().ok()).count(), is_held)
     };
@@ -72,7 +94,7 @@ fn a_speed_at_its_limit_is_refused_on_the_screen() {
     {
         *lock(&shared.screen) = inserted();
         lock(&shared.screen).progress.speed_mm_per_s = speed_mm_per_s;
-        Keys::default().take(key, &shared, &mut orders);
+        Keys::default().take(Instant::now(), key, &shared, &mut orders);
         let command = commands.pop().expect("a command");
         assert_eq!(command.to_string(), asked);
         ask(&mut lock(&shared.screen), 20.0, command);
@@ -92,7 +114,7 @@ fn a_speed_asked_for_at_once_counts_from_the_highest() {
     let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
     *lock(&shared.screen) = inserted();
     lock(&shared.screen).progress.speed_mm_per_s = 0.0;
-    Keys::default().take(b"-", &shared, &mut orders);
+    Keys::default().take(Instant::now(), b"-", &shared, &mut orders);
     assert_eq!(commands.pop().expect("a command").to_string(), "speed 1.800 mm/s");
 }
 
@@ -105,7 +127,7 @@ fn the_needle_is_withdrawn_after_a_w_and_a_y() {
         lock(&shared.screen).withdrawal = Some(left.ok_or_else(|| "it is out".to_owned()));
         let (mut orders, mut commands) = RingBuffer::new(COMMANDS);
         shared.is_over.store(true, Ordering::Relaxed);
-        Keys::default().take(keys, &shared, &mut orders);
+        Keys::default().take(Instant::now(), keys, &shared, &mut orders);
         assert_eq!(commands.pop().ok(), None, "nothing is left to command");
         [&shared.wants_withdrawal, &shared.is_leaving].map(|flag| flag.load(Ordering::Relaxed))
     };

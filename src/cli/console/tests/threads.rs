@@ -17,10 +17,10 @@ fn a_stalled_console_delays_nothing() {
         console.progress(Progress::default());
     }
     assert_eq!(shared.dropped.load(Ordering::Relaxed), 3);
-    Keys::default().take(b"rrs++---rrrr", &shared, &mut orders);
+    Keys::default().take(Instant::now(), b"rrs++---rrrr", &shared, &mut orders);
     assert_eq!(shared.dropped.load(Ordering::Relaxed), 3 + 4);
     assert_eq!(console.command(), Some(OperatorCommand::Resume));
-    Keys::default().take(b" ", &shared, &mut orders);
+    Keys::default().take(Instant::now(), b" ", &shared, &mut orders);
     assert_eq!(console.command(), Some(OperatorCommand::Hold));
     assert_eq!(console.command(), None);
 }
