@@ -135,7 +135,7 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
         return vec![check.with(Fail, "is it a CiA 402 drive?")];
     }
     let drive = config.stage.axis(axis);
-    let AxisStatus { node, identity, statusword, .. } = status;
+    let AxisStatus { node, identity, statusword, extra_answers, .. } = status;
     let is_healthy = !statusword.is_fault() || config.stage.power.fault_reset_on_start;
     let is_named = drive.vendor_id.is_some() && drive.product_code.is_some();
     let is_right = drive.vendor_id.is_none_or(|vendor| vendor == identity.vendor)
@@ -146,12 +146,18 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
     let write = format!("write vendor_id and product_code into [stage.{axis}]");
     let other = format!("not the drive of [stage.{axis}]: is node right?");
     let reset = "find the cause, then needle-bench stage reset CONFIG";
+    let mut found = format!("node {node}, {identity}; {statusword}");
+    if extra_answers > 0 {
+        found += &format!("; {extra_answers} answers more than requests");
+    }
+    let twin = format!("two drives have node number {node}: give one of them another");
     let mut checks = vec![
-        Check::new(&name, format!("node {node}, {identity}; {statusword}"), limit)
+        Check::new(&name, found, limit)
             .unless(is_named, Warn, write)
             .unless(!may_have_power(statusword.state()), Warn, POWERED)
             .unless(is_healthy, Fail, reset)
-            .unless(is_right, Fail, other),
+            .unless(is_right, Fail, other)
+            .unless(extra_answers == 0, Fail, twin),
     ];
     let errors: Vec<String> =
         status.error_code.iter().chain(&status.error_history).map(ToString::to_string).collect();

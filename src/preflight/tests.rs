@@ -44,6 +44,7 @@ fn status() -> AxisStatus {
         error_history: Vec::new(),
         digital_inputs: None,
         nmt_state: None,
+        extra_answers: 0,
     }
 }
 
@@ -106,6 +107,12 @@ fn a_drive_that_a_run_would_refuse_fails() {
     }
     let other = Identity { product: 8, ..status().identity };
     assert_eq!(of(AxisStatus { identity: other, ..status() }), "FPPP");
+    let twins = AxisStatus { extra_answers: 9, ..status() };
+    let checks = drive(&config, Axis::Insertion, Ok(twins));
+    assert_eq!(verdicts(&checks), "FPPP");
+    assert!(checks[0].found.ends_with("; 9 answers more than requests"), "{}", checks[0].found);
+    let next = checks[0].next_step.as_deref();
+    assert_eq!(next, Some("two drives have node number 1: give one of them another"));
     for silent in [
         AxisStatus { position_counts: None, ..status() },
         AxisStatus { device_type: None, ..status() },

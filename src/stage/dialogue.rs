@@ -20,6 +20,10 @@ use crate::canopen::sdo::{SdoClient, SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::canopen::{Frame, NodeId, ObjectAddress};
 use crate::units::Time;
 
+/// From this many extra answers on, and if they came to a quarter of the requests, two drives have one node number. A
+/// bus may repeat a frame after a lost acknowledgement, but rarely.
+const EXTRA_ANSWERS_MIN: u32 = 3;
+
 /// A sans-IO machine that talks with the drives until it [is over](Self::is_over). Hand in frames and the
 /// time, and drain [`poll_transmit`](Self::poll_transmit) after each.
 pub trait Dialogue {
@@ -79,6 +83,13 @@ impl Sdo {
     /// The drive's NMT state, if a heartbeat was received.
     pub(super) fn nmt_state(&self) -> Option<NmtState> {
         self.0.borrow().nmt_state
+    }
+
+    /// How many more answers than requests there were, if they show that two drives have this node number; else 0.
+    pub(super) fn extra_answers(&self) -> u32 {
+        let line = self.0.borrow();
+        let (extra, answers) = (line.client.extra_answers(), line.client.answers());
+        if extra >= EXTRA_ANSWERS_MIN && 4 * extra >= answers { extra } else { 0 }
     }
 
     pub(super) fn send(&self, frame: Frame) {

@@ -153,6 +153,11 @@ impl Stage {
                 return self.handle_emcy(now, axis, frame);
             } else if cob_id == cob::sdo_tx(node) {
                 return self.handle_sdo(now, axis, frame);
+            } else if cob_id == cob::sdo_rx(node)
+                && let Some(bring_up) = &mut self.bring_ups[axis]
+            {
+                bring_up.runner.handle_frame(now, frame);
+                self.drain_bring_ups(now);
             }
         }
         let why = if self.is_own(cob_id) { Ignored::OwnIdentifier } else { Ignored::Foreign };

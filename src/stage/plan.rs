@@ -32,13 +32,28 @@ impl Script {
     pub(super) async fn run(self) -> Result<i32, String> {
         self.find().await?;
         self.identify().await?;
+        // Before anything is written to two drives.
+        self.check_node_number()?;
         self.disarm().await?;
         self.configure().await?;
         self.supervise().await?;
         self.map_pdos().await?;
         self.check_homed().await?;
         self.set_modes().await?;
-        self.seed_target().await
+        let position = self.seed_target().await?;
+        self.check_node_number()?;
+        Ok(position)
+    }
+
+    /// Checks that one drive alone answers: two drives of one node number would both move.
+    fn check_node_number(&self) -> Result<(), String> {
+        match self.sdo.extra_answers() {
+            0 => Ok(()),
+            extra => Err(format!(
+                "{extra} answers more than requests: two drives have this node number, give one of them \
+                 another"
+            )),
+        }
     }
 
     /// Reads the device type until the drive answers, and checks that it is a CiA 402 drive.

@@ -43,6 +43,8 @@ pub struct AxisStatus {
     pub digital_inputs: Option<u32>,
     /// NMT state, if a heartbeat came while the status was read.
     pub nmt_state: Option<NmtState>,
+    /// How many more answers than requests there were, if they show that two drives have this node number; else 0.
+    pub extra_answers: u32,
 }
 
 /// Reads the status of both drives at the same time.
@@ -64,14 +66,15 @@ impl StatusReader {
     /// If the drive does not answer, has no statusword, or was not read to the end.
     pub fn status(&self, axis: Axis) -> Result<AxisStatus, String> {
         let interrupted = || Err(format!("{axis}: reading the status was interrupted"));
-        let nmt_state = self.axis(axis).sdo().nmt_state();
+        let sdo = self.axis(axis).sdo();
+        let (nmt_state, extra_answers) = (sdo.nmt_state(), sdo.extra_answers());
         let status = self.outcome(axis).unwrap_or_else(interrupted);
         match (status, nmt_state) {
             (Err(_), Some(NmtState::Stopped)) => Err(format!(
                 "{axis}: the node is in NMT stopped, where it answers no SDO; needle-bench stop CONFIG \
                  leads it to Pre-operational"
             )),
-            (status, nmt_state) => Ok(AxisStatus { nmt_state, ..status? }),
+            (status, nmt_state) => Ok(AxisStatus { nmt_state, extra_answers, ..status? }),
         }
     }
 }
@@ -113,6 +116,7 @@ async fn read_status(sdo: Sdo, axis: Axis, config: AxisConfig) -> Result<AxisSta
         error_history: history,
         digital_inputs: number(object::DIGITAL_INPUTS).await?,
         nmt_state: None,
+        extra_answers: 0,
     })
 }
 

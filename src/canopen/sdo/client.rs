@@ -42,6 +42,12 @@ pub struct SdoClient {
     transfer: Option<Transfer>,
     /// An answer to an earlier request may still come.
     expects_old_answer: bool,
+    /// The last request, if it was answered.
+    answered: Option<SdoRequest>,
+    answers: u32,
+    extra_answers: u32,
+    /// Another client has sent the node a request.
+    has_other_client: bool,
     outgoing: VecDeque<ClientFrame>,
     result: Option<Result<SdoReply, SdoError>>,
 }
@@ -55,6 +61,10 @@ impl SdoClient {
             timeout,
             transfer: None,
             expects_old_answer: false,
+            answered: None,
+            answers: 0,
+            extra_answers: 0,
+            has_other_client: false,
             outgoing: VecDeque::new(),
             result: None,
         }
@@ -76,16 +86,15 @@ impl SdoClient {
         self.transfer = Some(Transfer { request, fence, deadline: now + self.timeout });
     }
 
-    /// Takes any frame; all but this node's SDO answers are ignored.
+    /// Takes any frame that another node sent; all but this node's SDO answers, and requests to it, are ignored.
     pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        self.has_other_client |= frame.cob_id() == Some(cob::sdo_rx(self.node));
         if frame.cob_id() != Some(cob::sdo_tx(self.node)) {
             return;
         }
-        let (Some(transfer), Some(answer)) =
-            (&mut self.transfer, ServerFrame::decode(frame.data()))
-        else {
-            return;
-        };
+        let Some(answer) = ServerFrame::decode(frame.data()) else { return };
+        self.extra_answers += u32::from(self.is_extra(answer));
+        let Some(transfer) = &mut self.transfer else { return };
         let object = transfer.request.object();
         if transfer.fence.is_some() {
             if answer.object() == transfer.fence {
@@ -133,6 +142,25 @@ impl SdoClient {
         self.result = None;
     }
 
+    /// The number of requests that were answered.
+    pub fn answers(&self) -> u32 {
+        self.answers
+    }
+
+    /// The number of answers beyond the first to a request. 0 if another client asks the node too, since the answers
+    /// to that client look the same.
+    pub fn extra_answers(&self) -> u32 {
+        if self.has_other_client { 0 } else { self.extra_answers }
+    }
+
+    /// Whether `answer` repeats that to the last request. While an answer from before a timeout may still come, none
+    /// does.
+    fn is_extra(&self, answer: ServerFrame) -> bool {
+        let current = self.transfer.map(|transfer| transfer.request);
+        let is_to = |request: Option<SdoRequest>| request.is_some_and(|it| can_answer(answer, it));
+        !self.expects_old_answer && is_to(self.answered) && !is_to(current)
+    }
+
     /// The next frame to send.
     pub fn poll_transmit(&mut self) -> Option<Frame> {
         Some(self.outgoing.pop_front()?.to_frame(self.node))
@@ -149,7 +177,9 @@ impl SdoClient {
     }
 
     fn end(&mut self, result: Result<SdoReply, SdoError>) {
-        self.transfer = None;
+        // A transfer that was aborted is gone already.
+        self.answered = self.transfer.take().map(|transfer| transfer.request);
+        self.answers += u32::from(self.answered.is_some());
         self.result = Some(result);
     }
 
@@ -160,4 +190,14 @@ impl SdoClient {
             self.outgoing.push_back(ClientFrame::Abort(transfer.request.object(), code));
         }
     }
+}
+
+/// Whether `answer` can be one to `request`.
+fn can_answer(answer: ServerFrame, request: SdoRequest) -> bool {
+    let is_kind = match answer {
+        ServerFrame::Reply(_, SdoReply::Downloaded) => matches!(request, SdoRequest::Download(..)),
+        ServerFrame::Reply(..) => matches!(request, SdoRequest::Upload(_)),
+        _ => true,
+    };
+    is_kind && answer.object() == Some(request.object())
 }

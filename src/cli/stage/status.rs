@@ -114,6 +114,7 @@ pub(in crate::cli) fn drive_json(axis: Axis, status: &AxisStatus) -> Value {
         "error_name": status.error_code.map(|code| code.to_string()),
         "error_history": status.error_history.iter().map(ToString::to_string).collect::<Vec<_>>(),
         "nmt_state": status.nmt_state.map(|state| state.to_string()),
+        "extra_answers": status.extra_answers,
     });
     object[format!("position_{unit}")] = json!(position);
     for (bit, name) in SWITCHES.into_iter().enumerate() {
@@ -139,6 +140,12 @@ fn line(axis: Axis, status: &AxisStatus) -> String {
     let closed = SWITCHES.iter().enumerate().filter(|(bit, _)| inputs >> bit & 1 != 0);
     parts.extend(closed.map(|(_, name)| format!("{} closed", name.replace('_', " "))));
     parts.extend(status.error_code.map(|code| format!("error {code}")));
+    let extra = status.extra_answers;
+    parts.extend(
+        (extra > 0).then(|| {
+            format!("{extra} answers more than requests: two drives have this node number")
+        }),
+    );
     let history: Vec<String> = status.error_history.iter().map(ToString::to_string).collect();
     parts.extend((!history.is_empty()).then(|| format!("errors before: {}", history.join(", "))));
     parts.join(", ")

@@ -118,6 +118,8 @@ struct Bench {
     sent: Vec<(Time, Frame)>,
     /// SDO answers arrive so much later, and these still have to.
     sdo_delay: Duration,
+    /// A second drive has the node number of the insertion drive, and answers each SDO request as that one does.
+    has_twin: bool,
     delayed: VecDeque<(Time, Frame)>,
     events: Vec<StageEvent>,
     /// Number of events that `run_until` has passed.
@@ -139,6 +141,7 @@ impl Bench {
             stage,
             sent: Vec::new(),
             sdo_delay: Duration::ZERO,
+            has_twin: false,
             delayed: VecDeque::new(),
             events: Vec::new(),
             seen: 0,
@@ -162,12 +165,15 @@ impl Bench {
                     let mut answers = self.insertion.handle_frame(self.now, &frame);
                     answers.extend(self.rotation.handle_frame(self.now, &frame));
                     for answer in answers {
-                        let is_sdo =
-                            [1, 2].iter().any(|&id| answer.cob_id() == Some(cob::sdo_tx(node(id))));
-                        if is_sdo && !self.sdo_delay.is_zero() {
-                            self.delayed.push_back((self.now + self.sdo_delay, answer));
-                        } else {
-                            self.stage.handle_frame(self.now, &answer);
+                        let is_sdo_of = |id: u8| answer.cob_id() == Some(cob::sdo_tx(node(id)));
+                        let is_sdo = is_sdo_of(1) || is_sdo_of(2);
+                        let copies = if self.has_twin && is_sdo_of(1) { 2 } else { 1 };
+                        for _ in 0..copies {
+                            if is_sdo && !self.sdo_delay.is_zero() {
+                                self.delayed.push_back((self.now + self.sdo_delay, answer));
+                            } else {
+                                self.stage.handle_frame(self.now, &answer);
+                            }
                         }
                     }
                 }

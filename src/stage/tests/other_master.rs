@@ -93,6 +93,59 @@ fn two_senders_of_one_tpdo1_are_a_fault_after_two_syncs() {
     assert!(fault.starts_with("insertion: two TPDO1 that differ after each of 2 SYNCs"), "{fault}");
 }
 
+/// Both answer, with the same value or not. Nothing is written to either, but power off.
+#[test]
+fn two_drives_of_one_node_number_are_a_fault_before_power() {
+    for delay_ms in [0, 1, 100] {
+        let mut bench = Bench::new(config());
+        bench.has_twin = true;
+        bench.sdo_delay = Duration::from_millis(delay_ms);
+        assert_eq!(
+            bench.until_fault(),
+            "node 1 (insertion): 5 answers more than requests: two drives have this node number, give one \
+             of them another"
+        );
+        assert!(!bench.until_stopped());
+        let to_node = bench.sent.iter().filter(|(_, frame)| frame.cob_id() == Some(0x601));
+        let written: Vec<String> = to_node
+            .filter(|(_, frame)| frame.data()[0] >> 5 == 1)
+            .map(|(_, frame)| frame.to_string())
+            .collect();
+        assert_eq!(written, ["601#2B40600000000000"], "Disable Voltage");
+    }
+}
+
+/// A tool that reads the drive in the bring-up is answered too, and its answers look like those of a second drive.
+#[test]
+fn extra_answers_are_no_fault_while_another_client_asks_the_drive() {
+    let mut bench = Bench::new(config());
+    bench.has_twin = true;
+    bench.sdo_delay = Duration::from_millis(1);
+    bench.until_progress(Progress::BringUp(Axis::Insertion, "checking its identity"));
+    bench.receive(Frame::new(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]));
+    bench.until_ready();
+    assert_eq!(bench.fault(), None);
+}
+
+#[test]
+fn the_status_names_two_drives_of_one_node_number() {
+    for (answers, extra) in [(1, 0), (2, 11)] {
+        let mut reader = StatusReader::new(&config(), Time::ZERO);
+        let mut drives = [TestDrive::new(node(1), 0), TestDrive::new(node(2), 0)];
+        while let Some(frame) = reader.poll_transmit() {
+            for drive in &mut drives {
+                for answer in drive.handle_frame(Time::ZERO, &frame) {
+                    (0..answers).for_each(|_| reader.handle_frame(Time::ZERO, &answer));
+                }
+            }
+        }
+        assert!(reader.is_over());
+        for axis in Axis::BOTH {
+            assert_eq!(reader.status(axis).map(|status| status.extra_answers), Ok(extra));
+        }
+    }
+}
+
 /// A bus repeats a frame after a lost acknowledgement.
 #[test]
 fn a_repeated_tpdo1_is_counted_and_no_fault() {

@@ -188,3 +188,62 @@ fn a_new_transfer_ends_the_one_under_way() {
     assert_eq!(client.poll_result(), None);
     assert_eq!(client.deadline(), Time::NEVER);
 }
+
+const VENDOR_IS_FB: [u8; 8] = [0x43, 0x18, 0x10, 0x01, 0xfb, 0, 0, 0];
+const REFUSED: [u8; 8] = [0x80, 0x18, 0x10, 0x01, 0, 0, 0x02, 0x06];
+
+/// Two nodes of one number answer each request twice.
+#[test]
+fn a_second_answer_to_a_request_is_counted() {
+    for second in [VENDOR_IS_FB, REFUSED] {
+        let mut client = started(SdoRequest::Upload(VENDOR));
+        answer(&mut client, VENDOR_IS_FB);
+        assert_eq!((client.answers(), client.extra_answers()), (1, 0));
+        answer(&mut client, second);
+        assert_eq!((client.answers(), client.extra_answers()), (1, 1), "between two requests");
+        client.start(at_ms(2), SdoRequest::Upload(STATUS));
+        answer(&mut client, second);
+        assert_eq!(client.extra_answers(), 2, "during the next request");
+        answer(&mut client, [0x4b, 0x41, 0x60, 0, 0x37, 0x02, 0, 0]);
+        answer(&mut client, VENDOR_IS_FB);
+        assert_eq!((client.answers(), client.extra_answers()), (2, 2), "of an older request");
+    }
+    // What was written is read back.
+    let object = ObjectAddress::new(0x1017, 0);
+    let mut client = started(SdoRequest::Download(object, SdoValue::from(1000_u16)));
+    answer(&mut client, [0x60, 0x17, 0x10, 0, 0, 0, 0, 0]);
+    client.start(at_ms(2), SdoRequest::Upload(object));
+    answer(&mut client, [0x60, 0x17, 0x10, 0, 0, 0, 0, 0]);
+    assert_eq!(client.extra_answers(), 1);
+    answer(&mut client, [0x4b, 0x17, 0x10, 0, 0xe8, 3, 0, 0]);
+    assert_eq!((client.answers(), client.extra_answers()), (2, 1));
+}
+
+/// The node answers the request and its repetition. The second answer comes before or after that to the fence.
+#[test]
+fn the_answers_to_a_request_that_was_repeated_after_a_timeout_are_not_counted() {
+    let mut client = started(SdoRequest::Upload(STATUS));
+    answer(&mut client, [0x4b, 0x41, 0x60, 0, 0x37, 0x02, 0, 0]);
+    client.start(at_ms(10), SdoRequest::Upload(VENDOR));
+    client.handle_timeout(at_ms(160));
+    answer(&mut client, VENDOR_IS_FB);
+    client.start(at_ms(161), SdoRequest::Upload(VENDOR));
+    answer(&mut client, VENDOR_IS_FB);
+    answer(&mut client, [0x4f, 0x01, 0x10, 0, 0, 0, 0, 0]);
+    answer(&mut client, VENDOR_IS_FB);
+    assert_eq!((client.answers(), client.extra_answers()), (2, 0));
+    answer(&mut client, VENDOR_IS_FB);
+    assert_eq!(client.extra_answers(), 1, "no old answer comes after that to the fence");
+}
+
+#[test]
+fn extra_answers_prove_nothing_when_another_client_asks_the_node() {
+    let mut client = started(SdoRequest::Upload(VENDOR));
+    let request = |id: u16| Frame::new(id, &[0x40, 0x18, 0x10, 0x01, 0, 0, 0, 0]);
+    client.handle_frame(at_ms(1), &request(0x606));
+    answer(&mut client, VENDOR_IS_FB);
+    answer(&mut client, VENDOR_IS_FB);
+    assert_eq!(client.extra_answers(), 1, "that request was to another node");
+    client.handle_frame(at_ms(1), &request(0x605));
+    assert_eq!(client.extra_answers(), 0);
+}
