@@ -8,6 +8,9 @@ use std::fmt;
 use std::ops::{Add, Sub};
 use std::time::Duration;
 
+/// The likely cause of positions whose distances are a thousandth of what they must be.
+pub(crate) const IN_METRES: &str = "the positions look like metres; OpenIGTLink is in mm";
+
 /// A point on the session's own time line, in nanoseconds since the run's origin.
 ///
 /// Pure code takes a `Time` as an argument; it never reads a clock. The origin is the start of the

@@ -4,6 +4,7 @@ use super::{CalibrationError, check_distances, cross_covariance, mean, principal
 use crate::geometry::Pose;
 use crate::keys::{Rule, section, within};
 use crate::table::{Table, TableError};
+use crate::units::IN_METRES;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use std::cmp::Ordering;
 
@@ -20,6 +21,9 @@ const BREADTH_PER_LENGTH_MIN: f64 = 0.02;
 const BREADTH_PER_ERROR_MIN: f64 = 3.0;
 /// Two sets that differ in size by more than this factor are not in the same unit.
 const SCALE_MAX: f64 = 2.0;
+/// Points in both frames that lie closer together than this, mm RMS along their longest axis, are not in mm: no tool
+/// touches them apart.
+const LENGTH_MIN_MM: f64 = 1.0;
 
 const COORDINATE: Rule = within(-5000.0, 5000.0);
 
@@ -74,7 +78,6 @@ pub struct RegistrationFit {
     axes: Matrix3<f64>,
 }
 
-const MIRRORED: &str = "the sets are mirror images: one axis of one frame points the other way";
 /// A scale counts as wrong if it differs from 1 by more than this many of its standard errors.
 const SCALE_SDS: f64 = 5.0;
 /// A smaller error of the scale is not reported: over 250 mm it moves a point by 0.5 mm at most.
@@ -107,7 +110,7 @@ impl RegistrationFit {
         let (centre_tracker, centre_bench) = (mean(&tracker_mm), mean(&bench_mm));
         let tracker_mm: Vec<_> = tracker_mm.iter().map(|p| p - centre_tracker).collect();
         let bench_mm: Vec<_> = bench_mm.iter().map(|p| p - centre_bench).collect();
-        let (rotation, is_mirrored) = nearest_rotation(&cross_covariance(&bench_mm, &tracker_mm));
+        let (rotation, reflection) = nearest_rotation(&cross_covariance(&bench_mm, &tracker_mm));
         let x_wt = Pose { rotation, translation: centre_bench - rotation * centre_tracker };
 
         let residual_mm = |p: &FiducialPair| (p.bench_mm - x_wt.transform(&p.tracker_mm)).norm();
@@ -122,8 +125,21 @@ impl RegistrationFit {
         let size_mm = |spread_mm: [f64; 3]| Vector3::from(spread_mm).norm();
         let ratio = size_mm(spread_tracker_mm) / size_mm(spread_mm);
         if !(1.0 / SCALE_MAX..=SCALE_MAX).contains(&ratio) {
+            let hint = match ratio {
+                _ if is_thousandfold(1.0 / ratio) => IN_METRES,
+                _ if is_thousandfold(ratio) => {
+                    "the bench's points look like metres; give both in mm"
+                }
+                _ => "give both in mm",
+            };
             return refused(format!(
-                "the tracker's points are {ratio:.4} times as far apart as the bench's; give both in mm"
+                "the tracker's points are {ratio:.4} times as far apart as the bench's; {hint}"
+            ));
+        }
+        if spread_mm[0] < LENGTH_MIN_MM && spread_tracker_mm[0] < LENGTH_MIN_MM {
+            return refused(format!(
+                "the points are {:.3} mm RMS apart (at least {LENGTH_MIN_MM} needed): {IN_METRES}",
+                spread_mm[0]
             ));
         }
         let turned_mm: Vec<_> = tracker_mm.iter().map(|p| rotation * p).collect();
@@ -139,11 +155,18 @@ impl RegistrationFit {
         };
         check_breadth(BREADTH_MIN_MM.max(BREADTH_PER_LENGTH_MIN * spread_mm[0]))?;
         if rms_mm > rms_max_mm || rms_max_mm.is_nan() {
-            let is_solid = spread_mm[2] > BREADTH_PER_LENGTH_MIN * spread_mm[0];
-            let hint = match scale {
-                _ if is_mirrored && is_solid => MIRRORED.to_owned(),
-                Some(scale) => scale_remark(scale),
-                None => SCATTERED.to_owned(),
+            let mirrored_rms_mm = reflection.map(|reflection| {
+                let off_mm2 =
+                    |(b, t): (&Vector3<f64>, &Vector3<f64>)| (b - reflection * t).norm_squared();
+                let squares = bench_mm.iter().zip(&tracker_mm).map(off_mm2).sum::<f64>();
+                (squares / points as f64).sqrt()
+            });
+            let hint = match (mirrored_rms_mm, scale) {
+                (Some(mm), _) if mm <= rms_max_mm => format!(
+                    "a mirrored frame, or two exchanged axes, fits to {mm:.2} mm: check the tracker's axes"
+                ),
+                (_, Some(scale)) => scale_remark(scale),
+                (_, None) => SCATTERED.to_owned(),
             };
             return refused(format!(
                 "{points} points, {rms_mm:.2} mm RMS (limit {rms_max_mm:.2}); worst is point \
@@ -246,14 +269,19 @@ fn check_positions(frame: &str, positions_mm: &[Vector3<f64>]) -> Result<(), Cal
     }
 }
 
-/// The rotation R that maximises tr(Rᵀ M), and whether a reflection would fit better.
-fn nearest_rotation(m: &Matrix3<f64>) -> (Rotation3<f64>, bool) {
+/// Whether `ratio` is that of metres to millimetres.
+fn is_thousandfold(ratio: f64) -> bool {
+    (1000.0 / SCALE_MAX..=1000.0 * SCALE_MAX).contains(&ratio)
+}
+
+/// The rotation R that maximises tr(Rᵀ M), and the reflection that does, if it fits better.
+fn nearest_rotation(m: &Matrix3<f64>) -> (Rotation3<f64>, Option<Matrix3<f64>>) {
     // Singular values are sorted, the smallest last.
     let svd = m.svd(true, true);
     let (u, v_t) = (svd.u.unwrap_or_default(), svd.v_t.unwrap_or_default());
     let sign = (u * v_t).determinant().signum();
     let proper = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, sign));
-    (Rotation3::from_matrix_unchecked(u * proper * v_t), sign < 0.0)
+    (Rotation3::from_matrix_unchecked(u * proper * v_t), (sign < 0.0).then(|| u * v_t))
 }
 
 #[cfg(test)]

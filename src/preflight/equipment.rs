@@ -8,6 +8,7 @@ use crate::math;
 use crate::session::PlaneOutOfReach;
 use crate::stage::{Axis, AxisConfig, AxisLimits, AxisStatus, Reference, may_have_power};
 use crate::tracker::{StampPolicy, Workspace};
+use crate::units::IN_METRES;
 use nalgebra::Vector3;
 
 /// Bits on the wire in one SYNC period: SYNC, two set-points, two answers, and a share of heartbeats.
@@ -271,8 +272,11 @@ fn workspace(config: &Config, report: &TrackerReport) -> Check {
         let next = "set tracker.workspace: positions outside it are refused";
         return check.unless(!config.stage.hardware, Warn, next);
     };
-    let is_inside = !is_registered || workspace.check(&tip_mm).is_ok();
-    let next = "check the registration with a tool at a known place, then tracker.workspace";
+    let is_inside = !is_registered || workspace.outside(&tip_mm).is_none();
+    let next = match report.is_in_metres {
+        true => IN_METRES,
+        false => "check the registration with a tool at a known place, then tracker.workspace",
+    };
     let check = check.unless(is_registered, Warn, "not compared before there is a registration");
     check.unless(is_inside, Fail, next)
 }

@@ -1,6 +1,6 @@
 //! Listens to the tracker for a while, without a run.
 
-use crate::tracker::{Event, Gate, GateCounts, Workspace};
+use crate::tracker::{Event, Gate, GateCounts, GateName, Refusal, Workspace};
 use crate::units::Time;
 use nalgebra::Vector3;
 use serde::Serialize;
@@ -30,6 +30,8 @@ pub struct TrackerReport {
     pub noise_sd_mm: Option<f64>,
     /// Smallest difference of receipt and stamp, each by its own clock, s.
     pub stamp_skew_s: Option<f64>,
+    /// The last position is outside the workspace, and would be inside if it were in metres.
+    pub is_in_metres: bool,
     /// Positions jump back and forth, as they do if two tools have the same name.
     pub has_two_tools: bool,
     /// Why no position was measured, and what to do; `None` if one was.
@@ -47,6 +49,7 @@ pub struct Listening {
     counts: GateCounts,
     positions_mm: Vec<Vector3<f64>>,
     heading: Option<Vector3<f64>>,
+    is_in_metres: bool,
     skew_ns: Option<i64>,
     refusal: Option<String>,
 }
@@ -62,6 +65,7 @@ impl Listening {
             counts: GateCounts::default(),
             positions_mm: Vec::new(),
             heading: None,
+            is_in_metres: false,
             skew_ns: None,
             refusal: None,
         }
@@ -72,8 +76,12 @@ impl Listening {
         let Event::Sample(sample) = event else { return };
         match self.gate.admit(sample) {
             Ok(position_mm) => {
-                let outside =
-                    self.workspace.and_then(|workspace| workspace.check(&position_mm).err());
+                let outside = self.workspace.and_then(|workspace| workspace.outside(&position_mm));
+                self.is_in_metres = outside.is_some()
+                    && self.workspace.is_some_and(|workspace| {
+                        workspace.is_for_metres(&self.gate.registration, sample)
+                    });
+                let outside = outside.map(|why| Refusal::new(GateName::Workspace, why));
                 self.counts.count(outside.as_ref());
                 self.positions_mm.push(position_mm);
                 self.heading = self.gate.registration.heading(sample);
@@ -115,6 +123,7 @@ impl Listening {
             // A difference has twice the variance, in each of three coordinates.
             noise_sd_mm: is_enough.then(|| to_next_mm / 6f64.sqrt()),
             stamp_skew_s: self.skew_ns.map(|ns| ns as f64 * 1e-9),
+            is_in_metres: self.is_in_metres,
             has_two_tools: is_enough
                 && to_next_mm > TURNS_MIN_MM
                 && to_next_mm > TURNS_RATIO * to_next_but_one_mm,

@@ -189,6 +189,14 @@ fn a_tip_outside_the_workspace_fails() {
         let report = listened(config, 0.0, move |k| Vector3::new(x_mm, 0.1 * f64::from(k), 0.5));
         tracker(config, &report).pop().unwrap()
     };
+    let in_metres = listened(
+        &rig(&[&REGISTRATION.replacen("x_mm = 0.0", "x_mm = -400.0", 1), BOX]),
+        0.0,
+        |_| Vector3::new(0.41, 0.005, 0.02),
+    );
+    let row = tracker(&config, &in_metres).pop().unwrap();
+    let next = "the positions look like metres; OpenIGTLink is in mm";
+    assert_eq!((row.verdict, row.next_step.as_deref()), (Verdict::Fail, Some(next)));
     let inside = at(&config, 29.9);
     assert_eq!(
         (inside.verdict, inside.found.as_str()),

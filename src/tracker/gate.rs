@@ -7,6 +7,7 @@ use super::sample::{Sample, Validity};
 use crate::geometry::POSITION;
 use crate::keys::section;
 use crate::text::clipped;
+use crate::units::IN_METRES;
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 
 /// How far the squared length of a quaternion may be from 1: enough for rounding.
@@ -84,30 +85,31 @@ impl Gate {
         if !is_finite(&p_wb_mm) {
             return Err(Refusal::not_finite(&p_wb_mm));
         }
-        if let Some(workspace) = &self.workspace {
-            workspace.check(&p_wb_mm)?;
-        }
-        Ok(p_wb_mm)
+        let Some(workspace) = &self.workspace else { return Ok(p_wb_mm) };
+        let Some(outside) = workspace.outside(&p_wb_mm) else { return Ok(p_wb_mm) };
+        let hint = match workspace.is_for_metres(&self.registration, sample) {
+            true => IN_METRES,
+            false => "check the registration",
+        };
+        Err(Refusal::new(GateName::Workspace, format!("{outside}; {hint}")))
     }
 }
 
 impl Workspace {
-    /// Checks that the tip can be at `p_wb_mm`.
-    ///
-    /// # Errors
-    /// [`Refusal`] of the first coordinate outside the box.
-    pub fn check(&self, p_wb_mm: &Vector3<f64>) -> Result<(), Refusal> {
-        for (k, axis) in ['x', 'y', 'z'].into_iter().enumerate() {
-            let (value_mm, min_mm, max_mm) = (p_wb_mm[k], self.min_mm[k], self.max_mm[k]);
-            if !(min_mm..=max_mm).contains(&value_mm) {
-                let why = format!(
-                    "tip at {axis} = {} mm, outside {min_mm:.1} to {max_mm:.1} mm; check the registration",
-                    short(value_mm)
-                );
-                return Err(Refusal::new(GateName::Workspace, why));
-            }
-        }
-        Ok(())
+    /// Whether the tip would be in the box if the position of the `sample` were in metres.
+    pub fn is_for_metres(&self, registration: &Registration, sample: &Sample) -> bool {
+        let in_mm = Sample { position_mm: 1e3 * sample.position_mm, ..sample.clone() };
+        registration.tip_mm(&in_mm).is_ok_and(|tip_mm| self.outside(&tip_mm).is_none())
+    }
+
+    /// The first coordinate of `p_wb_mm` that is outside the box, in words; `None` if the tip can be there.
+    pub fn outside(&self, p_wb_mm: &Vector3<f64>) -> Option<String> {
+        let axes = ['x', 'y', 'z'].into_iter().enumerate();
+        let limits = axes.map(|(k, axis)| (axis, p_wb_mm[k], self.min_mm[k], self.max_mm[k]));
+        let is_outside = |&(_, mm, min_mm, max_mm): &_| !(min_mm..=max_mm).contains(&mm);
+        let (axis, mm, min_mm, max_mm) = limits.into_iter().find(is_outside)?;
+        let mm = short(mm);
+        Some(format!("tip at {axis} = {mm} mm, outside {min_mm:.1} to {max_mm:.1} mm"))
     }
 }
 
@@ -224,6 +226,20 @@ mod tests {
                 "status: tool missing",
                 "workspace: tip at z = 200.5 mm, outside -1.0 to 200.0 mm; check the registration",
             ]
+        );
+    }
+
+    /// A tracker far from the bench sends its positions in metres.
+    #[test]
+    fn a_tip_outside_that_would_be_inside_in_metres_is_named() {
+        let mut gate = gate();
+        let translation = Vector3::new(-200.0, 0.0, -300.0);
+        gate.registration = Registration::new(Pose { translation, ..Pose::identity() });
+        assert!(gate.admit(&sample(210.0, 5.0, 340.0)).is_ok());
+        assert_eq!(
+            gate.admit(&sample(0.21, 0.005, 0.34)).expect_err("outside").to_string(),
+            "workspace: tip at x = -199.8 mm, outside -50.0 to 50.0 mm; the positions look like metres; \
+             OpenIGTLink is in mm"
         );
     }
 

@@ -9,6 +9,7 @@
 mod change;
 
 use super::refusal::{Effect, Refusal};
+use crate::units::IN_METRES;
 use change::{FASTER, SLOWER, ScaleChange, Tenths};
 use nalgebra::Vector3;
 use std::collections::VecDeque;
@@ -24,6 +25,10 @@ const POSITIONS_MIN: f64 = 6.0;
 const INDEPENDENT_PER_MM: f64 = 10.0;
 /// Standard deviations of the slope's length that are allowed for noise, besides the tolerance.
 const NOISE_SDS: f64 = 5.5;
+/// A tip that travels by this share of the depth is taken for one in metres, if the slope has a standard error, by its
+/// own scatter, of at most this share of the slope.
+const METRES: std::ops::Range<f64> = 0.0008..0.00125;
+const METRES_SD: f64 = 0.2;
 /// The explanation of a refusal looks at this many bins: 8 mm.
 const EXPLAINED_BINS: usize = 32;
 /// The tolerances of a slope that is too short and of one that is too long. 59 recorded insertions of a
@@ -91,6 +96,31 @@ impl Sums {
         self.square_mm2 += other.square_mm2;
         self.independent += other.independent;
     }
+
+    fn depth_spread_mm2(&self) -> f64 {
+        (self.depth_mm2 - self.depth_mm * self.depth_mm / self.count).max(0.0)
+    }
+
+    /// The slope of the positions over the depth.
+    fn slope(&self) -> Vector3<f64> {
+        (self.product_mm2 - self.position_mm * (self.depth_mm / self.count))
+            / self.depth_spread_mm2()
+    }
+
+    /// The variance of each coordinate about the line of that slope, mm².
+    fn scatter_mm2(&self) -> f64 {
+        let position_mm2 = self.square_mm2 - self.position_mm.norm_squared() / self.count;
+        let residual_mm2 = position_mm2 - self.slope().norm_squared() * self.depth_spread_mm2();
+        residual_mm2.max(0.0) / (3.0 * (self.count - 2.0))
+    }
+
+    /// Whether the tip travels a thousandth of the depth, and scatters as little. The configured noise does not count:
+    /// that of such positions is a thousandth of it.
+    fn is_in_metres(&self) -> bool {
+        let travel = self.slope().norm();
+        let sd = (self.scatter_mm2() / self.depth_spread_mm2()).sqrt();
+        self.count >= POSITIONS_MIN && METRES.contains(&travel) && sd <= METRES_SD * travel
+    }
 }
 
 impl TravelCheck {
@@ -147,7 +177,10 @@ impl TravelCheck {
     /// travel shows it, otherwise a list.
     pub fn explain(&self, mut refusal: Refusal) -> Refusal {
         if refusal.effect == Effect::Loses {
+            let mut sums = Sums::default();
+            self.bins.iter().rev().take(EXPLAINED_BINS).for_each(|bin| sums.add(bin));
             refusal.why += &match self.change_over(EXPLAINED_BINS, SLOWER) {
+                _ if sums.is_in_metres() => format!(": {IN_METRES}"),
                 Some(change) => format!(": {change}"),
                 None => ": a jump, a drift, or too large a scale".to_owned(),
             };
@@ -167,19 +200,16 @@ impl TravelCheck {
         if n < POSITIONS_MIN {
             return None;
         }
-        let spread_mm2 = (sums.depth_mm2 - sums.depth_mm * sums.depth_mm / n).max(0.0);
+        let spread_mm2 = sums.depth_spread_mm2();
         // The length of an evenly filled stretch with the same spread.
         let filled_mm = (12.0 * spread_mm2 / n).sqrt().min(stretch_mm);
         if filled_mm < 0.75 * stretch_mm {
             return None;
         }
-        let slope = (sums.product_mm2 - sums.position_mm * (sums.depth_mm / n)) / spread_mm2;
-        let scatter_mm2 = sums.square_mm2 - sums.position_mm.norm_squared() / n;
-        let residual_mm2 = (scatter_mm2 - slope.norm_squared() * spread_mm2).max(0.0);
-        let variance_mm2 = (residual_mm2 / (3.0 * (n - 2.0))).max(self.noise_sd_mm.powi(2));
+        let variance_mm2 = sums.scatter_mm2().max(self.noise_sd_mm.powi(2));
         let independent = sums.independent.max(1.0).min(INDEPENDENT_PER_MM * filled_mm);
         let sd = (variance_mm2 / (spread_mm2 * independent / n)).sqrt();
-        let ratio = slope.norm();
+        let ratio = sums.slope().norm();
         let bend_rad = CURVATURE_MARGIN * self.curvature_per_mm * stretch_mm;
         let min = 1.0
             - SHORT.share
@@ -190,12 +220,17 @@ impl TravelCheck {
         let max =
             (1.0 + 2.0 * sd * sd).sqrt() + LONG.share + LONG.length_mm / filled_mm + NOISE_SDS * sd;
         (ratio < min || ratio > max).then(|| {
-            let change = self.change_over(bins, if ratio < min { SLOWER } else { FASTER });
-            let what = change.map_or("a jump, or a drift".to_owned(), |change| change.to_string());
+            let what = if sums.is_in_metres() {
+                IN_METRES.to_owned()
+            } else {
+                let change = self.change_over(bins, if ratio < min { SLOWER } else { FASTER });
+                let what =
+                    change.map_or("a jump, or a drift".to_owned(), |change| change.to_string());
+                format!("{what}; check the tracker, counts_per_mm and needle.radius_mm")
+            };
             format!(
                 "over the last {stretch_mm:.1} mm the tip travelled {ratio:.3} mm per mm inserted \
-                 (expected {min:.3} to {max:.3}): {what}; check the tracker, counts_per_mm and \
-                 needle.radius_mm"
+                 (expected {min:.3} to {max:.3}): {what}"
             )
         })
     }
@@ -262,6 +297,34 @@ mod tests {
             "{text}"
         );
         assert!(text.len() < 200, "{}", text.len());
+    }
+
+    /// A frozen stream, with noise or to the bit, is not called one in metres.
+    #[test]
+    fn a_stream_in_metres_is_named() {
+        let said = |scale: f64, noise_mm: f64| {
+            let mut check = TravelCheck::new(0.6, 1.0 / 122.0);
+            for k in 0..100 {
+                let noise_mm = noise_mm * (2.0 * (f64::from(k) * 0.618_034).fract() - 1.0);
+                let along_mm = 0.05 * f64::from(k) * scale + noise_mm;
+                let position_mm = Vector3::new(-500.0, 80.0, 300.0 + along_mm);
+                check.take(0.05 * f64::from(k), &position_mm, 1.0);
+            }
+            let lost = Refusal { effect: Effect::Loses, ..Refusal::repeat(1) };
+            [check.check().unwrap_err(), check.explain(lost).why]
+        };
+        for text in said(1e-3, 1e-3) {
+            assert!(
+                text.contains(": the positions look like metres; OpenIGTLink is in mm"),
+                "{text}"
+            );
+            assert!(text.len() < 191, "{}", text.len());
+        }
+        for text in
+            [(0.0, 0.0), (0.0, 1e-3), (0.0, 1.0), (1e-3, 1.0)].map(|(a, b)| said(a, b)).concat()
+        {
+            assert!(!text.contains("metres"), "{text}");
+        }
     }
 
     /// Noise that changes slowly, 0.6 mm in 4 mm of depth and back, looks like travel.

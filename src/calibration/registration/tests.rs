@@ -103,7 +103,7 @@ fn flat_sets_give_no_reflection() {
         let mean = |of: fn(&FiducialPair) -> Vector3<f64>| pairs.iter().map(of).sum::<Vector3<_>>();
         let m = cross.sum::<Matrix3<f64>>()
             - mean(|p| p.bench_mm) * mean(|p| p.tracker_mm).transpose() / n;
-        mirrored += usize::from(nearest_rotation(&m).1);
+        mirrored += usize::from(nearest_rotation(&m).1.is_some());
     }
     assert!((50..150).contains(&mirrored), "{mirrored} of 200 sets would have been mirrored");
 }
@@ -222,13 +222,46 @@ fn points_that_determine_no_pose_are_refused() {
             )
         );
     }
-    let metres: Vec<_> =
-        good.iter().map(|p| FiducialPair { tracker_mm: p.tracker_mm * 1e-3, ..*p }).collect();
-    assert_eq!(
-        refusal(&metres),
-        "registration: the tracker's points are 0.0010 times as far apart as the bench's; give both \
-         in mm"
-    );
+}
+
+/// The message names the unit, and does not ask for more points.
+#[test]
+fn positions_in_metres_are_recognised() {
+    let good = pairs(&Pose::identity(), &square(100.0));
+    let scaled = |tracker: f64, bench: f64| {
+        let pair = |p: &FiducialPair| FiducialPair {
+            tracker_mm: p.tracker_mm * tracker,
+            bench_mm: p.bench_mm * bench,
+        };
+        refusal(&good.iter().map(pair).collect::<Vec<_>>())
+    };
+    for (tracker, bench, said) in [
+        (
+            1e-3,
+            1.0,
+            "the tracker's points are 0.0010 times as far apart as the bench's; the positions look like \
+             metres; OpenIGTLink is in mm",
+        ),
+        (
+            1.0,
+            1e-3,
+            "the tracker's points are 1000.0000 times as far apart as the bench's; the bench's points look \
+             like metres; give both in mm",
+        ),
+        (
+            0.1,
+            1.0,
+            "the tracker's points are 0.1000 times as far apart as the bench's; give both in mm",
+        ),
+        (
+            1e-3,
+            1e-3,
+            "the points are 0.050 mm RMS apart (at least 1 needed): the positions look like metres; \
+             OpenIGTLink is in mm",
+        ),
+    ] {
+        assert_eq!(scaled(tracker, bench), format!("registration: {said}"));
+    }
 }
 
 /// The points are on a line, and their errors are as large as their distances from it.
@@ -260,17 +293,36 @@ fn the_worst_point_is_named() {
     assert_eq!((fit.points, fit.worst_point), (8, 3));
 }
 
+/// The sets are mirror images, as they are in a left-handed frame of the tracker.
 #[test]
-fn an_axis_that_points_the_wrong_way_is_recognised() {
+fn a_mirrored_axis_or_two_exchanged_ones_are_recognised() {
     let mut points_mm = square(100.0);
-    points_mm.push(Vector3::new(50.0, 50.0, 80.0));
-    let mut pairs = pairs(&Pose::identity(), &points_mm);
-    pairs.iter_mut().for_each(|pair| pair.bench_mm.z = -pair.bench_mm.z);
-    let text = refusal(&pairs);
-    assert!(
-        text.ends_with("the sets are mirror images: one axis of one frame points the other way"),
-        "{text}"
-    );
+    points_mm.push(Vector3::new(50.0, 40.0, 80.0));
+    let noise = WhiteNoise::Gaussian(0.1);
+    let x_wt = Pose { rotation: so3::exp(&Vector3::new(0.3, -1.2, 0.4)), ..Pose::identity() };
+    let changed = |change: fn(&mut Vector3<f64>)| {
+        let mut pairs = pairs(&x_wt, &points_mm);
+        for (point, pair) in pairs.iter_mut().enumerate() {
+            change(&mut pair.tracker_mm);
+            pair.tracker_mm += noise.draw(1, point as u64);
+        }
+        pairs
+    };
+    for change in [
+        |p: &mut Vector3<f64>| p.z = -p.z,
+        |p: &mut Vector3<f64>| p.swap_rows(0, 1),
+        |p: &mut Vector3<f64>| *p = -*p,
+    ] {
+        let text = refusal(&changed(change));
+        let fits = text.split("; a mirrored frame, or two exchanged axes, fits to ").nth(1);
+        let mm = fits.and_then(|fits| fits.strip_suffix(" mm: check the tracker's axes"));
+        assert!(mm.and_then(|mm| mm.parse().ok()).is_some_and(|mm: f64| mm < 0.3), "{text}");
+    }
+    // One bad point besides: a reflection fits better, but not well.
+    let mut bad = changed(|p| p.z = -p.z);
+    bad[0].bench_mm.z += 8.0;
+    let text = refusal(&bad);
+    assert!(text.ends_with(SCATTERED), "{text}");
 }
 
 #[test]

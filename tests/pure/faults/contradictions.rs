@@ -397,6 +397,23 @@ fn a_stream_at_half_speed() {
     is_documented("a_stream_at_half_speed", 8.0, run);
 }
 
+/// The message says so; a frozen stream would ask for another mend.
+#[test]
+fn a_stream_in_metres_is_named() {
+    for speed in ["insertion.speed_mm_per_s=2", "insertion.speed_mm_per_s=1"] {
+        let in_metres = |sample: &mut Sample| sample.position_mm *= 1e-3;
+        let (bench, inserted_mm) = contradicted(steered(&[speed]), 0.0, in_metres);
+        let reason = bench.reason();
+        println!("{inserted_mm:.1} mm: {reason}");
+        assert!(
+            reason.contains("the positions look like metres; OpenIGTLink is in mm"),
+            "{reason}"
+        );
+        assert!(reason.len() < 200, "{}", reason.len());
+        assert!(inserted_mm < 5.0, "{inserted_mm}");
+    }
+}
+
 /// Not as a frozen stream, except for some draws of the noise. `NEEDLE_STARTS=30` gives the figures of
 /// `docs/hazards.md`.
 #[test]
