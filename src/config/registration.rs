@@ -12,7 +12,7 @@ use toml::{Table, Value};
 #[derive(Debug, Clone, PartialEq)]
 pub enum RegistrationConfig {
     /// A pose that was measured or computed before.
-    Given(GivenRegistration),
+    Given(Box<GivenRegistration>),
     /// Points known in both frames, from which the pose is solved.
     Fiducials(Fiducials),
 }
@@ -44,7 +44,7 @@ impl Field for RegistrationConfig {
     fn take(value: Option<&Value>) -> Self {
         match value.and_then(|value| value.get("fiducials")) {
             Some(_) => RegistrationConfig::Fiducials(Field::take(value)),
-            None => RegistrationConfig::Given(Field::take(value)),
+            None => RegistrationConfig::Given(Box::new(Field::take(value))),
         }
     }
 }

@@ -151,9 +151,9 @@ impl Covariance {
     fn transform(&mut self, states: usize, apply: impl Fn(&mut ErrorState)) {
         self.p[..states].iter_mut().for_each(&apply);
         for i in 0..states {
-            let mut column = self.p.map(|row| row[i]);
+            let mut column = std::array::from_fn(|k| self.p[k][i]);
             apply(&mut column);
-            for (row, value) in self.p.iter_mut().zip(column) {
+            for (row, value) in self.p[..states].iter_mut().zip(column) {
                 row[i] = value;
             }
         }
