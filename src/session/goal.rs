@@ -175,19 +175,26 @@ impl Pursuit {
     /// # Errors
     /// The reason, in words.
     pub(super) fn check_start(&mut self, tip_mm: &Vector3<f64>) -> Result<(), String> {
-        self.check_target()?;
+        self.check_on_plane()?;
         self.goal.check_start_with(&mut self.replanner, tip_mm)
     }
 
-    /// Checks that the target has not moved to where no path may end.
-    fn check_target(&self) -> Result<(), String> {
-        let Problem { target_mm, tolerance_mm, clearance_mm, .. } = self.goal.problem;
+    /// Checks that a path in the plane may end at the target.
+    fn check_on_plane(&self) -> Result<(), String> {
+        let Problem { target_mm, tolerance_mm, .. } = self.goal.problem;
         let off_mm = (self.target_mm - target_mm).norm();
         if off_mm > tolerance_mm {
             return Err(format!(
                 "the target is {off_mm:.1} mm off the plane (limit goal.tolerance_mm, {tolerance_mm})"
             ));
         }
+        Ok(())
+    }
+
+    /// Checks that the target has not moved to where no path may end.
+    fn check_target(&self) -> Result<(), String> {
+        self.check_on_plane()?;
+        let Problem { target_mm, tolerance_mm, clearance_mm, .. } = self.goal.problem;
         let slack_mm = self.goal.world.slack_mm(&target_mm, clearance_mm) + tolerance_mm;
         if slack_mm < 0.0 {
             return Err(format!(
