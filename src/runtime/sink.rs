@@ -56,7 +56,7 @@ pub struct Sink<'a> {
     recorder: Result<Recorder, TelemetryError>,
     figures: RunFigures,
     holds: Holds,
-    without_record: Option<&'static str>,
+    goes_on: Option<&'static str>,
     /// How long it took to hand each record to the recorder, ns.
     record_times: DurationHistogram,
     operator: &'a mut dyn Operator,
@@ -90,11 +90,11 @@ pub struct RunReport {
 
 impl<'a> Sink<'a> {
     /// Passes records to `recorder` and news to `operator`; stops the run once `interrupt` is raised. If
-    /// recording fails, the run is stopped, unless `without_record` says what goes on; lost records are then
+    /// recording fails, the run is stopped, unless `goes_on` says what goes on; lost records are then
     /// reported and counted.
     pub fn new(
         recorder: Result<Recorder, TelemetryError>,
-        without_record: Option<&'static str>,
+        goes_on: Option<&'static str>,
         operator: &'a mut dyn Operator,
         interrupt: &Interrupt,
     ) -> Self {
@@ -105,7 +105,7 @@ impl<'a> Sink<'a> {
             recorder,
             figures: RunFigures::default(),
             holds: Holds::default(),
-            without_record,
+            goes_on,
             record_times: DurationHistogram::default(),
             operator,
             interrupt: interrupt.clone(),
@@ -129,7 +129,7 @@ impl<'a> Sink<'a> {
     fn look_after_record(&mut self, now: Time, is_ending: bool) -> Option<String> {
         let mut reason = None;
         while let Some(news) = self.recorder.as_mut().ok().and_then(Recorder::news) {
-            let trouble = match (news, self.without_record) {
+            let trouble = match (news, self.goes_on) {
                 (RecordNews::Failed(error), Some(goes_on)) => format!("{error}; {goes_on}"),
                 (RecordNews::Failed(error), None) if reason.is_none() && !is_ending => {
                     self.operator.record_trouble(&error);

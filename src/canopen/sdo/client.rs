@@ -15,6 +15,8 @@ use crate::units::Time;
 /// If an old answer may still come, the first of these objects that the next request does not name is read
 /// before that request. Every node has both.
 const FENCES: [ObjectAddress; 2] = [ERROR_REGISTER, DEVICE_TYPE];
+/// An answer is looked for among this many requests: a second drive may answer later than the first.
+const ANSWERED_MAX: usize = 8;
 
 #[derive(Debug, Clone, Copy)]
 struct Transfer {
@@ -42,8 +44,8 @@ pub struct SdoClient {
     transfer: Option<Transfer>,
     /// An answer to an earlier request may still come.
     expects_old_answer: bool,
-    /// The last request, if it was answered.
-    answered: Option<SdoRequest>,
+    /// The last requests that were answered since one was aborted.
+    answered: VecDeque<SdoRequest>,
     answers: u32,
     extra_answers: u32,
     /// Another client has sent the node a request.
@@ -61,7 +63,7 @@ impl SdoClient {
             timeout,
             transfer: None,
             expects_old_answer: false,
-            answered: None,
+            answered: VecDeque::new(),
             answers: 0,
             extra_answers: 0,
             has_other_client: false,
@@ -147,18 +149,18 @@ impl SdoClient {
         self.answers
     }
 
-    /// The number of answers beyond the first to a request. 0 if another client asks the node too, since the answers
+    /// The number of answers beyond the first to one of the last eight requests. 0 if another client asks the node too, since the answers
     /// to that client look the same.
     pub fn extra_answers(&self) -> u32 {
         if self.has_other_client { 0 } else { self.extra_answers }
     }
 
-    /// Whether `answer` repeats that to the last request. While an answer from before a timeout may still come, none
-    /// does.
+    /// Whether `answer` repeats that to one of the last requests. While an answer from before a timeout may still
+    /// come, none does.
     fn is_extra(&self, answer: ServerFrame) -> bool {
-        let current = self.transfer.map(|transfer| transfer.request);
-        let is_to = |request: Option<SdoRequest>| request.is_some_and(|it| can_answer(answer, it));
-        !self.expects_old_answer && is_to(self.answered) && !is_to(current)
+        let is_due = self.transfer.is_some_and(|transfer| can_answer(answer, transfer.request));
+        let was_given = self.answered.iter().any(|request| can_answer(answer, *request));
+        !self.expects_old_answer && was_given && !is_due
     }
 
     /// The next frame to send.
@@ -178,8 +180,13 @@ impl SdoClient {
 
     fn end(&mut self, result: Result<SdoReply, SdoError>) {
         // A transfer that was aborted is gone already.
-        self.answered = self.transfer.take().map(|transfer| transfer.request);
-        self.answers += u32::from(self.answered.is_some());
+        if let Some(transfer) = self.transfer.take() {
+            self.answers += 1;
+            self.answered.push_back(transfer.request);
+            if self.answered.len() > ANSWERED_MAX {
+                self.answered.pop_front();
+            }
+        }
         self.result = Some(result);
     }
 
@@ -187,6 +194,7 @@ impl SdoClient {
     fn abort(&mut self, code: AbortCode) {
         if let Some(transfer) = self.transfer.take() {
             self.expects_old_answer = true;
+            self.answered.clear();
             self.outgoing.push_back(ClientFrame::Abort(transfer.request.object(), code));
         }
     }

@@ -27,6 +27,16 @@ pub(super) struct Keys {
 }
 
 impl Keys {
+    /// Notes that no byte is waiting at `now`. The start of a sequence that was read long before is none. Bytes that
+    /// are still waiting, because this thread was held up, belong to it.
+    pub(super) fn idle(&mut self, now: Instant) {
+        let is_old = |since: Instant| now.saturating_duration_since(since) > SEQUENCE_TIME_MAX;
+        if self.pending_since.is_some_and(is_old) {
+            self.pending.clear();
+            self.pending_since = None;
+        }
+    }
+
     /// Takes what was read from the terminal at `now`, and does what its keys say.
     pub(super) fn take(
         &mut self,
@@ -36,10 +46,6 @@ impl Keys {
         commands: &mut Producer<OperatorCommand>,
     ) {
         let mut since = self.pending_since.unwrap_or(now);
-        if now.saturating_duration_since(since) > SEQUENCE_TIME_MAX {
-            self.pending.clear();
-            since = now;
-        }
         self.pending.extend(pressed);
         // The speed asked for so far by the `+` and `-` of this read.
         let mut speed_mm_per_s = None;

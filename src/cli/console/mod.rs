@@ -317,7 +317,9 @@ fn serve_keys(
     while !shared.is_closing.load(Ordering::Relaxed) {
         let mut ready = [PollFd::new(keys.as_fd(), PollFlags::POLLIN)];
         let is_ready = poll(&mut ready, PollTimeout::from(GATHER_MS)).is_ok_and(|count| count > 0);
-        if is_ready {
+        if !is_ready {
+            parser.idle(Instant::now());
+        } else {
             match keys.read(&mut pressed) {
                 Ok(count) if count > 0 => {
                     parser.take(Instant::now(), &pressed[..count], shared, commands);

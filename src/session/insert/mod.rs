@@ -35,7 +35,7 @@ const HISTORY_MARGIN: Duration = Duration::from_secs(1);
 pub(super) struct InsertTask {
     config: SessionConfig,
     begun: Time,
-    /// What is thought of the start, until the insertion begins.
+    /// The bench's judgement of the start, until the insertion begins.
     start: Start,
     tracking: Tracking,
     /// The track of the target, if the target is a tool of its own.
@@ -260,8 +260,10 @@ impl InsertTask {
         let last_seen = tip.min(target).unwrap_or(self.begun).max(self.begun);
         let waiting_since = match power {
             Power::Off | Power::ComingOn => last_seen,
-            // The start is accepted; power comes on at the next SYNC.
-            Power::Awaited(_) if matches!(self.start, Start::Accepted(_)) => last_seen,
+            // The start is accepted; power comes on, or the insertion begins, at the next SYNC.
+            Power::Awaited(_) | Power::On(_) if matches!(self.start, Start::Accepted(_)) => {
+                last_seen
+            }
             Power::Awaited(since) | Power::On(since) => since.min(last_seen),
         };
         self.start.decided_by(waiting_since + self.config.tracker.timeout)
@@ -348,10 +350,19 @@ impl Task for InsertTask {
         if !shell.is_running() {
             self.tracking.refuse_unpaired(shell.now);
             self.drain_tracking(shell);
-        } else if self.insertion.is_none() && shell.now >= self.tip_due(shell.power()) {
-            return Err(self.explain_no_tip(shell.now));
+            return Ok(());
         }
-        Ok(())
+        let is_overdue = |this: &Self, shell: &Shell| {
+            this.insertion.is_none() && shell.now >= this.tip_due(shell.power())
+        };
+        if is_overdue(self, shell) {
+            // A start in doubt is decided first.
+            self.accepts_start(shell)?;
+        }
+        match is_overdue(self, shell) {
+            true => Err(self.explain_no_tip(shell.now)),
+            false => Ok(()),
+        }
     }
 
     fn deadline(&self, shell: &Shell) -> Time {

@@ -32,7 +32,7 @@ impl Seen {
     }
 }
 
-/// What is thought of the start.
+/// The bench's judgement of the start.
 #[derive(Debug, Clone)]
 pub(super) enum Start {
     /// The tip, or the target, is not seen.
@@ -44,7 +44,7 @@ pub(super) enum Start {
 }
 
 impl Start {
-    /// When the wait for a start ends that is due to end at `due`: a doubt that began before is decided first.
+    /// The deadline of the wait for a start: `due`, or later if a doubt that began before `due` is not decided yet.
     pub(super) fn decided_by(&self, due: Time) -> Time {
         match self {
             Start::InDoubt(since, _) => due.max((*since).min(due) + AVERAGE),
@@ -101,6 +101,8 @@ impl InsertTask {
         steering.check_start(&seen.tip_mm).map_err(|why| format!("goal: {why}"))?;
         let Err(why) = check_reach(&self.config, &seen.tip_mm) else { return Ok(()) };
         match self.config.insertion.plane_out_of_reach {
+            // It was said when the start was accepted first.
+            PlaneOutOfReach::Insert if matches!(self.start, Start::Accepted(_)) => Ok(()),
             PlaneOutOfReach::Insert => {
                 shell.report(Lane::Session, Severity::Warning, why);
                 Ok(())

@@ -191,8 +191,9 @@ fn a_start_whose_mean_is_within_reach_begins_although_the_tip_times_out() {
 /// The tip leaves before the drives are configured, or when power is coming on. The plane is out of reach from there.
 #[test]
 fn a_start_that_has_moved_out_of_reach_begins_no_insertion() {
-    for is_powered in [false, true] {
-        let mut bench = Bench::new(&["insertion.depth_mm=150"]);
+    for (is_powered, timeout_s) in [(false, 5.0), (true, 5.0), (true, 0.3)] {
+        let timeout = format!("tracker.timeout_s={timeout_s}");
+        let mut bench = Bench::new(&["insertion.depth_mm=150", &timeout]);
         bench.next_sample = Time::ZERO;
         match is_powered {
             true => bench.run_until(ENABLING),

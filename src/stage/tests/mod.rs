@@ -118,8 +118,9 @@ struct Bench {
     sent: Vec<(Time, Frame)>,
     /// SDO answers arrive so much later, and these still have to.
     sdo_delay: Duration,
-    /// A second drive has the node number of the insertion drive, and answers each SDO request as that one does.
-    has_twin: bool,
+    /// A second drive has the node number of the insertion drive. It answers each SDO request as that one does, so
+    /// much later.
+    twin_later: Option<Duration>,
     delayed: VecDeque<(Time, Frame)>,
     events: Vec<StageEvent>,
     /// Number of events that `run_until` has passed.
@@ -141,7 +142,7 @@ impl Bench {
             stage,
             sent: Vec::new(),
             sdo_delay: Duration::ZERO,
-            has_twin: false,
+            twin_later: None,
             delayed: VecDeque::new(),
             events: Vec::new(),
             seen: 0,
@@ -167,12 +168,17 @@ impl Bench {
                     for answer in answers {
                         let is_sdo_of = |id: u8| answer.cob_id() == Some(cob::sdo_tx(node(id)));
                         let is_sdo = is_sdo_of(1) || is_sdo_of(2);
-                        let copies = if self.has_twin && is_sdo_of(1) { 2 } else { 1 };
-                        for _ in 0..copies {
-                            if is_sdo && !self.sdo_delay.is_zero() {
-                                self.delayed.push_back((self.now + self.sdo_delay, answer));
-                            } else {
+                        let twin = self.twin_later.filter(|_| is_sdo_of(1));
+                        let own = if is_sdo { self.sdo_delay } else { Duration::ZERO };
+                        for delay in
+                            [Some(own), twin.map(|later| own + later)].into_iter().flatten()
+                        {
+                            let due = self.now + delay;
+                            if delay.is_zero() {
                                 self.stage.handle_frame(self.now, &answer);
+                            } else {
+                                let at = self.delayed.partition_point(|(other, _)| *other <= due);
+                                self.delayed.insert(at, (due, answer));
                             }
                         }
                     }

@@ -93,17 +93,19 @@ fn two_senders_of_one_tpdo1_are_a_fault_after_two_syncs() {
     assert!(fault.starts_with("insertion: two TPDO1 that differ after each of 2 SYNCs"), "{fault}");
 }
 
-/// Both answer, with the same value or not. Nothing is written to either, but power off.
+/// The second drive may answer later than the first. Nothing is written to either, but power off.
 #[test]
 fn two_drives_of_one_node_number_are_a_fault_before_power() {
-    for delay_ms in [0, 1, 100] {
+    for (delay_ms, later_ms, extra) in [(0, 0, 5), (1, 0, 5), (100, 0, 5), (2, 3, 4)] {
         let mut bench = Bench::new(config());
-        bench.has_twin = true;
+        bench.twin_later = Some(Duration::from_millis(later_ms));
         bench.sdo_delay = Duration::from_millis(delay_ms);
         assert_eq!(
             bench.until_fault(),
-            "node 1 (insertion): 5 answers more than requests: two drives have this node number, give one \
-             of them another"
+            format!(
+                "node 1 (insertion): {extra} answers more than requests: two drives have this node \
+                 number, give one of them another"
+            )
         );
         assert!(!bench.until_stopped());
         let to_node = bench.sent.iter().filter(|(_, frame)| frame.cob_id() == Some(0x601));
@@ -119,7 +121,7 @@ fn two_drives_of_one_node_number_are_a_fault_before_power() {
 #[test]
 fn extra_answers_are_no_fault_while_another_client_asks_the_drive() {
     let mut bench = Bench::new(config());
-    bench.has_twin = true;
+    bench.twin_later = Some(Duration::ZERO);
     bench.sdo_delay = Duration::from_millis(1);
     bench.until_progress(Progress::BringUp(Axis::Insertion, "checking its identity"));
     bench.receive(Frame::new(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]));

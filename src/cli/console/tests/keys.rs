@@ -43,18 +43,24 @@ fn keys_are_commands_and_escape_sequences_are_none() {
 #[test]
 fn half_an_escape_sequence_does_not_swallow_a_later_key() {
     let begun = Instant::now();
-    let is_stopped = |reads: &[(u64, &[u8])]| {
+    let is_stopped_after = |is_held_up: bool, reads: &[(u64, &[u8])]| {
         let shared = Shared::new(setup(), Interrupt::default());
         let (mut orders, _commands) = RingBuffer::new(COMMANDS);
         let mut keyboard = Keys::default();
         for (ms, keys) in reads {
-            keyboard.take(begun + Duration::from_millis(*ms), keys, &shared, &mut orders);
+            let now = begun + Duration::from_millis(*ms);
+            if !is_held_up {
+                keyboard.idle(now);
+            }
+            keyboard.take(now, keys, &shared, &mut orders);
         }
         shared.interrupt.is_raised()
     };
+    let is_stopped = |reads: &[(u64, &[u8])]| is_stopped_after(false, reads);
     for half in [&b"\x1b["[..], b"\x1bO", b"\x1b[15;2", b"\x1b[Ar\x1b["] {
         assert!(is_stopped(&[(0, half), (101, b"q")]), "{half:?}");
         assert!(!is_stopped(&[(0, half), (100, b"q")]), "the end of the sequence: {half:?}");
+        assert!(!is_stopped_after(true, &[(0, half), (500, b"q")]), "it was waiting: {half:?}");
         // The time counts from the first byte of this sequence.
         assert!(is_stopped(&[(0, half), (90, b"1"), (101, b"q")]));
         assert!(!is_stopped(&[(0, b"\x1b["), (90, &[b"A", half].concat()), (180, b"q")]));
