@@ -118,7 +118,7 @@ impl Job<'_> {
     ) -> Result<Performed> {
         let config = self.config;
         // A needle in tissue comes out, whatever happens to the record.
-        let without_record = match config.record.on_failure {
+        let goes_on = match config.record.on_failure {
             _ if self.is_withdrawal() => Some("the withdrawal goes on"),
             OnFailure::GoOn => Some("the run goes on (record.on_failure)"),
             OnFailure::Stop => None,
@@ -141,7 +141,7 @@ impl Job<'_> {
                 }),
             };
             let (recorder, _) = self.start_recording(SystemTime::now(), Backpressure::Block)?;
-            let sink = Sink::new(recorder, without_record, operator, interrupt);
+            let sink = Sink::new(recorder, goes_on, operator, interrupt);
             session = begin(Time::ZERO)?;
             run_virtual(&mut session, stage, tips, paced.then(Pace::begin), sink)
         } else {
@@ -151,7 +151,7 @@ impl Job<'_> {
             let mut tracker = self.open_tracker(runtime, clock)?;
             let (recorder, realtime) =
                 self.start_recording(clock.origin_utc(), Backpressure::DropAndCount)?;
-            let sink = Sink::new(recorder, without_record, operator, interrupt);
+            let sink = Sink::new(recorder, goes_on, operator, interrupt);
             // Last: the session's deadlines start to run here.
             session = begin(clock.now())?;
             run_live(&mut session, bus.as_mut(), tracker.as_mut(), clock, realtime, sink)

@@ -62,8 +62,8 @@ impl Route {
         Route { grid, lengths_mm, longer, target_mm: *target_mm }
     }
 
-    /// By how much the ways to `target_mm` may be shorter than those to the target of this route, mm: the way between
-    /// the two, which may lead around obstacles. Infinite if there is none.
+    /// By how much a way to `target_mm` may be shorter than the way from the same point to this route's target, mm.
+    /// This is the length of the way between the two targets, around the obstacles; infinite if no way is known.
     pub(super) fn moved_mm(&self, target_mm: &Vector3<f64>) -> f64 {
         if *target_mm == self.target_mm {
             return 0.0;

@@ -52,10 +52,11 @@ pub struct Holds {
 
 /// Takes the records of a run.
 pub struct Sink<'a> {
-    /// The recorder, or why there is none.
+    /// The recorder; an error if the run is not recorded.
     recorder: Result<Recorder, TelemetryError>,
     figures: RunFigures,
     holds: Holds,
+    /// What a warning says of the run, if it goes on when recording fails; `None` to stop it.
     goes_on: Option<&'static str>,
     /// How long it took to hand each record to the recorder, ns.
     record_times: DurationHistogram,
@@ -82,7 +83,7 @@ pub struct RunReport {
     pub timing: Option<TimingReport>,
     /// The run folder; `None` for a withdrawal without a record.
     pub run_dir: Option<PathBuf>,
-    /// The manifest of the closed record, or why there is none or it could not be closed.
+    /// The manifest of the closed record. An error if the run was not recorded, or the record not closed.
     pub record: Result<Manifest, TelemetryError>,
     /// What is known only in an emulated run; `None` in any other.
     pub emulated: Option<EmulationReport>,

@@ -20,8 +20,8 @@ use crate::canopen::sdo::{SdoClient, SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::canopen::{Frame, NodeId, ObjectAddress};
 use crate::units::Time;
 
-/// From this many extra answers on, and if they came to a quarter of the requests, two drives have one node number. A
-/// bus may repeat a frame after a lost acknowledgement, but rarely.
+/// This many extra answers, if they are also a quarter of the answered requests, show that two drives have the same
+/// node number. A bus may repeat a frame after a lost acknowledgement, but rarely.
 const EXTRA_ANSWERS_MIN: u32 = 3;
 
 /// A sans-IO machine that talks with the drives until it [is over](Self::is_over). Hand in frames and the

@@ -32,7 +32,7 @@ impl Script {
     pub(super) async fn run(self) -> Result<i32, String> {
         self.find().await?;
         self.identify().await?;
-        // Before anything is written to two drives.
+        // Two drives must not be configured as one.
         self.check_node_number()?;
         self.disarm().await?;
         self.configure().await?;
@@ -45,7 +45,7 @@ impl Script {
         Ok(position)
     }
 
-    /// Checks that one drive alone answers: two drives of one node number would both move.
+    /// Checks that only one drive answers. Two drives with the same node number would both move.
     fn check_node_number(&self) -> Result<(), String> {
         match self.sdo.extra_answers() {
             0 => Ok(()),

@@ -174,8 +174,10 @@ impl Run {
             tracker: text(file::TRACKER),
             steps: text(file::STEPS),
         };
+        let replayed = run.replay().expect("replays");
+        assert_eq!(replayed.difference, None, "{name}");
         // An older record lacks the columns that were added since.
-        run.steps = run.replay().expect("replays").steps_csv();
+        run.steps = replayed.steps_csv();
         run
     }
 

@@ -149,8 +149,8 @@ impl SdoClient {
         self.answers
     }
 
-    /// The number of answers beyond the first to one of the last eight requests. 0 if another client asks the node too, since the answers
-    /// to that client look the same.
+    /// The number of answers beyond the first to one of the last eight requests. 0 if another client asks the node
+    /// too, since the answers to that client look the same.
     pub fn extra_answers(&self) -> u32 {
         if self.has_other_client { 0 } else { self.extra_answers }
     }

@@ -27,8 +27,8 @@ pub(super) struct Keys {
 }
 
 impl Keys {
-    /// Notes that no byte is waiting at `now`. The start of a sequence that was read long before is none. Bytes that
-    /// are still waiting, because this thread was held up, belong to it.
+    /// Notes that no byte is waiting at `now`, and discards a sequence that has been incomplete for too long. Bytes
+    /// that wait because this thread was held up still complete a sequence.
     pub(super) fn idle(&mut self, now: Instant) {
         let is_old = |since: Instant| now.saturating_duration_since(since) > SEQUENCE_TIME_MAX;
         if self.pending_since.is_some_and(is_old) {

@@ -25,10 +25,11 @@ pub(super) struct Seen {
 }
 
 impl Seen {
-    /// True if tip and target are no farther from where they are in `other` than `noise_mm`.
+    /// True if tip and target are no farther from where they are in `other` than `noise_mm`. False for NaN.
     fn is_near(&self, other: &Seen, noise_mm: f64) -> bool {
-        let moved_mm = self.target_mm.zip(other.target_mm).map_or(0.0, |(a, b)| (a - b).norm());
-        (self.tip_mm - other.tip_mm).norm().max(moved_mm) <= noise_mm
+        let is_near = |(a, b): (Vector3<f64>, Vector3<f64>)| (a - b).norm() <= noise_mm;
+        is_near((self.tip_mm, other.tip_mm))
+            && self.target_mm.zip(other.target_mm).is_none_or(is_near)
     }
 }
 
@@ -110,6 +111,23 @@ impl InsertTask {
             PlaneOutOfReach::Refuse => {
                 Err(format!("insertion: {why}; see insertion.plane_out_of_reach"))
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_place_that_is_not_finite_is_near_no_other() {
+        let seen = |tip_mm: f64, target_mm: f64| Seen {
+            tip_mm: Vector3::x() * tip_mm,
+            target_mm: Some(Vector3::z() * target_mm),
+        };
+        assert!(seen(1.0, 60.0).is_near(&seen(3.0, 62.0), 2.0));
+        for other in [seen(3.1, 60.0), seen(1.0, 62.1), seen(f64::NAN, 60.0), seen(1.0, f64::NAN)] {
+            assert!(!seen(1.0, 60.0).is_near(&other, 2.0), "{other:?}");
         }
     }
 }

@@ -130,7 +130,7 @@ impl Content {
             Record::Drive { time, axis, node, identity } => {
                 self.set_time(time);
                 let text = format!("{axis}: node {node}, {identity}");
-                self.line("events/stage", "INFO", text)
+                self.line("events/stage", level(Severity::Info), text)
             }
             Record::State { time, state } => {
                 self.enter(time, &state.lane().to_string(), state.as_str(), Meaning::of(state))
@@ -166,9 +166,12 @@ impl Content {
     }
 }
 
-/// The greatest depth, µm, after `insertion_mm` was measured. NaN counts as 0.
+/// The greatest depth, µm, after `insertion_mm` was measured.
 fn deepest_um(before_um: i64, insertion_mm: f64) -> i64 {
-    before_um.max((insertion_mm * 1e3).round() as i64)
+    match insertion_mm.is_finite() {
+        true => before_um.max((insertion_mm * 1e3).round() as i64),
+        false => before_um,
+    }
 }
 
 /// rerun's name of a severity.

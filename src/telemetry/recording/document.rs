@@ -24,13 +24,13 @@ pub(super) fn manifest(manifest: &Manifest) -> String {
 fn add_rows(page: &mut String, key: &str, value: &Value) {
     let text = match value {
         Value::Object(parts) => {
-            return parts
-                .iter()
-                .for_each(|(p, value)| add_rows(page, &format!("{key} {p}"), value));
+            let add_part =
+                |(part, value): (&String, _)| add_rows(page, &format!("{key} {part}"), value);
+            return parts.iter().for_each(add_part);
         }
         Value::Array(parts) => {
-            let numbered = (1..).zip(parts);
-            return numbered.for_each(|(n, value)| add_rows(page, &format!("{key} {n}"), value));
+            let add_element = |(value, n)| add_rows(page, &format!("{key} {n}"), value);
+            return parts.iter().zip(1..).for_each(add_element);
         }
         Value::String(text) => cell(text),
         Value::Number(number) if number.is_f64() => {

@@ -15,8 +15,8 @@ const RATE_INTERVAL: Duration = Duration::from_millis(500);
 #[derive(Default)]
 pub(super) struct Samples {
     window_begin: Option<Time>,
-    /// How many were accepted and refused since then.
-    counts: [u32; 2],
+    accepted: u32,
+    refused: u32,
     /// The gate that refused the last sample; the inner `None` if it was accepted.
     last_gate: Option<Option<GateName>>,
 }
@@ -37,7 +37,10 @@ impl Samples {
             return Ok(());
         }
         log_refused(stream, sample)?;
-        self.counts[usize::from(gate.is_some())] += 1;
+        match gate {
+            None => self.accepted += 1,
+            Some(_) => self.refused += 1,
+        }
         if self.last_gate.replace(gate) != Some(gate) {
             let (state, meaning) = match gate {
                 None => ("accepted".to_owned(), Meaning::Good),
@@ -51,9 +54,11 @@ impl Samples {
             return Ok(());
         }
         let interval_s = time.seconds_after(begin);
+        let rates = [("accepted_per_s", self.accepted), ("refused_per_s", self.refused)];
+        let rates = rates.map(|(name, n)| (name, f64::from(n) / interval_s));
+        (self.accepted, self.refused) = (0, 0);
         self.window_begin = Some(time);
-        let rates = std::mem::take(&mut self.counts).map(|n| f64::from(n) / interval_s);
-        log_row(stream, "sample_rates", ["accepted_per_s", "refused_per_s"].into_iter().zip(rates))
+        log_row(stream, "sample_rates", rates)
     }
 }
 

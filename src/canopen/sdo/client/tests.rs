@@ -192,7 +192,7 @@ fn a_new_transfer_ends_the_one_under_way() {
 const VENDOR_IS_FB: [u8; 8] = [0x43, 0x18, 0x10, 0x01, 0xfb, 0, 0, 0];
 const REFUSED: [u8; 8] = [0x80, 0x18, 0x10, 0x01, 0, 0, 0x02, 0x06];
 
-/// Two nodes of one number answer each request twice.
+/// Two nodes have the same number, and both answer.
 #[test]
 fn a_second_answer_to_a_request_is_counted() {
     for second in [VENDOR_IS_FB, REFUSED] {
