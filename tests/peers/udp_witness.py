@@ -4,10 +4,21 @@ Each line is `id#data`, as in candump -L. Prints "listening" first; ends on SIGI
 """
 
 import argparse
+import os
 import signal
+import socket
 import sys
 
 import can
+
+
+# The SDO requests of a bring-up come faster than Python reads them; the default buffer holds some 270 frames.
+RECEIVE_BUFFER_BYTES = 2_000_000
+
+
+def enlarge_receive_buffer(bus):
+    with socket.socket(fileno=os.dup(bus.fileno())) as udp:
+        udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
 
 
 def main():
@@ -18,6 +29,7 @@ def main():
     ended = []
     signal.signal(signal.SIGINT, lambda *_: ended.append(True))
     with can.Bus(interface="udp_multicast", channel=args.group) as bus:
+        enlarge_receive_buffer(bus)
         print("listening", flush=True)
         while not ended:
             message = bus.recv(0.1)
