@@ -4,14 +4,14 @@
 #   usage: vcan/run.sh [--keep DIR]... COMMAND [ARGUMENT]...
 #
 # If this kernel has vcan, the script brings the interfaces up (as root, or with sudo without a
-# password) and runs the command here. Otherwise it runs it in a small QEMU machine with Debian's
+# password) and runs the command here. Otherwise it runs it in a virtual machine with Debian's
 # kernel, see vcan/guest/run.sh. In both cases the command sees this machine's files, working folder
 # and environment, and the script passes its output and exit status on. NEEDLE_VCAN=1 tells the
 # command's tests that a missing interface is a failure.
 #
-#   --keep DIR       in the QEMU machine, files written in DIR are kept; all others are lost
+#   --keep DIR       in the virtual machine, files written in DIR are kept; all others are lost
 #   VCAN_TIMEOUT_S   time limit, 300 by default; exit status 124 when it is exceeded
-#   VCAN_GUEST=1     use the QEMU machine even if this kernel has vcan
+#   VCAN_GUEST       uml or qemu: use that virtual machine even if this kernel has vcan
 #
 # As Cargo's runner it lets tests be built here and run in the machine:
 #   CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER=$PWD/vcan/run.sh cargo test --test vcan

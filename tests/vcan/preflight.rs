@@ -13,7 +13,7 @@ fn controller() -> Option<(RwLockWriteGuard<'static, ()>, String)> {
     let alone = vcan::alone_on_it()?;
     let can = std::env::var("NEEDLE_CAN").ok();
     if can.is_none() {
-        println!("no controller of the emulated machine: VCAN_GUEST=1 vcan/run.sh has one");
+        println!("no controller of the emulated machine: VCAN_GUEST=qemu vcan/run.sh has one");
     }
     Some((alone, can?))
 }

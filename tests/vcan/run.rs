@@ -252,8 +252,8 @@ fn an_interface_that_goes_down_ends_the_run_for_good() {
 #[test]
 fn setting_the_system_clock_during_a_run_changes_nothing() {
     let Some(_alone) = vcan::alone_on_it() else { return };
-    if std::env::var("NEEDLE_CAN").is_err() {
-        println!("skipped: only the clock of the emulated machine is set");
+    if std::env::var("NEEDLE_GUEST").is_err() {
+        println!("skipped: only the clock of the virtual machine is set");
         return;
     }
     let scratch = Scratch::new("clock");
