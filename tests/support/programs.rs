@@ -243,8 +243,9 @@ impl Scratch {
         command.current_dir(env!("CARGO_MANIFEST_DIR"));
         command.args(["run", "bench-config/vcan.toml"]).args(flags);
         let given = self.settings();
-        // At this speed the default `hold_after_mm` is reached in 0.1 s, and an emulated machine may stall longer.
-        let fast = ["insertion.speed_mm_per_s=5", "tracker.hold_after_mm=3"];
+        // At this speed the default `hold_after_mm` is reached in 0.1 s, and a virtual machine may stall longer.
+        let fast =
+            ["insertion.speed_mm_per_s=5", "tracker.hold_after_mm=3", "tracker.hold_after_s=3"];
         let given = given.iter().map(String::as_str).chain(fast);
         for setting in given.chain(settings.iter().copied()) {
             command.args(["--set", setting]);

@@ -46,10 +46,13 @@ printf '%s\n' "${keep[@]}" >"$shared/keep"
 exec 8> >(exec cat) && out=$!
 exec 9> >(exec cat >&2) && err=$!
 
+start=()
 case $kind in
 uml)
+    # Its processes take turns, which costs a quarter less time on one processor.
+    if command -v taskset >/dev/null; then start=(taskset -c "$(($(nproc) - 1))"); fi
     # Its terminals 1 and 2 are the command's stdout and stderr; init finds the folder by the name `shared`.
-    start=("$machine/linux" mem="${memory_mb}M" initrd="$machine/initrd.gz" quiet uml_dir="$shared"
+    start+=("$machine/linux" mem="${memory_mb}M" initrd="$machine/initrd.gz" quiet uml_dir="$shared"
         con=null "con0=null,fd:1" "con1=null,fd:8" "con2=null,fd:9" shared="$shared")
     ;;
 qemu)
@@ -59,7 +62,7 @@ qemu)
     if [ -w /dev/kvm ] && grep -qwE 'vmx|svm' /proc/cpuinfo; then accel=kvm cpu=host; fi
     # norandmaps: every process has its code at the same addresses, so that the emulation translates it once. A
     # jog, with its record, takes 4 s instead of 12.
-    start=("$machine/qemu-system-x86_64"
+    start+=("$machine/qemu-system-x86_64"
         -nodefaults -no-user-config -display none -no-reboot
         -machine q35 -accel "$accel" -cpu "$cpu" -smp "${VCAN_CPUS:-1}" -m "$memory_mb"
         -kernel "$machine/vmlinux" -initrd "$machine/initrd.gz"
