@@ -39,9 +39,11 @@ struct Line<'a> {
     refused: Option<String>,
 }
 
-/// When a sample of `tracker.ndjson` was received, and whether it was accepted.
+/// Of which tool a sample of `tracker.ndjson` is, when it was received, and whether it was accepted.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 pub struct TrackerTimes {
+    /// The tool, as it was sent.
+    pub tool: String,
     /// When the bench received it, ns on the run's time line.
     pub receive_time_ns: i64,
     /// When the tip was at this position, if the sample was accepted.
@@ -123,8 +125,10 @@ mod tests {
     fn the_times_of_whole_lines_are_read() {
         let text = "{\"receive_time_ns\":20,\"acquisition_time_ns\":7,\"refused\":null,\"tool\":\"N\"}\n\
                     {}\n\
-                    {\"receive_time_ns\":30,\"acquisition_time_ns\":null,\"refused\":\"zero\"}\n{\"rece";
+                    {\"receive_time_ns\":30,\"acquisition_time_ns\":null,\"refused\":\"zero\",\"tool\":\"N\"}\n\
+                    {\"rece";
         let times = |receive_time_ns, acquisition_time_ns, refused: Option<&str>| TrackerTimes {
+            tool: "N".to_owned(),
             receive_time_ns,
             acquisition_time_ns,
             refused: refused.map(str::to_owned),

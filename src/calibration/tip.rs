@@ -19,6 +19,8 @@ const RADIUS_PER_RMS_MIN: f64 = 3.0;
 /// The least length of the mean of unit vectors that should all be equal: 0.9 is a spread of 26°,
 /// which leaves room for the shaft's torsion.
 const COHERENCE_MIN: f64 = 0.9;
+/// A sensor whose roll is not seen is taken to point along the needle; it may not point farther away from it.
+const TILT_MAX_DEG: f64 = 30.0;
 
 /// One position while the base turns.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -168,6 +170,15 @@ impl TipFit {
                 axis.angle(&Vector3::z()).to_degrees()
             ));
         }
+        if let Some(tilt_rad) = tilt(samples, &circle).filter(|_| mount.is_none())
+            && tilt_rad.to_degrees() > TILT_MAX_DEG
+        {
+            return refused(format!(
+                "the sensor's z axis is {:.0} deg from the needle's (limit {TILT_MAX_DEG:.0} without the sensor's \
+                 roll): is stage.rotation.sign right, or is the sensor mounted backwards or across?",
+                tilt_rad.to_degrees()
+            ));
+        }
         Ok(TipFit {
             points,
             radius_mm,
@@ -196,6 +207,16 @@ impl TipFit {
         };
         Pose { rotation: angles.to_rotation(), translation: to_axis_mm + axis * along_mm }
     }
+}
+
+/// The mean angle between the sensor's z axis and the needle's axis, rad; `None` unless every sample has an
+/// orientation.
+fn tilt(samples: &[TurnSample], circle: &Circle) -> Option<f64> {
+    let along = samples
+        .iter()
+        .map(|sample| Some((sample.orientation_meas? * Vector3::z()).dot(&circle.normal)));
+    let sum: f64 = along.sum::<Option<f64>>()?;
+    Some(math::acos((sum / samples.len() as f64).clamp(-1.0, 1.0)))
 }
 
 fn refused<T>(reason: String) -> Result<T, CalibrationError> {

@@ -108,7 +108,7 @@ pub(super) fn after_insertion(
 /// Where the insertion axis stands after an insertion, mm. `None` if the drives have not reported it, or if it is less
 /// than the run has inserted from the lower limit on, as of a drive that has restarted and counts anew.
 fn depth_mm(config: &Config, report: &RunReport) -> Option<f64> {
-    let depth_mm = report.stage_at_end.position?.insertion_mm;
+    let depth_mm = report.stage_at_end.position_of(Axis::Insertion)?;
     let least_mm = config.stage.insertion.limits.min + report.figures.report().insertion_mm;
     (depth_mm >= least_mm - config.insertion.arrival_mm).then_some(depth_mm)
 }
@@ -139,13 +139,16 @@ pub(super) fn after_operation(
     if !is_stopped && required.is_none() {
         return None;
     }
+    let position_of = |axis| report.stage_at_end.position_of(axis);
+    let shown = |axis: Axis| match position_of(axis) {
+        Some(position) => format!("{axis} at {}", axis.shown(position)),
+        None => format!("not known where the {axis} stands"),
+    };
     let positions = match report.stage_at_end.position {
-        Some(position) => {
-            let shown = |axis: Axis| format!("{axis} at {}", axis.shown(position.along(axis)));
-            Axis::BOTH.map(shown).join(", ")
-        }
+        Some(_) => Axis::BOTH.map(shown).join(", "),
         None => "not known where the axes stand".to_owned(),
     };
+    let remaining = remaining.filter(|_| position_of(Axis::Insertion).is_some());
     let next = match (required, remaining) {
         (Some(required), _) => next_stage(required.operation(), "", path, report),
         (None, Some(remaining)) => next_stage("withdraw", remaining, path, report),

@@ -312,7 +312,7 @@ pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
             GoalKind::Plane => None,
             GoalKind::Target => Some(config.to_plan(&mask_reader(None))?),
         },
-        truth: config.is_emulated(),
+        truth: config.knows_truth(),
         shadows: config
             .observer
             .observers()

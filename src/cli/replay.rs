@@ -4,7 +4,7 @@ use super::output::{print_result, print_stderr, refuse_existing, write_new};
 use super::records::{open, recorded_run_config};
 use super::{Failure, Result, STOPPED, finish_with};
 use crate::archive::file;
-use crate::config::{CanInterface, Config, Source};
+use crate::config::{Config, Source, TrackerSource};
 use crate::operation::RunConfig;
 use crate::replay::{Recorded, replay as run_again};
 use crate::session::ObserverConfig;
@@ -93,7 +93,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<()> {
             rows.push(context! { title, observer, rms, last });
         }
     }
-    let has_truth = folder.manifest().bus == CanInterface::Memory.to_string();
+    let has_truth = folder.manifest().tracker == TrackerSource::Emulated.to_string();
     let more = context! { figures => rows, has_truth };
     let text = || screen(include_str!("replay.txt"), &object, more);
     print_result(arguments.json, &object, text)?;

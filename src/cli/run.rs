@@ -138,6 +138,7 @@ fn screen_values(config: &Config, path: Option<&Path>, report: &RunReport) -> Sh
     context! {
         depth_mm => config.insertion.depth_mm,
         is_virtual => config.is_emulated(),
+        has_truth => config.knows_truth(),
         rehearsed => config.emulator.rehearse.then(|| config.can.interface.to_string()),
         is_stopped => matches!(report.outcome, Outcome::Stopped(_)),
         tracker => report.gates.to_string(),

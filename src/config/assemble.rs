@@ -26,6 +26,11 @@ impl Config {
         *self.bus() == CanInterface::Memory
     }
 
+    /// True if the true tip is known: the positions are those of the needle that is emulated in this process.
+    pub fn knows_truth(&self) -> bool {
+        self.is_emulated() && self.tip_source() == TrackerSource::Emulated
+    }
+
     /// The source of a run's tip positions; that of a rehearsal is the emulated tracker.
     pub fn tip_source(&self) -> TrackerSource {
         if self.emulator.rehearse { TrackerSource::Emulated } else { self.tracker.source }

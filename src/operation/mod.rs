@@ -82,8 +82,8 @@ impl OperationConfig {
         let OperationConfig { stage: config, operation } = self;
         let purpose = PerAxis::from_fn(|axis| match &operation {
             Operation::Home(axes) if axes[axis] => AxisUse::Home,
-            Operation::Home(_) => AxisUse::Hold,
-            Operation::Move(_) => AxisUse::Move,
+            Operation::Move(request) if request.axis == axis => AxisUse::Move,
+            Operation::Home(_) | Operation::Move(_) => AxisUse::Hold,
             Operation::Prove | Operation::Answer(_) => AxisUse::Steer,
         });
         let stage = Stage::for_use(config.clone(), purpose, now);

@@ -183,6 +183,9 @@ impl Task for MoveOneAxis {
             StageEvent::Located(at) => self.plan_from(shell, *at).map(drop),
             StageEvent::Feedback(feedback) => {
                 shell.record(Record::Stage(*feedback));
+                if let Some(moved) = self.moves.last_mut() {
+                    moved.to = feedback.measured.along(moved.axis);
+                }
                 if shell.is_running() { self.advance(shell, feedback) } else { Ok(()) }
             }
             _ => Ok(()),
@@ -190,10 +193,11 @@ impl Task for MoveOneAxis {
     }
 
     /// A stop from outside ends the feedback while the axis still brakes, so the end of the move is where the axis
-    /// was measured last.
+    /// was measured last, unless the drive has restarted since.
     fn end(&mut self, shell: &mut Shell) {
-        if let (Some(moved), Some(position)) = (self.moves.last_mut(), shell.position()) {
-            moved.to = position.along(moved.axis);
+        let Some(moved) = self.moves.last_mut() else { return };
+        if let Some(position) = shell.stage_at_end().position_of(moved.axis) {
+            moved.to = position;
         }
     }
 

@@ -335,8 +335,26 @@ fn an_axis_that_needs_homing_is_not_moved_before_it() {
     let mut bench = Bench::new(&config, Operation::Move(by(Axis::Insertion, 2.0)));
     let reason = bench.reason();
     assert!(reason.starts_with("stage: node 1 (insertion): not homed"), "{reason}");
-    assert!(reason.ends_with("home it first: needle-bench stage home CONFIG"), "{reason}");
+    assert!(
+        reason.ends_with("home it first: needle-bench stage home CONFIG --axis insertion"),
+        "{reason}"
+    );
     assert_eq!(bench.travel(), (0.0, 0.0));
+}
+
+/// The rotation drive has lost its home. The base is only held while the needle comes out.
+#[test]
+fn an_axis_is_moved_although_the_other_is_not_homed() {
+    let config = config(&["stage.rotation.reference=homing", "stage.rotation.zero=0"]);
+    let mut bench = Bench::new(&config, Operation::Move(by(Axis::Insertion, 2.0)));
+    assert_eq!(bench.run(), Outcome::Completed);
+    assert!((bench.travel().0 - 2.0).abs() < 1e-3, "{}", bench.travel().0);
+    let mut bench = Bench::new(&config, Operation::Move(by(Axis::Rotation, 1.0)));
+    let reason = bench.reason();
+    assert!(
+        reason.ends_with("), home it first: needle-bench stage home CONFIG --axis rotation"),
+        "{reason}"
+    );
 }
 
 #[test]

@@ -91,7 +91,7 @@ impl Campaign {
                 }
             };
             known.extend(keys.keys().cloned());
-            let has_truth = folder.is_emulated();
+            let has_truth = folder.has_truth();
             groups.entry((label, has_truth)).or_default().push((folder, keys));
         }
         if let Some(key) = by.filter(|key| !known.is_empty() && !known.contains(*key)) {

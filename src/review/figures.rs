@@ -124,7 +124,7 @@ fn figures(folder: &Folder, report: Option<&FigureReport>, limits: &Limits) -> V
     let mut all: Vec<Figure> = FIGURES.iter().map(of_report).collect();
     // An open record's manifest may not name the bus. The last step may have no estimate.
     let has_error = report.is_some_and(|it| it.final_error.or(it.estimate_rms).is_some());
-    let has_truth = folder.is_emulated() || has_error;
+    let has_truth = folder.has_truth() || has_error;
     let provenance = if has_truth { "true" } else { "estimated" };
     for figure in all.iter_mut().filter(|figure| figure.key == OFF_PLANE) {
         figure.label = format!("off plane ({provenance}), RMS over {}", last_third(folder, report));
@@ -312,6 +312,9 @@ mod tests {
         let mut closed = run();
         assert!(!is_true(&closed));
         closed.folder.manifest.bus = "memory".to_owned();
+        closed.folder.manifest.tracker = "csv tip.csv".to_owned();
+        assert!(!is_true(&closed), "the recording is of another needle");
+        closed.folder.manifest.tracker = "emulated".to_owned();
         assert!(is_true(&closed));
         let mut open = run();
         open.folder.manifest.figures.clear();

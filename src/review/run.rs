@@ -4,7 +4,7 @@ use super::compare::{Keys, keys};
 use super::figures::{Limits, limits};
 use super::motion::{Course, Motion};
 use crate::archive::{EventKind, EventLine, Manifest, RunOutcome, StepsTable, TrackerTimes};
-use crate::config::{CanInterface, Config, Source};
+use crate::config::{CanInterface, Config, GoalKind, Source, TrackerSource};
 use crate::session::{Lane, Severity, State};
 use crate::study::{FigureReport, PlanStatus};
 use crate::text::{escaped, shell_word};
@@ -59,7 +59,7 @@ pub struct Run {
     pub folder: Folder,
     /// `steps.csv`.
     pub steps: StepsTable,
-    /// The times in `tracker.ndjson`.
+    /// The times of the needle's tip in `tracker.ndjson`.
     pub samples: Vec<TrackerTimes>,
     /// The motion of the axes.
     pub motion: Motion,
@@ -169,9 +169,14 @@ impl Folder {
         }
     }
 
-    /// True if stage and needle were emulated in memory, so that the truth is recorded.
+    /// True if the stage was emulated in memory.
     pub(super) fn is_emulated(&self) -> bool {
         self.manifest.bus == CanInterface::Memory.to_string()
+    }
+
+    /// True if the truth is recorded: the tip positions are those of the emulated needle.
+    pub(super) fn has_truth(&self) -> bool {
+        self.is_emulated() && self.manifest.tracker == TrackerSource::Emulated.to_string()
     }
 
     /// True if the manifest says that a part of the run is missing.
@@ -223,6 +228,11 @@ impl Folder {
     pub(super) fn config(&self) -> Result<Config, String> {
         let source = Source { name: "config.toml", text: self.toml()? };
         Config::from_sources(&[source], &[]).map_err(first_line)
+    }
+
+    /// The tool that marks its target on the tracker's stream; `None` without one.
+    pub fn target_tool(&self) -> Option<String> {
+        self.config().ok().filter(|config| config.goal.kind == GoalKind::Target)?.goal.tool
     }
 
     /// Every key of its configuration.

@@ -179,7 +179,9 @@ impl<W: Witness> World for VirtualRun<'_, W> {
         if let Record::State { state: State::Stopping, .. } = &record {
             self.emulated.stopping = Some(Moment::of(&self.stage, self.now));
         }
-        self.witness.take(record, Some(self.stage.truth(self.now)));
+        // A recording is of another needle than the emulated one.
+        let truth = self.replay().is_none().then(|| self.stage.truth(self.now));
+        self.witness.take(record, truth);
     }
 
     fn take_arrived(&mut self) -> bool {

@@ -161,8 +161,21 @@ impl Insertion {
 
     /// True when the needle stands where a hold has brought its set-points to rest.
     pub(crate) fn is_standing(&self, insertion_meas_mm: f64) -> bool {
+        self.profile.is_at_rest() && self.misses_by(insertion_meas_mm).is_none()
+    }
+
+    /// True if the set-points have come to rest and the axis has had time to follow, in a hold that lasts for `held`.
+    pub(crate) fn must_stand(&self, held: Duration) -> bool {
+        self.profile.is_at_rest() && held >= ARRIVAL_TIMEOUT
+    }
+
+    /// How far the needle is off its set-point, in words, if that is more than its tolerance.
+    pub(crate) fn misses_by(&self, insertion_meas_mm: f64) -> Option<String> {
         let off_mm = (self.profile.position_mm() - insertion_meas_mm).abs();
-        self.profile.is_at_rest() && off_mm <= self.config.arrival_mm
+        let limit_mm = self.config.arrival_mm;
+        (off_mm > limit_mm).then(|| {
+            format!("the needle is {off_mm:.3} mm off its set-point (limit {limit_mm:.3}, insertion.arrival_mm)")
+        })
     }
 
     /// Checks that the needle arrives where its set-points end; otherwise the run would wait there for

@@ -1,6 +1,6 @@
 //! How a run ended.
 
-use crate::stage::{DriveReport, PerAxis, SetPoint};
+use crate::stage::{Axis, DriveReport, PerAxis, SetPoint};
 use serde::Serialize;
 
 /// Whether the run reached its depth.
@@ -34,4 +34,12 @@ pub struct StageAtEnd {
     pub drives: PerAxis<DriveReport>,
     /// Last measured position of both axes; `None` before both drives have sent it.
     pub position: Option<SetPoint>,
+}
+
+impl StageAtEnd {
+    /// Where `axis` stands, mm or rad; `None` if that is not known. A drive that has restarted may count anew.
+    pub fn position_of(&self, axis: Axis) -> Option<f64> {
+        let position = self.position.filter(|_| !self.drives[axis].restarted);
+        position.map(|position| position.along(axis))
+    }
 }

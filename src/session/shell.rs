@@ -305,7 +305,7 @@ impl Shell {
     }
 
     /// The state in which the run leaves the stage.
-    pub(super) fn stage_at_end(&self) -> StageAtEnd {
+    pub(crate) fn stage_at_end(&self) -> StageAtEnd {
         StageAtEnd {
             had_power: self.had_power(),
             unknown: self.unconfirmed,

@@ -87,7 +87,7 @@ pub enum AxisUse {
     Steer,
     /// It is moved by the operator: it must be homed. If it stands outside its soft limits, it may come back.
     Move,
-    /// It is held while the other axis is homed.
+    /// It is held while the other axis is homed or moved.
     Hold,
     /// It is homed.
     Home,

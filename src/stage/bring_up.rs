@@ -76,6 +76,8 @@ pub(super) struct BringUpState {
     pub(super) disarmed: bool,
     /// The drive may have been configured to monitor the bench's heartbeat; its power was taken off before.
     pub(super) may_be_supervised: bool,
+    /// The last statusword that was read.
+    pub(super) statusword: Option<Statusword>,
     /// The fault that the drive was in when its statusword was read.
     pub(super) found_in_fault: Option<FoundFault>,
 }

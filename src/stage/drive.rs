@@ -24,6 +24,8 @@ pub struct DriveReport {
     pub state: Option<DriveState>,
     /// The last error that it reported, unless it has reported its end since.
     pub error: Option<EmcyCode>,
+    /// It has restarted since its bring-up, and may count its position anew.
+    pub restarted: bool,
 }
 
 impl DriveReport {
@@ -95,6 +97,10 @@ pub(super) struct Drive {
     pub(super) reading: Reading,
     /// The fault that the drive was found in, if its bring-up was abandoned.
     pub(super) found_fault: Option<FoundFault>,
+    /// The last statusword that its bring-up read, if that was abandoned.
+    pub(super) found_statusword: Option<Statusword>,
+    /// It has restarted since its bring-up.
+    pub(super) restarted: bool,
     /// The last emergency message, and how many times in a row it came.
     emcy: (Option<Emcy>, u64),
     pub(super) controlword: Controlword,
@@ -134,6 +140,8 @@ impl Drive {
             held_syncs_max: config.bus.missed_feedback_max.max(1).into(),
             reading: Reading::begun(Time::ZERO),
             found_fault: None,
+            found_statusword: None,
+            restarted: false,
             emcy: (None, 0),
             controlword: Controlword::DISABLE_VOLTAGE,
             standstill: config.standstill(axis),
@@ -456,11 +464,12 @@ impl Drive {
     }
 
     pub(super) fn report(&self) -> DriveReport {
-        let statusword = self.statusword.or(self.found_fault.map(|fault| fault.statusword));
+        let statusword = self.statusword.or(self.found_statusword);
         let found_code = self.found_fault.and_then(|fault| fault.error_code);
         let reported_code = self.emcy.0.map(|emcy| emcy.code);
         let error = reported_code.or(found_code).filter(|code| *code != EmcyCode::NO_ERROR);
-        DriveReport { state: statusword.and_then(Statusword::state), error }
+        let state = statusword.and_then(Statusword::state);
+        DriveReport { state, error, restarted: self.restarted }
     }
 
     /// Starts to watch for standstill.

@@ -3,7 +3,7 @@
 use super::bring_up::{FoundFault, Identity, Object, POLL_PERIOD, Script, optional};
 use super::config::unsigned_counts;
 use super::drive::may_have_power;
-use super::{AxisConfig, AxisUse, HomingConfig, Reference, Sign, StageEvent};
+use super::{Axis, AxisConfig, AxisUse, HomingConfig, Reference, Sign, StageEvent};
 use crate::canopen::cia402::{Controlword, Mode, Statusword, object as drive};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::object::communication::{
@@ -186,7 +186,9 @@ impl Script {
 
     async fn read_statusword(&self) -> Result<Statusword, String> {
         let value = self.read(drive::STATUSWORD).await?;
-        Ok(Statusword(value.map_or(0, SdoValue::to_u32) as u16))
+        let statusword = Statusword(value.map_or(0, SdoValue::to_u32) as u16);
+        self.note(|state| state.statusword = Some(statusword));
+        Ok(statusword)
     }
 
     /// Writes the raw objects of the configuration, then its settings that have objects of their own.
@@ -296,8 +298,11 @@ impl Script {
         if homing.says_homed(statusword) {
             return Ok(());
         }
+        let axis = self.axis;
+        let first = if axis == Axis::Insertion { "take the needle off and " } else { "" };
         Err(format!(
-            "not homed (statusword {statusword}, bit {} clear), home it first: needle-bench stage home CONFIG",
+            "not homed (statusword {statusword}, bit {} clear), {first}home it first: \
+             needle-bench stage home CONFIG --axis {axis}",
             homing.homed_bit
         ))
     }

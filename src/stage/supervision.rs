@@ -89,6 +89,7 @@ impl Stage {
             matches!(self.phase, Phase::BringUp | Phase::Standby { .. } | Phase::Enabling { .. });
         let fault = match event {
             HeartbeatEvent::BootUp => {
+                self.drives[axis].restarted = true;
                 "boot-up message in mid-run, the drive restarted; is its supply stable?".to_owned()
             }
             HeartbeatEvent::Lost => {

@@ -290,7 +290,10 @@ fn home_homes_both_axes_and_other_commands_ask_for_it() {
         assert_eq!(said.status, 1, "{arguments:?}");
         let last = said.stdout.lines().last().unwrap();
         assert!(last.starts_with("stopped: stage: node 1 (insertion): not homed"), "{last}");
-        assert!(last.ends_with("home it first: needle-bench stage home CONFIG"), "{last}");
+        assert!(
+            last.ends_with("home it first: needle-bench stage home CONFIG --axis insertion"),
+            "{last}"
+        );
     }
 }
 

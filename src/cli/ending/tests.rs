@@ -91,7 +91,7 @@ fn stood() -> StageAtEnd {
 
 /// As [`stood`], at `insertion_mm`.
 fn at(insertion_mm: f64) -> StageAtEnd {
-    let off = DriveReport { state: Some(DriveState::SwitchOnDisabled), error: None };
+    let off = DriveReport { state: Some(DriveState::SwitchOnDisabled), ..DriveReport::default() };
     let position = SetPoint { insertion_mm, rotation_rad: 90_f64.to_radians() };
     let drives = PerAxis::from_fn(|_| off);
     StageAtEnd { had_power: true, unknown: None, drives, position: Some(position) }
@@ -100,8 +100,11 @@ fn at(insertion_mm: f64) -> StageAtEnd {
 /// Like [`stood`], with the rotation drive in Fault.
 fn in_fault() -> StageAtEnd {
     let mut stage = stood();
-    stage.drives.rotation =
-        DriveReport { state: Some(DriveState::Fault), error: Some(EmcyCode::HEARTBEAT) };
+    stage.drives.rotation = DriveReport {
+        state: Some(DriveState::Fault),
+        error: Some(EmcyCode::HEARTBEAT),
+        restarted: false,
+    };
     stage
 }
 
@@ -145,6 +148,24 @@ fn the_depth_after_a_run_is_that_of_the_axis_not_the_travel_of_the_run() {
                     next        needle-bench stage status rig.toml";
     assert_eq!(lines, expected);
     assert_eq!(withdrawal.unwrap_err(), "the needle's depth is not known; look at the stage");
+}
+
+/// It may count anew from 0, or from elsewhere, with the needle in.
+#[test]
+fn the_position_of_a_drive_that_has_restarted_is_not_known() {
+    let real = config(&["stage.insertion.zero=0"]);
+    let mut stage = at(10.0);
+    stage.drives.insertion.restarted = true;
+    let report = stopped(stage);
+    let rig = Some(Path::new(RIG));
+    let expected = "needle      its depth is not known; both axes stand, power is off\n\
+                    next        needle-bench stage status rig.toml";
+    assert_eq!(after_insertion(&real, rig, &report).unwrap(), expected);
+    let withdrawal = possible_withdrawal(&real, &report).unwrap_err();
+    assert_eq!(withdrawal, "the needle's depth is not known; look at the stage");
+    let expected = "stage       not known where the insertion stands, rotation at 90.000 deg; both axes \
+                    stand, power is off\nnext        needle-bench stage status rig.toml";
+    assert_eq!(after_operation(&real, rig, Some(" --by 5.0mm"), &report).unwrap(), expected);
 }
 
 /// A drive without power loses its position: after a restart it may report 0 with the needle in.

@@ -372,6 +372,7 @@ mod tests {
     fn the_age_is_that_of_the_previous_accepted_position() {
         let mut run = run();
         let at = |ms: i64, refused: bool| TrackerTimes {
+            tool: "NeedleToTracker".to_owned(),
             receive_time_ns: (ms + 100) * 1_000_000,
             acquisition_time_ns: (!refused).then_some(ms * 1_000_000),
             refused: refused.then(|| "zero".to_owned()),
@@ -402,6 +403,7 @@ mod tests {
         run.folder.manifest.set_outcome(&Outcome::Stopped("tracker: no tip".to_owned()));
         run.motion.measured.insertion = vec![(2.0, 10.0), (5.0, 13.0), (9.0, 13.5)];
         let at = |ms: i64, refused: Option<String>| TrackerTimes {
+            tool: "NeedleToTracker".to_owned(),
             receive_time_ns: ms * 1_000_000,
             acquisition_time_ns: refused.is_none().then_some(ms * 1_000_000),
             refused,

@@ -108,14 +108,20 @@ impl InsertTask {
             shell.report_at(now, Lane::Tracker, Severity::Info, text);
             return Ok(());
         }
-        let (end, trouble) = if tracker.hold.resume == Resume::Stop && is_standing {
+        let is_over = is_standing || insertion.must_stand(now.since(hold.since));
+        let (end, trouble) = if tracker.hold.resume == Resume::Stop && is_over {
             ("held and stopped".to_owned(), first)
         } else if now.since(hold.since) + hold.before >= tracker.hold.timeout {
             let in_a_row = if hold.before.is_zero() { "" } else { " in a row" };
             let timeout_s = tracker.hold.timeout.as_secs_f64();
+            let end = format!("held for {timeout_s:.1} s{in_a_row} and stopped");
             // The first trouble may be over and another may hold the insertion now.
-            let latest = found.as_ref().unwrap_or(first);
-            (format!("held for {timeout_s:.1} s{in_a_row} and stopped"), latest)
+            match (&found, insertion.misses_by(insertion_meas_mm)) {
+                (None, Some(off)) if self.is_seen(now) => {
+                    return Err(format!("tracker: the tip is seen again, but {off}; {end}"));
+                }
+                _ => (end, found.as_ref().unwrap_or(first)),
+            }
         } else {
             return Ok(());
         };
@@ -187,7 +193,12 @@ impl InsertTask {
         };
         let insertion_mm = self.progress.insertion_meas_mm;
         if !insertion.is_standing(insertion_mm) {
-            return Err("the needle is still braking; try again once it stands".to_owned());
+            return Err(match insertion.misses_by(insertion_mm) {
+                Some(off) if insertion.profile.is_at_rest() => {
+                    format!("{off}; try again once it is there")
+                }
+                _ => "the needle is still braking; try again once it stands".to_owned(),
+            });
         }
         if let Some(Trouble { what, why }) = self.trouble(shell.now, insertion_mm, insertion) {
             return Err(clipped(&format!("{what}; {why}"), MESSAGE_MAX).into_owned());

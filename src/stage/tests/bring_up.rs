@@ -238,6 +238,19 @@ fn a_drive_that_keeps_its_power_is_not_configured() {
     assert!(!bench.insertion.configured_under_power);
 }
 
+/// The stop comes before it has obeyed Disable Voltage.
+#[test]
+fn a_drive_that_has_power_when_its_bring_up_is_stopped_is_reported_with_power() {
+    let mut bench = Bench::new(config());
+    bench.insertion.state = DriveState::OperationEnabled;
+    (bench.insertion.ignores_sdo, bench.insertion.ignores_rpdo) = (true, true);
+    bench.run_for(Duration::from_millis(100));
+    bench.stage.quick_stop(bench.now);
+    assert!(!bench.until_stopped());
+    let reports = bench.stage.drive_reports();
+    assert!(reports.insertion.says_power() && !reports.rotation.says_power());
+}
+
 #[test]
 fn a_drive_left_enabled_loses_power_before_it_is_configured() {
     let mut bench = Bench::new(config());

@@ -157,8 +157,8 @@ fn an_axis_that_needs_homing_is_not_enabled_without_it() {
     let mut bench = Bench::new(homing_config());
     assert_eq!(
         bench.until_fault(),
-        "node 1 (insertion): not homed (statusword 0x0650 switch on disabled, bit 12 clear), home \
-         it first: needle-bench stage home CONFIG"
+        "node 1 (insertion): not homed (statusword 0x0650 switch on disabled, bit 12 clear), take the \
+         needle off and home it first: needle-bench stage home CONFIG --axis insertion"
     );
     bench.until_stopped();
 

@@ -122,6 +122,15 @@ fn a_drive_that_falls_silent_restarts_or_leaves_operational_stops_the_run() {
 }
 
 #[test]
+fn a_drive_that_restarts_is_reported_as_such_until_the_end() {
+    let mut bench = Bench::ready();
+    bench.receive(heartbeat_frame(bench.insertion.node, NmtState::BootUp));
+    bench.until_stopped();
+    let reports = bench.stage.drive_reports();
+    assert!(reports.insertion.restarted && !reports.rotation.restarted);
+}
+
+#[test]
 fn the_end_of_an_emergency_is_no_fault() {
     let mut bench = Bench::ready();
     bench.receive(bench.rotation.emergency(0x0000));

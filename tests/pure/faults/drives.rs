@@ -48,6 +48,25 @@ fn tpdos_of_one_drive_lost() {
     }
 }
 
+/// The axis stands while its target goes on, and catches up if the set-points arrive again in time.
+#[test]
+fn set_points_lost_to_one_drive() {
+    let lost_for = |time: Duration| {
+        let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+        bench.run_to_mm(10.0);
+        bench.lose_to_drives(|frame| frame.cob_id() == Some(0x201));
+        bench.run_for(time);
+        bench.lose_to_drives(|_| false);
+        bench.run_to_end();
+        bench
+    };
+    let bench = lost_for(Duration::from_millis(200));
+    assert!(bench.completed(), "{}", bench.reason());
+    let bench = lost_for(Duration::from_secs(1));
+    let expected = "stage: insertion: following error of 0.5";
+    assert!(bench.reason().starts_with(expected), "{}", bench.reason());
+}
+
 #[test]
 fn tpdos_of_both_drives_lost() {
     let stops = stopped(&[], |bench| bench.lose(|input| is_frame(input, &TPDOS)));

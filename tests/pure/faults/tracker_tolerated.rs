@@ -4,6 +4,7 @@ use super::stream::{blind_mm, states, tolerated, went_on};
 use super::tracker::refusals;
 use crate::support::bench::{Bench, Fate, configured, is_tracker};
 use crate::support::stop::Stop;
+use needle_bench::canopen::Frame;
 use needle_bench::session::{Input, Lane, Machine as _, Record, StepRecord};
 use needle_bench::tracker::{Event, GateName};
 use needle_bench::units::Time;
@@ -393,4 +394,37 @@ fn a_sender_whose_clock_is_set_back_a_little() {
         assert_eq!(bench.events().filter(|text| text.contains(&report)).count(), 1, "{test}");
         went_on(&run, test, 0.7);
     }
+}
+
+/// Friction may keep the axis off its set-point by more than `insertion.arrival_mm`: here by 0.1 mm.
+#[test]
+fn a_hold_in_which_the_needle_rests_off_its_set_point_ends_with_the_reason() {
+    let ended = |resume: &str, mut lost: u32| {
+        let resume = format!("tracker.resume={resume}");
+        let sets = ["insertion.depth_mm=30", "tracker.hold_timeout_s=6", &resume];
+        let mut bench = Bench::new(configured(&sets));
+        bench.run_to_mm(10.0);
+        bench.spoil(move |input| match input {
+            Input::Tracker(_) if lost > 0 => {
+                lost -= 1;
+                Fate::Lost
+            }
+            Input::Frame(frame) if frame.cob_id() == Some(0x181) => {
+                let mut data: [u8; 6] = frame.data().try_into().unwrap();
+                let counts = i32::from_le_bytes(data[2..].try_into().unwrap()) - 465;
+                data[2..].copy_from_slice(&counts.to_le_bytes());
+                Fate::Arrives(Input::Frame(Frame::new(0x181, &data)))
+            }
+            _ => Fate::Arrives(input),
+        });
+        let from = bench.now;
+        bench.run_to_end();
+        (bench.reason().to_owned(), bench.now.seconds_after(from))
+    };
+    let (reason, lasted_s) = ended("stop", u32::MAX);
+    assert!(reason.contains("; held and stopped; ") && lasted_s < 4.0, "{reason} {lasted_s}");
+    let (reason, lasted_s) = ended("automatic", 40);
+    let off = "tracker: the tip is seen again, but the needle is 0.1";
+    assert!(reason.starts_with(off) && reason.ends_with("held for 6.0 s and stopped"), "{reason}");
+    assert!(lasted_s < 8.0, "{lasted_s}");
 }
