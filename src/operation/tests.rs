@@ -1,6 +1,7 @@
 //! Operations on the virtual stage, in virtual time.
 
 mod handedness;
+mod prove;
 
 use super::*;
 use crate::canopen::Frame;
