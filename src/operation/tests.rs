@@ -435,6 +435,22 @@ fn a_home_outside_the_axis_limits_is_an_error() {
     );
 }
 
+/// In whole counts the home is the limit; in mm it is 0.07 µm outside.
+#[test]
+fn a_home_on_the_limit_is_inside_it() {
+    let config = config(&[
+        "stage.insertion.counts_per_mm={ counts = 590_000, mm = 127 }",
+        "stage.insertion.homing.method=37",
+        "stage.insertion.homing.offset_mm=1.0",
+        "stage.insertion.min_mm=-1",
+    ]);
+    let stage = config.to_stage().unwrap();
+    let mut bench = Bench::new(&config, Operation::home(&stage, None));
+    assert_eq!(bench.run(), Outcome::Completed);
+    let home_mm = bench.operation.moves()[0].to;
+    assert!(home_mm < -1.0 && home_mm > -1.001, "{home_mm}");
+}
+
 /// Another sender switches its heartbeat consumer off.
 #[test]
 fn prove_fails_on_a_drive_that_does_not_miss_the_bench() {
