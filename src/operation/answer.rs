@@ -175,7 +175,11 @@ impl Answering {
         self.leg = Leg::Returning(Box::new(back));
         match verdict {
             Ok(text) => shell.report(Lane::Session, Severity::Info, text),
-            Err(reason) => self.failed = Some(reason),
+            Err(reason) => {
+                // At once: the turn back may be stopped, and then the run ends for another reason.
+                shell.report(Lane::Session, Severity::Warning, reason.clone());
+                self.failed = Some(reason);
+            }
         }
         Ok(())
     }

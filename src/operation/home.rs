@@ -1,13 +1,13 @@
 //! Homes the chosen axes, one after the other.
 
 use crate::session::{AxisMove, Record, Shell, State, Task};
-use crate::stage::{Axis, AxisLimits, PerAxis, StageConfig, StageEvent};
+use crate::stage::{Axis, AxisConfig, AxisLimits, PerAxis, StageConfig, StageEvent};
 use std::collections::VecDeque;
 
 /// Homes the chosen axes, the other held.
 #[derive(Debug)]
 pub(super) struct Homing {
-    limits: PerAxis<AxisLimits>,
+    configs: PerAxis<AxisConfig>,
     /// The axes that are not homed yet, beginning with the one that is being homed.
     remaining: VecDeque<Axis>,
     moves: Vec<AxisMove>,
@@ -16,7 +16,7 @@ pub(super) struct Homing {
 impl Homing {
     pub(super) fn new(config: &StageConfig, axes: PerAxis<bool>) -> Self {
         Homing {
-            limits: PerAxis::from_fn(|axis| config.axis(axis).limits),
+            configs: PerAxis::from_fn(|axis| config.axis(axis).clone()),
             remaining: Axis::BOTH.into_iter().filter(|axis| axes[*axis]).collect(),
             moves: Vec::new(),
         }
@@ -34,10 +34,12 @@ impl Homing {
 
     /// Refuses a home outside the limits, from which the axis could not be moved.
     fn check_home(&self, axis: Axis, position: f64) -> Result<(), String> {
-        let AxisLimits { min, max, .. } = self.limits[axis];
-        if (min..=max).contains(&position) {
+        let config = &self.configs[axis];
+        let scale = config.scale(axis, 0);
+        if config.limits.check_counts(axis, position, &scale).is_ok() {
             return Ok(());
         }
+        let AxisLimits { min, max, .. } = config.limits;
         let [position, min, max] = [position, min, max].map(|value| axis.shown(value));
         Err(format!(
             "{axis}: home is at {position}, out of its limits of {min} to {max}: nothing could be \

@@ -108,7 +108,8 @@ impl Moving {
         if self.profile.position_mm() < self.profile.goal_mm() {
             return Ok(false);
         }
-        let goal = self.goal().along(axis);
+        // What was sent: the goal, rounded to whole counts.
+        let goal = feedback.commanded.along(axis);
         let off = (goal + offset - here).abs();
         let since = *self.ended.get_or_insert(feedback.time);
         if off <= arrival {

@@ -1,6 +1,7 @@
 //! Operations on the virtual stage, in virtual time.
 
 mod handedness;
+mod prove;
 
 use super::*;
 use crate::canopen::Frame;
@@ -276,25 +277,40 @@ fn the_end_of_a_move_that_is_stopped_from_outside_is_where_the_axis_stands() {
 
 #[test]
 fn an_axis_that_does_not_reach_its_goal_is_an_error() {
-    let feedback = |time_s: f64| crate::stage::Feedback {
+    let feedback = |time_s: f64, commanded_mm: f64| crate::stage::Feedback {
         time: Time::from_secs_f64(time_s),
         sync: 1,
         measured: crate::stage::SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 },
-        commanded: crate::stage::SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 },
+        commanded: crate::stage::SetPoint { insertion_mm: commanded_mm, rotation_rad: 0.0 },
     };
     let way = Move { speed: 10.0, acceleration: 1e6, ..by(Axis::Insertion, 0.1) };
-    let mut moving = moving::Moving::new(way, feedback(0.0).measured).unwrap();
-    assert_eq!(moving.has_arrived(&feedback(0.0)), Ok(false));
+    let mut moving = moving::Moving::new(way, feedback(0.0, 0.0).measured).unwrap();
+    assert_eq!(moving.has_arrived(&feedback(0.0, 0.0)), Ok(false));
     for _ in 0..10 {
         moving.advance(Duration::from_millis(10));
     }
-    assert_eq!(moving.has_arrived(&feedback(0.1)), Ok(false));
-    assert_eq!(moving.has_arrived(&feedback(2.0)), Ok(false));
-    let text = moving.has_arrived(&feedback(2.1)).unwrap_err();
+    assert_eq!(moving.has_arrived(&feedback(0.1, 0.1)), Ok(false));
+    assert_eq!(moving.has_arrived(&feedback(2.0, 0.1)), Ok(false));
+    let text = moving.has_arrived(&feedback(2.1, 0.1)).unwrap_err();
     assert!(
         text.starts_with("insertion: stands at 0.000 mm, 0.100 mm from the 0.100 mm"),
         "{text}"
     );
+}
+
+/// 0.36° is one count, so the axis stands 0.16° from the goal, and exactly at the count that was sent.
+#[test]
+fn a_move_ends_at_the_count_nearest_to_its_goal() {
+    let config = config(&["stage.rotation.counts_per_turn={ counts = 1000, turns = 1 }"]);
+    let degrees = Move {
+        speed: 0.5,
+        arrival: 0.1_f64.to_radians(),
+        ..by(Axis::Rotation, 10.6_f64.to_radians())
+    };
+    let mut bench = Bench::new(&config, Operation::Move(degrees));
+    assert_eq!(bench.run(), Outcome::Completed);
+    let [moved] = bench.operation.moves() else { panic!("one move") };
+    assert!((moved.to.to_degrees() - 10.44).abs() < 1e-9, "{moved:?}");
 }
 
 /// From 1 mm onto the negative limit switch at -0.8 mm and off it again. There the drive sets its zero.
@@ -435,6 +451,22 @@ fn a_home_outside_the_axis_limits_is_an_error() {
         ),
         "{reason}"
     );
+}
+
+/// In whole counts the home is the limit; in mm it is 0.07 µm outside.
+#[test]
+fn a_home_on_the_limit_is_inside_it() {
+    let config = config(&[
+        "stage.insertion.counts_per_mm={ counts = 590_000, mm = 127 }",
+        "stage.insertion.homing.method=37",
+        "stage.insertion.homing.offset_mm=1.0",
+        "stage.insertion.min_mm=-1",
+    ]);
+    let stage = config.to_stage().unwrap();
+    let mut bench = Bench::new(&config, Operation::home(&stage, None));
+    assert_eq!(bench.run(), Outcome::Completed);
+    let home_mm = bench.operation.moves()[0].to;
+    assert!(home_mm < -1.0 && home_mm > -1.001, "{home_mm}");
 }
 
 /// Another sender switches its heartbeat consumer off.

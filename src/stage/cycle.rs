@@ -36,6 +36,7 @@ impl Reading {
 impl Stage {
     /// Checks the answers to the last SYNC, then sends the RPDOs that were not sent ahead, and the next SYNC.
     pub(super) fn cycle(&mut self, now: Time) {
+        self.check_unexplained_faults(now);
         self.judge_feedback(now);
         match self.phase {
             Phase::Standby { give_up, located } => self.stand_by(now, give_up, located),
@@ -114,9 +115,10 @@ impl Stage {
         }
         let missed_max = u32::from(self.config.bus.missed_feedback_max);
         for axis in Axis::BOTH {
+            let may_be_missed = self.has_noticed_silence(axis);
             let drive = &mut self.drives[axis];
             let missed = drive.missed_in_a_row.saturating_add(1);
-            drive.missed_in_a_row = if drive.fresh { 0 } else { missed };
+            drive.missed_in_a_row = if drive.fresh || may_be_missed { 0 } else { missed };
             if let Some((syncs, frame)) = drive.count_conflict()
                 && syncs > missed_max
             {
@@ -127,12 +129,14 @@ impl Stage {
                 return self.fail(now, fault);
             }
         }
-        if self.drives.all(|drive| drive.fresh) {
+        if !self.drives.all(|drive| drive.fresh) {
+            self.counters.feedback_missed += 1;
+        }
+        if self.drives.all(|drive| drive.missed_in_a_row == 0) {
             self.missed_in_a_row = 0;
             return;
         }
         self.missed_in_a_row = self.missed_in_a_row.saturating_add(1);
-        self.counters.feedback_missed += 1;
         if self.missed_in_a_row > missed_max {
             let syncs = self.missed_in_a_row;
             // Name the drive that has missed more: the other may have missed only this SYNC.
@@ -141,14 +145,14 @@ impl Stage {
             let axis = if is_rotation { Axis::Rotation } else { Axis::Insertion };
             let fault = match self.drives[axis].tpdo_of_wrong_length {
                 Some(bytes) => format!(
-                    "{axis}: TPDO1 of {bytes} bytes after {syncs} SYNCs in a row, 6 are mapped; does \
+                    "TPDO1 of {bytes} bytes after {syncs} SYNCs in a row, 6 are mapped; does \
                      another node have the same ID, or another tool map it?"
                 ),
                 None => format!(
-                    "{axis}: no TPDO1 for {syncs} SYNCs in a row, check bus load, cable and the drive"
+                    "no TPDO1 for {syncs} SYNCs in a row, check bus load, cable and the drive"
                 ),
             };
-            self.fail(now, fault);
+            self.fail_drive(now, axis, &fault);
         }
     }
 

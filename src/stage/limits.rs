@@ -43,6 +43,16 @@ impl AxisLimits {
         self.check_rounded(axis, target, |value| value)
     }
 
+    /// As [`check_range`](Self::check_range), with the target and the limits rounded to whole counts of `scale`.
+    ///
+    /// # Errors
+    /// The position limit that `target` exceeds.
+    pub fn check_counts(&self, axis: Axis, target: f64, scale: &Scale) -> Result<(), String> {
+        let to_whole_counts =
+            |value| scale.counts(value).map_or(value, |counts| scale.value(counts));
+        self.check_rounded(axis, target, to_whole_counts)
+    }
+
     /// As [`check_range`](Self::check_range), with `round` applied to the target and to the limits.
     fn check_rounded(
         &self,
@@ -147,9 +157,7 @@ impl LimitCheck {
             )
         };
         let counts = self.scale.counts(target).ok_or_else(does_not_fit)?;
-        let to_whole_counts =
-            |value| self.scale.counts(value).map_or(value, |counts| self.scale.value(counts));
-        self.limits.check_rounded(axis, target, to_whole_counts)?;
+        self.limits.check_counts(axis, target, &self.scale)?;
         if !self.wraps && i32::try_from(counts).is_err() {
             return Err(does_not_fit());
         }

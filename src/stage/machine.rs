@@ -8,6 +8,7 @@ use super::config::no_homing;
 use super::drive::{Drive, DriveReport};
 use super::flood::FloodWatch;
 use super::homing::Homing;
+use super::silence::SilenceTest;
 use super::{
     Axis, AxisUse, Counters, Ignored, Output, PerAxis, Progress, SetPoint, StageConfig, StageEvent,
 };
@@ -63,15 +64,17 @@ pub struct Stage {
     pub(super) bring_ups: PerAxis<Option<BringUp>>,
     pub(super) drives: PerAxis<Drive>,
     pub(super) monitors: PerAxis<HeartbeatConsumer>,
-    heartbeat: HeartbeatProducer,
+    pub(super) heartbeat: HeartbeatProducer,
     pub(super) sync: SyncProducer,
     pub(super) sync_time: Time,
     pub(super) sync_count: u64,
     pub(super) missed_in_a_row: u32,
     /// When drives that do not obey a quick stop are commanded again by SDO.
     pub(super) repeat_due: Time,
-    /// A fault was reported, or is not to be reported any more: see [`Stage::fall_silent`].
+    /// A fault was reported.
     faulted: bool,
+    /// The bench is silent on purpose, see [`Stage::fall_silent`].
+    pub(super) silence_test: Option<SilenceTest>,
     /// The axes may be given power, see [`Stage::permit_power`].
     pub(super) power_permitted: bool,
     pub(super) counters: Counters,
@@ -126,6 +129,7 @@ impl Stage {
             missed_in_a_row: 0,
             repeat_due: Time::NEVER,
             faulted: false,
+            silence_test: None,
             power_permitted: true,
             counters: Counters::default(),
             flood: FloodWatch::new(now),
@@ -284,7 +288,7 @@ impl Stage {
     pub fn quick_stop(&mut self, now: Time) {
         match self.phase {
             Phase::Listening { .. } => {
-                self.fall_silent();
+                self.heartbeat.stop();
                 self.end(false, false);
             }
             Phase::BringUp => self.abandon_bring_up(),
@@ -299,17 +303,6 @@ impl Stage {
             Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped => {}
             _ => self.quick_stop(now),
         }
-    }
-
-    /// Sends no more heartbeats, while SYNC and set-points go on: drives that monitor them stop by themselves and
-    /// send emergency messages. From here on the stage reports no fault, and does not stop the axes by itself.
-    /// Returns when the last heartbeat was sent; `None` if there was none.
-    pub fn fall_silent(&mut self) -> Option<Time> {
-        self.faulted = true;
-        for axis in Axis::BOTH {
-            self.drives[axis].restart_emcy_count();
-        }
-        self.heartbeat.stop()
     }
 
     /// Frames without effect, missed answers, skipped and late SYNCs.

@@ -49,6 +49,7 @@ mod machine;
 mod plan;
 mod quick_stop;
 mod scale;
+mod silence;
 mod standstill;
 mod status;
 mod supervision;

@@ -96,8 +96,11 @@ impl Stage {
                 let ms = self.config.bus.heartbeat_timeout_ms;
                 format!("no heartbeat for {ms} ms, is the drive powered and on the bus?")
             }
+            HeartbeatEvent::State(_) if self.has_noticed_silence(axis) => return,
             HeartbeatEvent::State(state) if state != NmtState::Operational && !may_be_old => {
-                format!("NMT state {state} instead of operational, is there another master?")
+                let fault =
+                    format!("NMT state {state} instead of operational, is there another master?");
+                return self.fail_drive(now, axis, &fault);
             }
             HeartbeatEvent::State(_) => return,
         };
@@ -115,7 +118,9 @@ impl Stage {
         let is_watched = self.bring_ups[axis].as_ref().is_none_or(|drive| drive.state().disarmed)
             && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped);
         let is_of_found_fault = self.drives[axis].is_of_found_fault(emcy.code);
-        if is_watched && !is_of_found_fault && emcy.code != EmcyCode::NO_ERROR {
+        let is_expected = emcy.code == EmcyCode::NO_ERROR
+            || emcy.code == EmcyCode::HEARTBEAT && self.note_silence_noticed(axis);
+        if is_watched && !is_of_found_fault && !is_expected {
             let hint = match emcy.code {
                 EmcyCode::HEARTBEAT => {
                     ": the drive missed the bench's heartbeat; is the bench stalled or unplugged?"
@@ -150,7 +155,9 @@ impl Stage {
         let state = statusword.state();
         let standby = matches!(self.phase, Phase::Standby { .. });
         let enabling = matches!(self.phase, Phase::Enabling { .. });
+        let stops_by_itself = self.has_noticed_silence(axis) && state != Some(S::OperationEnabled);
         let must_follow = match self.phase {
+            _ if stops_by_itself => false,
             Phase::Ready | Phase::Homing(_) | Phase::Stopping { quick: false, .. } => true,
             // As soon as the drive is in Operation Enabled, even if it still waits for the other drive.
             Phase::Enabling { .. } => [previous, state].contains(&Some(S::OperationEnabled)),
@@ -178,7 +185,9 @@ impl Stage {
                 "the drive has power before the bench gave it any (statusword {statusword}), does an \
                  input or another tool enable it?"
             )
-        } else if statusword.is_fault() && !((standby || enabling) && drive.may_be_in_found_fault())
+        } else if statusword.is_fault()
+            && !stops_by_itself
+            && !((standby || enabling) && drive.may_be_in_found_fault())
         {
             format!("drive in fault (statusword {statusword})")
         } else if fell_back {
@@ -204,7 +213,7 @@ impl Stage {
         } else {
             return;
         };
-        self.fail(now, format!("{axis}: {fault}"));
+        self.fail_drive(now, axis, &fault);
     }
 }
 

@@ -87,3 +87,17 @@ fn a_base_is_turned_back_before_a_check_of_handedness_fails() {
     assert!(bench.reason().contains("handedness cannot be seen"));
     assert!(bench.travel().1.abs() < 0.003, "{} rad", bench.travel().1);
 }
+
+/// The outcome is the stop; the verdict is in the record all the same.
+#[test]
+fn an_adverse_verdict_is_reported_before_the_base_is_turned_back() {
+    let mut bench = answer(Some(|turned_rad| off_axis(-turned_rad)));
+    let is_mirrored = |text: &String| text.contains("is a tracker axis mirrored");
+    while !bench.events.iter().any(is_mirrored) {
+        assert_eq!(bench.operation.outcome(), None);
+        bench.step();
+    }
+    assert!(bench.travel().1 > FRAC_PI_4, "before the turn back: {} rad", bench.travel().1);
+    bench.operation.handle(bench.now, Input::Stop("operator: interrupted".to_owned()));
+    assert_eq!(bench.reason(), "operator: interrupted");
+}
