@@ -1,6 +1,6 @@
 //! Runs an observer over a recorded insertion and scores it against the recorded tip.
 
-use super::recording::{RecordedRow, Recording};
+use super::recording::{RecordedRoll, RecordedRow, Recording};
 use super::statistics::{quantile, rms};
 use crate::geometry::{Pose, so3};
 use crate::math;
@@ -22,8 +22,8 @@ pub struct RecordingScore {
     pub insertion_mm: f64,
     /// Steps scored.
     pub steps: usize,
-    /// RMS of estimated minus recorded roll, deg; `None` without recorded orientations that change, or
-    /// without an estimate.
+    /// RMS of estimated minus recorded roll, deg; `None` without recorded orientations that turn with the base
+    /// ([`Recording::roll`]), or without an estimate.
     pub roll_rms_deg: Option<f64>,
     /// The same for an observer that does not know the roll at the start; `None` for observers that
     /// must know it.
@@ -108,7 +108,7 @@ struct Step {
 /// If a row has a number far beyond any needle; the text names its line.
 fn steps(recording: &Recording, r_sb: &Rotation3<f64>) -> Result<Vec<Step>, String> {
     let first = &recording.rows[0];
-    let lacks_roll = recording.lacks_roll();
+    let has_roll = recording.roll() == Some(RecordedRoll::Turns);
     // R_PS0: the sensor's first orientation in the plane frame is the inverse of the mount.
     let r_ps = r_sb.inverse() * first.sensor_orientation.unwrap_or_default().inverse();
     let (mut depth_mm, mut rotation_rad) = (0.0, first.rotation_meas_rad);
@@ -124,7 +124,7 @@ fn steps(recording: &Recording, r_sb: &Rotation3<f64>) -> Result<Vec<Step>, Stri
             let way = "way from the first position in mm";
             refused(NeedleError::too_large(way, position_mm.amax()))
         })?;
-        let rotation_true = row.sensor_orientation.filter(|_| !lacks_roll);
+        let rotation_true = row.sensor_orientation.filter(|_| has_roll);
         let rotation_true = rotation_true.map(|rotation| r_ps * rotation * r_sb);
         Ok(Step { increment, depth_mm, tip_meas, rotation_true })
     };
@@ -301,16 +301,16 @@ mod tests {
     fn orientations_that_never_change_are_not_scored() {
         let r_sb = mount(Vector3::z(), Vector3::x()).unwrap();
         let mut recording = recording(&r_sb);
-        assert!(!recording.lacks_roll());
+        assert_eq!(recording.roll(), Some(RecordedRoll::Turns));
         for row in &mut recording.rows {
             row.sensor_orientation = Some(Rotation3::identity());
         }
-        assert!(recording.lacks_roll());
+        assert_eq!(recording.roll(), Some(RecordedRoll::DoesNotTurn));
         let mut observer = FiniteDifference::new(Needle::new(0.0125).unwrap(), 2.0).unwrap();
         let score = evaluate(&mut observer, &recording, &scoring(r_sb, 1.0, 8.0)).unwrap();
         assert!(score.roll_rms_deg.is_none() && score.position_rms_mm.is_some(), "{score:?}");
         recording.rows.iter_mut().for_each(|row| row.sensor_orientation = None);
-        assert!(!recording.lacks_roll(), "it has no orientations");
+        assert_eq!(recording.roll(), None, "it has no orientations");
     }
 
     /// An observer that counts its calls and always predicts the origin.

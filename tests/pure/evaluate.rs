@@ -81,6 +81,26 @@ fn the_observers_never_see_the_recorded_orientation() {
     assert!(without["roll_rms_deg"]["median"].is_null());
 }
 
+/// The base turns by up to 115 degrees.
+#[test]
+fn no_roll_is_scored_against_headings_after_a_small_turn() {
+    let scratch = Scratch::new();
+    scratch.write("posed.csv", &recording());
+    scratch.write("heading.csv", &recording::heading_only(&recording()));
+    let evaluate = |file| {
+        let mut arguments = vec!["evaluate", file, "--json"];
+        arguments.extend(IN_LINE);
+        needle_bench(&scratch, &arguments)
+    };
+    let (posed, heading) = (evaluate("posed.csv"), evaluate("heading.csv"));
+    assert!(posed.json()["roll_rms_deg"]["median"].is_f64(), "{}", posed.stdout);
+    assert!(heading.json()["roll_rms_deg"]["median"].is_null(), "{}", heading.stdout);
+    let warning = "warning: heading.csv: the base turned by only 115 deg, so the orientations do not show whether \
+                   they turn with it: no roll is scored";
+    assert!(heading.stderr.contains(warning), "{}", heading.stderr);
+    assert!(!posed.stderr.contains("no roll is scored"), "{}", posed.stderr);
+}
+
 #[test]
 fn a_position_that_is_not_finite_is_refused_with_its_line() {
     let scratch = Scratch::new();
