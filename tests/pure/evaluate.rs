@@ -108,6 +108,39 @@ fn a_position_that_is_not_finite_is_refused_with_its_line() {
     insta::assert_snapshot!(refusals(&scratch, &[&["evaluate", "bad.csv"]]));
 }
 
+/// The tip travels a thousandth of the depth, or stands still in the second half.
+#[test]
+fn positions_that_contradict_the_insertion_are_refused() {
+    let scratch = Scratch::new();
+    let changed = |change: &dyn Fn(usize, &str) -> String| -> String {
+        let text = recording();
+        let (header, rows) = text.split_once('\n').unwrap();
+        let rows = rows.lines().enumerate().map(|(row, line)| change(row, line) + "\n");
+        format!("{header}\n{}", rows.collect::<String>())
+    };
+    let metres = |_: usize, line: &str| {
+        let mut cells: Vec<String> = line.split(',').map(str::to_owned).collect();
+        for cell in &mut cells[2..5] {
+            *cell = (1e-3 * cell.parse::<f64>().unwrap()).to_string();
+        }
+        cells.join(",")
+    };
+    let middle = recording().lines().nth(301).unwrap().to_owned();
+    let frozen = |row: usize, line: &str| {
+        let base: Vec<&str> = line.splitn(3, ',').take(2).collect();
+        let still = middle.splitn(3, ',').nth(2).unwrap();
+        if row < 300 { line.to_owned() } else { format!("{},{still}", base.join(",")) }
+    };
+    scratch.write("metres.csv", &changed(&metres));
+    scratch.write("frozen.csv", &changed(&frozen));
+    let commands: [&[&str]; 3] = [
+        &["evaluate", "metres.csv"],
+        &["evaluate", "frozen.csv"],
+        &["calibrate", "needle", "metres.csv"],
+    ];
+    insta::assert_snapshot!(refusals(&scratch, &commands));
+}
+
 /// Counted twice, a recording would make the figures look more certain than they are.
 #[test]
 fn a_recording_given_twice_is_refused() {
