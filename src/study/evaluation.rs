@@ -47,31 +47,48 @@ pub struct Evaluation {
     pub roll_unknown_rms_deg: Quantiles,
     /// Median of the recordings' position RMS, mm.
     pub position_rms_mm: Option<f64>,
+    /// Number of recordings that it is the median of.
+    pub position_insertions: usize,
     /// Median of the recordings' RMS of the position predicted 5 mm ahead, mm.
     pub prediction_5mm_rms_mm: Option<f64>,
+    /// Number of recordings that it is the median of.
+    pub prediction_5mm_insertions: usize,
 }
 
-/// Median and 90% quantile.
+/// Median and 90% quantile over the recordings that have the value.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Quantiles {
     /// Median.
     pub median: Option<f64>,
     /// 90% quantile.
     pub p90: Option<f64>,
+    /// Number of recordings that have the value.
+    pub insertions: usize,
 }
 
 impl Evaluation {
     /// The figures over all recordings.
     pub fn of<'a>(scores: impl Iterator<Item = &'a RecordingScore> + Clone) -> Self {
-        let quantile = |of: fn(&RecordingScore) -> Option<f64>, q: f64| {
-            quantile(&scores.clone().filter_map(of).collect::<Vec<f64>>(), q)
+        let values = |of: fn(&RecordingScore) -> Option<f64>| -> Vec<f64> {
+            scores.clone().filter_map(of).collect()
         };
-        let quantiles = |of| Quantiles { median: quantile(of, 0.5), p90: quantile(of, 0.9) };
+        let quantiles = |of| {
+            let values = values(of);
+            Quantiles {
+                median: quantile(&values, 0.5),
+                p90: quantile(&values, 0.9),
+                insertions: values.len(),
+            }
+        };
+        let position = quantiles(|score| score.position_rms_mm);
+        let prediction = quantiles(|score| score.prediction_5mm_rms_mm);
         Evaluation {
             roll_rms_deg: quantiles(|score| score.roll_rms_deg),
             roll_unknown_rms_deg: quantiles(|score| score.roll_unknown_rms_deg),
-            position_rms_mm: quantile(|score| score.position_rms_mm, 0.5),
-            prediction_5mm_rms_mm: quantile(|score| score.prediction_5mm_rms_mm, 0.5),
+            position_rms_mm: position.median,
+            position_insertions: position.insertions,
+            prediction_5mm_rms_mm: prediction.median,
+            prediction_5mm_insertions: prediction.insertions,
         }
     }
 }

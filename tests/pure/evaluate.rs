@@ -108,6 +108,26 @@ fn a_position_that_is_not_finite_is_refused_with_its_line() {
     insta::assert_snapshot!(refusals(&scratch, &[&["evaluate", "bad.csv"]]));
 }
 
+/// A recording without orientations has no roll: the medians of the roll name how many have it.
+#[test]
+fn a_median_of_fewer_recordings_names_their_number() {
+    let scratch = Scratch::new();
+    let plain: String = recording()
+        .lines()
+        .map(|line| line.splitn(6, ',').take(5).collect::<Vec<_>>().join(",") + "\n")
+        .collect();
+    scratch.write("plain.csv", plain.rsplit_once("\n59").unwrap().0);
+    scratch.write("posed.csv", &recording());
+    let files = ["evaluate", "plain.csv", "posed.csv", "--set", "observer.shadows=[]"];
+    let said = needle_bench(&scratch, &files);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    assert!(said.stdout.contains(" deg median (1 of 2), "), "{}", said.stdout);
+    assert!(!said.stdout.contains("mm (2 of 2)"), "{}", said.stdout);
+    let json = needle_bench(&scratch, &[&files[..], &["--json"]].concat()).json();
+    assert_eq!(json["roll_rms_deg"]["insertions"], 1);
+    assert_eq!(json["position_insertions"], 2);
+}
+
 /// The tip travels a thousandth of the depth, or stands still in the second half.
 #[test]
 fn positions_that_contradict_the_insertion_are_refused() {
