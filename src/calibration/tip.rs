@@ -5,6 +5,7 @@ use super::{CalibrationError, check_distances, mean, principal_axes};
 use crate::geometry::{FixedAngles, Pose};
 use crate::math;
 use crate::table::{Table, TableError};
+use crate::units::IN_METRES;
 use nalgebra::{Matrix2, Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
 use std::f64::consts::{PI, TAU};
 
@@ -16,6 +17,10 @@ const POINTS_MIN: usize = 8;
 const ARC_MIN_RAD: f64 = PI;
 /// A radius under this many times the RMS distance from the circle may be only noise.
 const RADIUS_PER_RMS_MIN: f64 = 3.0;
+/// A smaller radius, mm, is no offset: no tracker resolves it.
+const RADIUS_MIN_MM: f64 = 0.02;
+/// From this radius on, mm, it may be the offset of a sensor in metres.
+const RADIUS_IN_METRES_MIN_MM: f64 = 1e-4;
 /// The least length of the mean of unit vectors that should all be equal: 0.9 is a spread of 26°,
 /// which leaves room for the shaft's torsion.
 const COHERENCE_MIN: f64 = 0.9;
@@ -93,7 +98,7 @@ impl TipFit {
     ///
     /// # Errors
     /// Fewer than eight positions, more than `rms_max_mm` RMS off a circle, under half a turn, a
-    /// radius within the noise, or a sensor that does not follow the base.
+    /// radius within the noise or under 0.02 mm, or a sensor that does not follow the base.
     pub fn of(samples: &[TurnSample], rms_max_mm: f64) -> Result<Self, CalibrationError> {
         let points = samples.len();
         if points < POINTS_MIN {
@@ -136,6 +141,16 @@ impl TipFit {
             return refused(format!(
                 "the circle's radius is {radius_mm:.3} mm, and the positions scatter {rms_mm:.3} mm RMS about \
                  it (limit: a third of the radius): no offset from the needle's axis can be seen; leave \
+                 tracker.tip_offset_mm at zero"
+            ));
+        }
+        if radius_mm < RADIUS_MIN_MM {
+            let hint = match radius_mm >= RADIUS_IN_METRES_MIN_MM {
+                true => format!("{IN_METRES}; for a sensor on the axis"),
+                false => "no offset from the needle's axis can be seen;".to_owned(),
+            };
+            return refused(format!(
+                "the circle's radius is {radius_mm:.5} mm (at least {RADIUS_MIN_MM} needed): {hint} leave \
                  tracker.tip_offset_mm at zero"
             ));
         }

@@ -4,7 +4,9 @@ use super::output::{merged, print_result, print_stderr};
 use super::records::{Insertion, Insertions};
 use super::{Failure, Result};
 use crate::session::ObserverConfig;
-use crate::study::{Evaluation, Recording, RecordingScore, evaluate as evaluate_observer};
+use crate::study::{
+    Evaluation, RecordedRoll, Recording, RecordingScore, evaluate as evaluate_observer,
+};
 use crate::text::screen;
 use clap::Args;
 use minijinja::context;
@@ -32,11 +34,11 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<()> {
         evaluate_observer(observer.as_mut(), recording, &scoring)
     };
     for Insertion { path, recording, .. } in &insertions {
-        if recording.lacks_roll() {
-            print_stderr(format_args!(
-                "warning: {}: its orientations do not turn with the base: no roll is scored",
-                path.display()
-            ));
+        match recording.roll() {
+            None | Some(RecordedRoll::Turns) => {}
+            Some(why) => {
+                print_stderr(format_args!("warning: {}: {why}: no roll is scored", path.display()))
+            }
         }
     }
     let mut observers = Vec::new();

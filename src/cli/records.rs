@@ -18,7 +18,7 @@ use crate::stage::SetPoint;
 use crate::study::{RecordedRow, Recording};
 use crate::telemetry::RunFolder;
 use crate::text::shell_word;
-use crate::tracker::{Registration, Sample};
+use crate::tracker::{Registration, Sample, check_recorded};
 use crate::units::Time;
 use clap::Args;
 use std::io;
@@ -193,7 +193,7 @@ pub(super) struct Insertion {
 
 impl Insertions {
     /// Reads the configuration, with the key `extra_key` over it, and the insertions. Refuses an insertion that is
-    /// named twice.
+    /// named twice, and one whose tip does not travel as far as the needle is inserted.
     pub(super) fn read(&self, extra_key: Option<String>) -> Result<(Config, Vec<Insertion>)> {
         let (configuration, files) = self.split_files()?;
         let set = self.set.iter().cloned().chain(extra_key).collect();
@@ -202,6 +202,10 @@ impl Insertions {
         let mut insertions: Vec<Insertion> = Vec::new();
         for &path in &files {
             let insertion = read_insertion(path)?;
+            let rows = insertion.recording.rows.iter();
+            let rows: Vec<_> =
+                rows.map(|row| (row.insertion_meas_mm, row.position_meas_mm)).collect();
+            check_recorded(&rows).map_err(|error| Failure::bad_input(path, error))?;
             let is_same = |other: &&Insertion| other.recording.is_same(&insertion.recording);
             if let Some(first) = insertions.iter().find(is_same) {
                 let first = first.path.display();

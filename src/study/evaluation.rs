@@ -1,6 +1,6 @@
 //! Runs an observer over a recorded insertion and scores it against the recorded tip.
 
-use super::recording::{RecordedRow, Recording};
+use super::recording::{RecordedRoll, RecordedRow, Recording};
 use super::statistics::{quantile, rms};
 use crate::geometry::{Pose, so3};
 use crate::math;
@@ -22,8 +22,8 @@ pub struct RecordingScore {
     pub insertion_mm: f64,
     /// Steps scored.
     pub steps: usize,
-    /// RMS of estimated minus recorded roll, deg; `None` without recorded orientations that change, or
-    /// without an estimate.
+    /// RMS of estimated minus recorded roll, deg; `None` without recorded orientations that turn with the base
+    /// ([`Recording::roll`]), or without an estimate.
     pub roll_rms_deg: Option<f64>,
     /// The same for an observer that does not know the roll at the start; `None` for observers that
     /// must know it.
@@ -47,31 +47,48 @@ pub struct Evaluation {
     pub roll_unknown_rms_deg: Quantiles,
     /// Median of the recordings' position RMS, mm.
     pub position_rms_mm: Option<f64>,
+    /// Number of recordings that it is the median of.
+    pub position_insertions: usize,
     /// Median of the recordings' RMS of the position predicted 5 mm ahead, mm.
     pub prediction_5mm_rms_mm: Option<f64>,
+    /// Number of recordings that it is the median of.
+    pub prediction_5mm_insertions: usize,
 }
 
-/// Median and 90% quantile.
+/// Median and 90% quantile over the recordings that have the value.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Quantiles {
     /// Median.
     pub median: Option<f64>,
     /// 90% quantile.
     pub p90: Option<f64>,
+    /// Number of recordings that have the value.
+    pub insertions: usize,
 }
 
 impl Evaluation {
     /// The figures over all recordings.
     pub fn of<'a>(scores: impl Iterator<Item = &'a RecordingScore> + Clone) -> Self {
-        let quantile = |of: fn(&RecordingScore) -> Option<f64>, q: f64| {
-            quantile(&scores.clone().filter_map(of).collect::<Vec<f64>>(), q)
+        let values = |of: fn(&RecordingScore) -> Option<f64>| -> Vec<f64> {
+            scores.clone().filter_map(of).collect()
         };
-        let quantiles = |of| Quantiles { median: quantile(of, 0.5), p90: quantile(of, 0.9) };
+        let quantiles = |of| {
+            let values = values(of);
+            Quantiles {
+                median: quantile(&values, 0.5),
+                p90: quantile(&values, 0.9),
+                insertions: values.len(),
+            }
+        };
+        let position = quantiles(|score| score.position_rms_mm);
+        let prediction = quantiles(|score| score.prediction_5mm_rms_mm);
         Evaluation {
             roll_rms_deg: quantiles(|score| score.roll_rms_deg),
             roll_unknown_rms_deg: quantiles(|score| score.roll_unknown_rms_deg),
-            position_rms_mm: quantile(|score| score.position_rms_mm, 0.5),
-            prediction_5mm_rms_mm: quantile(|score| score.prediction_5mm_rms_mm, 0.5),
+            position_rms_mm: position.median,
+            position_insertions: position.insertions,
+            prediction_5mm_rms_mm: prediction.median,
+            prediction_5mm_insertions: prediction.insertions,
         }
     }
 }
@@ -108,7 +125,7 @@ struct Step {
 /// If a row has a number far beyond any needle; the text names its line.
 fn steps(recording: &Recording, r_sb: &Rotation3<f64>) -> Result<Vec<Step>, String> {
     let first = &recording.rows[0];
-    let lacks_roll = recording.lacks_roll();
+    let has_roll = recording.roll() == Some(RecordedRoll::Turns);
     // R_PS0: the sensor's first orientation in the plane frame is the inverse of the mount.
     let r_ps = r_sb.inverse() * first.sensor_orientation.unwrap_or_default().inverse();
     let (mut depth_mm, mut rotation_rad) = (0.0, first.rotation_meas_rad);
@@ -124,7 +141,7 @@ fn steps(recording: &Recording, r_sb: &Rotation3<f64>) -> Result<Vec<Step>, Stri
             let way = "way from the first position in mm";
             refused(NeedleError::too_large(way, position_mm.amax()))
         })?;
-        let rotation_true = row.sensor_orientation.filter(|_| !lacks_roll);
+        let rotation_true = row.sensor_orientation.filter(|_| has_roll);
         let rotation_true = rotation_true.map(|rotation| r_ps * rotation * r_sb);
         Ok(Step { increment, depth_mm, tip_meas, rotation_true })
     };
@@ -301,16 +318,16 @@ mod tests {
     fn orientations_that_never_change_are_not_scored() {
         let r_sb = mount(Vector3::z(), Vector3::x()).unwrap();
         let mut recording = recording(&r_sb);
-        assert!(!recording.lacks_roll());
+        assert_eq!(recording.roll(), Some(RecordedRoll::Turns));
         for row in &mut recording.rows {
             row.sensor_orientation = Some(Rotation3::identity());
         }
-        assert!(recording.lacks_roll());
+        assert_eq!(recording.roll(), Some(RecordedRoll::DoesNotTurn));
         let mut observer = FiniteDifference::new(Needle::new(0.0125).unwrap(), 2.0).unwrap();
         let score = evaluate(&mut observer, &recording, &scoring(r_sb, 1.0, 8.0)).unwrap();
         assert!(score.roll_rms_deg.is_none() && score.position_rms_mm.is_some(), "{score:?}");
         recording.rows.iter_mut().for_each(|row| row.sensor_orientation = None);
-        assert!(!recording.lacks_roll(), "it has no orientations");
+        assert_eq!(recording.roll(), None, "it has no orientations");
     }
 
     /// An observer that counts its calls and always predicts the origin.

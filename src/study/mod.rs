@@ -19,7 +19,7 @@ pub use consistency::{Consistency, Nees, TrialNees, Verdict};
 pub use evaluation::{Evaluation, Quantiles, RecordingScore, Scoring, evaluate};
 pub use figures::{FigureReport, OFF_PLANE_LIMIT_MM, PlanStatus, RunFigures, TipError};
 pub use mount::mount;
-pub use recording::{RecordedRow, Recording};
+pub use recording::{RecordedRoll, RecordedRow, Recording};
 pub use score::{TargetScore, TrialResult, TrialScorer};
 pub use statistics::{quantile, rms};
 pub use summary::{StudySummary, trial_seed};

@@ -4,6 +4,7 @@ use crate::geometry::so3;
 use crate::table::{Table, TableError};
 use crate::units::wrap_angle;
 use nalgebra::{Rotation3, Vector3};
+use std::fmt;
 
 /// The columns that a recording must have, in any order.
 const REQUIRED: [&str; 5] = ["insertion_mm", "rotation_rad", "x_mm", "y_mm", "z_mm"];
@@ -13,6 +14,10 @@ const SAME_MAX_RAD: f64 = 1e-3;
 /// Once the base has turned by this much, rad, the orientations show whether they turn with it: no needle bends by
 /// half of this, and no shaft holds back half of it.
 const TURNED_RAD: f64 = 2.5;
+/// After a smaller turn, orientations turn with the base if they do so by at least this share of it, ...
+const FOLLOWED_SHARE: f64 = 0.3;
+/// ... and by at least this, rad: a bend of 30 deg about a sensor tilted by 10 deg looks like a roll of 5 deg.
+const FOLLOWED_MIN_RAD: f64 = 0.12;
 
 /// One row of a recording, in the recording's own frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -27,6 +32,34 @@ pub struct RecordedRow {
     pub position_meas_mm: Vector3<f64>,
     /// Recorded sensor orientation. Scoring takes it for the truth; `calibrate needle` fits it.
     pub sensor_orientation: Option<Rotation3<f64>>,
+}
+
+/// Whether the orientations of a recording turn with the base about the needle's axis.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum RecordedRoll {
+    /// They do: they contain the roll.
+    Turns,
+    /// They do not: they contain only the heading, or never change.
+    DoesNotTurn,
+    /// The base turned by too little to show it.
+    Unknown {
+        /// The largest turn of the base from its start, rad.
+        base_rad: f64,
+    },
+}
+
+impl fmt::Display for RecordedRoll {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            RecordedRoll::Turns => f.write_str("the orientations turn with the base"),
+            RecordedRoll::DoesNotTurn => f.write_str("the orientations do not turn with the base"),
+            RecordedRoll::Unknown { base_rad } => write!(
+                f,
+                "the base turned by only {:.0} deg, so the orientations do not show whether they turn with it",
+                base_rad.to_degrees()
+            ),
+        }
+    }
 }
 
 /// A recorded insertion.
@@ -61,29 +94,39 @@ impl Recording {
         }
     }
 
-    /// True if the orientations contain no roll. A sensor with five degrees of freedom measures only the heading,
-    /// so its orientations do not turn with the base about the needle's axis. A tracker without orientations may
-    /// send the same one in every row.
-    pub fn lacks_roll(&self) -> bool {
+    /// Whether the orientations contain the roll; `None` if a row has no orientation, or there is only one. A sensor with five degrees of
+    /// freedom measures only the heading, so its orientations do not turn with the base about the needle's axis. A
+    /// tracker without orientations may send the same one in every row.
+    ///
+    /// After a small turn the answer is the slope of the sensor's roll over the base's turn, by least squares over
+    /// all rows: it averages the noise, and a shaft that twists makes it smaller than 1.
+    pub fn roll(&self) -> Option<RecordedRoll> {
         let first = &self.rows[0];
+        let first_orientation = first.sensor_orientation.filter(|_| self.rows.len() > 1)?;
         let axis = self.axis();
-        let (mut is_fixed, mut roll_rad, mut largest_rad, mut base_rad) =
-            (true, 0.0, 0.0f64, 0.0f64);
+        let (mut is_fixed, mut roll_rad) = (true, 0.0);
+        let (mut turns_rad, mut rolls_rad) = (vec![0.0], vec![0.0]);
         for (last, row) in self.rows.iter().zip(&self.rows[1..]) {
-            let (Some(start), Some(before), Some(now)) =
-                (first.sensor_orientation, last.sensor_orientation, row.sensor_orientation)
-            else {
-                return false;
-            };
-            is_fixed &= start.angle_to(&now) < SAME_MAX_RAD;
+            let (before, now) = (last.sensor_orientation?, row.sensor_orientation?);
+            is_fixed &= first_orientation.angle_to(&now) < SAME_MAX_RAD;
             // A change of heading is no roll, however large the needle's bend makes it.
             roll_rad += so3::log(&(before.inverse() * now)).dot(&axis);
-            largest_rad = largest_rad.max(wrap_angle(roll_rad).abs());
-            let turn_rad = row.rotation_meas_rad - first.rotation_meas_rad;
-            base_rad = base_rad.max(wrap_angle(turn_rad).abs());
+            rolls_rad.push(roll_rad);
+            turns_rad.push(wrap_angle(row.rotation_meas_rad - first.rotation_meas_rad));
         }
-        let is_without = base_rad > TURNED_RAD && largest_rad < 0.5 * TURNED_RAD;
-        self.rows.len() > 1 && (is_fixed || is_without)
+        let base_rad = turns_rad.iter().fold(0.0f64, |largest, turn| largest.max(turn.abs()));
+        let largest_rad =
+            rolls_rad.iter().fold(0.0f64, |largest, roll| largest.max(wrap_angle(*roll).abs()));
+        let slope = slope(&turns_rad, &rolls_rad).abs();
+        Some(match base_rad > TURNED_RAD {
+            _ if is_fixed => RecordedRoll::DoesNotTurn,
+            true if largest_rad < 0.5 * TURNED_RAD => RecordedRoll::DoesNotTurn,
+            true => RecordedRoll::Turns,
+            false if slope >= FOLLOWED_SHARE && slope * base_rad >= FOLLOWED_MIN_RAD => {
+                RecordedRoll::Turns
+            }
+            false => RecordedRoll::Unknown { base_rad },
+        })
     }
 
     /// The needle's axis in the sensor's frame: the mean direction of its motion there; zero if it does not move.
@@ -104,6 +147,18 @@ impl Recording {
     }
 }
 
+/// The slope of `y` over `x` by least squares; 0 if `x` is constant.
+fn slope(x: &[f64], y: &[f64]) -> f64 {
+    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+    let (mean_x, mean_y) = (mean(x), mean(y));
+    let (mut square, mut product) = (0.0, 0.0);
+    for (x, y) in x.iter().zip(y) {
+        square += (x - mean_x).powi(2);
+        product += (x - mean_x) * (y - mean_y);
+    }
+    if square > 0.0 { product / square } else { 0.0 }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -122,33 +177,69 @@ mod tests {
         assert_eq!(posed.rows[0].position_meas_mm, Vector3::new(1.0, 2.0, 3.0));
     }
 
-    /// The base turns by 20 degrees a mm, and the sensor by `turns` times that; the needle bends to one side.
+    /// A needle that bends to one side, over `depth_mm`. `turned` gives the base's turn and the sensor's, rad, at a
+    /// depth in mm. The sensor is tilted by `tilt_rad`.
+    fn bent(depth_mm: u32, tilt_rad: f64, turned: impl Fn(f64) -> [f64; 2]) -> Recording {
+        let row = |mm: u32| {
+            let (mm, bend_rad) = (f64::from(mm), f64::from(mm) / 122.0);
+            let [base_rad, sensor_rad] = turned(mm);
+            let roll = Rotation3::from_axis_angle(&Vector3::z_axis(), sensor_rad);
+            let bend = Rotation3::from_axis_angle(&Vector3::x_axis(), bend_rad);
+            let tilt = Rotation3::from_axis_angle(&Vector3::y_axis(), tilt_rad);
+            let (sin, cos) = bend_rad.sin_cos();
+            RecordedRow {
+                line: 1,
+                insertion_meas_mm: mm,
+                rotation_meas_rad: base_rad,
+                position_meas_mm: 122.0 * Vector3::new(0.0, cos - 1.0, sin),
+                sensor_orientation: Some(bend * roll * tilt),
+            }
+        };
+        Recording { rows: (0..depth_mm).map(row).collect() }
+    }
+
+    /// The base turns by 20 degrees a mm, and the sensor by `turns` times that.
     #[test]
     fn orientations_that_do_not_turn_with_the_base_lack_roll() {
-        let recording = |depth_mm: u32, turns: f64| {
-            let row = |mm: u32| {
-                let (mm, bend_rad) = (f64::from(mm), f64::from(mm) / 122.0);
-                let roll = Rotation3::from_axis_angle(&Vector3::z_axis(), turns * 0.35 * mm);
-                let bend = Rotation3::from_axis_angle(&Vector3::x_axis(), bend_rad);
-                let (sin, cos) = bend_rad.sin_cos();
-                RecordedRow {
-                    line: 1,
-                    insertion_meas_mm: mm,
-                    rotation_meas_rad: 0.35 * mm,
-                    position_meas_mm: 122.0 * Vector3::new(0.0, cos - 1.0, sin),
-                    sensor_orientation: Some(bend * roll),
-                }
-            };
-            Recording { rows: (0..depth_mm).map(row).collect() }
+        let roll = |depth_mm: u32, turns: f64| {
+            bent(depth_mm, 0.0, |mm| [0.35 * mm, turns * 0.35 * mm]).roll().unwrap()
         };
         for depth_mm in [100, 250] {
-            assert!(recording(depth_mm, 0.0).lacks_roll(), "{depth_mm} mm");
-            assert!(!recording(depth_mm, 1.0).lacks_roll(), "{depth_mm} mm");
+            assert_eq!(roll(depth_mm, 0.0), RecordedRoll::DoesNotTurn, "{depth_mm} mm");
+            assert_eq!(roll(depth_mm, 1.0), RecordedRoll::Turns, "{depth_mm} mm");
         }
-        // The base has turned by too little to see it.
-        assert!(!recording(7, 0.0).lacks_roll());
         // The sensor lacks half a radian of the turn.
-        assert!(!recording(10, 0.85).lacks_roll());
+        assert_eq!(roll(10, 0.85), RecordedRoll::Turns);
+    }
+
+    /// The base turns by 48 degrees and back, in 60 mm.
+    #[test]
+    fn after_a_small_turn_only_orientations_that_follow_it_have_roll() {
+        let base_rad = |mm: f64| 0.84 * (mm * 0.1).sin();
+        let unknown = |recording: Recording| match recording.roll() {
+            Some(RecordedRoll::Unknown { base_rad }) => (base_rad - 0.84).abs() < 0.01,
+            _ => false,
+        };
+        for tilt_rad in [0.0, 0.17, -0.17] {
+            assert!(unknown(bent(60, tilt_rad, |mm| [base_rad(mm), 0.0])), "{tilt_rad}");
+            // The bend grows with the base's turn.
+            assert!(unknown(bent(60, tilt_rad, |mm| [0.84 * mm / 59.0, 0.0])), "{tilt_rad}");
+            let rigid = bent(60, tilt_rad, |mm| [base_rad(mm), base_rad(mm)]);
+            assert_eq!(rigid.roll(), Some(RecordedRoll::Turns), "{tilt_rad}");
+            // The shaft holds back 10 degrees.
+            let twisted = bent(60, tilt_rad, |mm| {
+                let back_rad = 0.17 * (mm * 0.1).cos().signum();
+                [base_rad(mm), if mm > 0.0 { base_rad(mm) - back_rad } else { 0.0 }]
+            });
+            assert_eq!(twisted.roll(), Some(RecordedRoll::Turns), "{tilt_rad}");
+        }
+        let still = bent(60, 0.1, |_| [0.0, 0.0]).roll();
+        assert_eq!(still, Some(RecordedRoll::Unknown { base_rad: 0.0 }));
+        let text = RecordedRoll::Unknown { base_rad: 0.84 }.to_string();
+        assert_eq!(
+            text,
+            "the base turned by only 48 deg, so the orientations do not show whether they turn with it"
+        );
     }
 
     #[test]

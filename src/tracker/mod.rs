@@ -37,4 +37,4 @@ pub use sample::{Sample, Validity};
 pub use sieve::Sieve;
 pub use timing::{AcquisitionClock, StampPolicy};
 pub use track::{Fix, Prediction, Track, TrackSettings, TrackState, TrackerKind};
-pub use travel::TravelCheck;
+pub use travel::{TravelCheck, check_recorded};

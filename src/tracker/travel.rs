@@ -40,6 +40,14 @@ const LONG: Tolerance = Tolerance { share: 0.03, length_mm: 0.5 };
 /// configured by this factor.
 const CURVATURE_MARGIN: f64 = 1.3;
 
+/// A recorded insertion is checked in equal stretches of at least this depth, mm, each by itself.
+const RECORDED_STRETCH_MM: f64 = 10.0;
+/// A recorded insertion has at most this many stretches.
+const RECORDED_STRETCHES_MAX: f64 = 100.0;
+/// The travel of the tip, in mm per mm inserted, that a recorded stretch may have besides its noise. It is wide, since
+/// neither needle nor noise of a recording are known: over 20 mm an arc with a radius of 10 mm has 0.9.
+const RECORDED_TRAVEL: std::ops::Range<f64> = 0.5..1.5;
+
 /// What is tolerated besides noise.
 struct Tolerance {
     /// A share of the travel.
@@ -236,6 +244,44 @@ impl TravelCheck {
     }
 }
 
+/// Checks that in no stretch of a recorded insertion the tip travels far less or far more than the needle is inserted.
+/// `rows` are depths, mm, and positions, mm. Stretches with few positions are not checked.
+///
+/// # Errors
+/// The first stretch that contradicts the insertion.
+pub fn check_recorded(rows: &[(f64, Vector3<f64>)]) -> Result<(), String> {
+    let Some((first_mm, origin_mm)) = rows.first() else { return Ok(()) };
+    let depth_mm = rows.iter().fold(0.0f64, |deepest, (mm, _)| deepest.max(mm - first_mm));
+    let stretches = (depth_mm / RECORDED_STRETCH_MM).floor().clamp(1.0, RECORDED_STRETCHES_MAX);
+    let stretch_mm = depth_mm / stretches;
+    for number in 0..stretches as u32 {
+        let from_mm = first_mm + f64::from(number) * stretch_mm;
+        let to_mm = from_mm + stretch_mm;
+        let mut sums = Sums::default();
+        for (mm, position_mm) in rows.iter().filter(|(mm, _)| (from_mm..=to_mm).contains(mm)) {
+            sums.add(&Sums::of(mm - first_mm, &(position_mm - origin_mm), 1.0));
+        }
+        let filled_mm = (12.0 * sums.depth_spread_mm2() / sums.count).sqrt();
+        if sums.count < POSITIONS_MIN || filled_mm < 0.5 * RECORDED_STRETCH_MM {
+            continue;
+        }
+        let allowed = NOISE_SDS * (sums.scatter_mm2() / sums.depth_spread_mm2()).sqrt();
+        let (min, max) = (RECORDED_TRAVEL.start - allowed, RECORDED_TRAVEL.end + allowed);
+        let travel = sums.slope().norm();
+        let what = match travel {
+            _ if sums.is_in_metres() => IN_METRES,
+            _ if travel < min => "is the tracker's stream frozen, or are the positions not in mm?",
+            _ if travel > max => "a jump, or positions that are not in mm",
+            _ => continue,
+        };
+        return Err(format!(
+            "from {from_mm:.1} to {to_mm:.1} mm the tip travelled {travel:.4} mm per mm inserted (expected \
+             {min:.2} to {max:.2}): {what}"
+        ));
+    }
+    Ok(())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -325,6 +371,54 @@ mod tests {
         {
             assert!(!text.contains("metres"), "{text}");
         }
+    }
+
+    /// Rows each 0.05 mm to a depth of 126 mm, with noise of ±`noise_mm`.
+    fn recorded(noise_mm: f64, position: impl Fn(f64) -> Vector3<f64>) -> Vec<(f64, Vector3<f64>)> {
+        let noise = |k: u32, step: f64| 2.0 * (f64::from(k) * step).fract() - 1.0;
+        let row = |k: u32| {
+            let depth_mm = 0.05 * f64::from(k);
+            let steps = [0.618_034, 0.414_214, 0.732_051];
+            let off_mm = steps.map(|step| noise_mm * noise(k * 7919 % 65_537, step));
+            (depth_mm, position(depth_mm) + Vector3::from(off_mm))
+        };
+        (0..2520).map(row).collect()
+    }
+
+    /// A needle with a radius of 40 mm bends through half a circle.
+    #[test]
+    fn any_recorded_arc_is_accepted() {
+        for radius_mm in [10.0, 40.0, 122.0] {
+            for noise_mm in [0.0, 0.1, 1.0, 3.0] {
+                let rows = recorded(noise_mm, |depth_mm| {
+                    let angle: f64 = depth_mm / radius_mm;
+                    radius_mm * Vector3::new(0.0, angle.cos() - 1.0, angle.sin())
+                });
+                assert_eq!(check_recorded(&rows), Ok(()), "{radius_mm} {noise_mm}");
+                let sparse: Vec<_> = rows.iter().step_by(20).copied().collect();
+                assert_eq!(check_recorded(&sparse), Ok(()), "{radius_mm} {noise_mm}");
+            }
+        }
+        assert_eq!(check_recorded(&[]), Ok(()));
+        assert_eq!(check_recorded(&[(0.0, Vector3::zeros()); 9]), Ok(()));
+    }
+
+    #[test]
+    fn a_recording_in_metres_or_of_a_frozen_stream_is_refused() {
+        let z = Vector3::<f64>::z();
+        for noise_mm in [0.0, 1e-3] {
+            let metres = recorded(noise_mm, |depth_mm| Vector3::x() + z * (1e-3 * depth_mm));
+            let text = check_recorded(&metres).unwrap_err();
+            assert!(text.starts_with("from 0.0 to 10.5 mm the tip travelled 0.001"), "{text}");
+            assert!(text.ends_with(IN_METRES) && text.len() < 150, "{text}");
+        }
+        for noise_mm in [0.0, 0.1, 1.0, 3.0] {
+            let frozen = recorded(noise_mm, |depth_mm| z * depth_mm.min(63.0));
+            let text = check_recorded(&frozen).unwrap_err();
+            assert!(text.contains("stream frozen") && text.len() < 170, "{text}");
+        }
+        let twice = recorded(1.0, |depth_mm| z * (2.0 * depth_mm));
+        assert!(check_recorded(&twice).unwrap_err().ends_with("not in mm"));
     }
 
     /// Noise that changes slowly, 0.6 mm in 4 mm of depth and back, looks like travel.

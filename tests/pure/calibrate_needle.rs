@@ -1,7 +1,7 @@
 //! `needle-bench calibrate needle`: recorded insertions become a configuration.
 
 use crate::support::program::{Scratch, needle_bench, refusals};
-use crate::support::recording::{recording, to_and_fro};
+use crate::support::recording::{heading_only, recording, to_and_fro};
 use needle_bench::needle::{Needle, Torsion, TorsionConfig};
 
 /// Four insertions of a needle with a curvature of 0.012 per mm, its tip 6 mm ahead, and a shaft that creeps
@@ -92,4 +92,21 @@ fn too_few_or_unusable_recordings_are_refused_with_the_reason() {
         ],
     );
     insta::assert_snapshot!(screens);
+}
+
+/// The base turns both ways, but by too little to show whether the orientations turn with it.
+#[test]
+fn headings_after_small_turns_are_refused_as_such() {
+    let scratch = Scratch::new();
+    let rigid = Torsion::default();
+    let names = ["a.csv", "b.csv", "c.csv"];
+    for (name, turn_rad) in names.into_iter().zip([0.03, 0.04, 0.05]) {
+        let to_and_fro = |n: u32| if (n / 20).is_multiple_of(2) { turn_rad } else { -turn_rad };
+        let csv = recording(Needle::new(0.012).unwrap(), &rigid, to_and_fro);
+        scratch.write(name, &heading_only(&csv));
+    }
+    let said = needle_bench(&scratch, &[&["calibrate", "needle"], &names[..]].concat());
+    assert_eq!(said.status, 2, "{}", said.stdout);
+    let why = "a.csv: the base turned by only 34 deg, so the orientations do not show whether they turn with it";
+    assert!(said.stderr.replace("\n       ", " ").contains(why), "{}", said.stderr);
 }

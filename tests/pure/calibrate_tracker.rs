@@ -80,6 +80,31 @@ fn the_noise_of_a_recording_becomes_a_configuration() {
     assert!(json["fit"]["axes"][2]["drift_mm_per_min"]["error"].as_f64().unwrap() > 0.0);
 }
 
+/// The configuration takes no noise under 0.001 mm.
+#[test]
+fn a_tracker_in_metres_or_without_noise_is_refused() {
+    let scratch = Scratch::new();
+    let refused = |scale: f64| {
+        let row = |(k, p_mm): (u64, Vector3<f64>)| {
+            let p = p_mm * scale;
+            format!("{},{},{},{}\n", k * 25_000_000, p.x, p.y, p.z)
+        };
+        let rows: String = positions().map(row).collect();
+        scratch.write("rest.csv", &format!("receive_time_ns,x_mm,y_mm,z_mm\n{rows}"));
+        let said = needle_bench(&scratch, &["calibrate", "tracker", "rest.csv"]);
+        assert_eq!((said.status, said.stdout.as_str()), (2, ""), "{}", said.stderr);
+        said.stderr.replace("\n       ", " ")
+    };
+    let metres = refused(1e-3);
+    assert!(metres.contains("rest.csv: the noise is 0.0005"), "{metres}");
+    assert!(
+        metres.contains("mm (at least 0.001 needed): the positions look like metres"),
+        "{metres}"
+    );
+    let noiseless = refused(1e-9);
+    assert!(noiseless.contains("an emulated tracker without noise?"), "{noiseless}");
+}
+
 #[test]
 fn a_file_that_is_not_a_recording_at_rest_is_refused_with_the_reason() {
     let scratch = Scratch::new();

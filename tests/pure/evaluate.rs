@@ -81,11 +81,84 @@ fn the_observers_never_see_the_recorded_orientation() {
     assert!(without["roll_rms_deg"]["median"].is_null());
 }
 
+/// The base turns by up to 115 degrees.
+#[test]
+fn no_roll_is_scored_against_headings_after_a_small_turn() {
+    let scratch = Scratch::new();
+    scratch.write("posed.csv", &recording());
+    scratch.write("heading.csv", &recording::heading_only(&recording()));
+    let evaluate = |file| {
+        let mut arguments = vec!["evaluate", file, "--json"];
+        arguments.extend(IN_LINE);
+        needle_bench(&scratch, &arguments)
+    };
+    let (posed, heading) = (evaluate("posed.csv"), evaluate("heading.csv"));
+    assert!(posed.json()["roll_rms_deg"]["median"].is_f64(), "{}", posed.stdout);
+    assert!(heading.json()["roll_rms_deg"]["median"].is_null(), "{}", heading.stdout);
+    let warning = "warning: heading.csv: the base turned by only 115 deg, so the orientations do not show whether \
+                   they turn with it: no roll is scored";
+    assert!(heading.stderr.contains(warning), "{}", heading.stderr);
+    assert!(!posed.stderr.contains("no roll is scored"), "{}", posed.stderr);
+}
+
 #[test]
 fn a_position_that_is_not_finite_is_refused_with_its_line() {
     let scratch = Scratch::new();
     scratch.write("bad.csv", "insertion_mm,rotation_rad,x_mm,y_mm,z_mm\n0,0,0,0,inf\n");
     insta::assert_snapshot!(refusals(&scratch, &[&["evaluate", "bad.csv"]]));
+}
+
+/// A recording without orientations has no roll: the medians of the roll name how many have it.
+#[test]
+fn a_median_of_fewer_recordings_names_their_number() {
+    let scratch = Scratch::new();
+    let plain: String = recording()
+        .lines()
+        .map(|line| line.splitn(6, ',').take(5).collect::<Vec<_>>().join(",") + "\n")
+        .collect();
+    scratch.write("plain.csv", plain.rsplit_once("\n59").unwrap().0);
+    scratch.write("posed.csv", &recording());
+    let files = ["evaluate", "plain.csv", "posed.csv", "--set", "observer.shadows=[]"];
+    let said = needle_bench(&scratch, &files);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    assert!(said.stdout.contains(" deg median (1 of 2), "), "{}", said.stdout);
+    assert!(!said.stdout.contains("mm (2 of 2)"), "{}", said.stdout);
+    let json = needle_bench(&scratch, &[&files[..], &["--json"]].concat()).json();
+    assert_eq!(json["roll_rms_deg"]["insertions"], 1);
+    assert_eq!(json["position_insertions"], 2);
+}
+
+/// The tip travels a thousandth of the depth, or stands still in the second half.
+#[test]
+fn positions_that_contradict_the_insertion_are_refused() {
+    let scratch = Scratch::new();
+    let changed = |change: &dyn Fn(usize, &str) -> String| -> String {
+        let text = recording();
+        let (header, rows) = text.split_once('\n').unwrap();
+        let rows = rows.lines().enumerate().map(|(row, line)| change(row, line) + "\n");
+        format!("{header}\n{}", rows.collect::<String>())
+    };
+    let metres = |_: usize, line: &str| {
+        let mut cells: Vec<String> = line.split(',').map(str::to_owned).collect();
+        for cell in &mut cells[2..5] {
+            *cell = (1e-3 * cell.parse::<f64>().unwrap()).to_string();
+        }
+        cells.join(",")
+    };
+    let middle = recording().lines().nth(301).unwrap().to_owned();
+    let frozen = |row: usize, line: &str| {
+        let base: Vec<&str> = line.splitn(3, ',').take(2).collect();
+        let still = middle.splitn(3, ',').nth(2).unwrap();
+        if row < 300 { line.to_owned() } else { format!("{},{still}", base.join(",")) }
+    };
+    scratch.write("metres.csv", &changed(&metres));
+    scratch.write("frozen.csv", &changed(&frozen));
+    let commands: [&[&str]; 3] = [
+        &["evaluate", "metres.csv"],
+        &["evaluate", "frozen.csv"],
+        &["calibrate", "needle", "metres.csv"],
+    ];
+    insta::assert_snapshot!(refusals(&scratch, &commands));
 }
 
 /// Counted twice, a recording would make the figures look more certain than they are.

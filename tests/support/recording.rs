@@ -1,6 +1,6 @@
 //! Recordings of an insertion with known parameters.
 
-use nalgebra::UnitQuaternion;
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use needle_bench::geometry::Pose;
 use needle_bench::needle::{Increment, Needle, Play, Torsion};
 use std::fmt::Write as _;
@@ -27,4 +27,17 @@ pub(crate) fn recording(needle: Needle, torsion: &Torsion, turns: impl Fn(u32) -
 /// Turns the base to and fro, by 0.6 and −0.5 rad/mm, each way for `way_mm`.
 pub(crate) fn to_and_fro(way_mm: u32) -> impl Fn(u32) -> f64 {
     move |n| if (n / (10 * way_mm)).is_multiple_of(2) { 0.06 } else { -0.05 }
+}
+
+/// The recording `csv` as a sensor of five degrees of freedom gives it: its orientations contain only the heading.
+pub(crate) fn heading_only(csv: &str) -> String {
+    let (header, rows) = csv.split_once('\n').unwrap();
+    let row = |line: &str| {
+        let cells: Vec<f64> = line.split(',').map(|cell| cell.parse().unwrap()).collect();
+        let [insertion, rotation, x, y, z, w, i, j, k] = cells[..] else { panic!("{line}") };
+        let heading = UnitQuaternion::from_quaternion(Quaternion::new(w, i, j, k)) * Vector3::z();
+        let q = UnitQuaternion::rotation_between(&Vector3::z(), &heading).unwrap();
+        format!("{insertion},{rotation},{x},{y},{z},{},{},{},{}\n", q.w, q.i, q.j, q.k)
+    };
+    format!("{header}\n{}", rows.lines().map(row).collect::<String>())
 }

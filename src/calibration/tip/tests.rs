@@ -206,6 +206,22 @@ fn turns_that_determine_no_tip_are_refused() {
     let text = refusal(&coaxial);
     assert!(text.contains("no offset from the needle's axis can be seen"), "{text}");
 
+    let scaled = |scale: f64| {
+        let mut samples = whole();
+        samples.iter_mut().for_each(|sample| sample.position_meas_mm *= scale);
+        samples
+    };
+    assert_eq!(
+        refusal(&scaled(1e-3)),
+        "tip: the circle's radius is 0.00130 mm (at least 0.02 needed): the positions look like metres; OpenIGTLink \
+         is in mm; for a sensor on the axis leave tracker.tip_offset_mm at zero"
+    );
+    let on_axis = refusal(&scaled(1e-6));
+    assert!(on_axis.contains("can be seen; leave") && !on_axis.contains("metres"), "{on_axis}");
+    // An ideal sensor exactly on the axis.
+    let ideal = refusal(&turned(&standing(), &Pose::identity(), TAU, 100));
+    assert!(ideal.contains("axis") && !ideal.contains("metres"), "{ideal}");
+
     let mut in_degrees = whole();
     in_degrees.iter_mut().for_each(|s| s.rotation_meas_rad = s.rotation_meas_rad.to_degrees());
     let text = refusal(&in_degrees);

@@ -16,6 +16,7 @@ use crate::calibration::{FiducialPair, NeedleFit, PosedRow, RegistrationFit, Tip
 use crate::config::RegistrationConfig;
 use crate::geometry::FixedAngles;
 use crate::needle::TorsionConfig;
+use crate::study::RecordedRoll;
 use crate::telemetry::utc_text;
 use crate::text::screen;
 use clap::{Args, Subcommand};
@@ -177,6 +178,7 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<()> {
         return Err(Failure::bad_input(path, why));
     }
     let posed_rows = insertions.iter().map(posed_rows).collect::<Result<Vec<_>, _>>()?;
+    check_roll(&insertions)?;
     let fit = NeedleFit::of(&posed_rows, &config.path_noise()).map_err(Failure::configuration)?;
     let mut file = insertions[0].path.display().to_string();
     if insertions.len() > 1 {
@@ -212,11 +214,6 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<()> {
 
 /// The rows of an insertion; every row must have an orientation.
 fn posed_rows(Insertion { path, recording, .. }: &Insertion) -> Result<Vec<PosedRow>> {
-    if recording.lacks_roll() {
-        let why = "its orientations do not turn with the base; a needle is calibrated from those of a sensor \
-                   of six degrees of freedom";
-        return Err(Failure::bad_input(path, why));
-    }
     let rows = recording.rows.iter().map(|row| {
         Some(PosedRow {
             line: row.line,
@@ -230,6 +227,27 @@ fn posed_rows(Insertion { path, recording, .. }: &Insertion) -> Result<Vec<Posed
         let why = "no columns qw,qx,qy,qz; a needle is calibrated from recorded orientations";
         Failure::bad_input(path, why)
     })
+}
+
+/// Refuses insertions whose orientations contain no roll: one that shows this, or all if none shows that they turn
+/// with the base.
+fn check_roll(insertions: &[Insertion]) -> Result<()> {
+    let rolls = insertions.iter().map(|insertion| Some((insertion, insertion.recording.roll()?)));
+    let rolls: Vec<_> = rolls.flatten().collect();
+    let has_any_roll = rolls.iter().any(|(_, roll)| *roll == RecordedRoll::Turns);
+    for (Insertion { path, .. }, roll) in rolls {
+        let next = match roll {
+            RecordedRoll::DoesNotTurn => {
+                "a needle is calibrated from those of a sensor of six degrees of freedom"
+            }
+            RecordedRoll::Unknown { .. } if !has_any_roll => {
+                "turn the base by more while inserting"
+            }
+            _ => continue,
+        };
+        return Err(Failure::bad_input(path, format_args!("{roll}; {next}")));
+    }
+    Ok(())
 }
 
 /// A torsion in the keys of the configuration.

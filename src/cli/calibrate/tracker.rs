@@ -12,6 +12,7 @@ use crate::table::Table;
 use crate::text::escaped;
 use crate::tracker::gate::is_same_tool;
 use crate::tracker::{CsvMapping, Event, Gate, Sample, TimeColumns, csv, ndjson};
+use crate::units::IN_METRES;
 use clap::Args;
 use minijinja::context;
 use serde_json::json;
@@ -25,6 +26,8 @@ pub(in crate::cli) const QUATERNION: [&str; 4] = ["qw", "qx", "qy", "qz"];
 
 /// The smallest noise that the configuration accepts, mm.
 const SD_MIN_MM: f64 = 0.001;
+/// From this noise on, mm, it may be that of positions in metres.
+const SD_IN_METRES_MIN_MM: f64 = 1e-6;
 
 #[derive(Debug, Args)]
 pub(in crate::cli) struct Arguments {
@@ -86,6 +89,15 @@ fn fit_and_write(
     let fit = TrackerFit::of(samples).map_err(bad_input)?;
     let found = serde_json::to_value(&fit).map_err(Failure::environment)?;
     let all = &fit.together;
+    let sd_mm = all.sd_mm.value;
+    if sd_mm < SD_MIN_MM {
+        let hint = match sd_mm >= SD_IN_METRES_MIN_MM {
+            true => IN_METRES,
+            false => "is this an emulated tracker without noise?",
+        };
+        let error = format!("the noise is {sd_mm:.5} mm (at least {SD_MIN_MM} needed): {hint}");
+        return Err(Failure::bad_input(source.as_ref(), error));
+    }
     let json = json!({
         "tracker": {
             "noise": {
@@ -93,9 +105,9 @@ fn fit_and_write(
                 "correlated_sd_mm": all.correlated_sd_mm.value,
                 "correlation_time_s": all.correlation_time_s.value,
             },
-            "gates": { "noise_sd_mm": all.sd_mm.value.max(SD_MIN_MM) },
+            "gates": { "noise_sd_mm": sd_mm },
         },
-        "observer": { "invariant": { "position_sd_mm": all.sd_mm.value.max(SD_MIN_MM) } },
+        "observer": { "invariant": { "position_sd_mm": sd_mm } },
         "fit": fit_table(source, text, &found),
     });
     let more = context! { source => escaped(source) };
