@@ -91,10 +91,16 @@ pub fn screen(template: &str, object: &impl Serialize, more: Value) -> Result<St
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
     environment.add_filter("escaped", |text: &str| escaped(text).into_owned());
     environment.add_filter("fixed", fixed);
+    environment.add_filter("part_of", part_of);
     environment.add_filter("table", |rows: Vec<Vec<String>>| table(&rows).join("\n"));
     let values = context! { ..more, ..Value::from(Serde(object)) };
     let screen = environment.template_from_str(template)?.render(values)?;
     Ok(screen.trim_end_matches('\n').to_owned())
+}
+
+/// ` (1 of 2)` if a figure is of some of all recordings; empty if it is of all or of none.
+fn part_of(count: u64, total: u64) -> String {
+    if (1..total).contains(&count) { format!(" ({count} of {total})") } else { String::new() }
 }
 
 /// `value` with `decimals`; `never` for infinity, a depth or time that is never reached; a dash for `None`.

@@ -94,9 +94,9 @@ impl Recording {
         }
     }
 
-    /// Whether the orientations contain the roll; `None` if a row has no orientation, or there is only one. A sensor with five degrees of
-    /// freedom measures only the heading, so its orientations do not turn with the base about the needle's axis. A
-    /// tracker without orientations may send the same one in every row.
+    /// Whether the orientations contain the roll; `None` if a row has no orientation, or there is only one. A sensor
+    /// with five degrees of freedom measures only the heading, so its orientations do not turn with the base about
+    /// the needle's axis. A tracker without orientations may send the same one in every row.
     ///
     /// After a small turn the answer is the slope of the sensor's roll over the base's turn, by least squares over
     /// all rows: it averages the noise, and a shaft that twists makes it smaller than 1.

@@ -173,6 +173,25 @@ fn a_sensor_without_roll_gives_the_axis_and_no_mount() {
     assert_eq!(fit.x_sb(4.0), Pose { translation: Vector3::z() * 4.0, ..Pose::identity() });
 }
 
+/// The tip is taken to be ahead on the sensor's z axis.
+#[test]
+fn a_sensor_without_roll_must_point_along_the_needle() {
+    let tilted = |deg: f64| {
+        let mut samples = turned(&standing(), &X_SB, TAU, 100);
+        let tilt = so3::exp(&(Vector3::x() * deg.to_radians()));
+        for sample in &mut samples {
+            sample.orientation_meas = Some(standing().rotation * tilt);
+        }
+        samples
+    };
+    assert!(TipFit::of(&tilted(29.0), 0.5).is_ok());
+    for deg in [31.0, 90.0, 180.0] {
+        let expected =
+            format!("tip: the sensor's z axis is {deg:.0} deg from the needle's (limit 30");
+        assert!(refusal(&tilted(deg)).starts_with(&expected), "{}", refusal(&tilted(deg)));
+    }
+}
+
 #[test]
 fn turns_that_determine_no_tip_are_refused() {
     let whole = || turned(&standing(), &X_SB, TAU, 100);
