@@ -8,6 +8,7 @@ use crate::config::{CanInterface, Config, GoalKind, Source, TrackerSource};
 use crate::session::{Lane, Severity, State};
 use crate::study::{FigureReport, PlanStatus};
 use crate::text::{escaped, shell_word};
+use crate::tracker::gate::is_same_tool;
 use serde::Serialize;
 use std::borrow::Cow;
 use std::fmt::Display;
@@ -230,9 +231,12 @@ impl Folder {
         Config::from_sources(&[source], &[]).map_err(first_line)
     }
 
-    /// The tool that marks its target on the tracker's stream; `None` without one.
-    pub fn target_tool(&self) -> Option<String> {
-        self.config().ok().filter(|config| config.goal.kind == GoalKind::Target)?.goal.tool
+    /// Those of `samples` that are not of the target, which a run may track as well.
+    pub fn tip_samples(&self, mut samples: Vec<TrackerTimes>) -> Vec<TrackerTimes> {
+        let goal = self.config().ok().map(|config| config.goal);
+        let target = goal.filter(|goal| goal.kind == GoalKind::Target).and_then(|goal| goal.tool);
+        samples.retain(|it| !target.as_ref().is_some_and(|tool| is_same_tool(&it.tool, tool)));
+        samples
     }
 
     /// Every key of its configuration.
@@ -358,6 +362,24 @@ pub(super) mod tests {
     }
 
     /// The depth counts from the first step, at 2 s.
+    /// The target's samples are no tip positions: with them the curves would hide a tip that is lost.
+    #[test]
+    fn the_samples_of_a_tracked_target_are_not_those_of_the_tip() {
+        let of = |tool: &str| TrackerTimes {
+            tool: tool.to_owned(),
+            receive_time_ns: 0,
+            acquisition_time_ns: None,
+            refused: None,
+        };
+        let samples = ["NeedleToTracker", "Target"].map(of).to_vec();
+        let mut folder = run().folder;
+        assert_eq!(folder.tip_samples(samples.clone()), samples);
+        let target =
+            "[goal]\nkind = \"target\"\nposition_mm = [0.0, 0.0, 100.0]\ntool = \"Target\"\n";
+        folder.config_toml = Some(target.to_owned());
+        assert_eq!(folder.tip_samples(samples), [of("NeedleToTracker")]);
+    }
+
     #[test]
     fn the_depth_at_a_time_is_the_measured_one() {
         let mut run = run();

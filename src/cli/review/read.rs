@@ -8,7 +8,6 @@ use crate::review::{
 };
 use crate::telemetry::{RunFolder, TelemetryError, is_being_written};
 use crate::text::shell_word;
-use crate::tracker::gate::is_same_tool;
 use std::io;
 use std::path::Path;
 
@@ -25,9 +24,8 @@ pub(super) fn run(path: &Path) -> Result<Run> {
         StepsTable::default()
     });
     unreadable.extend(steps.miscount().map(|why| format!("{}: {why}", shown.display())));
-    let mut samples = lines(&record, file::TRACKER, TrackerTimes::parse, &mut unreadable);
-    let target = folder.target_tool();
-    samples.retain(|sample| !target.as_ref().is_some_and(|tool| is_same_tool(&sample.tool, tool)));
+    let samples = lines(&record, file::TRACKER, TrackerTimes::parse, &mut unreadable);
+    let samples = folder.tip_samples(samples);
     let motion = Motion::new(&lines(&record, file::CAN, parse_frame, &mut unreadable), &folder);
     let events = lines(&record, file::EVENTS, parse_event, &mut unreadable);
     // A record that is not closed has no `run.rrd` yet.
