@@ -361,7 +361,6 @@ pub(super) mod tests {
         );
     }
 
-    /// The depth counts from the first step, at 2 s.
     /// The target's samples are no tip positions: with them the curves would hide a tip that is lost.
     #[test]
     fn the_samples_of_a_tracked_target_are_not_those_of_the_tip() {
@@ -380,6 +379,7 @@ pub(super) mod tests {
         assert_eq!(folder.tip_samples(samples), [of("NeedleToTracker")]);
     }
 
+    /// The depth counts from the first step, at 2 s.
     #[test]
     fn the_depth_at_a_time_is_the_measured_one() {
         let mut run = run();

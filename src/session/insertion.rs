@@ -161,7 +161,7 @@ impl Insertion {
 
     /// True when the needle stands where a hold has brought its set-points to rest.
     pub(crate) fn is_standing(&self, insertion_meas_mm: f64) -> bool {
-        self.profile.is_at_rest() && self.misses_by(insertion_meas_mm).is_none()
+        self.profile.is_at_rest() && self.off_mm(insertion_meas_mm) <= self.config.arrival_mm
     }
 
     /// True if the set-points have come to rest and the axis has had time to follow, in a hold that lasts for `held`.
@@ -169,13 +169,17 @@ impl Insertion {
         self.profile.is_at_rest() && held >= ARRIVAL_TIMEOUT
     }
 
-    /// How far the needle is off its set-point, in words, if that is more than its tolerance.
-    pub(crate) fn misses_by(&self, insertion_meas_mm: f64) -> Option<String> {
-        let off_mm = (self.profile.position_mm() - insertion_meas_mm).abs();
-        let limit_mm = self.config.arrival_mm;
-        (off_mm > limit_mm).then(|| {
+    /// How far the needle is off its set-point, in words; `None` if it stands there or its set-points still move.
+    pub(crate) fn explain_miss(&self, insertion_meas_mm: f64) -> Option<String> {
+        let is_off = self.profile.is_at_rest() && !self.is_standing(insertion_meas_mm);
+        is_off.then(|| {
+            let (off_mm, limit_mm) = (self.off_mm(insertion_meas_mm), self.config.arrival_mm);
             format!("the needle is {off_mm:.3} mm off its set-point (limit {limit_mm:.3}, insertion.arrival_mm)")
         })
+    }
+
+    fn off_mm(&self, insertion_meas_mm: f64) -> f64 {
+        (self.profile.position_mm() - insertion_meas_mm).abs()
     }
 
     /// Checks that the needle arrives where its set-points end; otherwise the run would wait there for

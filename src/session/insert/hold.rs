@@ -116,7 +116,7 @@ impl InsertTask {
             let timeout_s = tracker.hold.timeout.as_secs_f64();
             let end = format!("held for {timeout_s:.1} s{in_a_row} and stopped");
             // The first trouble may be over and another may hold the insertion now.
-            match (&found, insertion.misses_by(insertion_meas_mm)) {
+            match (&found, insertion.explain_miss(insertion_meas_mm)) {
                 (None, Some(off)) if self.is_seen(now) => {
                     return Err(format!("tracker: the tip is seen again, but {off}; {end}"));
                 }
@@ -193,11 +193,9 @@ impl InsertTask {
         };
         let insertion_mm = self.progress.insertion_meas_mm;
         if !insertion.is_standing(insertion_mm) {
-            return Err(match insertion.misses_by(insertion_mm) {
-                Some(off) if insertion.profile.is_at_rest() => {
-                    format!("{off}; try again once it is there")
-                }
-                _ => "the needle is still braking; try again once it stands".to_owned(),
+            return Err(match insertion.explain_miss(insertion_mm) {
+                Some(off) => format!("{off}; try again once it is there"),
+                None => "the needle is still braking; try again once it stands".to_owned(),
             });
         }
         if let Some(Trouble { what, why }) = self.trouble(shell.now, insertion_mm, insertion) {
