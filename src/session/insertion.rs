@@ -337,6 +337,19 @@ mod tests {
     use super::*;
     use crate::config::Config;
 
+    #[test]
+    fn a_needle_stands_within_its_tolerance_of_the_set_point() {
+        let config = Config::from_sources(&[], &[]).unwrap().session().unwrap().insertion;
+        let at = SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 };
+        let insertion = Insertion::new(config, at, at);
+        assert!(insertion.is_standing(0.04) && insertion.explain_miss(0.04).is_none());
+        for off_mm in [0.06, f64::NAN] {
+            assert!(!insertion.is_standing(off_mm), "{off_mm}");
+            let miss = insertion.explain_miss(off_mm).expect("words");
+            assert!(miss.ends_with("(limit 0.050, insertion.arrival_mm)"), "{miss}");
+        }
+    }
+
     /// At 1 mm a step the needle stands for longer than it moves at full speed.
     #[test]
     fn the_time_to_go_of_a_stepwise_insertion_counts_its_standstills() {

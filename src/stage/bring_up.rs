@@ -42,11 +42,9 @@ impl fmt::Display for Identity {
 
 /// A fault that a drive was found in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct FoundFault {
-    /// 0x6041.
-    pub statusword: Statusword,
+pub(super) struct FoundFault {
     /// 0x603F, when the drive has it.
-    pub error_code: Option<EmcyCode>,
+    pub(super) error_code: Option<EmcyCode>,
 }
 
 /// Length of an expedited answer that does not say its size.

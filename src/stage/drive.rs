@@ -2,11 +2,10 @@
 
 use std::time::Duration;
 
+use super::bring_up::BringUpState;
 use super::cycle::Reading;
 use super::standstill::Standstill;
-use super::{
-    Axis, AxisConfig, AxisUse, Commanded, DriveFlag, FoundFault, LimitCheck, StageConfig, Unwrapper,
-};
+use super::{Axis, AxisConfig, AxisUse, Commanded, DriveFlag, LimitCheck, StageConfig, Unwrapper};
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
 use crate::canopen::emcy::{Emcy, EmcyCode};
 use crate::canopen::{Frame, cob};
@@ -95,10 +94,8 @@ pub(super) struct Drive {
     held_syncs: u32,
     held_syncs_max: u32,
     pub(super) reading: Reading,
-    /// The fault that the drive was found in, if its bring-up was abandoned.
-    pub(super) found_fault: Option<FoundFault>,
-    /// The last statusword that its bring-up read, if that was abandoned.
-    pub(super) found_statusword: Option<Statusword>,
+    /// How far its bring-up had come, if that was abandoned.
+    pub(super) abandoned: BringUpState,
     /// It has restarted since its bring-up.
     pub(super) restarted: bool,
     /// The last emergency message, and how many times in a row it came.
@@ -139,8 +136,7 @@ impl Drive {
             held_syncs: 0,
             held_syncs_max: config.bus.missed_feedback_max.max(1).into(),
             reading: Reading::begun(Time::ZERO),
-            found_fault: None,
-            found_statusword: None,
+            abandoned: BringUpState::default(),
             restarted: false,
             emcy: (None, 0),
             controlword: Controlword::DISABLE_VOLTAGE,
@@ -464,8 +460,8 @@ impl Drive {
     }
 
     pub(super) fn report(&self) -> DriveReport {
-        let statusword = self.statusword.or(self.found_statusword);
-        let found_code = self.found_fault.and_then(|fault| fault.error_code);
+        let statusword = self.statusword.or(self.abandoned.statusword);
+        let found_code = self.abandoned.found_in_fault.and_then(|fault| fault.error_code);
         let reported_code = self.emcy.0.map(|emcy| emcy.code);
         let error = reported_code.or(found_code).filter(|code| *code != EmcyCode::NO_ERROR);
         let state = statusword.and_then(Statusword::state);

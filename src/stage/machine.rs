@@ -425,9 +425,9 @@ impl Stage {
                     bring_up.runner.cancel();
                     let unsent = std::iter::from_fn(|| bring_up.runner.poll());
                     self.outputs.extend(unsent);
-                    self.drives[axis].found_fault = bring_up.state().found_in_fault;
-                    self.drives[axis].found_statusword = bring_up.state().statusword;
-                    (bring_up.state().identified, bring_up.state().may_be_supervised)
+                    let abandoned = bring_up.state();
+                    self.drives[axis].abandoned = abandoned;
+                    (abandoned.identified, abandoned.may_be_supervised)
                 }
                 None => (true, true),
             };

@@ -57,7 +57,7 @@ mod supervision;
 mod tests;
 
 pub use axis::{Axis, AxisUse, PerAxis};
-pub use bring_up::{FoundFault, Identity};
+pub use bring_up::Identity;
 pub use config::{AxisConfig, BusConfig, PowerConfig, RawSdo, StageConfig};
 pub use dialogue::Dialogue;
 pub use drive::{DriveReport, may_have_power};

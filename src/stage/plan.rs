@@ -144,7 +144,7 @@ impl Script {
         if !statusword.is_fault() {
             return Ok(());
         }
-        let mut fault = FoundFault { statusword, error_code: None };
+        let mut fault = FoundFault { error_code: None };
         self.note(|state| state.found_in_fault = Some(fault));
         // A fault is reset only if its code can be read, unless the drive has no codes.
         let error_code = match self.config.power.fault_reset_on_start {
