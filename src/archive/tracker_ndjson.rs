@@ -1,6 +1,7 @@
 //! `tracker.ndjson`: every sample as received, one JSON object a line.
 
 use crate::session::SampleRecord;
+use crate::tracker::gate::is_same_tool;
 use crate::units::Time;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize, Serializer};
@@ -56,6 +57,11 @@ impl TrackerTimes {
     /// The times in `line`; `None` if it is not a sample.
     pub fn parse(line: &str) -> Option<Self> {
         serde_json::from_str(line).ok()
+    }
+
+    /// True if the sample is of `tool`, whose name may have been cut on the way.
+    pub fn is_of(&self, tool: &str) -> bool {
+        is_same_tool(&self.tool, tool)
     }
 }
 

@@ -8,7 +8,6 @@ use crate::config::{CanInterface, Config, GoalKind, Source, TrackerSource};
 use crate::session::{Lane, Severity, State};
 use crate::study::{FigureReport, PlanStatus};
 use crate::text::{escaped, shell_word};
-use crate::tracker::gate::is_same_tool;
 use serde::Serialize;
 use std::borrow::Cow;
 use std::fmt::Display;
@@ -235,7 +234,7 @@ impl Folder {
     pub fn tip_samples(&self, mut samples: Vec<TrackerTimes>) -> Vec<TrackerTimes> {
         let goal = self.config().ok().map(|config| config.goal);
         let target = goal.filter(|goal| goal.kind == GoalKind::Target).and_then(|goal| goal.tool);
-        samples.retain(|it| !target.as_ref().is_some_and(|tool| is_same_tool(&it.tool, tool)));
+        samples.retain(|sample| !target.as_ref().is_some_and(|tool| sample.is_of(tool)));
         samples
     }
 
