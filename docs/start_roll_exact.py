@@ -5,7 +5,7 @@
     python3 docs/start_roll_exact.py --wait 0.5      # the base stands until the resultant length is 0.5
     python3 docs/start_roll_exact.py --slow 0.5      # it turns the slower, the more the length is under 0.5
 
-`start_roll_bound.py` gives a method what no real one can have. This one has what the bench has: 20 positions a mm
+`start_roll_references.py` gives a method what no real one can have. This one has what the bench has: 20 positions a mm
 with noise of +-1 mm, yaw known to 12 degrees and pitch to 8 at the start, the start position, the curvature, and each
 turn of the base. It keeps the whole posterior of yaw, pitch and roll on a grid, given how the needle was turned, and
 each mm turns the base toward the target by the posterior's mean, by 60 degrees a mm at most. With `--wait` and
@@ -23,7 +23,7 @@ import math
 import numpy as np
 
 from rotate_to_target import RADIUS_MM, draw_targets
-from start_roll_bound import (
+from start_roll_references import (
     HEADING_SDS, POSITIONS_PER_MM, ROLLS, SHARE_MAX, SLOPES, SLOPE_PRIOR, TARGETS, Gaussian, Uniform, reached,
 )
 

@@ -21,8 +21,11 @@ use derive_more::Display;
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI};
 use thiserror::Error;
 
-/// An alternative that is `e^7` times as likely as the configured model ends the run.
+/// An alternative that is `e^7` times as likely as the configured model ends the run …
 const LOG_ODDS_MAX: f64 = 7.0;
+/// … but another roll at the start has to be `e^10` times as likely. Its odds grow so fast that this takes 2 to 4 mm
+/// more, and `e^7` stopped one correct run of 2,000.
+const TURNED_LOG_ODDS_MAX: f64 = 10.0;
 /// At most this many positions per mm count as independent.
 const INDEPENDENT_PER_MM: f64 = 20.0;
 /// Share of the bank that searches for a torsion if none is configured: the shaft is assumed to
@@ -40,7 +43,8 @@ const HEADING_JUDGED_MM: f64 = 30.0;
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 #[error(
     "the positions fit {alternative} e^{log_odds:.0} times better after {depth_mm:.1} mm (limit \
-     e^{LOG_ODDS_MAX:.0}): {}",
+     e^{:.0}): {}",
+    .alternative.log_odds_max(),
     .alternative.question()
 )]
 pub struct StreamContradiction {
@@ -66,6 +70,14 @@ enum Alternative {
 }
 
 impl Alternative {
+    /// Log odds against the configured model that end the run.
+    fn log_odds_max(self) -> f64 {
+        match self {
+            Alternative::Mirrored | Alternative::Tilted => LOG_ODDS_MAX,
+            Alternative::Turned => TURNED_LOG_ODDS_MAX,
+        }
+    }
+
     /// What the operator should check.
     fn question(self) -> &'static str {
         match self {
@@ -156,7 +168,7 @@ impl HandednessWatch {
             // Noise beyond the configured standard deviation exaggerates every difference. The
             // innovations of the alternative itself show by how much.
             let log_odds = (model.log_evidence() - configured) / model.innovation_excess();
-            if log_odds > LOG_ODDS_MAX {
+            if log_odds > alternative.log_odds_max() {
                 let alternative = *alternative;
                 contradiction.get_or_insert(StreamContradiction {
                     alternative,

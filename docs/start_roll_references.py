@@ -11,7 +11,7 @@ A method knows where the needle starts, its curvature, its yaw to 12 degrees and
   target the best of several limits counts.
 - After REVEALED_MM the roll is told to it, and one arc of the full curvature leads to the target.
 
-This is the best of a family of methods, not a proof for all of them.
+This is the best of a family of methods; `start_roll_bound.py` has a bound for all of them.
 
 Prints how well the positions tell the roll (RMS error of the posterior's mean), and the share of the targets that
 are then reached within 1 mm and within 0.4 mm, for uniform noise of +-1 mm and for Gaussian noise of the same
