@@ -4,7 +4,7 @@
 use super::{ENVIRONMENT_FAILED, STOPPED};
 use crate::archive::file;
 use crate::canopen::cia402::DriveState;
-use crate::config::{Config, OnFailure};
+use crate::config::{Config, GoalKind, OnFailure};
 use crate::runtime::RunReport;
 use crate::session::{Outcome, StageAtEnd};
 use crate::stage::{Axis, DriveReport};
@@ -75,7 +75,8 @@ pub(super) fn folder_bytes(dir: &Path) -> u64 {
 /// What became of the plan; `None` without a target.
 pub(super) fn plan_status(config: &Config, report: &RunReport) -> Option<PlanStatus> {
     let is_completed = report.outcome == Outcome::Completed;
-    report.figures.report().plan_status(is_completed, config.goal.tolerance_mm)
+    let status = report.figures.report().plan_status(is_completed, config.goal.tolerance_mm);
+    status.filter(|_| config.goal.kind == GoalKind::Target)
 }
 
 /// How far a completed run missed the plane, mm; `None` if it did not.

@@ -3,11 +3,12 @@
 use super::reader::{Reader, contradictions};
 use super::tracker::FILE;
 use super::value::join;
-use super::{Config, ConfigError, TrackerSource};
+use super::{Config, ConfigError, ObserverKind, TrackerSource};
 use crate::control::ControlKind;
 use crate::geometry::{POSITION, Pose};
 use crate::keys::{Rule, choice, not_blank, over, section, within};
-use crate::plan::{Obstacle, Problem, Tip, Workspace, World};
+use crate::observer::Gains;
+use crate::plan::{CLEARANCE_MIN_MM, Obstacle, Problem, Tip, Workspace, World};
 use crate::session::{Goal, TargetTool};
 use crate::tracker::{Gate, Registration};
 use nalgebra::Vector3;
@@ -251,9 +252,6 @@ impl Config {
     }
 }
 
-/// A path is tested at points this far apart, mm, so with half of it a path could lead through a thin obstacle.
-const CLEARANCE_MIN_MM: f64 = 0.1;
-
 /// Reports contradictions in `[goal]`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
     let goal = &config.goal;
@@ -277,9 +275,18 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
         }
     }
     let clearance_mm = goal.clearance_mm;
-    let is_too_near = (is_drawn || !goal.obstacle.is_empty()) && clearance_mm < CLEARANCE_MIN_MM;
+    let has_obstacles = is_drawn || !goal.obstacle.is_empty();
+    let registration_sd_mm = config.observer.invariant.registration_sd_mm;
+    let is_too_near = has_obstacles && clearance_mm < CLEARANCE_MIN_MM;
+    let is_in_doubt = has_obstacles && 2.0 * registration_sd_mm >= clearance_mm;
     let has_one_tool = config.tip_source() == TrackerSource::Csv;
     let law = config.control.kind;
+    let observer = config.observer.kind;
+    let states_sd = match observer {
+        ObserverKind::Invariant => true,
+        ObserverKind::Coupled => config.observer.coupled.gains == Gains::Fading,
+        ObserverKind::FiniteDifference => false,
+    };
     let Workspace { min_mm: min, max_mm: max, .. } = goal.workspace_mm;
     let has_size = is_box(&min, &max);
     let has_plane = min.x <= 0.0 && max.x >= 0.0;
@@ -294,6 +301,12 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
             "goal.tool needs a stream of two tools, and tracker.source = \"csv\" has one";
         ["control.kind", "goal.kind"] if is_target && law != ControlKind::NestedSaturation =>
             "control.kind is \"{law}\", allowed with goal.kind = \"target\": \"nested-saturation\"";
+        ["observer.kind", "observer.coupled.gains", "goal.kind"] if is_target && !states_sd =>
+            "goal.kind = \"target\" needs an observer that states how well it knows the tip: \"invariant\", or \
+             \"coupled\" with observer.coupled.gains = \"fading\"; observer.kind is \"{observer}\"";
+        ["goal.clearance_mm", "tracker.registration"] if is_target && is_in_doubt =>
+            "goal.clearance_mm is {clearance_mm}, allowed with obstacles: over {:.2}, twice the sd_mm of \
+             tracker.registration: the tip may be in an obstacle that seems that far away", 2.0 * registration_sd_mm;
         ["goal.workspace_mm"] if !has_size =>
             "goal.workspace_mm: each coordinate of max must be over that of min";
         ["goal.workspace_mm", "goal.in_plane"] if has_size && goal.in_plane && !has_plane =>

@@ -10,6 +10,8 @@ use std::borrow::Cow;
 /// nearer to an obstacle than a clearance of 1 mm by 0.0013 mm, and than one of 0.1 mm, the least that is
 /// allowed with obstacles, by 0.0134 mm. With less than half a step it could lead through a thin obstacle.
 const TEST_STEP_MM: f64 = 0.1;
+/// The least clearance from obstacles, mm.
+pub const CLEARANCE_MIN_MM: f64 = 0.1;
 /// An arc longer than this, mm, is first tested at a few points, at these fractions of its length.
 const FEW_POINTS_MM: f64 = 5.0;
 const PARTS: [f64; 7] = [0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875];

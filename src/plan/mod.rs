@@ -17,11 +17,12 @@ mod route;
 mod search;
 
 pub use arc::{Arc, Tip};
+pub use field::CLEARANCE_MIN_MM;
 pub use lattice::Resolution;
 pub use mask::Mask;
 pub use obstacle::{Obstacle, Workspace, World};
 pub use path::Path;
 pub use reach::{Reach, reach_around};
-pub use replanner::{Replanner, Steer, Step, StopReason, TipEstimate};
+pub use replanner::{NoPath, Replanner, Steer, Step, StopReason, TipEstimate};
 pub use reserve::{RoomyPath, plan_with_reserve};
 pub use search::{Answer, Problem, Status, plan};

@@ -17,7 +17,7 @@ const EXPANSIONS_MAX: u32 = 20_000;
 const DISTANCE_SHARE: f64 = 0.1;
 /// A smaller gain in distance does not count, mm.
 const GAIN_MIN_MM: f64 = 0.05;
-/// Maximum number of changes of a path.
+/// Maximum number of changes of a path. To find one takes no more tries than the problem allows nodes.
 const CHANGES_MAX: u32 = 10;
 /// Distance between the points at which an arc may leave a path or end, mm.
 const LEAVE_MM: f64 = 2.0;
@@ -116,8 +116,10 @@ pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path 
 
 /// The path after changes that bring its end nearer to the target. Each time the best change is made.
 fn improved(field: &mut Field<'_>, problem: &Problem, mut path: Path) -> Path {
+    let mut tries_left = problem.expansions_max;
     for _ in 0..CHANGES_MAX {
-        let Some((along_mm, ways)) = best_change(field, problem, &path) else { break };
+        let change = best_change(field, problem, &path, &mut tries_left);
+        let Some((along_mm, ways)) = change else { break };
         path = Path { arcs: [path.first(along_mm), ways.to_vec()].concat(), ..path }.joined();
     }
     path
@@ -125,8 +127,13 @@ fn improved(field: &mut Field<'_>, problem: &Problem, mut path: Path) -> Path {
 
 /// The change of `path` that brings its end nearest to the target: leave it somewhere on one arc, then go on by
 /// the sharpest arc toward the target. Returns where to leave it, mm, and the two arcs; `None` if the gain is too
-/// small.
-fn best_change(field: &mut Field<'_>, problem: &Problem, path: &Path) -> Option<(f64, [Arc; 2])> {
+/// small. Each arc that is tried uses up one of `tries_left`.
+fn best_change(
+    field: &mut Field<'_>,
+    problem: &Problem,
+    path: &Path,
+    tries_left: &mut u32,
+) -> Option<(f64, [Arc; 2])> {
     let Problem { curvature_per_mm, in_plane, length_max_mm, .. } = *problem;
     let mut best_mm = problem.to_target_mm(&path.end().position_mm) - GAIN_MIN_MM;
     let mut best = None;
@@ -139,6 +146,10 @@ fn best_change(field: &mut Field<'_>, problem: &Problem, path: &Path) -> Option<
                 curvature_per_mm: share * curvature_per_mm,
                 length_mm: ARC_MAX_MM.min(length_max_mm - along_mm),
             };
+            if *tries_left == 0 {
+                return best;
+            }
+            *tries_left -= 1;
             let clear_mm = field.clear_part(&tip, arc).length_mm;
             let parts = (clear_mm / LEAVE_MM).ceil();
             for part in 1..=parts as u32 {
@@ -147,6 +158,7 @@ fn best_change(field: &mut Field<'_>, problem: &Problem, path: &Path) -> Option<
                 if miss_mm(&to, problem) > best_mm {
                     continue;
                 }
+                *tries_left = tries_left.saturating_sub(1);
                 let left_mm = length_max_mm - along_mm - arc.length_mm;
                 let sharpest = field.clear_part(&to, sharpest_arc(&to, problem, left_mm));
                 let end_mm = problem.to_target_mm(&to.after(&sharpest).position_mm);

@@ -1,13 +1,13 @@
 //! Plans again at each step of a run, and decides what the needle does next.
 
 use super::arc::{Arc, Tip};
-use super::field::Field;
+use super::field::{CLEARANCE_MIN_MM, Field};
 use super::nearest::path_to_nearest;
 use super::obstacle::World;
 use super::path::{Path, bend_after};
 use super::reserve::RESERVE_MM;
 use super::route::Route;
-use super::search::{Problem, Status, plan_thoroughly, search_only};
+use super::search::{Answer, Problem, Status, plan_thoroughly, search_only};
 use derive_more::Display;
 use nalgebra::Vector3;
 use std::borrow::Cow;
@@ -31,8 +31,15 @@ const ARRIVED_MM: f64 = 0.02;
 const PATIENCE_MM: f64 = 5.0;
 /// After a whole turn of the base, the path may end farther from the target by this much, mm.
 const TURN_LOSS_MAX_MM: f64 = 0.05;
-/// On a path that does not surely lead to the target, this much of the way ahead must be clear of obstacles, mm.
+/// On a path that does not surely lead to the target, this much of the way ahead must be clear of obstacles, mm; and
+/// at least as much as the needle may go before the next step can stop it.
 const CLEAR_AHEAD_MM: f64 = 3.0;
+/// A new path may be longer than the rest of the last one by this much, mm, …
+const LONGER_MAX_MM: f64 = 10.0;
+/// … and this share of the rest. A whole circle, which would come back to a target that was missed, is longer.
+const LONGER_MAX_SHARE: f64 = 0.25;
+/// The way ahead is tested at points at most this far apart, mm.
+const AHEAD_SPACING_MM: f64 = 0.25;
 
 /// The estimate of the tip.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -94,12 +101,29 @@ pub enum StopReason {
     NoPath,
 }
 
+/// No path leads to the target.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NoPath {
+    /// Why, in words.
+    pub reason: String,
+    /// The reachable point nearest to the target, mm, of those that were found; `None` if even the start is not
+    /// allowed.
+    pub nearest_mm: Option<Vector3<f64>>,
+    /// How the search ended.
+    pub status: Status,
+}
+
 /// Keeps the plan of a run. It uses no clock: the budget of each call is a number of expansions.
 #[derive(Debug, Clone)]
 pub struct Replanner {
     field: Field<'static>,
     route: Route,
+    /// The start is the tip at the last step, and the length that which a path may have there.
     problem: Problem,
+    /// The depth that may still be inserted, mm.
+    depth_left_mm: f64,
+    /// How far the needle may go on after a stop, mm.
+    stopping_mm: f64,
     /// The path of the last step, from where the tip was then.
     path: Option<Path>,
     /// The last path that was found with a well-known position, from where it was found, and how far the tip
@@ -128,6 +152,8 @@ impl Replanner {
             reserve_mm: room_mm.clamp(0.0, RESERVE_MM),
             field,
             route,
+            depth_left_mm: problem.length_max_mm,
+            stopping_mm: 0.0,
             problem,
             curvature_margin,
             remembered: path.clone().map(|path| (path, 0.0)),
@@ -137,9 +163,20 @@ impl Replanner {
         }
     }
 
+    /// The replanner of a needle that may go on by `stopping_mm` after a stop.
+    #[must_use]
+    pub fn with_stopping_mm(self, stopping_mm: f64) -> Self {
+        Replanner { stopping_mm, ..self }
+    }
+
     /// Sets the position of the target, plane frame, mm.
     pub fn set_target(&mut self, target_mm: Vector3<f64>) {
         self.problem.target_mm = target_mm;
+    }
+
+    /// The position of the target, plane frame, mm.
+    pub fn target_mm(&self) -> Vector3<f64> {
+        self.problem.target_mm
     }
 
     /// The path of the last step; `None` if there was none.
@@ -151,8 +188,8 @@ impl Replanner {
     /// most `curvature_per_mm`: the known path, or one that a search finds.
     ///
     /// # Errors
-    /// Why no path is found, in words.
-    pub fn check_start(&mut self, start: Tip, curvature_per_mm: f64) -> Result<(), String> {
+    /// Why no path is found, and the point nearest to the target.
+    pub fn check_start(&mut self, start: Tip, curvature_per_mm: f64) -> Result<(), NoPath> {
         self.problem.start = start;
         self.problem.curvature_per_mm = curvature_per_mm;
         let last = self.path.as_ref().map(|path| rest_of(path, 0.0, start));
@@ -161,14 +198,15 @@ impl Replanner {
             return Ok(());
         }
         let answer = plan_thoroughly(&mut self.field, &self.problem, &self.route);
-        match (answer.path, answer.status) {
-            (Some(_), _) => Ok(()),
-            (None, Status::Budget) => Err(format!(
+        let Answer { status, path: None, reason, nearest_mm, .. } = answer else { return Ok(()) };
+        let reason = match status {
+            Status::Budget => format!(
                 "goal.step_expansions_max, {}, was spent before one was found; raise it",
                 self.problem.expansions_max
-            )),
-            (None, _) => Err(answer.reason.unwrap_or_default()),
-        }
+            ),
+            _ => reason.unwrap_or_default(),
+        };
+        Err(NoPath { reason, nearest_mm, status })
     }
 
     /// What to do for the next `step_mm`, from the present `estimate`. Since the last call, the tip was inserted
@@ -180,6 +218,9 @@ impl Replanner {
     /// standard deviation of the position, plus the reserve if a path is left with it. Then a path is searched
     /// for. If that fails and the estimate is so uncertain that the tip may still be on the remembered path,
     /// this path is followed. The last resort is a known path at the clearance minus twice the deviation.
+    ///
+    /// No path is much longer than the rest of the last one. If the target is beside or behind the tip and no path
+    /// leads to it, the tip has arrived, however far off it is.
     pub fn step(&mut self, estimate: &TipEstimate, inserted_mm: f64, step_mm: f64) -> Step {
         let TipEstimate { mut tip, position_sd_mm, heading_sd_rad, .. } = *estimate;
         if self.problem.in_plane {
@@ -190,19 +231,24 @@ impl Replanner {
         if ahead_mm <= ARRIVED_MM && error_mm <= self.problem.tolerance_mm.max(step_mm) {
             return Step::Arrived { error_mm };
         }
-        let remaining_mm = self.problem.length_max_mm - inserted_mm;
-        self.problem.length_max_mm = remaining_mm.max(0.0);
-        // The step goes no farther than a target that is ahead.
-        let next_mm = if ahead_mm > 0.0 { step_mm.min(ahead_mm) } else { step_mm };
-        if let Some(reason) = self.stop_reason(estimate, &tip, next_mm) {
+        self.depth_left_mm = (self.depth_left_mm - inserted_mm).max(0.0);
+        // If the next step does not allow to go on, the needle stops after it. It goes no farther than a target that
+        // is ahead.
+        let next_mm = step_mm + self.stopping_mm;
+        let to_target_mm = if ahead_mm > 0.0 { ahead_mm } else { f64::INFINITY };
+        if let Some(reason) = self.stop_reason(estimate, &tip, next_mm.min(to_target_mm)) {
             return Step::Stop(reason);
         }
         self.problem.start = tip;
         let last = self.path.take().map(|path| rest_of(&path, inserted_mm, tip));
+        let longest_mm = last.as_ref().map_or(f64::INFINITY, |last| {
+            last.length_mm() * (1.0 + LONGER_MAX_SHARE) + LONGER_MAX_MM
+        });
+        self.problem.length_max_mm = self.depth_left_mm.min(longest_mm);
         if let Some((_, along_mm)) = &mut self.remembered {
             *along_mm += inserted_mm;
         }
-        let path = self.find(estimate, step_mm, last.as_ref());
+        let path = self.find(estimate, next_mm, last.as_ref());
         self.without_path_mm = match path {
             Some(_) => 0.0,
             None => self.without_path_mm + inserted_mm,
@@ -210,10 +256,14 @@ impl Replanner {
         if let Some(path) = path.as_ref().filter(|_| position_sd_mm <= REMEMBER_SD_MAX_MM) {
             self.remembered = Some((path.clone(), 0.0));
         }
+        if path.is_none() && ahead_mm <= ARRIVED_MM {
+            return Step::Arrived { error_mm };
+        }
+        let clear_mm = next_mm.max(CLEAR_AHEAD_MM);
         let path = path
-            .or_else(|| self.last_path_blindly(last?, heading_sd_rad))
+            .or_else(|| self.last_path_blindly(last?, heading_sd_rad, clear_mm))
             .or_else(|| self.nearest_path(estimate))
-            .or_else(|| self.toward_target(heading_sd_rad));
+            .or_else(|| self.toward_target(heading_sd_rad, clear_mm));
         let Some(path) = path else { return Step::Stop(StopReason::NoPath) };
         let first = path.arcs.iter().find(|arc| arc.length_mm > 0.0).copied();
         let first =
@@ -229,19 +279,30 @@ impl Replanner {
     }
 
     /// Why the tip must not go on: the estimated tip, or the same `tip` moved into the plane, is where it must not
-    /// be, or the next `next_mm` straight ahead lead there. The needle may go straight ahead while its base turns,
-    /// and off the plane, although the path is in the plane.
+    /// be, or the next `next_mm` straight ahead lead there or nearer to it. The needle may go straight ahead while its
+    /// base turns, and off the plane, although the path is in the plane.
     fn stop_reason(&self, estimate: &TipEstimate, tip: &Tip, next_mm: f64) -> Option<StopReason> {
         let Tip { position_mm, heading } = estimate.tip;
-        let is_allowed = |at: &Vector3<f64>, sds: f64| {
-            let clearance_mm = self.problem.clearance_mm - sds * estimate.position_sd_mm;
-            self.field.world.slack_mm(at, clearance_mm) >= 0.0
-        };
-        if !is_allowed(&position_mm, SDS) || !is_allowed(&tip.position_mm, SDS) {
+        let world = &self.field.world;
+        // However uncertain the estimate is, it must not be in an obstacle.
+        let limit_mm =
+            |sds: f64| (self.problem.clearance_mm - sds * estimate.position_sd_mm).max(0.0);
+        let is_allowed = |at: &Vector3<f64>, limit_mm| world.slack_mm(at, limit_mm) >= 0.0;
+        let here = [&position_mm, &tip.position_mm];
+        if !here.into_iter().all(|at| is_allowed(at, limit_mm(SDS))) {
             return Some(StopReason::TipNotAllowed);
         }
-        let next_mm = position_mm + heading * next_mm;
-        (!is_allowed(&next_mm, NEXT_STEP_SDS)).then_some(StopReason::AheadNotAllowed)
+        let (end_limit_mm, here_mm) = (limit_mm(NEXT_STEP_SDS), world.distance_mm(&position_mm));
+        let points = (next_mm / AHEAD_SPACING_MM).ceil().max(1.0) as u32;
+        let is_clear = (1..=points).all(|point| {
+            let ahead_mm = next_mm * f64::from(point) / f64::from(points);
+            // A tip that is too near already must come away from there.
+            let limit_mm = if point == points { end_limit_mm } else { end_limit_mm.min(here_mm) };
+            // The needle bends, to whichever side.
+            let aside_mm = 0.5 * estimate.curvature_per_mm * ahead_mm * ahead_mm;
+            is_allowed(&(position_mm + heading * ahead_mm), limit_mm + aside_mm)
+        });
+        (!is_clear).then_some(StopReason::AheadNotAllowed)
     }
 
     /// True if a path to the target is left after `turn_mm` straight ahead, the distance that the needle goes while
@@ -275,7 +336,7 @@ impl Replanner {
 
     /// A path that suits the uncertainty of the estimate. The searches share one budget; each may spend half of
     /// what remains of it.
-    fn find(&mut self, estimate: &TipEstimate, step_mm: f64, last: Option<&Path>) -> Option<Path> {
+    fn find(&mut self, estimate: &TipEstimate, next_mm: f64, last: Option<&Path>) -> Option<Path> {
         let doubt_mm = SDS * estimate.position_sd_mm;
         let (clearance_mm, margin) = (self.problem.clearance_mm, self.curvature_margin);
         let (cautious_mm, tip) = (clearance_mm + doubt_mm, self.problem.start);
@@ -298,8 +359,10 @@ impl Replanner {
             self.known(last).or_else(|| self.search())
         });
         searched.or_else(|| {
-            set_limits(self, clearance_mm - doubt_mm, 0.0);
-            self.remembered_from(tip, estimate, step_mm).or_else(|| self.known(last))
+            // A path leads through no obstacle, however uncertain the estimate is.
+            let least_mm = (clearance_mm - doubt_mm).max(CLEARANCE_MIN_MM.min(clearance_mm));
+            set_limits(self, least_mm, 0.0);
+            self.remembered_from(tip, estimate, next_mm).or_else(|| self.known(last))
         })
     }
 
@@ -329,10 +392,9 @@ impl Replanner {
 
     /// The sharpest arc toward the target, if there was a path lately and the arc's next millimetres are clear; or
     /// if the whole arc is clear and, given the uncertainty of the heading, may end within the tolerance.
-    fn toward_target(&mut self, heading_sd_rad: f64) -> Option<Path> {
+    fn toward_target(&mut self, heading_sd_rad: f64, clear_mm: f64) -> Option<Path> {
         let path = self.sharpest();
-        let was_lately =
-            self.without_path_mm < PATIENCE_MM && self.begins_clear(&path, CLEAR_AHEAD_MM);
+        let was_lately = self.without_path_mm < PATIENCE_MM && self.begins_clear(&path, clear_mm);
         let may_end_near = self.may_end_near(&path, heading_sd_rad)
             && self.field.is_clear(&path.start, &path.arcs[0]);
         (was_lately || may_end_near).then_some(path)
@@ -340,15 +402,20 @@ impl Replanner {
 
     /// The last path as it is from here, if its next millimetres are clear and, given the uncertainty of the
     /// heading, it may end within the tolerance.
-    fn last_path_blindly(&mut self, last: Path, heading_sd_rad: f64) -> Option<Path> {
+    fn last_path_blindly(
+        &mut self,
+        last: Path,
+        heading_sd_rad: f64,
+        clear_mm: f64,
+    ) -> Option<Path> {
         let is_free =
-            self.may_end_near(&last, heading_sd_rad) && self.begins_clear(&last, CLEAR_AHEAD_MM);
+            self.may_end_near(&last, heading_sd_rad) && self.begins_clear(&last, clear_mm);
         is_free.then_some(last)
     }
 
-    /// The rest of the remembered path, moved to start at `tip`, if the tip may still be on it and the next step
-    /// is clear.
-    fn remembered_from(&mut self, tip: Tip, estimate: &TipEstimate, step_mm: f64) -> Option<Path> {
+    /// The rest of the remembered path, moved to start at `tip`, if the tip may still be on it and its next
+    /// `next_mm` are clear.
+    fn remembered_from(&mut self, tip: Tip, estimate: &TipEstimate, next_mm: f64) -> Option<Path> {
         let (path, along_mm) = self.remembered.as_ref()?;
         let (expected, _) = path.at(*along_mm);
         let off_mm = (expected.position_mm - tip.position_mm).norm();
@@ -359,7 +426,7 @@ impl Replanner {
             return None;
         }
         let rest = rest_of(path, *along_mm, tip);
-        self.begins_clear(&rest, step_mm).then_some(rest)
+        self.begins_clear(&rest, next_mm).then_some(rest)
     }
 
     fn may_end_near(&self, path: &Path, heading_sd_rad: f64) -> bool {

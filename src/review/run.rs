@@ -259,10 +259,11 @@ impl Folder {
         self.limits().ok()?.get("target_error_mm").copied()
     }
 
-    /// Whether the run reached its target; `None` without a target or a step.
+    /// Whether the run reached its target; `None` without a target.
     pub(super) fn plan_status(&self) -> Option<PlanStatus> {
         let is_completed = self.manifest.outcome? == RunOutcome::Completed;
-        self.figures()?.plan_status(is_completed, self.tolerance_mm()?)
+        let tolerance_mm = self.tolerance_mm().filter(|_| self.manifest.operation.is_none())?;
+        self.figures()?.plan_status(is_completed, tolerance_mm)
     }
 
     /// The figures in the manifest, or else those computed from the steps.

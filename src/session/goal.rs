@@ -1,12 +1,12 @@
 //! Steering to a target: the path is planned anew each step, and a control law follows it.
 
+use super::config::SessionConfig;
 use super::target::TargetTool;
-use crate::control::{Bend, BendLaw, Command, ControlConfig, ControlKind};
+use crate::control::{Bend, BendLaw, Command, ControlKind};
 use crate::geometry::Pose;
-use crate::needle::Needle;
 use crate::observer::Estimate;
 use crate::plan::{
-    self, Path, Problem, Replanner, RoomyPath, Status, Step, Tip, World, plan_with_reserve,
+    self, NoPath, Path, Problem, Replanner, RoomyPath, Status, Step, Tip, World, plan_with_reserve,
 };
 use nalgebra::Vector3;
 
@@ -42,14 +42,8 @@ impl Goal {
         let (shortest, target_mm) = (plan::plan(&world, &problem), problem.target_mm);
         let roomy = plan_with_reserve(&world, &problem, reserve_mm, &shortest);
         let RoomyPath { path, .. } = roomy.map_err(|reason| {
-            let nearest = shortest.nearest_mm.filter(|_| shortest.path.is_none()).map(|at| {
-                let (at, off_mm) = (shown(&at), (at - target_mm).norm());
-                let what = match shortest.status {
-                    Status::Budget => "the nearest point that was reached",
-                    _ => "the nearest reachable point",
-                };
-                format!("; {what} is {at}, {off_mm:.1} mm from the target")
-            });
+            let nearest = shortest.nearest_mm.filter(|_| shortest.path.is_none());
+            let nearest = nearest.map(|at| explain_nearest(&at, &target_mm, shortest.status));
             let hint = (shortest.may_bend_too_little && curvature_margin > 0.0).then(|| {
                 format!(
                     "; {curvature_margin} of the curvature is left unused, see goal.curvature_margin"
@@ -96,9 +90,16 @@ impl Goal {
         }
         let whole_per_mm = curvature_per_mm / (1.0 - self.curvature_margin);
         let seen = shown(tip_mm);
-        replanner.check_start(start, whole_per_mm).map_err(|reason| {
-            format!("no path to the target from {seen}, where the tip is seen: {reason}")
-        })?;
+        replanner.check_start(start, whole_per_mm).map_err(
+            |NoPath { reason, nearest_mm, status }| {
+                let target_mm = replanner.target_mm();
+                let nearest = nearest_mm.map(|at| explain_nearest(&at, &target_mm, status));
+                let nearest = nearest.unwrap_or_default();
+                format!(
+                    "no path to the target from {seen}, where the tip is seen: {reason}{nearest}"
+                )
+            },
+        )?;
         // The path begins in the plane, but the tip may be off the plane.
         if self.world.slack_mm(tip_mm, clearance_mm) < 0.0 {
             return Err(format!(
@@ -108,6 +109,16 @@ impl Goal {
         }
         Ok(())
     }
+}
+
+/// The nearest point to a target without a path, and how far off it is.
+fn explain_nearest(at_mm: &Vector3<f64>, target_mm: &Vector3<f64>, status: Status) -> String {
+    let what = match status {
+        Status::Budget => "the nearest point that was reached",
+        _ => "the nearest reachable point",
+    };
+    let (at, off_mm) = (shown(at_mm), (at_mm - target_mm).norm());
+    format!("; {what} is {at}, {off_mm:.1} mm from the target")
 }
 
 fn shown(at_mm: &Vector3<f64>) -> String {
@@ -143,22 +154,27 @@ pub(super) struct Pursuit {
     planned_at_mm: f64,
     /// The needle's curvature as configured, per mm.
     curvature_per_mm: f64,
+    /// How far the needle may go on after a stop, mm.
+    stopping_mm: f64,
 }
 
 impl Pursuit {
     /// `None` if the control law cannot follow a path.
-    pub(super) fn new(goal: Goal, needle: Needle, control: &ControlConfig) -> Option<Self> {
+    pub(super) fn new(goal: Goal, config: &SessionConfig) -> Option<Self> {
+        let SessionConfig { needle, control, .. } = config;
         if control.kind != ControlKind::NestedSaturation {
             return None;
         }
+        let stopping_mm = config.stopping_mm();
         Some(Pursuit {
-            replanner: goal.replanner(),
-            law: BendLaw::new(needle, control.nested_saturation),
+            replanner: goal.replanner().with_stopping_mm(stopping_mm),
+            law: BendLaw::new(*needle, control.nested_saturation),
             target_mm: goal.problem.target_mm,
             goal,
             tip_before: None,
             planned_at_mm: 0.0,
             curvature_per_mm: needle.curvature_per_mm(),
+            stopping_mm,
         })
     }
 
@@ -215,6 +231,15 @@ impl Pursuit {
         Approach { target_mm, distance_mm, clearance_mm, error_mm: distance_mm, path: None }
     }
 
+    /// The approach at a step that stops the run: the needle may go on a little, straight ahead.
+    pub(super) fn stopped(&mut self, estimate: &Estimate) -> Approach {
+        let end = self.end(estimate);
+        let ahead = Pose { translation: Vector3::z() * self.stopping_mm, ..Pose::identity() };
+        let after = estimate.x_pb * ahead;
+        let stopping_mm = self.goal.world.distance_on_way_mm(&estimate.x_pb, &after);
+        Approach { clearance_mm: end.clearance_mm.min(stopping_mm), ..end }
+    }
+
     /// Plans from `estimate` at `depth_mm` on. The command is `None` once the tip has arrived.
     pub(super) fn step(
         &mut self,
@@ -222,6 +247,11 @@ impl Pursuit {
         depth_mm: f64,
         step_mm: f64,
     ) -> (Approach, Result<Option<Command>, String>) {
+        let sd = estimate.sd.filter(|sd| sd.iter().all(|sd| sd.is_finite()));
+        let Some([x, y, z, yaw, pitch, _]) = sd else {
+            let unknown = "goal: the observer does not state how well it knows the tip";
+            return (self.stopped(estimate), Err(unknown.to_owned()));
+        };
         let heading = estimate.x_pb.rotation * Vector3::z();
         let nominal_per_mm = self.curvature_per_mm;
         let curvature_per_mm =
@@ -230,17 +260,17 @@ impl Pursuit {
             tip: Tip { position_mm: estimate.x_pb.translation, heading },
             // An estimate above the configured curvature may be chance.
             curvature_per_mm: curvature_per_mm.clamp(0.1 * nominal_per_mm, nominal_per_mm),
-            position_sd_mm: estimate.sd.map_or(0.0, |[x, y, z, ..]| x.max(y).max(z)),
-            heading_sd_rad: estimate.sd.map_or(0.0, |[.., yaw, pitch, _]| yaw.max(pitch)),
+            position_sd_mm: x.max(y).max(z),
+            heading_sd_rad: yaw.max(pitch),
         };
         let inserted_mm = depth_mm - self.planned_at_mm;
         self.planned_at_mm = depth_mm;
-        let end = self.end(estimate);
         if let Err(error) = self.check_target() {
-            return (end, Err(format!("goal: {error}")));
+            return (self.stopped(estimate), Err(format!("goal: {error}")));
         }
         match self.replanner.step(&known, inserted_mm, step_mm) {
             Step::Steer(steer) => {
+                let end = self.end(estimate);
                 let bend = Bend {
                     toward: steer.bend,
                     curvature_per_mm: steer.curvature_per_mm,
@@ -253,8 +283,8 @@ impl Pursuit {
                 let approach = Approach { error_mm: steer.error_mm, path, ..end };
                 (approach, command.map(Some).map_err(|error| format!("control: {error}")))
             }
-            Step::Arrived { .. } => (end, Ok(None)),
-            Step::Stop(why) => (end, Err(format!("goal: {why}"))),
+            Step::Arrived { .. } => (self.end(estimate), Ok(None)),
+            Step::Stop(why) => (self.stopped(estimate), Err(format!("goal: {why}"))),
         }
     }
 }

@@ -72,10 +72,7 @@ impl Steering {
             observer: config.observer.build(config.needle, config.needle_torsion)?,
             shadows,
             control: config.control.build(config.needle),
-            pursuit: config
-                .goal
-                .clone()
-                .and_then(|goal| Pursuit::new(goal, config.needle, &config.control)),
+            pursuit: config.goal.clone().and_then(|goal| Pursuit::new(goal, config)),
             depth_mm: 0.0,
             handedness,
             samples: config.insertion.corrected_by,
@@ -149,7 +146,7 @@ impl Steering {
     }
 
     /// Decides on the next step, from the estimates predicted over the increments `ahead` of the observers'
-    /// states. Without an estimate the needle goes on unturned.
+    /// states. Without an estimate the needle goes on unturned, unless there is a target.
     pub fn decide(&mut self, ahead: &[Increment], is_last: bool) -> Decision {
         let estimate = self.observer.estimate_after(ahead);
         let shadows = self.shadows.iter();
@@ -161,7 +158,10 @@ impl Steering {
         let (approach, command) = match (self.check(), &estimate) {
             (Err(error), estimate) => {
                 let pursuit = self.pursuit.as_mut().zip(estimate.as_ref());
-                (pursuit.map(|(pursuit, estimate)| pursuit.end(estimate)), Err(error))
+                (pursuit.map(|(pursuit, estimate)| pursuit.stopped(estimate)), Err(error))
+            }
+            (Ok(()), None) if self.pursuit.is_some() => {
+                (None, Err("goal: no estimate says where the tip is".to_owned()))
             }
             (Ok(()), None) => (None, Ok((!is_last).then_some(unturned))),
             (Ok(()), Some(estimate)) => self.command(estimate, self.depth_mm + ahead_mm, is_last),
@@ -279,6 +279,35 @@ mod tests {
         let decision = steering.decide(&[], false);
         assert!(decision.refused.is_some());
         assert_eq!(decision.approach.expect("an approach").distance_mm, 10.0);
+    }
+
+    /// An observer that states no standard deviation, or has no estimate, would switch the checks of the clearance off.
+    #[test]
+    fn a_run_to_a_target_needs_an_estimate_with_its_uncertainty() {
+        struct Sure(Option<Estimate>);
+        impl Observer for Sure {
+            fn predict(&mut self, _: Increment) {}
+            fn correct(&mut self, _: &TipPosition, _: f64) {}
+            fn estimate_after(&self, _: &[Increment]) -> Option<Estimate> {
+                self.0
+            }
+        }
+        let sets = ["goal.kind=\"target\"", "goal.position_mm=[0.0, 0.0, 120.0]"];
+        let config = Config::from_sources(&[], &sets.map(str::to_owned)).unwrap();
+        let config = config.session().unwrap();
+        for (estimate, why) in [
+            (None, "goal: no estimate says where the tip is"),
+            (
+                Some(Estimate::of_pose(Pose::identity())),
+                "goal: the observer does not state how well it knows the tip",
+            ),
+        ] {
+            let observer = Box::new(Sure(estimate));
+            let mut steering = Steering { observer, ..Steering::new(&config).unwrap() };
+            let decision = steering.decide(&[], false);
+            assert_eq!(decision.rotation_cmd_rad_per_mm, None);
+            assert_eq!(decision.refused.as_deref(), Some(why));
+        }
     }
 
     /// Standard deviation of x after an arc of 60 mm with `per_mm` positions a mm, each sent `times` times.

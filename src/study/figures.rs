@@ -177,14 +177,14 @@ impl FigureReport {
         self.target_error_mm.or(self.target_error_est_mm)
     }
 
-    /// How the run to the target ended, by the estimate; `None` without a target.
+    /// How the run to a target ended, by the estimate; `None` if it completed without one.
     pub fn plan_status(&self, is_completed: bool, tolerance_mm: f64) -> Option<PlanStatus> {
-        let error_mm = self.target_error_est_mm?;
-        Some(match is_completed {
-            true if error_mm <= tolerance_mm => PlanStatus::Arrived,
-            true => PlanStatus::Missed,
-            false => PlanStatus::Lost,
-        })
+        match (is_completed, self.target_error_est_mm) {
+            (false, _) => Some(PlanStatus::Lost),
+            (true, None) => None,
+            (true, Some(error_mm)) if error_mm <= tolerance_mm => Some(PlanStatus::Arrived),
+            (true, Some(_)) => Some(PlanStatus::Missed),
+        }
     }
 }
 

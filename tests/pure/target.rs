@@ -251,6 +251,37 @@ fn a_tip_off_the_plane_keeps_clear_of_obstacles_beside_the_plane() {
     assert_eq!(number(&json, "steps"), 0.0, "{json}");
 }
 
+/// At 10 mm/s the needle goes on by more than 2 mm after the step that stops it. The ball is beside the plane.
+#[test]
+fn a_stop_at_speed_keeps_clear() {
+    let scratch = Scratch::new();
+    let said = run(
+        &scratch,
+        &[
+            "emulator.start={x_mm=8.0,y_mm=0.0,z_mm=0.0,yaw_deg=0.0,pitch_deg=0.0,roll_deg=0.0}",
+            "goal.obstacle=[{shape=\"sphere\",centre_mm=[9.0,0.0,15.0],radius_mm=5.0}]",
+            "insertion.plane_out_of_reach=\"insert\"",
+            "insertion.speed_mm_per_s=10",
+            "control.nested_saturation.rotation_max_deg_per_mm=20",
+            "tracker.hold_after_mm=5",
+        ],
+    );
+    let json = said.json();
+    let reason = json["stop_reason"].as_str().unwrap();
+    assert!(reason.contains("the next step may lead nearer"), "{reason}");
+    let steps = steps_csv(&scratch, &said);
+    let mut rows = steps.lines();
+    let names: Vec<&str> = rows.next().unwrap().split(',').collect();
+    let last: Vec<&str> = rows.last().unwrap().split(',').collect();
+    let value = |name| last[names.iter().position(|n| *n == name).unwrap()].parse::<f64>().unwrap();
+    let [x, y, z] = ["x_true_mm", "y_true_mm", "z_true_mm"].map(value);
+    // From its last step on the needle goes straight toward the ball at worst.
+    let gone_mm = number(&json, "insertion_mm") - value("insertion_mm");
+    let from_ball_mm = ((x - 9.0).powi(2) + y * y + (z - 15.0).powi(2)).sqrt() - 5.0 - gone_mm;
+    assert!(gone_mm > 1.5 && from_ball_mm > 1.5, "{gone_mm} {from_ball_mm} {json}");
+    assert!(number(&json, "clearance_mm_min") < from_ball_mm + 1.0, "{json}");
+}
+
 /// One expansion per step is too few to replan.
 #[test]
 fn a_step_without_budget_follows_the_plan_that_is_there() {

@@ -308,3 +308,24 @@ fn a_clearance_of_0_is_refused_with_drawn_obstacles() {
         "{error}"
     );
 }
+
+/// A clearance means something only with an estimate whose uncertainty is stated, and smaller.
+#[test]
+fn a_target_needs_an_estimate_that_bears_the_clearance() {
+    let target = "[goal]\nkind = \"target\"\nposition_mm = [0.0, 0.0, 100.0]";
+    let refused = |sets: &[&str]| load(target, sets).expect_err("a refusal").to_string();
+    loaded(target, &["observer.kind=coupled"]);
+    for sets in [
+        &["observer.kind=finite-difference"][..],
+        &["observer.kind=coupled", "observer.coupled.gains=placed"],
+    ] {
+        let error = refused(sets);
+        assert!(error.contains("needs an observer that states how well"), "{error}");
+    }
+    let registered = |sd_mm| format!("tracker.registration.sd_mm={sd_mm:.1}");
+    let ball = "goal.obstacle=[{shape=\"sphere\",centre_mm=[0.0,20.0,50.0],radius_mm=5.0}]";
+    loaded(target, &[&registered(1.0)]);
+    loaded(target, &[&registered(0.9), ball]);
+    let error = refused(&[&registered(1.0), ball]);
+    assert!(error.contains("goal.clearance_mm is 2, allowed with obstacles: over 2.00"), "{error}");
+}

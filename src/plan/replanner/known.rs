@@ -19,12 +19,14 @@ const CURVATURE_SLACK: f64 = 0.05;
 impl Replanner {
     /// A path that is found without a search.
     pub(super) fn known(&mut self, last: Option<&Path>) -> Option<Path> {
-        let direct = self.direct();
         // Where one arc is too long, several may be short enough.
-        let short = direct.clone().filter(|path| path.length_mm() <= self.problem.length_max_mm);
-        let known = short.or_else(|| self.mended(last?)).or(direct);
+        let known = self.direct().or_else(|| self.mended(last?));
         let known = known.or_else(|| self.nearly_direct());
         known.or_else(|| self.continued(last?)).or_else(|| self.rejoined())
+    }
+
+    fn is_short(&self, path: &Path) -> bool {
+        path.length_mm() <= self.problem.length_max_mm
     }
 
     /// In the plane: back onto the remembered path, if the way there and the path from there on are clear.
@@ -41,18 +43,19 @@ impl Replanner {
             let rest = rest_of(&path, join_mm, to);
             ways_in_plane(&start, &to, curvature_per_mm).find_map(|way| {
                 let whole = Path { start, arcs: [&way[..], &rest.arcs[..]].concat() };
-                self.is_clear(&whole).then(|| whole.joined())
+                (self.is_short(&whole) && self.is_clear(&whole)).then(|| whole.joined())
             })
         })
     }
 
-    /// The arc to the target; if that is too sharp, the sharpest arc toward it, up to the point nearest to it.
+    /// The arc to the target; if that is too sharp, the sharpest arc toward it, up to the point nearest to it. Either
+    /// ends where the longest path ends.
     pub(super) fn sharpest(&self) -> Path {
         let Problem { start, length_max_mm, target_mm, curvature_per_mm, .. } = self.problem;
         let direct =
             start.arc_to(&target_mm).filter(|arc| arc.curvature_per_mm <= curvature_per_mm);
         let arc = direct.unwrap_or_else(|| sharpest_arc(&start, &self.problem, length_max_mm));
-        Path { start, arcs: vec![arc] }
+        Path { start, arcs: vec![arc.with_length(arc.length_mm.min(length_max_mm))] }
     }
 
     /// The arc of [`Replanner::sharpest`], if it is clear and ends within the tolerance.
@@ -81,13 +84,13 @@ impl Replanner {
         arc.curvature_per_mm <= self.problem.curvature_per_mm * (1.0 + CURVATURE_SLACK)
     }
 
-    /// One arc from the tip to the target, if it is clear.
+    /// One arc from the tip to the target, if it is clear and not too long.
     fn direct(&mut self) -> Option<Path> {
         let start = self.problem.start;
         let arc = start.arc_to(&self.problem.target_mm)?;
         let is_bent = arc.curvature_per_mm <= self.problem.curvature_per_mm;
         let is_free = is_bent && self.field.is_clear(&start, &arc);
-        is_free.then(|| Path { start, arcs: vec![arc] })
+        is_free.then(|| Path { start, arcs: vec![arc] }).filter(|path| self.is_short(path))
     }
 
     /// The last path from here up to some point, then directly to the target; the shortest of these.
@@ -112,6 +115,7 @@ impl Replanner {
                 });
                 let length_mm =
                     |path: &Option<Path>| path.as_ref().map_or(f64::INFINITY, Path::length_mm);
+                let whole = whole.filter(|whole| self.is_short(whole));
                 if length_mm(&whole) < length_mm(&best) {
                     best = whole;
                 }

@@ -261,7 +261,7 @@ fn a_start_from_which_the_path_is_too_long_is_refused() {
     };
     assert_eq!(check(120.0), Ok(()));
     assert_eq!(check(119.5), Ok(()), "within the tolerance");
-    let why = check(118.0).unwrap_err();
+    let why = check(118.0).unwrap_err().reason;
     assert!(why.contains("takes 120 mm at least, allowed are 118"), "{why}");
 }
 
@@ -345,4 +345,76 @@ fn a_tip_at_an_obstacle_stops_the_insertion() {
     let mut planner = Replanner::new(world(vec![ball]), problem, 0.0, None);
     let first = planner.step(&estimate, 0.0, STEP_MM);
     assert_eq!(first, Step::Stop(StopReason::TipNotAllowed));
+}
+
+/// The path leads past a ball, but at speed the needle would go on toward it after a stop.
+#[test]
+fn the_way_on_after_a_stop_counts() {
+    let (centre_mm, radius_mm) = (Vector3::new(0.0, 3.6, 6.5), 3.0);
+    let ball = Obstacle::Sphere { centre_mm, radius_mm };
+    let target_mm = [0.0, -9.29, 9.97];
+    let problem = Problem { curvature_per_mm: 1.0 / 9.9, ..problem(target_mm, true) };
+    let first = |stopping_mm| {
+        let planner = Replanner::new(world(vec![ball.clone()]), problem.clone(), 0.0, None);
+        let estimate = TipEstimate { position_sd_mm: 0.0, ..known(problem.start, &problem) };
+        planner.with_stopping_mm(stopping_mm).step(&estimate, 0.0, STEP_MM)
+    };
+    assert!(matches!(first(0.1), Step::Steer(_)), "{:?}", first(0.1));
+    assert_eq!(first(2.3), Step::Stop(StopReason::AheadNotAllowed));
+}
+
+/// The ball is half way along a step of 10 mm.
+#[test]
+fn a_thin_obstacle_within_a_step_counts() {
+    let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, 2.2, 6.0), radius_mm: 0.5 };
+    let problem = problem([0.0, -20.0, 120.0], true);
+    let mut planner = Replanner::new(world(vec![ball]), problem.clone(), 0.0, None);
+    let first = planner.step(&exact(problem.start), 0.0, 10.0);
+    assert_eq!(first, Step::Stop(StopReason::AheadNotAllowed));
+}
+
+/// However uncertain the estimate is, a tip in an obstacle is not allowed.
+#[test]
+fn doubt_does_not_allow_a_tip_in_an_obstacle() {
+    let centre_mm = Vector3::new(0.0, 4.9, 0.0);
+    let ball = Obstacle::Sphere { centre_mm, radius_mm: 5.0 };
+    let problem = problem([0.0, -20.0, 120.0], true);
+    let estimate = TipEstimate { position_sd_mm: 10.0, ..exact(problem.start) };
+    let mut planner = Replanner::new(world(vec![ball]), problem, 0.0, None);
+    let first = planner.step(&estimate, 0.0, STEP_MM);
+    assert_eq!(first, Step::Stop(StopReason::TipNotAllowed));
+}
+
+/// The target moves aside 3 mm before the tip, by more than the needle can follow. A whole circle, 157 mm long, would
+/// come back to it.
+#[test]
+fn a_target_that_is_missed_is_not_circled() {
+    let radius_mm = 25.0;
+    for in_plane in [true, false] {
+        let straight = [0.0, 0.0, 60.0];
+        let sharp = Problem {
+            curvature_per_mm: 1.0 / radius_mm,
+            tolerance_mm: 0.05,
+            length_max_mm: 400.0,
+            ..problem(straight, in_plane)
+        };
+        let path = plan(&world(vec![]), &sharp).path;
+        let mut planner = Replanner::new(world(vec![]), sharp.clone(), 0.0, path);
+        let mut needle = Simulated::new(radius_mm);
+        let mut depth_mm = 0.0;
+        let end = loop {
+            let target_mm = if depth_mm < 57.0 { straight } else { [0.0, 2.2, 60.0] };
+            planner.set_target(target_mm.into());
+            let estimate = known(needle.tip, &sharp);
+            match planner.step(&estimate, if depth_mm == 0.0 { 0.0 } else { STEP_MM }, STEP_MM) {
+                Step::Steer(steer) => {
+                    assert!(depth_mm + steer.remaining_mm < 62.0, "{depth_mm} {steer:?}");
+                    needle.step(&steer, radius_mm);
+                }
+                end => break end,
+            }
+            depth_mm += STEP_MM;
+        };
+        assert!((1.0..2.2).contains(&error_mm(&end)) && depth_mm < 62.0, "{end:?} {depth_mm}");
+    }
 }
