@@ -45,6 +45,7 @@ fn read_mask(path: &Path, crc32: Option<u32>, pose: &Pose) -> Result<Obstacle, S
         return Err("its header turns or mirrors the voxels; resample it along x, y, z".to_owned());
     }
     check_voxel_size(&header)?;
+    check_data_type(&header)?;
     let [_, x, y, z, ..] = header.pixdim.map(f64::from);
     let spacing_mm = Vector3::new(x, y, z);
     let voxels = Mask::voxel_count(size, &spacing_mm)?;
@@ -198,6 +199,21 @@ fn check_voxel_size(header: &NiftiHeader) -> Result<(), String> {
         ));
     }
     Ok(())
+}
+
+/// Refuses an image whose `bitpix` contradicts its `datatype`: its length would be checked by one of them, and its
+/// voxels read by the other.
+fn check_data_type(header: &NiftiHeader) -> Result<(), String> {
+    let data_type = header.data_type().map_err(|error| reason(&error))?;
+    let (bitpix, bits) = (header.bitpix, 8 * data_type.size_of());
+    match usize::try_from(bitpix) == Ok(bits) {
+        true => Ok(()),
+        false => Err(format!(
+            "its header gives voxels of {bitpix} bits (bitpix) and of {bits} bits (datatype {}, {data_type:?}); \
+             correct the header",
+            header.datatype
+        )),
+    }
 }
 
 #[cfg(test)]

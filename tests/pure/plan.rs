@@ -303,6 +303,8 @@ fn a_file_that_is_not_a_mask_is_refused() {
     beyond[VOX_OFFSET].copy_from_slice(&1e9f32.to_le_bytes());
     let mut negative = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
     negative[42..44].copy_from_slice(&(-2i16).to_le_bytes());
+    let mut two_lengths = nifti([2, 2, 2], [1.0; 3], &[1; 16]);
+    two_lengths[72..74].copy_from_slice(&16i16.to_le_bytes());
     let images = [
         b"no image".to_vec(),
         pair,
@@ -321,6 +323,7 @@ fn a_file_that_is_not_a_mask_is_refused() {
         negative,
         vec![0x1f, 0x8b, 8, 0],
         nifti([50, 50, 120], [1.0; 3], &[1; 300_000]),
+        two_lengths,
     ];
     let mut screens = refusals(&scratch, &[&["check", "goal.toml"]]);
     for image in images {
