@@ -9,14 +9,25 @@ use nifti::{NiftiError, NiftiHeader, NiftiObject, RandomAccessNiftiVolume, Reade
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
-/// A reader of the masks that the configuration in `file` names. Their paths are relative to its folder.
+/// A reader of the masks that the configuration in `file` names. Their paths are relative to its folder. It reads
+/// each mask once: the trials of a study share it.
 pub(super) fn mask_reader(
     file: Option<&Path>,
 ) -> impl Fn(&str, Option<u32>, &Pose) -> Result<Obstacle, String> + Sync {
+    let read = Mutex::new(Vec::new());
     move |name, crc32, pose| {
+        let mut read = read.lock().unwrap_or_else(PoisonError::into_inner);
+        let key = (name.to_owned(), crc32, *pose);
+        if let Some((_, obstacle)) = read.iter().find(|(other, _)| *other == key) {
+            return Ok(Obstacle::clone(obstacle));
+        }
         let path = file.map_or_else(|| PathBuf::from(name), |file| file.with_file_name(name));
-        read_mask(&path, crc32, pose).map_err(|error| format!("{}: {error}", path.display()))
+        let obstacle = read_mask(&path, crc32, pose)
+            .map_err(|error| format!("{}: {error}", path.display()))?;
+        read.push((key, obstacle.clone()));
+        Ok(obstacle)
     }
 }
 
@@ -234,6 +245,27 @@ mod tests {
         assert!(is_upright_with(0.49e-3) && is_upright_with(-0.49e-3));
         assert!(!is_upright_with(0.51e-3) && !is_upright_with(-0.51e-3));
         assert!(!is_upright_with(f32::NAN));
+    }
+
+    /// The trials of a study share the masks that the configuration names.
+    #[test]
+    fn a_mask_is_read_once() {
+        let mut image = vec![0; 352];
+        let mut put = |at: usize, bytes: &[u8]| image[at..at + bytes.len()].copy_from_slice(bytes);
+        put(0, &348i32.to_le_bytes());
+        put(40, &[3u16, 2, 1, 1, 1, 1, 1, 1].map(u16::to_le_bytes).concat());
+        put(70, &[2i16, 8].map(i16::to_le_bytes).concat());
+        put(76, &[1f32; 4].map(f32::to_le_bytes).concat());
+        put(108, &352f32.to_le_bytes());
+        put(344, b"n+1\0");
+        image.extend([0, 1]);
+        let file = std::env::temp_dir().join(format!("needle-once-{}.nii", std::process::id()));
+        std::fs::write(&file, image).expect("a mask");
+        let (read, name) = (mask_reader(None), file.to_str().expect("text"));
+        let first = read(name, None, &Pose::identity()).expect("a mask");
+        std::fs::remove_file(&file).expect("the mask");
+        assert_eq!(read(name, None, &Pose::identity()), Ok(first));
+        assert!(read(name, Some(1), &Pose::identity()).is_err(), "another checksum is expected");
     }
 
     #[test]

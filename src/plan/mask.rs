@@ -2,8 +2,9 @@
 
 use crate::geometry::Pose;
 use nalgebra::Vector3;
+use std::sync::Arc;
 
-/// The signed distance field of occupied voxels.
+/// The signed distance field of occupied voxels. Clones share it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Mask {
     /// The plane frame P in the frame G of the grid, whose origin is the centre of voxel (0, 0, 0).
@@ -11,7 +12,7 @@ pub struct Mask {
     size: [usize; 3],
     spacing_mm: Vector3<f64>,
     /// Distance of each voxel's centre from the surface, mm, negative inside; the first coordinate runs fastest.
-    distances_mm: Vec<f32>,
+    distances_mm: Arc<[f32]>,
 }
 
 impl Mask {
