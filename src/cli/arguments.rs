@@ -65,6 +65,19 @@ impl Configured {
         Ok((config, warnings))
     }
 
+    /// `config`, which these arguments gave, as a record or another folder needs it: each mask with its absolute
+    /// path and, if `crc32` computes one, its checksum. Without a file, the path of a mask is relative to the working
+    /// directory.
+    pub(super) fn completed(
+        &self,
+        config: &Config,
+        crc32: impl Fn(&Path) -> Option<u32>,
+    ) -> Config {
+        let file = self.path().unwrap_or(Path::new("command-line"));
+        let file = std::path::absolute(file).unwrap_or_else(|_| file.to_owned());
+        config.recorded_beside(&file, crc32)
+    }
+
     fn read(&self, fallback: Option<(&str, &str)>) -> Result<(Config, Vec<String>)> {
         let source = match self.path() {
             Some(path) => Some((path.display().to_string(), text_of(path)?)),

@@ -1,7 +1,7 @@
 //! `needle-bench check`: checks a configuration and, with --connect, the equipment. Nothing moves.
 
 use super::arguments::{Configured, number_in};
-use super::mask::mask_reader;
+use super::mask::{file_crc32, mask_reader};
 use super::output::{print_stderr, print_stdout, print_wrapped};
 use super::preflight::{Preflight, troubles};
 use super::stage::drive_json;
@@ -53,6 +53,7 @@ pub(super) fn check(arguments: &Arguments) -> Result<()> {
         config.session_without_goal()?;
     }
     if arguments.print {
+        let config = arguments.configured.completed(&config, |mask| file_crc32(mask).ok());
         return print_stdout(config.to_toml().map_err(Failure::environment)?.trim_end());
     }
     let mut report = json!({

@@ -78,10 +78,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<()> {
         config = config.drawn(seed)?;
     }
     // The record names each mask by its absolute path and checksum, for a replay to find and check it.
-    if let Some(file) = configured.path() {
-        let file = std::path::absolute(file)?;
-        config = config.recorded_beside(&file, |mask| file_crc32(mask).ok());
-    }
+    config = configured.completed(&config, |mask| file_crc32(mask).ok());
     let session = config.session_reading(&mask_reader(None))?;
     session.check().map_err(Failure::configuration)?;
     let preflight = if arguments.rehearse {

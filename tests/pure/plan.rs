@@ -281,6 +281,40 @@ fn a_path_keeps_clear_of_a_mask() {
     assert!(said.status == 2 && said.stderr.contains("all of its voxels are 0"), "{}", said.stderr);
 }
 
+/// Without a configuration file, the path of a mask is relative to the working directory.
+#[test]
+fn a_mask_of_the_command_line_is_recorded_with_its_path_and_checksum() {
+    let scratch = Scratch::new();
+    let mask = scratch.path().join("mask.nii");
+    std::fs::write(&mask, nifti([2, 2, 2], [1.0; 3], &[1; 8])).unwrap();
+    let sets = [
+        "goal.kind=target",
+        "goal.position_mm=[0, 0, 8]",
+        "goal.obstacle=[{shape=\"mask\", file=\"mask.nii\", \
+         pose={x_mm=0, y_mm=20, z_mm=20, yaw_deg=0, pitch_deg=0, roll_deg=0}}]",
+        "emulator.start.x_mm=0",
+        "observer.invariant.start_sd={yaw_deg=3, pitch_deg=3, roll_deg=5}",
+    ];
+    let sets: Vec<&str> = sets.iter().flat_map(|set| ["--set", *set]).collect();
+    let said = needle_bench(&scratch, &[&["run", "--json", "--quiet"], &sets[..]].concat());
+    assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
+    let recorded = std::fs::read_to_string(said.run_dir(&scratch).join("config.toml")).unwrap();
+    let printed = needle_bench(&scratch, &[&["check", "--print"], &sets[..]].concat()).stdout;
+    for text in [recorded, printed] {
+        assert!(text.contains(&format!("file = {mask:?}")), "{text}");
+        assert!(text.contains("\ncrc32 = "), "{text}");
+    }
+    // The record of a motion shows the obstacles too, wherever its configuration lies.
+    std::fs::create_dir(scratch.path().join("rig")).unwrap();
+    std::fs::rename(&mask, scratch.path().join("rig/mask.nii")).unwrap();
+    scratch.write("rig/goal.toml", MASK);
+    let jog =
+        ["stage", "--virtual", "--json", "jog", "rig/goal.toml", "--axis=rotation", "--by=5deg"];
+    let said = needle_bench(&scratch, &jog);
+    assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
+    assert!(said.run_dir(&scratch).join("run.rrd").is_file());
+}
+
 #[test]
 fn a_file_that_is_not_a_mask_is_refused() {
     let scratch = Scratch::new();
