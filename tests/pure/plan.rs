@@ -257,11 +257,12 @@ fn a_path_keeps_clear_of_a_mask() {
     let svg = std::fs::read_to_string(scratch.path().join("mask.svg")).unwrap();
     let squares = svg.matches("<polygon").count();
     assert!((25 + 50..=36 + 66).contains(&squares), "{squares} squares of 2 mm");
-    // A run and its replay read the mask too.
+    // A run and its replay read the mask too, and the viewer's file shows it in a workspace of any size.
+    let largest = "goal.workspace_mm={ min=[-10000, -10000, 0], max=[10000, 10000, 10000] }";
     let start = "emulator.start={ x_mm=0, y_mm=0, z_mm=0, yaw_deg=0, pitch_deg=0, roll_deg=0 }";
     let fast = "insertion.speed_mm_per_s=5";
     let known = "observer.invariant.start_sd={ yaw_deg=3, pitch_deg=3, roll_deg=5 }";
-    let sets = ["--set", start, "--set", fast, "--set", known];
+    let sets = ["--set", start, "--set", fast, "--set", known, "--set", largest];
     let run = [&["run", "goal.toml", "--quiet", "--json"], &sets[..]].concat();
     let said = needle_bench(&scratch, &run);
     let dir = said.json()["run_dir"].as_str().unwrap().to_owned();

@@ -10,6 +10,7 @@ mod can;
 mod content;
 mod document;
 mod file;
+mod goal;
 mod layout;
 pub(super) mod live;
 mod motion;

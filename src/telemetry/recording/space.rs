@@ -1,29 +1,28 @@
-//! The 3-D views: the desired plane with its lines and axes, the target and the obstacles; the tips, their
-//! trails, the measured points and the ellipsoid.
+//! The 3-D views: the desired plane with its lines and axes; the tips, their trails, the measured points and the
+//! ellipsoid.
 //!
 //! Each step logs one segment of a trail and one measured point. The layout shows all of them up to the
 //! cursor, so no step logs the earlier ones again.
 
+use super::goal::{log_approach, log_goal};
 use super::palette::{
-    COMMANDED, ESTIMATE, ESTIMATE_BOUND, GOOD, LIMIT, MEASURED, NEUTRAL, OUT_OF_REACH, PLANE_LINES,
-    PLANE_SHEET, TRUTH,
+    ESTIMATE, ESTIMATE_BOUND, MEASURED, NEUTRAL, PLANE_LINES, PLANE_SHEET, TRUTH,
 };
 use super::{Logged, layout};
 use crate::emulator::Truth;
 use crate::geometry::Pose;
 use crate::observer::Estimate;
-use crate::plan::{Obstacle, Problem, Reach, Tip as PlanTip, Workspace, World, reach_around};
-use crate::session::{Approach, StepRecord};
+use crate::session::StepRecord;
 use crate::telemetry::Scene;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use rerun::{
-    Arrows3D, Boxes3D, Color, Cylinders3D, Ellipsoids3D, FillMode, LineStrips3D, Mesh3D, Points3D,
-    Quaternion, Radius, RecordingStream, Transform3D, ViewCoordinates,
+    Arrows3D, Color, Ellipsoids3D, FillMode, LineStrips3D, Mesh3D, Points3D, Quaternion, Radius,
+    RecordingStream, Transform3D, ViewCoordinates,
 };
 use std::f64::consts::PI;
 
 /// The entity of the desired plane P. Everything about the needle is logged in its frame.
-const PLANE: &str = "bench/plane";
+pub(super) const PLANE: &str = "bench/plane";
 /// The entities that are shown with their whole history up to the cursor.
 pub(super) const TRAILS: [&str; 3] =
     ["bench/plane/path/estimate", "bench/plane/path/true", MEASURED_PATH];
@@ -33,10 +32,6 @@ const ELLIPSOID_PATH: &str = "bench/plane/tip/covariance";
 const ARROW_MM: f32 = 12.0;
 /// 95 % quantile of the χ² distribution with three degrees of freedom.
 const CHI_SQUARE_95: f64 = 7.815;
-/// Distance between the points of the planned path, mm.
-const PLANNED_STEP_MM: f64 = 2.0;
-/// Distance between two points at which a mask is drawn, mm.
-const MASK_STEP_MM: f64 = 3.0;
 
 /// The rectangle of the plane that an insertion can reach, with a margin, mm.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -189,7 +184,7 @@ impl Space {
             log_ellipsoid(stream, estimate)?;
         }
         if let Some(approach) = &step.decision.approach {
-            self.log_approach(stream, approach, estimate.as_ref())?;
+            log_approach(stream, self.scene.goal.as_ref(), approach, estimate.as_ref())?;
         }
         if let Some(truth) = truth.map(Truth::x_pb).filter(|x_pb| x_pb.is_finite()) {
             self.truth.log(stream, truth)?;
@@ -207,92 +202,6 @@ impl Space {
         layout::send(stream, &self.scene, &sheet)?;
         sheet.log(stream)
     }
-
-    /// Logs the planned path, the target, which may move, and points around the target, coloured by whether one
-    /// arc from the estimated tip reaches them: green if clear, red if obstructed, blue if out of reach.
-    fn log_approach(
-        &self,
-        stream: &RecordingStream,
-        approach: &Approach,
-        estimate: Option<&Estimate>,
-    ) -> Logged {
-        if let Some(path) = &approach.path {
-            // From the present tip to the target; only the newest is shown.
-            let points: Vec<_> = path.points_mm(PLANNED_STEP_MM).iter().map(point).collect();
-            let strip = LineStrips3D::new([points]).with_colors([COMMANDED]);
-            stream.log("bench/plane/planned", &strip)?;
-        }
-        let target_mm = approach.target_mm;
-        let seen = Points3D::new([point(&target_mm)]).with_colors([MEASURED]).with_radii([0.5]);
-        stream.log("bench/plane/goal/target_seen", &seen)?;
-        let known = self.scene.goal.as_ref().zip(estimate);
-        let Some(((world, problem), estimate)) = known else { return Ok(()) };
-        let Pose { rotation, translation } = estimate.x_pb;
-        let tip = PlanTip { position_mm: translation, heading: rotation * Vector3::z() };
-        let points = reach_around(world, &Problem { target_mm, ..problem.clone() }, &tip);
-        let colours = points.iter().map(|(_, reach)| match reach {
-            Reach::Clear => GOOD,
-            Reach::Obstructed => LIMIT,
-            Reach::OutOfReach => OUT_OF_REACH,
-        });
-        let points = Points3D::new(points.iter().map(|(point_mm, _)| point(point_mm)))
-            .with_colors(colours)
-            .with_radii([0.4]);
-        stream.log("bench/plane/goal/reach", &points)
-    }
-}
-
-/// Logs the target with its tolerance, and the obstacles.
-fn log_goal(stream: &RecordingStream, world: &World, problem: &Problem) -> Logged {
-    let ball = |centre_mm: &Vector3<f64>, radius_mm: f64, colour| {
-        Ellipsoids3D::from_centers_and_half_sizes([point(centre_mm)], [[radius_mm as f32; 3]])
-            .with_colors([colour])
-            .with_fill_mode(FillMode::DenseWireframe)
-    };
-    let target = ball(&problem.target_mm, problem.tolerance_mm, GOOD);
-    stream.log_static(format!("{PLANE}/goal/target"), &target)?;
-    for (i, obstacle) in world.obstacles.iter().enumerate() {
-        let path = format!("{PLANE}/goal/obstacle_{i}");
-        match obstacle {
-            Obstacle::Sphere { centre_mm, radius_mm } => {
-                stream.log_static(path, &ball(centre_mm, *radius_mm, LIMIT))?;
-            }
-            Obstacle::Cylinder { from_mm, to_mm, radius_mm } => {
-                let axis = to_mm - from_mm;
-                let turn = Rotation3::rotation_between(&Vector3::z(), &axis);
-                let turn =
-                    turn.unwrap_or_else(|| Rotation3::from_axis_angle(&Vector3::x_axis(), PI));
-                let cylinder =
-                    Cylinders3D::from_lengths_and_radii([axis.norm() as f32], [*radius_mm as f32])
-                        .with_centers([point(&((from_mm + to_mm) * 0.5))])
-                        .with_quaternions([quaternion(&turn)])
-                        .with_colors([LIMIT])
-                        .with_fill_mode(FillMode::DenseWireframe);
-                stream.log_static(path, &cylinder)?;
-            }
-            Obstacle::Box { min_mm, max_mm } => {
-                let [centre, half] = [(min_mm + max_mm) * 0.5, (max_mm - min_mm) * 0.5];
-                let block = Boxes3D::from_centers_and_half_sizes([point(&centre)], [point(&half)])
-                    .with_colors([LIMIT]);
-                stream.log_static(path, &block)?;
-            }
-            Obstacle::Mask(mask) => {
-                let Workspace { min_mm, max_mm, .. } = world.workspace;
-                let counts = (max_mm - min_mm).map(|mm| (mm / MASK_STEP_MM) as u32);
-                let along = |i: u32| (0..=counts[i as usize]).map(f64::from);
-                let nodes = along(0).flat_map(|x| {
-                    along(1).flat_map(move |y| along(2).map(move |z| Vector3::new(x, y, z)))
-                });
-                let places = nodes.map(|node| min_mm + node * MASK_STEP_MM);
-                let inside = places.filter(|place| mask.distance_mm(place) < 0.0);
-                let points = Points3D::new(inside.map(|place| point(&place)))
-                    .with_colors([LIMIT])
-                    .with_radii([0.5]);
-                stream.log_static(path, &points)?;
-            }
-        }
-    }
-    Ok(())
 }
 
 /// A tip and its trail. The tip is drawn as two arrows: along its axis, and in the direction in which it bends.
@@ -358,19 +267,19 @@ fn principal(covariance_mm2: &Matrix3<f64>) -> (Vector3<f64>, Rotation3<f64>) {
 }
 
 /// `pose` as rerun takes it.
-fn transform(pose: &Pose) -> Transform3D {
+pub(super) fn transform(pose: &Pose) -> Transform3D {
     Transform3D::update_fields()
         .with_translation(point(&pose.translation))
         .with_quaternion(quaternion(&pose.rotation))
 }
 
 /// A point, mm, as rerun takes it.
-fn point(mm: &Vector3<f64>) -> [f32; 3] {
+pub(super) fn point(mm: &Vector3<f64>) -> [f32; 3] {
     mm.cast::<f32>().into()
 }
 
 /// `rotation` as rerun takes it.
-fn quaternion(rotation: &Rotation3<f64>) -> Quaternion {
+pub(super) fn quaternion(rotation: &Rotation3<f64>) -> Quaternion {
     let q = UnitQuaternion::from_rotation_matrix(rotation).into_inner().cast::<f32>();
     Quaternion::from_xyzw([q.i, q.j, q.k, q.w])
 }

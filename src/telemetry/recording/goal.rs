@@ -1,0 +1,156 @@
+//! The goal in the 3-D views: the target, the obstacles, the planned path, and what the tip still reaches.
+
+use super::Logged;
+use super::palette::{COMMANDED, GOOD, LIMIT, MEASURED, OUT_OF_REACH};
+use super::space::{PLANE, point, quaternion};
+use crate::geometry::Pose;
+use crate::observer::Estimate;
+use crate::plan::{Mask, Obstacle, Problem, Reach, Tip, World, reach_around};
+use crate::session::Approach;
+use nalgebra::{Rotation3, Vector3};
+use rerun::{
+    Boxes3D, Cylinders3D, Ellipsoids3D, FillMode, LineStrips3D, Points3D, RecordingStream,
+};
+use std::collections::BTreeMap;
+use std::f64::consts::PI;
+
+/// Distance between the points of the planned path, mm.
+const PLANNED_STEP_MM: f64 = 2.0;
+/// Smallest side of the cubes of which each shows one occupied voxel of a mask, mm.
+const MASK_STEP_MM: f64 = 3.0;
+/// At most this many voxels of a mask are shown.
+const MASK_POINTS_MAX: usize = 50_000;
+
+/// Logs the target with its tolerance, and the obstacles.
+pub(super) fn log_goal(stream: &RecordingStream, world: &World, problem: &Problem) -> Logged {
+    let ball = |centre_mm: &Vector3<f64>, radius_mm: f64, colour| {
+        Ellipsoids3D::from_centers_and_half_sizes([point(centre_mm)], [[radius_mm as f32; 3]])
+            .with_colors([colour])
+            .with_fill_mode(FillMode::DenseWireframe)
+    };
+    let target = ball(&problem.target_mm, problem.tolerance_mm, GOOD);
+    stream.log_static(format!("{PLANE}/goal/target"), &target)?;
+    for (i, obstacle) in world.obstacles.iter().enumerate() {
+        let path = format!("{PLANE}/goal/obstacle_{i}");
+        match obstacle {
+            Obstacle::Sphere { centre_mm, radius_mm } => {
+                stream.log_static(path, &ball(centre_mm, *radius_mm, LIMIT))?;
+            }
+            Obstacle::Cylinder { from_mm, to_mm, radius_mm } => {
+                let axis = to_mm - from_mm;
+                let turn = Rotation3::rotation_between(&Vector3::z(), &axis);
+                let turn =
+                    turn.unwrap_or_else(|| Rotation3::from_axis_angle(&Vector3::x_axis(), PI));
+                let cylinder =
+                    Cylinders3D::from_lengths_and_radii([axis.norm() as f32], [*radius_mm as f32])
+                        .with_centers([point(&((from_mm + to_mm) * 0.5))])
+                        .with_quaternions([quaternion(&turn)])
+                        .with_colors([LIMIT])
+                        .with_fill_mode(FillMode::DenseWireframe);
+                stream.log_static(path, &cylinder)?;
+            }
+            Obstacle::Box { min_mm, max_mm } => {
+                let [centre, half] = [(min_mm + max_mm) * 0.5, (max_mm - min_mm) * 0.5];
+                let block = Boxes3D::from_centers_and_half_sizes([point(&centre)], [point(&half)])
+                    .with_colors([LIMIT]);
+                stream.log_static(path, &block)?;
+            }
+            Obstacle::Mask(mask) => {
+                let (points_mm, side_mm) = mask_points(mask);
+                let points = Points3D::new(points_mm.iter().map(point))
+                    .with_colors([LIMIT])
+                    .with_radii([side_mm as f32 / 6.0]);
+                stream.log_static(path, &points)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// One occupied voxel's centre of each cube that has one, and the side of the cubes, mm. The cubes are as small as
+/// allowed.
+fn mask_points(mask: &Mask) -> (Vec<Vector3<f64>>, f64) {
+    let mut side_mm = MASK_STEP_MM;
+    let mut points_mm = BTreeMap::new();
+    let mut last = None;
+    for point_mm in mask.occupied_mm() {
+        let cube = |axis: usize| (point_mm[axis] / side_mm).floor() as i64;
+        let cube = [0, 1, 2].map(cube);
+        // The next voxel is mostly in the same cube.
+        if last.replace(cube) == Some(cube) {
+            continue;
+        }
+        points_mm.entry(cube).or_insert(point_mm);
+        while points_mm.len() > MASK_POINTS_MAX {
+            (side_mm, last) = (2.0 * side_mm, None);
+            for (cube, point_mm) in std::mem::take(&mut points_mm) {
+                points_mm.entry(cube.map(|index| index.div_euclid(2))).or_insert(point_mm);
+            }
+        }
+    }
+    (points_mm.into_values().collect(), side_mm)
+}
+
+/// Logs the planned path, the target, which may move, and points around the target, coloured by whether one
+/// arc from the estimated tip reaches them: green if clear, red if obstructed, blue if out of reach.
+pub(super) fn log_approach(
+    stream: &RecordingStream,
+    goal: Option<&(World, Problem)>,
+    approach: &Approach,
+    estimate: Option<&Estimate>,
+) -> Logged {
+    if let Some(path) = &approach.path {
+        // From the present tip to the target; only the newest is shown.
+        let points: Vec<_> = path.points_mm(PLANNED_STEP_MM).iter().map(point).collect();
+        let strip = LineStrips3D::new([points]).with_colors([COMMANDED]);
+        stream.log("bench/plane/planned", &strip)?;
+    }
+    let target_mm = approach.target_mm;
+    let seen = Points3D::new([point(&target_mm)]).with_colors([MEASURED]).with_radii([0.5]);
+    stream.log("bench/plane/goal/target_seen", &seen)?;
+    let known = goal.zip(estimate);
+    let Some(((world, problem), estimate)) = known else { return Ok(()) };
+    let Pose { rotation, translation } = estimate.x_pb;
+    let tip = Tip { position_mm: translation, heading: rotation * Vector3::z() };
+    let points = reach_around(world, &Problem { target_mm, ..problem.clone() }, &tip);
+    let colours = points.iter().map(|(_, reach)| match reach {
+        Reach::Clear => GOOD,
+        Reach::Obstructed => LIMIT,
+        Reach::OutOfReach => OUT_OF_REACH,
+    });
+    let points = Points3D::new(points.iter().map(|(point_mm, _)| point(point_mm)))
+        .with_colors(colours)
+        .with_radii([0.4]);
+    stream.log("bench/plane/goal/reach", &points)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn mask(size: [usize; 3], spacing_mm: f64) -> Mask {
+        let occupied = vec![true; size.iter().product()];
+        let x_pg = Pose { translation: Vector3::new(-3.0, 1.0, 7.0), ..Pose::identity() };
+        Mask::new(size, Vector3::repeat(spacing_mm), &occupied, &x_pg).unwrap()
+    }
+
+    /// Thinner than the distance between two points, and wherever it lies.
+    #[test]
+    fn a_sheet_of_one_voxel_is_shown() {
+        let mask = mask([40, 1, 60], 0.5);
+        let (points_mm, side_mm) = mask_points(&mask);
+        assert_eq!(side_mm, MASK_STEP_MM);
+        assert!(points_mm.iter().all(|point_mm| mask.distance_mm(point_mm) < 0.0));
+        let is_shown = |voxel_mm: Vector3<f64>| {
+            points_mm.iter().any(|point_mm| (point_mm - voxel_mm).amax() < side_mm)
+        };
+        assert!(mask.occupied_mm().all(is_shown));
+    }
+
+    #[test]
+    fn a_large_mask_is_shown_by_a_bounded_number_of_points() {
+        let (points_mm, side_mm) = mask_points(&mask([60, 60, 60], 10.0));
+        assert_eq!(side_mm, 24.0);
+        assert!((MASK_POINTS_MAX / 10..=MASK_POINTS_MAX).contains(&points_mm.len()));
+    }
+}
