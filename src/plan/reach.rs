@@ -1,6 +1,6 @@
 //! The points that the tip can still reach, to show them to the operator.
 
-use super::arc::Tip;
+use super::arc::{Arc, Tip};
 use super::field::Field;
 use super::obstacle::World;
 use super::search::Problem;
@@ -19,7 +19,7 @@ pub enum Reach {
     Clear,
     /// The arc comes nearer to an obstacle than the clearance, or leaves the workspace.
     Obstructed,
-    /// The needle does not bend enough, or the point is behind it.
+    /// The needle does not bend enough or is not long enough, or the point is behind it.
     OutOfReach,
 }
 
@@ -41,7 +41,12 @@ pub fn reach_around(world: &World, problem: &Problem, tip: &Tip) -> Vec<(Vector3
     let mut field = Field::new(Cow::Borrowed(world), problem.clearance_mm, false);
     let mut reach = |point_mm: &Vector3<f64>| {
         let arc = tip.arc_to(point_mm);
-        match arc.filter(|arc| arc.curvature_per_mm <= problem.curvature_per_mm) {
+        let can_reach = |arc: &Arc| {
+            // As a path, the arc may end within the tolerance.
+            arc.curvature_per_mm <= problem.curvature_per_mm
+                && arc.length_mm <= problem.length_max_mm + problem.tolerance_mm
+        };
+        match arc.filter(can_reach) {
             None => Reach::OutOfReach,
             Some(arc) if field.is_clear(tip, &arc) => Reach::Clear,
             Some(_) => Reach::Obstructed,
@@ -72,6 +77,20 @@ mod tests {
             assert_eq!([at(0.0), at(-12.0)], [Reach::Clear; 2], "{in_plane}");
             assert_eq!([at(15.0), at(27.0)], [Reach::Obstructed, Reach::OutOfReach], "{in_plane}");
         }
+    }
+
+    /// The point ahead is 90 mm away, the one 30 mm aside 96 mm.
+    #[test]
+    fn a_point_beyond_the_length_that_is_left_is_out_of_reach() {
+        let problem = problem([0.0, 0.0, 90.0], true);
+        let reach = |length_max_mm: f64| {
+            let problem = Problem { length_max_mm, ..problem.clone() };
+            let points = reach_around(&world(vec![]), &problem, &problem.start);
+            [30, 0].map(|i| points[i].1)
+        };
+        assert_eq!(reach(97.0), [Reach::Clear, Reach::Clear]);
+        assert_eq!(reach(89.5), [Reach::Clear, Reach::OutOfReach]);
+        assert_eq!(reach(80.0), [Reach::OutOfReach; 2]);
     }
 
     /// The arc swings 6.8 mm aside. A wall is 5 mm beside its ends.

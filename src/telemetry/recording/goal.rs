@@ -10,10 +10,13 @@ use crate::session::Approach;
 use nalgebra::{Rotation3, Vector3};
 use rerun::{
     Boxes3D, Cylinders3D, Ellipsoids3D, FillMode, LineStrips3D, Points3D, RecordingStream,
+    Transform3D,
 };
 use std::collections::BTreeMap;
 use std::f64::consts::PI;
 
+/// The entity of the target's tolerance.
+const TARGET_PATH: &str = "bench/plane/goal/target";
 /// Distance between the points of the planned path, mm.
 const PLANNED_STEP_MM: f64 = 2.0;
 /// Smallest side of the cubes of which each shows one occupied voxel of a mask, mm.
@@ -29,7 +32,7 @@ pub(super) fn log_goal(stream: &RecordingStream, world: &World, problem: &Proble
             .with_fill_mode(FillMode::DenseWireframe)
     };
     let target = ball(&problem.target_mm, problem.tolerance_mm, GOOD);
-    stream.log_static(format!("{PLANE}/goal/target"), &target)?;
+    stream.log_static(TARGET_PATH, &target)?;
     for (i, obstacle) in world.obstacles.iter().enumerate() {
         let path = format!("{PLANE}/goal/obstacle_{i}");
         match obstacle {
@@ -92,12 +95,14 @@ fn mask_points(mask: &Mask) -> (Vec<Vector3<f64>>, f64) {
 }
 
 /// Logs the planned path, the target, which may move, and points around the target, coloured by whether one
-/// arc from the estimated tip reaches them: green if clear, red if obstructed, blue if out of reach.
+/// arc from the estimated tip at `insertion_meas_mm` reaches them: green if clear, red if obstructed, blue if out of
+/// reach.
 pub(super) fn log_approach(
     stream: &RecordingStream,
     goal: Option<&(World, Problem)>,
     approach: &Approach,
     estimate: Option<&Estimate>,
+    insertion_meas_mm: f64,
 ) -> Logged {
     if let Some(path) = &approach.path {
         // From the present tip to the target; only the newest is shown.
@@ -108,11 +113,17 @@ pub(super) fn log_approach(
     let target_mm = approach.target_mm;
     let seen = Points3D::new([point(&target_mm)]).with_colors([MEASURED]).with_radii([0.5]);
     stream.log("bench/plane/goal/target_seen", &seen)?;
-    let known = goal.zip(estimate);
-    let Some(((world, problem), estimate)) = known else { return Ok(()) };
+    let Some((world, problem)) = goal else { return Ok(()) };
+    // The tolerance moves with the target.
+    let moved =
+        Transform3D::update_fields().with_translation(point(&(target_mm - problem.target_mm)));
+    stream.log(TARGET_PATH, &moved)?;
+    let Some(estimate) = estimate else { return Ok(()) };
     let Pose { rotation, translation } = estimate.x_pb;
     let tip = Tip { position_mm: translation, heading: rotation * Vector3::z() };
-    let points = reach_around(world, &Problem { target_mm, ..problem.clone() }, &tip);
+    let length_max_mm = problem.length_max_mm - insertion_meas_mm;
+    let left = Problem { target_mm, length_max_mm, ..problem.clone() };
+    let points = reach_around(world, &left, &tip);
     let colours = points.iter().map(|(_, reach)| match reach {
         Reach::Clear => GOOD,
         Reach::Obstructed => LIMIT,
@@ -127,11 +138,39 @@ pub(super) fn log_approach(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Config;
+    use rerun::RecordingStreamBuilder;
+    use rerun::log::{Chunk, LogMsg};
 
     fn mask(size: [usize; 3], spacing_mm: f64) -> Mask {
         let occupied = vec![true; size.iter().product()];
         let x_pg = Pose { translation: Vector3::new(-3.0, 1.0, 7.0), ..Pose::identity() };
         Mask::new(size, Vector3::repeat(spacing_mm), &occupied, &x_pg).unwrap()
+    }
+
+    /// With `goal.tool` the target may move.
+    #[test]
+    fn the_tolerance_moves_with_the_target() {
+        let sets = ["goal.kind=target", "goal.position_mm=[0, 0, 90]"].map(str::to_owned);
+        let read_no_mask = |_: &str, _: Option<u32>, _: &Pose| Err(String::new());
+        let goal = Config::from_sources(&[], &sets).unwrap().to_plan(&read_no_mask).unwrap();
+        let (stream, storage) = RecordingStreamBuilder::new("test").memory().unwrap();
+        log_goal(&stream, &goal.0, &goal.1).unwrap();
+        let target_mm = Vector3::new(0.0, 3.0, 92.0);
+        let approach =
+            Approach { target_mm, distance_mm: 92.0, clearance_mm: 9.0, error_mm: 0.0, path: None };
+        log_approach(&stream, Some(&goal), &approach, None, 0.0).unwrap();
+        stream.flush_blocking().unwrap();
+        let mut moved_mm = Vec::new();
+        for message in storage.take() {
+            let LogMsg::ArrowMsg(_, rows) = message else { continue };
+            let chunk = Chunk::from_arrow_msg(&rows).unwrap();
+            if chunk.entity_path().to_string() == format!("/{TARGET_PATH}") {
+                let translation = Transform3D::descriptor_translation().component;
+                moved_mm.extend(chunk.iter_slices::<[f32; 3]>(translation).flatten().copied());
+            }
+        }
+        assert_eq!(moved_mm, [[0.0, 3.0, 2.0]]);
     }
 
     /// Thinner than the distance between two points, and wherever it lies.

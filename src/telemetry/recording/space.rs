@@ -184,7 +184,8 @@ impl Space {
             log_ellipsoid(stream, estimate)?;
         }
         if let Some(approach) = &step.decision.approach {
-            log_approach(stream, self.scene.goal.as_ref(), approach, estimate.as_ref())?;
+            let (goal, depth_mm) = (self.scene.goal.as_ref(), step.insertion_meas_mm);
+            log_approach(stream, goal, approach, estimate.as_ref(), depth_mm)?;
         }
         if let Some(truth) = truth.map(Truth::x_pb).filter(|x_pb| x_pb.is_finite()) {
             self.truth.log(stream, truth)?;
