@@ -81,7 +81,8 @@ impl Listening {
                     && self.workspace.is_some_and(|workspace| {
                         workspace.is_for_metres(&self.gate.registration, sample)
                     });
-                let outside = outside.map(|why| Refusal::new(GateName::Workspace, why));
+                let outside = outside
+                    .map(|outside| Refusal::new(GateName::Workspace, format!("tip at {outside}")));
                 self.counts.count(outside.as_ref());
                 self.positions_mm.push(position_mm);
                 self.heading = self.gate.registration.heading(sample);

@@ -141,7 +141,7 @@ impl TargetTracking {
     /// Applies the gates that judge a sample by itself. Returns its acquisition time and position, plane
     /// frame, mm.
     fn admit(&mut self, sample: &Sample) -> Result<(Time, Vector3<f64>), Refusal> {
-        let position_mm = self.x_pw.transform(&self.tool.gate.admit(sample)?);
+        let position_mm = self.x_pw.transform(&self.tool.gate.admit_as("target", sample)?);
         let TargetTool { expected_mm, range_mm: limit_mm, .. } = self.tool;
         let off_mm = (position_mm - expected_mm).norm();
         // Written so that NaN is refused.

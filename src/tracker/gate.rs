@@ -74,6 +74,14 @@ impl Gate {
     /// # Errors
     /// [`Refusal`], by the first check that fails.
     pub fn admit(&self, sample: &Sample) -> Result<Vector3<f64>, Refusal> {
+        self.admit_as("tip", sample)
+    }
+
+    /// Like [`Gate::admit`]; what the tool marks is called `what` in a refusal.
+    ///
+    /// # Errors
+    /// [`Refusal`], by the first check that fails.
+    pub fn admit_as(&self, what: &str, sample: &Sample) -> Result<Vector3<f64>, Refusal> {
         if !is_same_tool(&sample.tool, &self.tool) {
             let sent = clipped(&sample.tool, SHOWN_MAX);
             let why = format!("\"{sent}\" is not the tracked tool");
@@ -91,7 +99,7 @@ impl Gate {
             true => IN_METRES,
             false => "check the registration",
         };
-        Err(Refusal::new(GateName::Workspace, format!("{outside}; {hint}")))
+        Err(Refusal::new(GateName::Workspace, format!("{what} at {outside}; {hint}")))
     }
 }
 
@@ -102,14 +110,14 @@ impl Workspace {
         registration.tip_mm(&in_mm).is_ok_and(|tip_mm| self.outside(&tip_mm).is_none())
     }
 
-    /// The first coordinate of `p_wb_mm` that is outside the box, in words; `None` if the tip can be there.
+    /// The first coordinate of `p_wb_mm` that is outside the box, in words; `None` if the point is inside.
     pub fn outside(&self, p_wb_mm: &Vector3<f64>) -> Option<String> {
         let axes = ['x', 'y', 'z'].into_iter().enumerate();
         let limits = axes.map(|(k, axis)| (axis, p_wb_mm[k], self.min_mm[k], self.max_mm[k]));
         let is_outside = |&(_, mm, min_mm, max_mm): &_| !(min_mm..=max_mm).contains(&mm);
         let (axis, mm, min_mm, max_mm) = limits.into_iter().find(is_outside)?;
         let mm = short(mm);
-        Some(format!("tip at {axis} = {mm} mm, outside {min_mm:.1} to {max_mm:.1} mm"))
+        Some(format!("{axis} = {mm} mm, outside {min_mm:.1} to {max_mm:.1} mm"))
     }
 }
 

@@ -46,6 +46,8 @@ enum HeldBy {
         /// How long and how far the insertion went on blind, or how the stream contradicts the model; and why the
         /// tip was not seen, or what the operator should check.
         trouble: Trouble,
+        /// Whose trouble it is: "tip" or "target".
+        lost: &'static str,
         /// The hold interrupted a single step, which never goes on by itself.
         in_step: bool,
     },
@@ -69,12 +71,12 @@ impl InsertTask {
     ) -> Result<(), String> {
         let found = self.trouble(now, insertion_meas_mm, insertion);
         let Some(hold) = &self.hold else {
-            if let Some(trouble) = found {
+            if let Some((lost, trouble)) = found {
                 let text = format!("{}; insertion held; {}", trouble.what, trouble.why);
                 let text = clipped(&text, MESSAGE_MAX).into_owned();
                 insertion.profile.hold(self.config.tracker.hold.braking_mm_per_s2);
                 let in_step = insertion.profile.is_stepping();
-                let by = HeldBy::Tracker { trouble, in_step };
+                let by = HeldBy::Tracker { trouble, lost, in_step };
                 let before = self.ended_hold.map_or(Duration::ZERO, |ended| {
                     ended.lasted.saturating_sub(now.since(ended.at))
                 });
@@ -86,7 +88,7 @@ impl InsertTask {
             }
             return Ok(());
         };
-        let HeldBy::Tracker { trouble: first, in_step } = &hold.by else { return Ok(()) };
+        let HeldBy::Tracker { trouble: first, lost, in_step } = &hold.by else { return Ok(()) };
         let tracker = &self.config.tracker;
         let is_standing = insertion.is_standing(insertion_meas_mm);
         if tracker.hold.resume == Resume::Automatic
@@ -100,7 +102,8 @@ impl InsertTask {
             }
             let held = now.since(hold.since);
             let held_s = held.as_secs_f64();
-            let text = format!("the tip is seen again; insertion goes on, held for {held_s:.2} s");
+            let text =
+                format!("the {lost} is seen again; insertion goes on, held for {held_s:.2} s");
             self.ended_hold = Some(EndedHold { at: now, lasted: held + hold.before });
             insertion.profile.release(None);
             self.hold = None;
@@ -118,9 +121,9 @@ impl InsertTask {
             // The first trouble may be over and another may hold the insertion now.
             match (&found, insertion.explain_miss(insertion_meas_mm)) {
                 (None, Some(off)) if self.is_seen(now) => {
-                    return Err(format!("tracker: the tip is seen again, but {off}; {end}"));
+                    return Err(format!("tracker: the {lost} is seen again, but {off}; {end}"));
                 }
-                _ => (end, found.as_ref().unwrap_or(first)),
+                _ => (end, found.as_ref().map_or(first, |(_, trouble)| trouble)),
             }
         } else {
             return Ok(());
@@ -166,8 +169,8 @@ impl InsertTask {
         let hold = self.hold.as_ref().ok_or("the insertion is not held; hold it first")?;
         match (&hold.by, self.config.tracker.hold.resume) {
             (HeldBy::Tracker { .. }, Resume::Stop) => return Err(RUN_WILL_END.to_owned()),
-            (HeldBy::Tracker { .. }, Resume::Automatic) => {
-                return Err("the tracker holds it, until the tip is seen again".to_owned());
+            (HeldBy::Tracker { lost, .. }, Resume::Automatic) => {
+                return Err(format!("the tracker holds it, until the {lost} is seen again"));
             }
             _ => {}
         }
@@ -198,7 +201,7 @@ impl InsertTask {
                 None => "the needle is still braking; try again once it stands".to_owned(),
             });
         }
-        if let Some(Trouble { what, why }) = self.trouble(shell.now, insertion_mm, insertion) {
+        if let Some((_, Trouble { what, why })) = self.trouble(shell.now, insertion_mm, insertion) {
             return Err(clipped(&format!("{what}; {why}"), MESSAGE_MAX).into_owned());
         }
         let remaining_mm = insertion.remaining_mm();
@@ -215,15 +218,22 @@ impl InsertTask {
         Ok(format!("{what} at {insertion_mm:.2} mm, held for {held_s:.2} s"))
     }
 
-    /// Why the insertion must be held; `None` if nothing calls for a hold.
-    fn trouble(&self, now: Time, insertion_meas_mm: f64, insertion: &Insertion) -> Option<Trouble> {
+    /// Why the insertion must be held, after whose trouble it is, "tip" or "target"; `None` if nothing calls for a
+    /// hold.
+    fn trouble(
+        &self,
+        now: Time,
+        insertion_meas_mm: f64,
+        insertion: &Insertion,
+    ) -> Option<(&'static str, Trouble)> {
         if let Some(jump) = &self.tracking.jump {
-            return Some(Trouble { what: jump.clone(), why: JUMP_ADVICE.to_owned() });
+            return Some(("tip", Trouble { what: jump.clone(), why: JUMP_ADVICE.to_owned() }));
         }
         if let Some(what) = self.blindness(now, insertion_meas_mm, insertion) {
-            return Some(Trouble { what, why: self.tracking.explain_silence() });
+            return Some(("tip", Trouble { what, why: self.tracking.explain_silence() }));
         }
-        self.target.as_ref()?.trouble(now)
+        let trouble = self.target.as_ref()?.trouble(now)?;
+        Some(("target", trouble))
     }
 
     /// How long and how far the insertion has gone on blind, if it must be held for that: the tip is too old,

@@ -77,6 +77,15 @@ fn a_target_stream_that_changes_its_frame() {
 }
 
 #[test]
+fn a_target_outside_the_trackers_workspace() {
+    let box_mm = "tracker.workspace={ min_mm=[-50, -50, -10], max_mm=[50, 50, 100] }";
+    let mut bench = bench(&[box_mm]);
+    bench.run_to_mm(10.0);
+    let stop = Stop::of(bench, |bench| change(bench, |sample| sample.position_mm.x = 60.0));
+    is_lost(&stop, "workspace: target at x = 60.0 mm, outside -50.0 to 50.0 mm");
+}
+
+#[test]
 fn a_target_that_is_frozen() {
     let frozen = |sample: &mut Sample| sample.position_mm = [0.0, 4.0, 60.0].into();
     is_lost(&changed(frozen), "repeat: the same position to the bit");
@@ -103,6 +112,8 @@ fn a_target_that_is_seen_again() {
     bench.run_to_end();
     assert!(bench.completed(), "{}", bench.reason());
     assert!(bench.detection.is_some(), "the insertion was not held");
+    let resumed = "the target is seen again; insertion goes on, held for ";
+    assert!(bench.events().any(|text| text.contains(resumed)));
 }
 
 #[test]
