@@ -10,6 +10,9 @@ use crate::keys::{Rule, choice, not_blank, over, section, within};
 use crate::observer::Gains;
 use crate::plan::{CLEARANCE_MIN_MM, Obstacle, Problem, Tip, Workspace, World};
 use crate::session::{Goal, TargetTool};
+use crate::text::clipped;
+use crate::tracker::gate::are_cut_alike;
+use crate::tracker::openigtlink::DEVICE_NAME_LEN;
 use crate::tracker::{Gate, Registration};
 use nalgebra::Vector3;
 use std::path::Path;
@@ -252,6 +255,9 @@ impl Config {
     }
 }
 
+/// A message shows at most this many characters of a tool's name.
+const NAME_SHOWN_MAX: usize = 30;
+
 /// Reports contradictions in `[goal]`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
     let goal = &config.goal;
@@ -291,12 +297,18 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     let has_size = is_box(&min, &max);
     let has_plane = min.x <= 0.0 && max.x >= 0.0;
     let aside_mm = goal.position_mm.map_or(0.0, |target_mm| target_mm.x);
+    let tools = [goal.tool.as_deref().unwrap_or_default(), &config.tracker.tool];
+    let are_alike = tools[0] != tools[1] && are_cut_alike(tools[0], tools[1]);
+    let [target, tip] = tools.map(|tool| clipped(tool, NAME_SHOWN_MAX));
     contradictions! { reader;
         ["goal.clearance_mm", "goal.obstacle", "study.obstacles"] if is_too_near =>
             "goal.clearance_mm is {clearance_mm}, allowed with obstacles: at least {CLEARANCE_MIN_MM}; with \
              less a path may lead through a thin obstacle";
         ["goal.tool", "tracker.tool"] if goal.tool.as_ref() == Some(&config.tracker.tool) =>
             "goal.tool is tracker.tool, the needle's tip: name the target's own tool";
+        ["goal.tool", "tracker.tool"] if are_alike =>
+            "goal.tool \"{target}\" and tracker.tool \"{tip}\" have the same first {DEVICE_NAME_LEN} bytes, where \
+             OpenIGTLink version 1 cuts a name; rename one";
         ["goal.tool", "tracker.source"] if goal.tool.is_some() && has_one_tool =>
             "goal.tool needs a stream of two tools, and tracker.source = \"csv\" has one";
         ["control.kind", "goal.kind"] if is_target && law != ControlKind::NestedSaturation =>

@@ -166,6 +166,15 @@ pub fn is_same_tool(sent: &str, wanted: &str) -> bool {
             )
 }
 
+/// True if version 1, which cuts a name to the length of the header's field, sends both names as the same.
+pub fn are_cut_alike(one: &str, other: &str) -> bool {
+    let sent = |name: &str| {
+        let bytes = name.as_bytes();
+        String::from_utf8_lossy(&bytes[..bytes.len().min(DEVICE_NAME_LEN)]).into_owned()
+    };
+    sent(one) == sent(other)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -249,6 +258,15 @@ mod tests {
             "workspace: tip at x = -199.8 mm, outside -50.0 to 50.0 mm; the positions look like metres; \
              OpenIGTLink is in mm"
         );
+    }
+
+    /// A part of a character arrives as a replacement, whichever it was.
+    #[test]
+    fn names_that_differ_within_a_cut_character_are_cut_alike() {
+        let stem = "x".repeat(DEVICE_NAME_LEN - 1);
+        let [first, second] = ["ä", "ж"].map(|end| format!("{stem}{end}"));
+        assert!(are_cut_alike(&first, &second) && !are_cut_alike(&first, &stem));
+        assert!(!are_cut_alike("NeedleToTracker", "TargetToTracker"));
     }
 
     #[test]

@@ -281,6 +281,34 @@ fn a_workspace_on_the_way_into_the_plane() {
     assert!(printed.contains("workspace_mm") && load(&printed, &[]).is_ok(), "{printed}");
 }
 
+/// OpenIGTLink version 1 would send both tools by one name.
+#[test]
+fn tools_whose_names_are_cut_to_the_same_one_are_refused() {
+    let target = ["goal.kind=target", "goal.position_mm=[0.0, 0.0, 100.0]"];
+    let named = |tip: &str, tool: &str| {
+        let [tip, tool] = [format!("tracker.tool={tip}"), format!("goal.tool={tool}")];
+        [&target[..], &[tip.as_str(), tool.as_str()]]
+            .concat()
+            .into_iter()
+            .map(str::to_owned)
+            .collect::<Vec<_>>()
+    };
+    let refusal = |tip: &str, tool: &str| {
+        Config::from_sources(&[], &named(tip, tool)).expect_err("refused").to_string()
+    };
+    assert_eq!(
+        refusal("NeedleSensorToTracker1", "NeedleSensorToTracker2"),
+        "--set goal.tool \"NeedleSensorToTracker2\" and tracker.tool \"NeedleSensorToTracker1\" have the same \
+         first 20 bytes, where OpenIGTLink version 1 cuts a name; rename one"
+    );
+    let whole = refusal("NeedleSensorToTracke", "NeedleSensorToTracker");
+    assert!(whole.contains("the same first 20 bytes"), "{whole}");
+    let long = refusal(&"x".repeat(64), &"x".repeat(63));
+    assert!(long.chars().count() <= 200, "{long}");
+    let apart = Config::from_sources(&[], &named("NeedleSensorToTrac1er", "NeedleSensorToTrac2er"));
+    assert!(apart.is_ok(), "{apart:?}");
+}
+
 /// Only a path to a target leads around obstacles.
 #[test]
 fn obstacles_on_the_way_into_the_plane_are_refused() {
