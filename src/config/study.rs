@@ -3,7 +3,7 @@
 use super::emulator::TIP_PITCH;
 use super::{Config, ConfigError, EmulatorConfig, GoalKind};
 use crate::emulator::split_mix64;
-use crate::geometry::{POSITION, TURN};
+use crate::geometry::{POSITION, Pose, TURN};
 use crate::keys::{Field, Words, find, over, section, within};
 use crate::math;
 use crate::needle::{HALF_WIDTH, HALF_WIDTH_PER_MM, OFFSET};
@@ -125,7 +125,8 @@ impl Config {
         }
         emulator["seed"] = i64::try_from(seed).unwrap_or(i64::MAX).into();
         if self.goal.kind == GoalKind::Target {
-            let target_mm = self.draw_goal(seed, &mut toml["goal"])?;
+            let start = Pose::take(toml["emulator"].get("start"));
+            let target_mm = self.draw_goal(seed, &start, &mut toml["goal"])?;
             if let Some([low, high]) = self.study.target_move_mm {
                 let drift = self.draw_drift(seed, [low, high], &target_mm);
                 toml["emulator"]["target_drift_mm_per_mm"] = array(&drift);
@@ -174,8 +175,8 @@ impl Config {
         Vector3::new(along, across * sin, across * cos) * (move_mm / target_mm.norm())
     }
 
-    /// Draws target and obstacles of the trial with this seed; returns the target, mm.
-    fn draw_goal(&self, seed: u64, goal: &mut Value) -> Result<Vector3<f64>, String> {
+    /// Draws target and obstacles of the trial with this seed, which begins at `start`; returns the target, mm.
+    fn draw_goal(&self, seed: u64, start: &Pose, goal: &mut Value) -> Result<Vector3<f64>, String> {
         let study = &self.study;
         let mut number = GOAL_DRAWS;
         let mut draw = |low: f64, high: f64| {
@@ -207,11 +208,16 @@ impl Config {
         }
         let [low, high] = study.obstacle_radius_mm.unwrap_or_default();
         let obstacles = study.obstacles.unwrap_or_default();
+        // The path begins in the plane.
+        let mut start_mm = start.translation;
+        if self.goal.in_plane {
+            start_mm.x = 0.0;
+        }
         let mut drawn = goal["obstacle"].as_array().cloned().unwrap_or_default();
         for obstacle in 1..=obstacles {
             let mut tries = (0..TRIES_MAX).map(|_| {
                 let radius_mm = draw(low, high);
-                let mut centre_mm = target_mm * draw(0.0, 1.0);
+                let mut centre_mm = start_mm + (target_mm - start_mm) * draw(0.0, 1.0);
                 let aside = [draw(-ASIDE_MM, ASIDE_MM), draw(-ASIDE_MM, ASIDE_MM)];
                 centre_mm += Vector3::new(aside[0], aside[1], 0.0);
                 if self.goal.in_plane {
@@ -221,7 +227,7 @@ impl Config {
             });
             let has_room = |(centre_mm, radius_mm): &(Vector3<f64>, f64)| {
                 let room_mm = radius_mm + self.goal.clearance_mm + ROOM_MM;
-                centre_mm.norm() >= room_mm && (centre_mm - target_mm).norm() >= room_mm
+                [start_mm, target_mm].iter().all(|end_mm| (centre_mm - end_mm).norm() >= room_mm)
             };
             let (centre_mm, radius_mm) = tries.find(has_room).ok_or_else(|| {
                 format!(

@@ -368,6 +368,35 @@ fn the_two_constants_of_creep_are_drawn_independently() {
     assert!(correlation.abs() < 0.15, "{correlation}");
 }
 
+/// In space from the tip as drawn; in the plane from where the path begins, which is nearer.
+#[test]
+fn drawn_obstacles_leave_room_around_the_drawn_start() {
+    let sets = [
+        "goal.kind=target",
+        "goal.position_mm=[0.0, 0.0, 100.0]",
+        "study.x_mm=[-8, 8]",
+        "study.y_mm=[20, 40]",
+        "study.z_mm=[10, 20]",
+        "study.obstacles=5",
+    ];
+    for in_plane in [true, false] {
+        let in_plane_set = format!("goal.in_plane={in_plane}");
+        let config = loaded("", &[&sets[..], &[in_plane_set.as_str()]].concat());
+        for seed in 0..50 {
+            let drawn = config.drawn(seed).unwrap();
+            let mut start_mm = drawn.emulator.start.translation;
+            if in_plane {
+                start_mm.x = 0.0;
+            }
+            for obstacle in &drawn.goal.obstacle {
+                let off_mm = (obstacle.centre_mm.unwrap() - start_mm).norm();
+                let room_mm = off_mm - obstacle.radius_mm.unwrap();
+                assert!(room_mm >= drawn.goal.clearance_mm, "{in_plane} {seed}: {room_mm}");
+            }
+        }
+    }
+}
+
 /// The number of attempts to place a sphere is limited.
 #[test]
 fn obstacles_that_have_no_room_are_refused() {
