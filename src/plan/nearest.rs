@@ -17,8 +17,11 @@ const EXPANSIONS_MAX: u32 = 20_000;
 const DISTANCE_SHARE: f64 = 0.1;
 /// A smaller gain in distance does not count, mm.
 const GAIN_MIN_MM: f64 = 0.05;
-/// Maximum number of changes of a path. To find one takes no more tries than the problem allows nodes.
+/// Maximum number of changes of a path.
 const CHANGES_MAX: u32 = 10;
+/// To find them, this many arcs may be tried for each node that the problem allows; a search tries about as many at a
+/// node.
+const TRIES_PER_NODE: u32 = 10;
 /// Distance between the points at which an arc may leave a path or end, mm.
 const LEAVE_MM: f64 = 2.0;
 /// Maximum length of such an arc, mm.
@@ -116,7 +119,7 @@ pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path 
 
 /// The path after changes that bring its end nearer to the target. Each time the best change is made.
 fn improved(field: &mut Field<'_>, problem: &Problem, mut path: Path) -> Path {
-    let mut tries_left = problem.expansions_max;
+    let mut tries_left = problem.expansions_max.saturating_mul(TRIES_PER_NODE);
     for _ in 0..CHANGES_MAX {
         let change = best_change(field, problem, &path, &mut tries_left);
         let Some((along_mm, ways)) = change else { break };

@@ -232,11 +232,11 @@ impl Replanner {
             return Step::Arrived { error_mm };
         }
         self.depth_left_mm = (self.depth_left_mm - inserted_mm).max(0.0);
-        // If the next step does not allow to go on, the needle stops after it. It goes no farther than a target that
-        // is ahead.
+        // If the next step stops the needle, it goes on until it stands. It goes no farther than a target that is ahead.
         let next_mm = step_mm + self.stopping_mm;
         let to_target_mm = if ahead_mm > 0.0 { ahead_mm } else { f64::INFINITY };
-        if let Some(reason) = self.stop_reason(estimate, &tip, next_mm.min(to_target_mm)) {
+        let ways_mm = [step_mm, next_mm].map(|mm| mm.min(to_target_mm));
+        if let Some(reason) = self.stop_reason(estimate, &tip, ways_mm) {
             return Step::Stop(reason);
         }
         self.problem.start = tip;
@@ -279,9 +279,15 @@ impl Replanner {
     }
 
     /// Why the tip must not go on: the estimated tip, or the same `tip` moved into the plane, is where it must not
-    /// be, or the next `next_mm` straight ahead lead there or nearer to it. The needle may go straight ahead while its
-    /// base turns, and off the plane, although the path is in the plane.
-    fn stop_reason(&self, estimate: &TipEstimate, tip: &Tip, next_mm: f64) -> Option<StopReason> {
+    /// be, or the next millimetres straight ahead lead there: as many as a step takes, or as the step and the stop that
+    /// may follow it take. The needle may go straight ahead while its base turns, and off the plane, although the
+    /// path is in the plane.
+    fn stop_reason(
+        &self,
+        estimate: &TipEstimate,
+        tip: &Tip,
+        [step_mm, stopped_mm]: [f64; 2],
+    ) -> Option<StopReason> {
         let Tip { position_mm, heading } = estimate.tip;
         let world = &self.field.world;
         // However uncertain the estimate is, it must not be in an obstacle.
@@ -292,17 +298,21 @@ impl Replanner {
         if !here.into_iter().all(|at| is_allowed(at, limit_mm(SDS))) {
             return Some(StopReason::TipNotAllowed);
         }
-        let (end_limit_mm, here_mm) = (limit_mm(NEXT_STEP_SDS), world.distance_mm(&position_mm));
-        let points = (next_mm / AHEAD_SPACING_MM).ceil().max(1.0) as u32;
-        let is_clear = (1..=points).all(|point| {
-            let ahead_mm = next_mm * f64::from(point) / f64::from(points);
-            // A tip that is too near already must come away from there.
-            let limit_mm = if point == points { end_limit_mm } else { end_limit_mm.min(here_mm) };
-            // The needle bends, to whichever side.
-            let aside_mm = 0.5 * estimate.curvature_per_mm * ahead_mm * ahead_mm;
-            is_allowed(&(position_mm + heading * ahead_mm), limit_mm + aside_mm)
-        });
-        (!is_clear).then_some(StopReason::AheadNotAllowed)
+        let here_mm = world.distance_mm(&position_mm);
+        let is_clear = |way_mm: f64, limit_mm: f64| {
+            let points = (way_mm / AHEAD_SPACING_MM).ceil().max(1.0) as u32;
+            (1..=points).all(|point| {
+                let ahead_mm = way_mm * f64::from(point) / f64::from(points);
+                // A tip that is too near already must come away from there.
+                let limit_mm = if point == points { limit_mm } else { limit_mm.min(here_mm) };
+                // The needle bends, to whichever side.
+                let aside_mm = 0.5 * estimate.curvature_per_mm * ahead_mm * ahead_mm;
+                is_allowed(&(position_mm + heading * ahead_mm), limit_mm + aside_mm)
+            })
+        };
+        let may_go =
+            is_clear(step_mm, limit_mm(NEXT_STEP_SDS)) && is_clear(stopped_mm, limit_mm(SDS));
+        (!may_go).then_some(StopReason::AheadNotAllowed)
     }
 
     /// True if a path to the target is left after `turn_mm` straight ahead, the distance that the needle goes while
