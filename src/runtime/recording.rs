@@ -11,6 +11,7 @@ use crate::units::Time;
 use std::error::Error;
 use std::fmt::Display;
 use std::io::{self, ErrorKind};
+use std::iter::Peekable;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
@@ -144,7 +145,7 @@ fn make_from_text_files(
         };
     }
     log.text_until(Time::NEVER);
-    let unread = log.frames.fault().or_else(|| log.events.fault());
+    let unread = unread(&mut log.frames).or_else(|| unread(&mut log.events));
     match log.failed {
         Some(error) => return Err(error.into()),
         None => log.recording.finish()?,
@@ -174,12 +175,12 @@ impl Log<'_> {
     /// Logs the frames and events up to `time`.
     fn text_until(&mut self, time: Time) {
         loop {
-            let events_first = self.events.next_time() <= self.frames.next_time();
+            let events_first = next_time(&mut self.events) <= next_time(&mut self.frames);
             let earlier = if events_first { &mut self.events } else { &mut self.frames };
-            if earlier.next_time() > time || self.failed.is_some() {
+            if next_time(earlier) > time || self.failed.is_some() {
                 return;
             }
-            let Some((time, record)) = earlier.take_next() else { return };
+            let Some(Ok((time, record))) = earlier.next_if(Result::is_ok) else { return };
             self.take(time, Entry::from(record));
         }
     }
@@ -187,54 +188,36 @@ impl Log<'_> {
 
 type TimedRecord = (Time, Record);
 
-/// Reads the record in a line; `None` if there is none.
-type ParseLine = Box<dyn Fn(&str) -> Option<TimedRecord>>;
+/// The records of a text file, in the order of the file. Where a line cannot be read there is instead the fault of a
+/// recording without it and those after it.
+type TimedRecords = Peekable<Box<dyn Iterator<Item = Result<TimedRecord, String>>>>;
 
-/// The records of a text file, in the order of the file.
-struct TimedRecords {
+/// The records in `lines` of `file`; `parse` gives none for a line without one.
+fn timed_records(
     file: &'static str,
     lines: Lines,
-    parse: ParseLine,
-    next: Option<TimedRecord>,
-    /// An error of reading, which ends the records.
-    error: Option<io::Error>,
+    parse: impl Fn(&str) -> Option<TimedRecord> + 'static,
+) -> TimedRecords {
+    let fault = move |error| format!("{} lacks the rest of {file}: {error}", file::RECORDING);
+    let records = lines.filter_map(move |line| match line {
+        Ok(line) => parse(&line).map(Ok),
+        Err(error) => Some(Err(fault(error))),
+    });
+    let records: Box<dyn Iterator<Item = _>> = Box::new(records);
+    records.peekable()
 }
 
-impl TimedRecords {
-    fn new(
-        file: &'static str,
-        lines: Lines,
-        parse: impl Fn(&str) -> Option<TimedRecord> + 'static,
-    ) -> Self {
-        let parse = Box::new(parse);
-        let mut records = TimedRecords { file, lines, parse, next: None, error: None };
-        records.take_next();
-        records
+/// The time of the next record; [`Time::NEVER`] at the end, or where it cannot be read.
+fn next_time(records: &mut TimedRecords) -> Time {
+    match records.peek() {
+        Some(Ok((time, _))) => *time,
+        _ => Time::NEVER,
     }
+}
 
-    /// The time of the next record; [`Time::NEVER`] at the end.
-    fn next_time(&self) -> Time {
-        self.next.as_ref().map_or(Time::NEVER, |(time, _)| *time)
-    }
-
-    /// Takes the next record, and reads the one after it.
-    fn take_next(&mut self) -> Option<TimedRecord> {
-        let taken = self.next.take();
-        while self.next.is_none() && self.error.is_none() {
-            match self.lines.next() {
-                Some(Ok(line)) => self.next = (self.parse)(&line),
-                Some(Err(error)) => self.error = Some(error),
-                None => break,
-            }
-        }
-        taken
-    }
-
-    /// The fault of a recording without the lines that could not be read.
-    fn fault(&self) -> Option<String> {
-        let error = self.error.as_ref()?;
-        Some(format!("{} lacks the rest of {}: {error}", file::RECORDING, self.file))
-    }
+/// The fault of a recording without the rest of `records`, which cannot be read.
+fn unread(records: &mut TimedRecords) -> Option<String> {
+    records.peek()?.as_ref().err().cloned()
 }
 
 /// The time of `record`; `None` for a record that the text files hold completely.
@@ -251,7 +234,7 @@ fn time_of(record: &Record) -> Option<Time> {
 /// The records in `can.log`.
 fn frames(lines: Lines, manifest: &Manifest) -> TimedRecords {
     let started_unix_us = unix_us_of(&manifest.started_utc).unwrap_or_default();
-    TimedRecords::new(file::CAN, lines, move |line| {
+    timed_records(file::CAN, lines, move |line| {
         let line = CandumpLine::parse(line)?;
         let (time, direction, frame) = (line.time(started_unix_us), line.direction, line.frame);
         Some((time, Record::Can { time, direction, frame }))
@@ -260,7 +243,7 @@ fn frames(lines: Lines, manifest: &Manifest) -> TimedRecords {
 
 /// The records in `events.log`.
 fn events(lines: Lines) -> TimedRecords {
-    TimedRecords::new(file::EVENTS, lines, |line| {
+    timed_records(file::EVENTS, lines, |line| {
         let EventLine { time, lane, kind, text } = EventLine::parse(line)?;
         let record = match kind {
             EventKind::State => Record::State { time, state: State::named(lane, &text)? },
