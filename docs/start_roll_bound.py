@@ -16,7 +16,7 @@ and control of the base, and let it know the roll after KNOWN_MM. For every KNOW
 - Until the roll is known, the method makes some path. Of its heading h aside, the rolls of the posterior are the only
   unknown. h is at most KNOWN_MM / R, and the tip is KNOWN_MM / 2 h aside, give or take KNOWN_MM^2 / 4R, because
   h changes by 1 / R per mm; the tip falls back by at most KNOWN_MM^3 / 2R^2.
-- From there a curve of this curvature that is shorter than half a circle stays outside the ball that touches it
+- From there a curve of this curvature that is shorter than half a circle (383 mm, no insertion here is) stays outside the ball that touches it
   (Schur), and so outside the torus of all those balls. A target is missed if it is deeper in the torus than the
   tolerance. That depends on the angle between h and the target alone, and grows with it. So the method can do
   no better than to bend toward the mean of the posterior, by the best |h|.

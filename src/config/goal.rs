@@ -298,7 +298,8 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     let has_plane = min.x <= 0.0 && max.x >= 0.0;
     let aside_mm = goal.position_mm.map_or(0.0, |target_mm| target_mm.x);
     let tools = [goal.tool.as_deref().unwrap_or_default(), &config.tracker.tool];
-    let are_alike = tools[0] != tools[1] && are_cut_alike(tools[0], tools[1]);
+    let may_be_cut = config.tip_source() != TrackerSource::Ndjson;
+    let are_alike = may_be_cut && tools[0] != tools[1] && are_cut_alike(tools[0], tools[1]);
     let [target, tip] = tools.map(|tool| clipped(tool, NAME_SHOWN_MAX));
     contradictions! { reader;
         ["goal.clearance_mm", "goal.obstacle", "study.obstacles"] if is_too_near =>

@@ -23,6 +23,6 @@ pub use mask::Mask;
 pub use obstacle::{Obstacle, Workspace, World};
 pub use path::Path;
 pub use reach::{Reach, reach_around};
-pub use replanner::{NoPath, Replanner, Steer, Step, StopReason, TipEstimate};
+pub use replanner::{Replanner, StartRefused, Steer, Step, StopReason, TipEstimate};
 pub use reserve::{RoomyPath, plan_with_reserve};
 pub use search::{Answer, Problem, Status, plan};

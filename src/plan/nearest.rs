@@ -19,8 +19,8 @@ const DISTANCE_SHARE: f64 = 0.1;
 const GAIN_MIN_MM: f64 = 0.05;
 /// Maximum number of changes of a path.
 const CHANGES_MAX: u32 = 10;
-/// To find them, this many arcs may be tried for each node that the problem allows; a search tries about as many at a
-/// node.
+/// All of them together may take this many tries of an arc for each node that the problem allows; in space a search
+/// tries about as many at a node.
 const TRIES_PER_NODE: u32 = 10;
 /// Distance between the points at which an arc may leave a path or end, mm.
 const LEAVE_MM: f64 = 2.0;
@@ -161,7 +161,10 @@ fn best_change(
                 if miss_mm(&to, problem) > best_mm {
                     continue;
                 }
-                *tries_left = tries_left.saturating_sub(1);
+                if *tries_left == 0 {
+                    return best;
+                }
+                *tries_left -= 1;
                 let left_mm = length_max_mm - along_mm - arc.length_mm;
                 let sharpest = field.clear_part(&to, sharpest_arc(&to, problem, left_mm));
                 let end_mm = problem.to_target_mm(&to.after(&sharpest).position_mm);

@@ -8,11 +8,13 @@ use super::path::{Path, bend_after};
 use super::reserve::RESERVE_MM;
 use super::route::Route;
 use super::search::{Answer, Problem, Status, plan_thoroughly, search_only};
-use derive_more::Display;
 use nalgebra::Vector3;
 use std::borrow::Cow;
 
 mod known;
+mod step;
+
+pub use step::{StartRefused, Steer, Step, StopReason, TipEstimate};
 
 /// This many standard deviations of the position count as its uncertainty: paths keep that much more than the
 /// clearance from obstacles, and the estimated tip may be that much nearer.
@@ -41,87 +43,17 @@ const LONGER_MAX_SHARE: f64 = 0.25;
 /// The way ahead is tested at points at most this far apart, mm.
 const AHEAD_SPACING_MM: f64 = 0.25;
 
-/// The estimate of the tip.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TipEstimate {
-    /// Position and heading.
-    pub tip: Tip,
-    /// Curvature of the needle, over 0, per mm.
-    pub curvature_per_mm: f64,
-    /// Standard deviation of the position, mm.
-    pub position_sd_mm: f64,
-    /// Standard deviation of the heading, rad.
-    pub heading_sd_rad: f64,
-}
-
-/// What to do in the next step.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Step {
-    /// Steer and insert.
-    Steer(Steer),
-    /// The tip is as near to the target as it will come: insert no further.
-    Arrived {
-        /// Distance from the target, mm.
-        error_mm: f64,
-    },
-    /// The insertion must stop.
-    Stop(StopReason),
-}
-
-/// How to steer in the next step.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Steer {
-    /// The path bends toward this unit vector across the heading.
-    pub bend: Vector3<f64>,
-    /// The wanted mean curvature, at most that of the needle, per mm; negative if the path soon bends to the
-    /// other side.
-    pub curvature_per_mm: f64,
-    /// Remaining length of the path, mm.
-    pub remaining_mm: f64,
-    /// Distance from the target at the end of the path, mm.
-    pub error_mm: f64,
-}
-
-/// Why the insertion must stop.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
-pub enum StopReason {
-    /// The tip is outside the workspace, or nearer to an obstacle than the clearance.
-    #[display(
-        "the tip is nearer to an obstacle than goal.clearance_mm, or outside goal.workspace_mm"
-    )]
-    TipNotAllowed,
-    /// A step straight ahead may lead there.
-    #[display(
-        "the next step may lead nearer to an obstacle than goal.clearance_mm, or out of \
-         goal.workspace_mm"
-    )]
-    AheadNotAllowed,
-    /// Neither a new path nor the last one leads to the target.
-    #[display("no path to the target is left")]
-    NoPath,
-}
-
-/// No path leads to the target.
-#[derive(Debug, Clone, PartialEq)]
-pub struct NoPath {
-    /// Why, in words.
-    pub reason: String,
-    /// The reachable point nearest to the target, mm, of those that were found; `None` if even the start is not
-    /// allowed.
-    pub nearest_mm: Option<Vector3<f64>>,
-    /// How the search ended.
-    pub status: Status,
-}
-
 /// Keeps the plan of a run. It uses no clock: the budget of each call is a number of expansions.
 #[derive(Debug, Clone)]
 pub struct Replanner {
     field: Field<'static>,
     route: Route,
-    /// The start is the tip at the last step, and the length that which a path may have there.
+    /// Its start is the tip at the last step, and its `length_max_mm` what a path may have from there.
     problem: Problem,
     /// The depth that may still be inserted, mm.
     depth_left_mm: f64,
+    /// How long a path may be, by the last one that was found, mm.
+    longest_mm: f64,
     /// How far the needle may go on after a stop, mm.
     stopping_mm: f64,
     /// The path of the last step, from where the tip was then.
@@ -153,6 +85,7 @@ impl Replanner {
             field,
             route,
             depth_left_mm: problem.length_max_mm,
+            longest_mm: path.as_ref().map_or(f64::INFINITY, longest_after_mm),
             stopping_mm: 0.0,
             problem,
             curvature_margin,
@@ -189,16 +122,22 @@ impl Replanner {
     ///
     /// # Errors
     /// Why no path is found, and the point nearest to the target.
-    pub fn check_start(&mut self, start: Tip, curvature_per_mm: f64) -> Result<(), NoPath> {
+    pub fn check_start(&mut self, start: Tip, curvature_per_mm: f64) -> Result<(), StartRefused> {
         self.problem.start = start;
         self.problem.curvature_per_mm = curvature_per_mm;
         let last = self.path.as_ref().map(|path| rest_of(path, 0.0, start));
         let length_max_mm = self.problem.length_max_mm;
-        if self.known(last.as_ref()).is_some_and(|path| path.length_mm() <= length_max_mm) {
+        let known = self.known(last.as_ref()).filter(|path| path.length_mm() <= length_max_mm);
+        if let Some(path) = known {
+            self.longest_mm = self.longest_mm.max(longest_after_mm(&path));
             return Ok(());
         }
         let answer = plan_thoroughly(&mut self.field, &self.problem, &self.route);
-        let Answer { status, path: None, reason, nearest_mm, .. } = answer else { return Ok(()) };
+        let Answer { status, path, reason, nearest_mm, .. } = answer;
+        if let Some(path) = path {
+            self.longest_mm = self.longest_mm.max(longest_after_mm(&path));
+            return Ok(());
+        }
         let reason = match status {
             Status::Budget => format!(
                 "goal.step_expansions_max, {}, was spent before one was found; raise it",
@@ -206,7 +145,7 @@ impl Replanner {
             ),
             _ => reason.unwrap_or_default(),
         };
-        Err(NoPath { reason, nearest_mm, status })
+        Err(StartRefused { reason, nearest_mm, status })
     }
 
     /// What to do for the next `step_mm`, from the present `estimate`. Since the last call, the tip was inserted
@@ -219,8 +158,8 @@ impl Replanner {
     /// for. If that fails and the estimate is so uncertain that the tip may still be on the remembered path,
     /// this path is followed. The last resort is a known path at the clearance minus twice the deviation.
     ///
-    /// No path is much longer than the rest of the last one. If the target is beside or behind the tip and no path
-    /// leads to it, the tip has arrived, however far off it is.
+    /// No path is much longer than the rest of the last one that was found. At the end of the path, with the target
+    /// beside or behind the tip and no path to it, the tip has arrived, however far off it is.
     pub fn step(&mut self, estimate: &TipEstimate, inserted_mm: f64, step_mm: f64) -> Step {
         let TipEstimate { mut tip, position_sd_mm, heading_sd_rad, .. } = *estimate;
         if self.problem.in_plane {
@@ -232,7 +171,7 @@ impl Replanner {
             return Step::Arrived { error_mm };
         }
         self.depth_left_mm = (self.depth_left_mm - inserted_mm).max(0.0);
-        // If the next step stops the needle, it goes on until it stands. It goes no farther than a target that is ahead.
+        // If the next step stops the needle, it goes on until it stands, but no farther than a target that is ahead.
         let next_mm = step_mm + self.stopping_mm;
         let to_target_mm = if ahead_mm > 0.0 { ahead_mm } else { f64::INFINITY };
         let ways_mm = [step_mm, next_mm].map(|mm| mm.min(to_target_mm));
@@ -241,10 +180,9 @@ impl Replanner {
         }
         self.problem.start = tip;
         let last = self.path.take().map(|path| rest_of(&path, inserted_mm, tip));
-        let longest_mm = last.as_ref().map_or(f64::INFINITY, |last| {
-            last.length_mm() * (1.0 + LONGER_MAX_SHARE) + LONGER_MAX_MM
-        });
-        self.problem.length_max_mm = self.depth_left_mm.min(longest_mm);
+        let is_at_end = last.as_ref().is_none_or(|last| last.length_mm() <= step_mm);
+        self.longest_mm = (self.longest_mm - inserted_mm).max(0.0);
+        self.problem.length_max_mm = self.depth_left_mm.min(self.longest_mm);
         if let Some((_, along_mm)) = &mut self.remembered {
             *along_mm += inserted_mm;
         }
@@ -253,18 +191,24 @@ impl Replanner {
             Some(_) => 0.0,
             None => self.without_path_mm + inserted_mm,
         };
-        if let Some(path) = path.as_ref().filter(|_| position_sd_mm <= REMEMBER_SD_MAX_MM) {
-            self.remembered = Some((path.clone(), 0.0));
+        if let Some(path) = &path {
+            self.longest_mm = longest_after_mm(path);
+            if position_sd_mm <= REMEMBER_SD_MAX_MM {
+                self.remembered = Some((path.clone(), 0.0));
+            }
         }
-        if path.is_none() && ahead_mm <= ARRIVED_MM {
-            return Step::Arrived { error_mm };
-        }
+        let is_ahead = ahead_mm > ARRIVED_MM;
         let clear_mm = next_mm.max(CLEAR_AHEAD_MM);
         let path = path
             .or_else(|| self.last_path_blindly(last?, heading_sd_rad, clear_mm))
             .or_else(|| self.nearest_path(estimate))
-            .or_else(|| self.toward_target(heading_sd_rad, clear_mm));
-        let Some(path) = path else { return Step::Stop(StopReason::NoPath) };
+            .or_else(|| self.toward_target(heading_sd_rad, clear_mm).filter(|_| is_ahead));
+        let Some(path) = path else {
+            return match is_at_end && !is_ahead {
+                true => Step::Arrived { error_mm },
+                false => Step::Stop(StopReason::NoPath),
+            };
+        };
         let first = path.arcs.iter().find(|arc| arc.length_mm > 0.0).copied();
         let first =
             first.unwrap_or(Arc { bend: tip.across()[0], curvature_per_mm: 0.0, length_mm: 0.0 });
@@ -279,9 +223,8 @@ impl Replanner {
     }
 
     /// Why the tip must not go on: the estimated tip, or the same `tip` moved into the plane, is where it must not
-    /// be, or the next millimetres straight ahead lead there: as many as a step takes, or as the step and the stop that
-    /// may follow it take. The needle may go straight ahead while its base turns, and off the plane, although the
-    /// path is in the plane.
+    /// be, or would be straight ahead, after `step_mm` or after `stopped_mm`: a step, and the stop that may follow it.
+    /// The needle may go straight ahead while its base turns, and off the plane, although the path is in the plane.
     fn stop_reason(
         &self,
         estimate: &TipEstimate,
@@ -451,6 +394,11 @@ impl Replanner {
             self.field.is_clear(&start, &next)
         })
     }
+}
+
+/// How long the next path may be after `path` was found, mm.
+fn longest_after_mm(path: &Path) -> f64 {
+    path.length_mm() * (1.0 + LONGER_MAX_SHARE) + LONGER_MAX_MM
 }
 
 /// The tip moved into the plane, where the control law will bring it.

@@ -6,7 +6,8 @@ use crate::control::{Bend, BendLaw, Command, ControlKind};
 use crate::geometry::Pose;
 use crate::observer::Estimate;
 use crate::plan::{
-    self, NoPath, Path, Problem, Replanner, RoomyPath, Status, Step, Tip, World, plan_with_reserve,
+    self, Path, Problem, Replanner, RoomyPath, StartRefused, Status, Step, Tip, World,
+    plan_with_reserve,
 };
 use nalgebra::Vector3;
 
@@ -91,7 +92,7 @@ impl Goal {
         let whole_per_mm = curvature_per_mm / (1.0 - self.curvature_margin);
         let seen = shown(tip_mm);
         replanner.check_start(start, whole_per_mm).map_err(
-            |NoPath { reason, nearest_mm, status }| {
+            |StartRefused { reason, nearest_mm, status }| {
                 let target_mm = replanner.target_mm();
                 let nearest = nearest_mm.map(|at| explain_nearest(&at, &target_mm, status));
                 let nearest = nearest.unwrap_or_default();
@@ -236,8 +237,10 @@ impl Pursuit {
         let end = self.end(estimate);
         let ahead = Pose { translation: Vector3::z() * self.stopping_mm, ..Pose::identity() };
         let after = estimate.x_pb * ahead;
-        let stopping_mm = self.goal.world.distance_on_way_mm(&estimate.x_pb, &after);
-        Approach { clearance_mm: end.clearance_mm.min(stopping_mm), ..end }
+        let straight_mm = self.goal.world.distance_on_way_mm(&estimate.x_pb, &after);
+        // The needle bends, to whichever side.
+        let aside_mm = 0.5 * self.curvature_per_mm * self.stopping_mm * self.stopping_mm;
+        Approach { clearance_mm: end.clearance_mm.min(straight_mm - aside_mm), ..end }
     }
 
     /// Plans from `estimate` at `depth_mm` on. The command is `None` once the tip has arrived.

@@ -81,11 +81,13 @@ pub fn insert(
         };
         take(&record, &needle.truth(due.insertion_mm));
         if let Some(error) = refused {
-            // The needle goes on until it stands.
-            let stopped_mm = due.insertion_mm + session.stopping_mm();
-            needle.insert_to(stopped_mm);
-            let last = step_record(step + 1, stopped_mm, &needle.base, Decision::default());
-            take(&last, &needle.truth(stopped_mm));
+            // The needle goes on until it stands: that may be nearer to an obstacle.
+            if session.goal.is_some() {
+                let stopped_mm = due.insertion_mm + session.stopping_mm();
+                needle.insert_to(stopped_mm);
+                let last = step_record(step + 1, stopped_mm, &needle.base, Decision::default());
+                take(&last, &needle.truth(stopped_mm));
+            }
             return Ok(Outcome::Stopped(error.to_string()));
         }
         if let Some(rate_rad_per_mm) = command {

@@ -385,6 +385,38 @@ fn doubt_does_not_allow_a_tip_in_an_obstacle() {
     assert_eq!(first, Step::Stop(StopReason::TipNotAllowed));
 }
 
+/// A target that is suddenly behind the tip was not passed: the run must not end as if it had been.
+#[test]
+fn a_target_behind_the_tip_is_not_arrived_at_before_the_path_ends() {
+    let straight = problem([0.0, 0.0, 120.0], true);
+    let path = plan(&world(vec![]), &straight).path;
+    let mut planner = Replanner::new(world(vec![]), straight.clone(), 0.0, path);
+    let first = planner.step(&known(straight.start, &straight), 0.0, STEP_MM);
+    assert!(matches!(first, Step::Steer(_)), "{first:?}");
+    planner.set_target(Vector3::new(0.0, 0.0, -30.0));
+    let position_mm = Vector3::z() * STEP_MM;
+    let estimate = known(Tip { position_mm, ..straight.start }, &straight);
+    let next = planner.step(&estimate, STEP_MM, STEP_MM);
+    assert_eq!(next, Step::Stop(StopReason::NoPath));
+}
+
+/// By the estimate of one step the needle hardly bends, so that there is no path. What it then follows for a while does
+/// not limit the next path.
+#[test]
+fn a_step_without_a_path_does_not_shorten_the_next_path() {
+    let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, 1.0, 60.0), radius_mm: 4.0 };
+    let problem = problem([0.0, 0.0, 130.0], true);
+    let mut planner = Replanner::new(world(vec![ball]), problem.clone(), 0.0, None);
+    let certain = known(problem.start, &problem);
+    assert!(matches!(planner.step(&certain, 0.0, STEP_MM), Step::Steer(_)));
+    let longest_mm = planner.longest_mm;
+    let hardly_bent = TipEstimate { curvature_per_mm: 1e-4, ..certain };
+    planner.problem.expansions_max = 0;
+    planner.step(&hardly_bent, STEP_MM, STEP_MM);
+    assert!(planner.without_path_mm > 0.0, "no path was found");
+    assert_eq!(planner.longest_mm, longest_mm - STEP_MM);
+}
+
 /// The target moves aside 3 mm before the tip, by more than the needle can follow. A whole circle, 157 mm long, would
 /// come back to it.
 #[test]
