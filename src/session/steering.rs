@@ -264,12 +264,16 @@ mod tests {
         }
     }
 
+    fn with_target() -> SessionConfig {
+        let sets = ["goal.kind=\"target\"", "goal.position_mm=[0.0, 0.0, 120.0]"];
+        let config = Config::from_sources(&[], &sets.map(str::to_owned)).unwrap();
+        config.session().unwrap()
+    }
+
     /// The figures at the end of a run are those of its last row.
     #[test]
     fn a_refused_step_has_its_distance_from_the_target() {
-        let sets = ["goal.kind=\"target\"", "goal.position_mm=[0.0, 0.0, 120.0]"];
-        let config = Config::from_sources(&[], &sets.map(str::to_owned)).unwrap();
-        let config = config.session().unwrap();
+        let config = with_target();
         let translation = Vector3::new(0.0, 0.0, 110.0);
         let estimate = Estimate::of_pose(Pose { translation, ..Pose::identity() });
         let mut steering = Steering {
@@ -292,15 +296,13 @@ mod tests {
                 self.0
             }
         }
-        let sets = ["goal.kind=\"target\"", "goal.position_mm=[0.0, 0.0, 120.0]"];
-        let config = Config::from_sources(&[], &sets.map(str::to_owned)).unwrap();
-        let config = config.session().unwrap();
+        let config = with_target();
+        let unsure = Estimate::of_pose(Pose::identity());
+        let not_stated = "goal: the observer does not state how well it knows the tip";
         for (estimate, why) in [
             (None, "goal: no estimate says where the tip is"),
-            (
-                Some(Estimate::of_pose(Pose::identity())),
-                "goal: the observer does not state how well it knows the tip",
-            ),
+            (Some(unsure), not_stated),
+            (Some(Estimate { sd: Some([f64::NAN; 6]), ..unsure }), not_stated),
         ] {
             let observer = Box::new(Sure(estimate));
             let mut steering = Steering { observer, ..Steering::new(&config).unwrap() };
