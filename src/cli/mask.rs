@@ -98,6 +98,8 @@ fn read_mask(path: &Path, crc32: Option<u32>, pose: &Pose) -> Result<Obstacle, S
 
 /// The size of a NIfTI-1 header, and of the four bytes after it that say whether extensions follow.
 const HEADER_BYTES: usize = 352;
+/// Voxels begin at this byte at the latest.
+const VOXEL_OFFSET_MAX: f64 = 1e6;
 
 /// Refuses a compressed image whose name does not say so: `nifti` goes by the name.
 fn check_name(path: &Path) -> Result<(), String> {
@@ -117,6 +119,13 @@ fn is_compressed(path: &Path) -> bool {
 /// refused if its bytes are damaged.
 fn check_length(path: &Path, header: &NiftiHeader, voxels: usize) -> Result<(), String> {
     let unreadable = |error: io::Error| reason(&NiftiError::Io(error));
+    // `nifti` reads extensions into memory.
+    if f64::from(header.vox_offset) > VOXEL_OFFSET_MAX {
+        return Err(format!(
+            "its voxels begin at byte {} (vox_offset), allowed: {VOXEL_OFFSET_MAX}; remove its extensions",
+            header.vox_offset
+        ));
+    }
     let file = File::open(path).map_err(unreadable)?;
     let image: Box<dyn Read> =
         if is_compressed(path) { Box::new(MultiGzDecoder::new(file)) } else { Box::new(file) };

@@ -331,7 +331,7 @@ fn a_file_that_is_not_a_mask_is_refused() {
     }
     let mut pair = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
     pair[344..347].copy_from_slice(b"ni1");
-    // The voxels begin after 48 bytes of padding, or far beyond the end of the file.
+    // The voxels begin after 48 bytes of padding, or farther on than allowed.
     let mut padded = nifti([2, 2, 2], [1.0; 3], &[[0; 48].as_slice(), &[1; 8]].concat());
     padded[VOX_OFFSET].copy_from_slice(&400f32.to_le_bytes());
     let mut beyond = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
