@@ -51,7 +51,7 @@ fn tip(run: &Run, name: &str, title: &'static str, y: &'static str) -> Chart {
     let of = |provenance| coordinate(run, name, provenance);
     let (estimate, jump) = (of("est"), jump(name));
     let layers = vec![
-        band("estimate ± 2 σ", &depth, &estimate, &of("sd"), jump),
+        band("estimate ± 2 σ", &depth, &estimate, &of("sd"), jump, f64::NEG_INFINITY),
         dots("measured", MEASURED, points(&measured_depth(run), &of("meas"))),
         Layer::new("estimate", ESTIMATE, Shape::Broad, pieces(&depth, &estimate, jump)),
         Layer::new("truth", TRUTH, Shape::Line, pieces(&depth, &of("true"), jump)),
@@ -80,10 +80,13 @@ fn target_error(run: &Run, limits: &Limits) -> Chart {
     let heading = largest(&["yaw_sd_rad", "pitch_sd_rad"]).unwrap_or_default();
     let path_left = column(run, "path_left_mm");
     let sd = position.iter().zip(&heading).zip(&path_left);
-    let sd: Column =
-        sd.map(|((mm, rad), left_mm)| Some(math::hypot((*mm)?, (*rad)? * (*left_mm)?))).collect();
+    // A step without a path is the end.
+    let sd_mm = |mm: Option<f64>, rad: Option<f64>, left_mm: Option<f64>| {
+        Some(math::hypot(mm?, rad? * left_mm.unwrap_or(0.0)))
+    };
+    let sd: Column = sd.map(|((mm, rad), left_mm)| sd_mm(*mm, *rad, *left_mm)).collect();
     let mut layers = vec![
-        band("prediction ± 2 σ", &depth, &error, &sd, f64::INFINITY),
+        band("prediction ± 2 σ", &depth, &error, &sd, f64::INFINITY, 0.0),
         line("prediction", ESTIMATE, points(&depth, &error)),
     ];
     layers.extend(limits.get("target_error_mm").map(|mm| Layer::level("goal.tolerance_mm", *mm)));
@@ -233,13 +236,22 @@ fn dots(name: &'static str, colour: &'static str, points: Points) -> Layer {
 }
 
 /// The band of ± 2 standard deviations around the estimate, in the same pieces as its line.
-fn band(name: &'static str, depth: &Column, est: &Column, sd: &Column, jump: f64) -> Layer {
+fn band(
+    name: &'static str,
+    depth: &Column,
+    est: &Column,
+    sd: &Column,
+    jump: f64,
+    least: f64,
+) -> Layer {
     let known = depth.iter().zip(est).zip(sd);
     let known = known.filter_map(|((x, y), sd)| Some(((*x)?, (*y)?, *sd)));
     let known: Vec<(f64, f64, Option<f64>)> = known.collect();
     let outline = |piece: &[(f64, f64, Option<f64>)]| {
         let edge = |sign: f64| {
-            let edge = piece.iter().filter_map(|(x, y, sd)| Some((*x, y + sign * 2.0 * (*sd)?)));
+            let edge = piece
+                .iter()
+                .filter_map(|(x, y, sd)| Some((*x, (y + sign * 2.0 * (*sd)?).max(least))));
             edge.collect::<Points>()
         };
         edge(-1.0).into_iter().chain(edge(1.0).into_iter().rev()).collect()

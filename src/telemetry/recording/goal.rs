@@ -104,12 +104,11 @@ pub(super) fn log_approach(
     estimate: Option<&Estimate>,
     insertion_meas_mm: f64,
 ) -> Logged {
-    if let Some(path) = &approach.path {
-        // From the present tip to the target; only the newest is shown.
-        let points: Vec<_> = path.points_mm(PLANNED_STEP_MM).iter().map(point).collect();
-        let strip = LineStrips3D::new([points]).with_colors([COMMANDED]);
-        stream.log("bench/plane/planned", &strip)?;
-    }
+    // From the present tip to the target; only the newest is shown, and nothing without a path.
+    let points_mm = approach.path.iter().map(|path| path.points_mm(PLANNED_STEP_MM));
+    let points = points_mm.map(|path| path.iter().map(point).collect::<Vec<_>>());
+    let strips = LineStrips3D::new(points).with_colors([COMMANDED]);
+    stream.log("bench/plane/planned", &strips)?;
     let target_mm = approach.target_mm;
     let seen = Points3D::new([point(&target_mm)]).with_colors([MEASURED]).with_radii([0.5]);
     stream.log("bench/plane/goal/target_seen", &seen)?;
@@ -122,7 +121,9 @@ pub(super) fn log_approach(
     let Pose { rotation, translation } = estimate.x_pb;
     let tip = Tip { position_mm: translation, heading: rotation * Vector3::z() };
     let length_max_mm = problem.length_max_mm - insertion_meas_mm;
-    let left = Problem { target_mm, length_max_mm, ..problem.clone() };
+    let curvature_per_mm =
+        estimate.belief.map_or(problem.curvature_per_mm, |belief| belief.curvature_per_mm);
+    let left = Problem { target_mm, length_max_mm, curvature_per_mm, ..problem.clone() };
     let points = reach_around(world, &left, &tip);
     let colours = points.iter().map(|(_, reach)| match reach {
         Reach::Clear => GOOD,
