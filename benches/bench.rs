@@ -15,7 +15,7 @@ use needle_bench::geometry::{FixedAngles, Pose};
 use needle_bench::needle::{Increment, Needle, TipPosition};
 use needle_bench::runtime::Study;
 use needle_bench::session::{
-    Input, Machine, Output, PlaneOutOfReach, Session, SessionConfig, Steering,
+    Input, Machine, Output, PlaneOutOfReach, Pursuit, Session, SessionConfig, Steering, StepRecord,
 };
 use needle_bench::study::{insert, trial_seed};
 use needle_bench::tracker::openigtlink::{Body, Message, Quaternion, Tool, encode, tool_kind};
@@ -104,11 +104,17 @@ fn print_quantiles(name: &str, mut ns: Vec<u128>) {
     );
 }
 
-/// Quantiles of the time of a step on the way to targets among five spheres. A step has twenty corrections, the
-/// plan, and the emulated needle.
+/// Quantiles of the time of a step on the way to targets among five spheres, and of the time that its plan takes. A
+/// step has twenty corrections, the plan, and the emulated needle.
 fn steps_to_targets(_: &mut Criterion) {
+    time_steps_to_targets("in the plane", "goal.in_plane=true");
+    time_steps_to_targets("in space", "goal.in_plane=false");
+}
+
+fn time_steps_to_targets(name: &str, set: &str) {
     let text = include_str!("../bench-config/target-study.toml");
-    let sets = ["study.obstacles=5", "study.target_share=[0,0.6]", "goal.curvature_margin=0.1"];
+    let sets =
+        ["study.obstacles=5", "study.target_share=[0,0.6]", "goal.curvature_margin=0.1", set];
     let sources = [Source { name: "target-study.toml", text }];
     let config = Config::from_sources(&sources, &sets.map(str::to_owned)).expect("valid");
     let mut session = config.session_without_goal().expect("valid");
@@ -121,20 +127,30 @@ fn steps_to_targets(_: &mut Criterion) {
     let (tool, prior) = (&config.tracker.tool, config.prior());
     let study = Study { session, tool, prior, stage: &stage, goal: &|_| Ok(Ok(None)) };
     let timetable = study.timetable(0).expect("an insertion");
-    let mut ns = Vec::new();
+    let (mut ns, mut plan_ns) = (Vec::new(), Vec::new());
     for seed in (0..1000).map(|trial| trial_seed(1, trial)) {
         let drawn = config.drawn(seed).expect("room");
         let goal = drawn.to_goal(&|_, _, _| Err(String::new())).expect("no masks");
         let Ok(goal) = goal else { continue };
         let session = SessionConfig { goal, ..study.session.clone() };
+        let mut pursuit = session.goal.clone().and_then(|goal| Pursuit::new(goal, &session));
         let stage = drawn.virtual_stage().expect("valid");
         let mut last = Instant::now();
-        let take = |_: &_, _: &_| {
-            ns.push(std::mem::replace(&mut last, Instant::now()).elapsed().as_nanos())
+        // Each step is planned once more, to take the time of the plan alone.
+        let take = |step: &StepRecord, _: &_| {
+            ns.push(last.elapsed().as_nanos());
+            let begun = Instant::now();
+            if let (Some(pursuit), Some(estimate)) = (&mut pursuit, &step.decision.estimate) {
+                let step_mm = session.insertion.step_mm;
+                let _ = black_box(pursuit.step(estimate, step.insertion_meas_mm, step_mm));
+                plan_ns.push(begun.elapsed().as_nanos());
+            }
+            last = Instant::now();
         };
         insert(&session, &stage, &timetable, take).expect("a trial");
     }
-    print_quantiles("to a target among five spheres", ns);
+    print_quantiles(&format!("to a target among five spheres, {name}"), ns);
+    print_quantiles(&format!("its plan, {name}"), plan_ns);
 }
 
 /// Measures the time that each law takes for one command.

@@ -177,6 +177,14 @@ impl Config {
         let GoalConfig { reserve_mm, step_expansions_max, .. } = self.goal;
         let curvature_margin = self.goal.curvature_margin();
         let tool = self.target_tool(problem.target_mm)?;
+        let wall_mm = world.workspace.depth_mm(&problem.target_mm);
+        let stopping_mm = self.insertion.stopping_mm(&self.stage);
+        if (0.0..stopping_mm).contains(&wall_mm) {
+            return Ok(Err(format!(
+                "goal: the target is {wall_mm:.2} mm from a wall of goal.workspace_mm, and a needle that is stopped \
+                 goes on by up to {stopping_mm:.2} mm; widen goal.workspace_mm, or insert slower"
+            )));
+        }
         let goal = Goal::new(world, problem, reserve_mm, curvature_margin, step_expansions_max);
         Ok(goal.map(|goal| Some(Goal { tool, ..goal })))
     }
@@ -284,7 +292,8 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     let has_obstacles = is_drawn || !goal.obstacle.is_empty();
     let registration_sd_mm = config.observer.invariant.registration_sd_mm;
     let is_too_near = has_obstacles && clearance_mm < CLEARANCE_MIN_MM;
-    let is_in_doubt = has_obstacles && 2.0 * registration_sd_mm >= clearance_mm;
+    let is_in_doubt =
+        has_obstacles && registration_sd_mm > 0.0 && 2.0 * registration_sd_mm >= clearance_mm;
     let has_one_tool = config.tip_source() == TrackerSource::Csv;
     let law = config.control.kind;
     let observer = config.observer.kind;

@@ -71,6 +71,14 @@ impl Grid {
         })
     }
 
+    /// True if the nearest node of `point_mm` is within the radius. The start of a run may be outside the grid.
+    fn covers(&self, point_mm: &Vector3<f64>) -> bool {
+        (0..3).all(|i| {
+            let along_mm = point_mm[i] - self.first_mm[i];
+            (0.0..=(self.counts[i] - 1) as f64 * self.spacing_mm).contains(&along_mm)
+        })
+    }
+
     fn nearest(&self, point_mm: &Vector3<f64>) -> [usize; 3] {
         std::array::from_fn(|i| {
             let index = (point_mm[i] - self.first_mm[i]) / self.spacing_mm + 0.5;
@@ -115,6 +123,9 @@ impl<'a> Field<'a> {
         let depth_mm = self.world.workspace.depth_mm(point_mm);
         if depth_mm < 0.0 {
             return depth_mm;
+        }
+        if !self.grid.covers(point_mm) {
+            return (self.world.distance_mm(point_mm) - self.clearance_mm).min(depth_mm);
         }
         let node = self.grid.node(self.grid.nearest(point_mm));
         let node_slack_mm = self.node_slack_mm(node);

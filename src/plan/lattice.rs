@@ -2,6 +2,7 @@
 
 use super::arc::{Arc, Chord, Tip};
 use super::obstacle::Workspace;
+use super::problem::Problem;
 use crate::math;
 use nalgebra::Vector3;
 use std::f64::consts::TAU;
@@ -31,6 +32,8 @@ pub struct Resolution {
 #[derive(Debug)]
 pub(super) struct Lattice {
     pub(super) resolution: Resolution,
+    /// The cells are larger than they should be, to fit into the memory.
+    pub(super) is_coarse: bool,
     pub(super) in_plane: bool,
     curvature_per_mm: f64,
     /// The chord of one step at full curvature.
@@ -98,11 +101,11 @@ impl Lattice {
     /// In the plane there is only one resolution; in space, `level` 0 is the coarsest.
     pub(super) fn new(
         workspace: &Workspace,
-        curvature_per_mm: f64,
-        in_plane: bool,
+        problem: &Problem,
         level: usize,
         visited: Visited,
     ) -> Self {
+        let Problem { curvature_per_mm, in_plane, .. } = *problem;
         let (step_mm, mut cell_mm, headings) = match in_plane {
             true => {
                 let step_mm = (TURN_RAD / curvature_per_mm).clamp(STEP_MM[0], STEP_MM[1]);
@@ -115,20 +118,35 @@ impl Lattice {
             true => TAU / headings as f64,
             false => 0.25 * TAU / headings as f64,
         };
-        let [mut first_mm, last_mm] = workspace.bounds_mm();
-        let mut extent_mm = last_mm - first_mm;
-        if in_plane {
-            (extent_mm.x, first_mm.x) = (0.0, 0.0);
-        }
+        let bounds_mm = |[mut first_mm, mut last_mm]: [Vector3<f64>; 2]| {
+            if in_plane {
+                (first_mm.x, last_mm.x) = (0.0, 0.0);
+            }
+            (first_mm, last_mm - first_mm)
+        };
         let all_headings = if in_plane { headings } else { 6 * headings * headings };
-        let counts = |cell_mm: f64| extent_mm.map(|mm| (mm / cell_mm).floor() + 1.0);
-        while counts(cell_mm).product() * all_headings as f64 > BITS_MAX {
+        let counts = |extent_mm: Vector3<f64>, cell_mm: f64| {
+            extent_mm.map(|mm| (mm / cell_mm).floor() + 1.0)
+        };
+        let is_too_large = |extent_mm, cell_mm| {
+            counts(extent_mm, cell_mm).product() * all_headings as f64 > BITS_MAX
+        };
+        let [low_mm, high_mm] = workspace.bounds_mm();
+        let (mut first_mm, mut extent_mm) = bounds_mm([low_mm, high_mm]);
+        if is_too_large(extent_mm, cell_mm) {
+            let [down_mm, up_mm] = problem.reach_mm();
+            let (low_mm, high_mm) = (low_mm.sup(&down_mm), high_mm.inf(&up_mm));
+            (first_mm, extent_mm) = bounds_mm([low_mm, high_mm.sup(&low_mm)]);
+        }
+        let is_coarse = is_too_large(extent_mm, cell_mm);
+        while is_too_large(extent_mm, cell_mm) {
             cell_mm *= 1.25;
         }
-        let counts: [usize; 3] = counts(cell_mm).map(|count| count as usize).into();
+        let counts: [usize; 3] = counts(extent_mm, cell_mm).map(|count| count as usize).into();
         let cells = counts.iter().product::<usize>() * all_headings;
         Lattice {
             resolution: Resolution { step_mm, cell_mm, heading_rad },
+            is_coarse,
             in_plane,
             curvature_per_mm,
             chord: Chord::of(curvature_per_mm, step_mm),

@@ -4,7 +4,7 @@ use super::arc::{Arc, RelativePoint, Tip};
 use super::field::Field;
 use super::lattice::{LEVELS, Lattice, Place, STRAIGHT};
 use super::path::Path;
-use super::search::Problem;
+use super::problem::Problem;
 use crate::math;
 use nalgebra::Vector3;
 use std::cmp::Reverse;
@@ -62,9 +62,8 @@ pub(super) fn sharpest_arc(tip: &Tip, problem: &Problem, length_max_mm: f64) -> 
 pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path {
     let level = LEVELS.len() - 1;
     let visited = std::mem::take(&mut field.visited);
-    let Problem { curvature_per_mm, in_plane, length_max_mm, .. } = *problem;
-    let workspace = &field.world.workspace;
-    let mut lattice = Lattice::new(workspace, curvature_per_mm, in_plane, level, visited);
+    let length_max_mm = problem.length_max_mm;
+    let mut lattice = Lattice::new(&field.world.workspace, problem, level, visited);
     let step_mm = lattice.resolution.step_mm;
     let place = lattice.start(problem.start);
     let mut nodes = vec![Node { place, previous_heading: None, length_mm: 0.0, from: None }];

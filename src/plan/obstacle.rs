@@ -75,8 +75,8 @@ fn signed_distance<const N: usize>(over: [f64; N]) -> f64 {
     if squared > 0.0 { squared.sqrt() } else { over.into_iter().fold(f64::NEG_INFINITY, f64::max) }
 }
 
-/// Within this distance of the start the tip may be outside the workspace, mm: the first estimates scatter
-/// about the start, which may lie on a wall.
+/// Within this distance of the start the tip may be outside the workspace, mm: the start may lie on a wall, and the
+/// first positions and estimates scatter about it.
 const START_ROOM_MM: f64 = 3.0;
 
 section! {
@@ -89,8 +89,9 @@ section! {
         max_mm as "max": Vector3<f64> [POSITION];
     }
     beside {
-        /// Where a run starts, mm: a ball around it counts as inside.
-        pub start_mm: Option<Vector3<f64>> = None,
+        /// The tip at the start of a run and where its path starts, mm: what is near the line between them counts as
+        /// inside.
+        pub start_mm: Option<[Vector3<f64>; 2]> = None,
     }
 }
 
@@ -103,19 +104,35 @@ impl Workspace {
             return f64::NEG_INFINITY;
         }
         let depth_mm = (point_mm - self.min_mm).inf(&(self.max_mm - point_mm)).min();
-        let of_start_mm = |start_mm: Vector3<f64>| START_ROOM_MM - (point_mm - start_mm).norm();
+        let of_start_mm = |start_mm| START_ROOM_MM - distance_to_line_mm(point_mm, start_mm);
         self.start_mm.map_or(depth_mm, |start_mm| depth_mm.max(of_start_mm(start_mm)))
     }
 
-    /// The corners of the bounding box, with the ball around the start, mm.
+    /// Lets a run begin with the tip at `tip_mm` and its path at `path_mm`, unless the tip is too far outside.
+    pub(super) fn begin_at(&mut self, tip_mm: Vector3<f64>, path_mm: Vector3<f64>) {
+        if (Workspace { start_mm: None, ..*self }).depth_mm(&tip_mm) >= -START_ROOM_MM {
+            self.start_mm = Some([tip_mm, path_mm]);
+        }
+    }
+
+    /// The corners of the bounding box, with the room around the start, mm.
     pub(super) fn bounds_mm(&self) -> [Vector3<f64>; 2] {
         let room = Vector3::repeat(START_ROOM_MM);
         let [low_mm, high_mm] = match self.start_mm {
-            Some(start_mm) => [start_mm - room, start_mm + room],
+            Some([tip_mm, path_mm]) => [tip_mm.inf(&path_mm) - room, tip_mm.sup(&path_mm) + room],
             None => [self.min_mm, self.max_mm],
         };
         [self.min_mm.inf(&low_mm), self.max_mm.sup(&high_mm)]
     }
+}
+
+/// Distance of a point from the line between two others, mm.
+fn distance_to_line_mm(point_mm: &Vector3<f64>, [from_mm, to_mm]: [Vector3<f64>; 2]) -> f64 {
+    let line = to_mm - from_mm;
+    // The line may have no length.
+    let length2_mm2 = line.norm_squared().max(f64::MIN_POSITIVE);
+    let share = ((point_mm - from_mm).dot(&line) / length2_mm2).clamp(0.0, 1.0);
+    (point_mm - from_mm - line * share).norm()
 }
 
 /// Obstacles in a workspace.
@@ -289,11 +306,20 @@ mod tests {
     fn room_beyond_a_wall_is_at_the_start_alone() {
         let at = Vector3::new;
         let [min_mm, max_mm] = [at(0.0, 0.0, 0.0), at(10.0, 10.0, 10.0)];
-        let workspace = Workspace { min_mm, max_mm, start_mm: Some(at(5.0, 5.0, 0.0)) };
+        let start_mm = Some([at(5.0, 5.0, 0.0); 2]);
+        let workspace = Workspace { min_mm, max_mm, start_mm };
         assert_eq!(workspace.depth_mm(&at(5.0, 5.0, -2.0)), 1.0);
         assert_eq!(workspace.depth_mm(&at(5.0, 5.0, -4.0)), -1.0);
         assert_eq!(workspace.depth_mm(&at(9.0, 5.0, -2.0)), 3.0 - 20f64.sqrt(), "to the ball");
         assert_eq!(workspace.depth_mm(&at(5.0, 11.0, 9.0)), -1.0);
         assert_eq!(workspace.bounds_mm(), [at(0.0, 0.0, -3.0), max_mm]);
+
+        let mut aside = workspace;
+        aside.begin_at(at(1.0, 5.0, -0.5), at(5.0, 5.0, -0.5));
+        assert_eq!(aside.depth_mm(&at(3.0, 5.0, -2.5)), 1.0, "between the tip and its path");
+        assert_eq!(aside.depth_mm(&at(1.0, 5.0, -2.5)), 1.0);
+        let mut too_far = workspace;
+        too_far.begin_at(at(1.0, 5.0, -3.5), at(5.0, 5.0, -3.5));
+        assert_eq!(too_far, workspace);
     }
 }

@@ -3,7 +3,7 @@
 use super::arc::{Arc, Tip};
 use super::field::Field;
 use super::obstacle::World;
-use super::search::Problem;
+use super::problem::Problem;
 use nalgebra::Vector3;
 use std::borrow::Cow;
 

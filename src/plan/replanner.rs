@@ -5,9 +5,10 @@ use super::field::{CLEARANCE_MIN_MM, Field};
 use super::nearest::path_to_nearest;
 use super::obstacle::World;
 use super::path::{Path, bend_after};
+use super::problem::Problem;
 use super::reserve::RESERVE_MM;
 use super::route::Route;
-use super::search::{Answer, Problem, Status, plan_thoroughly, search_only};
+use super::search::{Answer, Status, plan_thoroughly, search_only};
 use nalgebra::Vector3;
 use std::borrow::Cow;
 
@@ -56,6 +57,8 @@ pub struct Replanner {
     longest_mm: f64,
     /// How far the needle may go on after a stop, mm.
     stopping_mm: f64,
+    /// A step was made.
+    has_begun: bool,
     /// The path of the last step, from where the tip was then.
     path: Option<Path>,
     /// The last path that was found with a well-known position, from where it was found, and how far the tip
@@ -87,6 +90,7 @@ impl Replanner {
             depth_left_mm: problem.length_max_mm,
             longest_mm: path.as_ref().map_or(f64::INFINITY, longest_after_mm),
             stopping_mm: 0.0,
+            has_begun: false,
             problem,
             curvature_margin,
             remembered: path.clone().map(|path| (path, 0.0)),
@@ -117,12 +121,23 @@ impl Replanner {
         self.path.as_ref()
     }
 
+    /// The obstacles, and where the tip may be.
+    pub fn world(&self) -> &World {
+        &self.field.world
+    }
+
     /// Checks, before the first step, that a path that is not too long leads from `start` to the target, with at
-    /// most `curvature_per_mm`: the known path, or one that a search finds.
+    /// most `curvature_per_mm`: the known path, or one that a search finds. The tip is seen at `tip_mm`.
     ///
     /// # Errors
     /// Why no path is found, and the point nearest to the target.
-    pub fn check_start(&mut self, start: Tip, curvature_per_mm: f64) -> Result<(), StartRefused> {
+    pub fn check_start(
+        &mut self,
+        start: Tip,
+        tip_mm: &Vector3<f64>,
+        curvature_per_mm: f64,
+    ) -> Result<(), StartRefused> {
+        self.begin_at(tip_mm, &start);
         self.problem.start = start;
         self.problem.curvature_per_mm = curvature_per_mm;
         let last = self.path.as_ref().map(|path| rest_of(path, 0.0, start));
@@ -164,6 +179,10 @@ impl Replanner {
         let TipEstimate { mut tip, position_sd_mm, heading_sd_rad, .. } = *estimate;
         if self.problem.in_plane {
             tip = in_plane(&tip);
+        }
+        if !self.has_begun {
+            self.begin_at(&estimate.tip.position_mm, &tip);
+            self.has_begun = true;
         }
         let error_mm = self.problem.to_target_mm(&estimate.tip.position_mm);
         let ahead_mm = (self.problem.target_mm - tip.position_mm).dot(&tip.heading);
@@ -222,6 +241,10 @@ impl Replanner {
         Step::Steer(steer)
     }
 
+    fn begin_at(&mut self, tip_mm: &Vector3<f64>, start: &Tip) {
+        self.field.world.to_mut().workspace.begin_at(*tip_mm, start.position_mm);
+    }
+
     /// Why the tip must not go on: the estimated tip, or the same `tip` moved into the plane, is where it must not
     /// be, or would be straight ahead, after `step_mm` or after `stopped_mm`: a step, and the stop that may follow it.
     /// The needle may go straight ahead while its base turns, and off the plane, although the path is in the plane.
@@ -236,26 +259,31 @@ impl Replanner {
         // However uncertain the estimate is, it must not be in an obstacle.
         let limit_mm =
             |sds: f64| (self.problem.clearance_mm - sds * estimate.position_sd_mm).max(0.0);
-        let is_allowed = |at: &Vector3<f64>, limit_mm| world.slack_mm(at, limit_mm) >= 0.0;
-        let here = [&position_mm, &tip.position_mm];
-        if !here.into_iter().all(|at| is_allowed(at, limit_mm(SDS))) {
-            return Some(StopReason::TipNotAllowed);
-        }
+        let reason_at = |at: Vector3<f64>, limit_mm: f64, [wall, obstacle]: [StopReason; 2]| {
+            if world.workspace.depth_mm(&at) < 0.0 {
+                return Some(wall);
+            }
+            (world.distance_mm(&at) < limit_mm).then_some(obstacle)
+        };
+        let at_tip = [StopReason::TipOutside, StopReason::TipNearObstacle];
+        let here = [position_mm, tip.position_mm];
+        let here = here.into_iter().find_map(|at| reason_at(at, limit_mm(SDS), at_tip));
         let here_mm = world.distance_mm(&position_mm);
-        let is_clear = |way_mm: f64, limit_mm: f64| {
+        let ahead = |way_mm: f64, limit_mm: f64| {
             let points = (way_mm / AHEAD_SPACING_MM).ceil().max(1.0) as u32;
-            (1..=points).all(|point| {
+            (1..=points).find_map(|point| {
                 let ahead_mm = way_mm * f64::from(point) / f64::from(points);
                 // A tip that is too near already must come away from there.
                 let limit_mm = if point == points { limit_mm } else { limit_mm.min(here_mm) };
                 // The needle bends, to whichever side.
                 let aside_mm = 0.5 * estimate.curvature_per_mm * ahead_mm * ahead_mm;
-                is_allowed(&(position_mm + heading * ahead_mm), limit_mm + aside_mm)
+                let at = position_mm + heading * ahead_mm;
+                let reasons = [StopReason::WallAhead, StopReason::ObstacleAhead];
+                reason_at(at, limit_mm + aside_mm, reasons)
             })
         };
-        let may_go =
-            is_clear(step_mm, limit_mm(NEXT_STEP_SDS)) && is_clear(stopped_mm, limit_mm(SDS));
-        (!may_go).then_some(StopReason::AheadNotAllowed)
+        here.or_else(|| ahead(step_mm, limit_mm(NEXT_STEP_SDS)))
+            .or_else(|| ahead(stopped_mm, limit_mm(SDS)))
     }
 
     /// True if a path to the target is left after `turn_mm` straight ahead, the distance that the needle goes while

@@ -2,7 +2,8 @@
 
 use super::obstacle::World;
 use super::path::Path;
-use super::search::{Answer, Problem, Status, plan};
+use super::problem::Problem;
+use super::search::{Answer, Status, plan};
 
 /// The extra distance from obstacles, mm, wherever a path exists with it. The shortest path passes obstacles
 /// as near as it may, and noise would push the needle past the last point from which it can pass them.

@@ -6,6 +6,7 @@ use super::lattice::{LEVELS, Lattice, Place, Resolution, STRAIGHT};
 use super::nearest::path_to_nearest;
 use super::obstacle::{Obstacle, World};
 use super::path::Path;
+use super::problem::Problem;
 use super::route::Route;
 use derive_more::Display;
 use nalgebra::Vector3;
@@ -20,34 +21,6 @@ const BUCKET_MM: f64 = 0.25;
 /// Each level of a search in space may spend the remaining budget divided by this.
 const BUDGET_DIVISORS: [u32; LEVELS.len()] = [8, 3, 1];
 
-/// A planning problem, in the plane frame.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Problem {
-    /// Where the path starts.
-    pub start: Tip,
-    /// Where the path should end.
-    pub target_mm: Vector3<f64>,
-    /// How far from the target the path may end, mm.
-    pub tolerance_mm: f64,
-    /// The largest curvature, over 0, per mm.
-    pub curvature_per_mm: f64,
-    /// How near the path may come to an obstacle, mm.
-    pub clearance_mm: f64,
-    /// The longest path, mm.
-    pub length_max_mm: f64,
-    /// The path stays in the plane x = 0, where start and target are.
-    pub in_plane: bool,
-    /// How many nodes may be expanded.
-    pub expansions_max: u32,
-}
-
-impl Problem {
-    /// Distance of a point from the target, mm.
-    pub(super) fn to_target_mm(&self, from_mm: &Vector3<f64>) -> f64 {
-        (from_mm - self.target_mm).norm()
-    }
-}
-
 /// What a search found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
 pub enum Status {
@@ -57,7 +30,8 @@ pub enum Status {
     /// There is no path at this resolution: the search was exhausted.
     #[display("none")]
     None,
-    /// The budget was spent: there may be a path, or a shorter one than the one found.
+    /// The budget was spent, or in space the share of it of the resolution at which a path was found: there may be a
+    /// path, or a shorter one than the one found.
     #[display("budget")]
     Budget,
 }
@@ -129,10 +103,8 @@ pub(super) fn search_only(field: &mut Field<'_>, problem: &Problem, route: &Rout
     loop {
         let remaining = problem.expansions_max - expansions;
         let budget = if problem.in_plane { remaining } else { remaining / BUDGET_DIVISORS[level] };
-        let curvature_per_mm = problem.curvature_per_mm;
         let visited = std::mem::take(&mut field.visited);
-        let workspace = &field.world.workspace;
-        let lattice = Lattice::new(workspace, curvature_per_mm, problem.in_plane, level, visited);
+        let lattice = Lattice::new(&field.world.workspace, problem, level, visited);
         let search = Search {
             field,
             problem,
@@ -453,10 +425,11 @@ impl Search<'_, '_> {
         if least_mm - tolerance_mm > *length_max_mm {
             let reason = format!(
                 "the target is out of reach: with nothing in the way, a needle of {:.0} mm radius takes \
-                 {least_mm:.0} mm at least, allowed are {length_max_mm:.0}",
+                 {least_mm:.0} mm at least, allowed are {length_max_mm:.0}, insertion.depth_mm",
                 curvature_per_mm.recip()
             );
-            return (reason, true);
+            let straight_mm = self.problem.to_target_mm(&start.position_mm);
+            return (reason, straight_mm - tolerance_mm <= *length_max_mm);
         }
         match status {
             Status::Budget => {
@@ -468,8 +441,17 @@ impl Search<'_, '_> {
                 (reason, false)
             }
             _ => {
-                let reason = "every tip within reach was tried, and none comes to the target";
-                (reason.to_owned(), true)
+                let coarse = self.lattice.is_coarse.then(|| {
+                    let cell_mm = self.lattice.resolution.cell_mm;
+                    format!(
+                        ", but only to {cell_mm:.1} mm, since goal.workspace_mm is large: narrow it"
+                    )
+                });
+                let coarse = coarse.unwrap_or_default();
+                let reason = format!(
+                    "every tip within reach was tried{coarse}, and none comes to the target"
+                );
+                (reason, true)
             }
         }
     }

@@ -40,16 +40,6 @@ pub struct SessionConfig {
 }
 
 impl SessionConfig {
-    /// How far the needle may go on after the step that stops it, mm: two SYNCs until it brakes, and the way of its
-    /// quick stop. Where that deceleration is not configured it is taken to be that of the insertion.
-    pub fn stopping_mm(&self) -> f64 {
-        let speed = self.insertion.speed_mm_per_s;
-        let deceleration = self.stage.insertion.quick_stop_deceleration;
-        let deceleration = deceleration.unwrap_or(self.insertion.acceleration_mm_per_s2);
-        2.0 * speed * self.stage.bus.sync_period().as_secs_f64()
-            + speed * speed / (2.0 * deceleration)
-    }
-
     /// Checks the configuration as [`Session::new`](super::Session::new) does, before a run folder is made.
     ///
     /// # Errors
@@ -102,6 +92,17 @@ section! {
     beside {
         /// Positions that correct the observers.
         pub corrected_by: Samples = Samples::All,
+    }
+}
+
+impl InsertionConfig {
+    /// How far the needle may go on after the step that stops it, mm: two SYNCs until it brakes, and the way of its
+    /// quick stop. Where that deceleration is not configured it is taken to be that of the insertion.
+    pub fn stopping_mm(&self, stage: &StageConfig) -> f64 {
+        let speed = self.speed_mm_per_s;
+        let deceleration = stage.insertion.quick_stop_deceleration;
+        let deceleration = deceleration.unwrap_or(self.acceleration_mm_per_s2);
+        2.0 * speed * stage.bus.sync_period().as_secs_f64() + speed * speed / (2.0 * deceleration)
     }
 }
 

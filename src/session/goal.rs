@@ -45,7 +45,14 @@ impl Goal {
         let RoomyPath { path, .. } = roomy.map_err(|reason| {
             let nearest = shortest.nearest_mm.filter(|_| shortest.path.is_none());
             let nearest = nearest.map(|at| explain_nearest(&at, &target_mm, shortest.status));
-            let hint = (shortest.may_bend_too_little && curvature_margin > 0.0).then(|| {
+            let may_bend_too_little = || {
+                let clearance_mm = problem.clearance_mm + reserve_mm;
+                let curvature_per_mm = problem.curvature_per_mm / (1.0 - curvature_margin);
+                let whole = Problem { clearance_mm, curvature_per_mm, ..problem.clone() };
+                let keeps_reserve = || plan::plan(&world, &whole).path.is_some();
+                shortest.may_bend_too_little || shortest.path.is_some() && keeps_reserve()
+            };
+            let hint = (curvature_margin > 0.0 && may_bend_too_little()).then(|| {
                 format!(
                     "; {curvature_margin} of the curvature is left unused, see goal.curvature_margin"
                 )
@@ -53,7 +60,7 @@ impl Goal {
             format!("goal: {reason}{}{}", nearest.unwrap_or_default(), hint.unwrap_or_default())
         })?;
         let problem = Problem { expansions_max: step_expansions_max, ..problem };
-        world.workspace.start_mm = Some(problem.start.position_mm);
+        world.workspace.start_mm = Some([problem.start.position_mm; 2]);
         Ok(Goal { world, problem, curvature_margin, path, tool: None })
     }
 
@@ -91,7 +98,7 @@ impl Goal {
         }
         let whole_per_mm = curvature_per_mm / (1.0 - self.curvature_margin);
         let seen = shown(tip_mm);
-        replanner.check_start(start, whole_per_mm).map_err(
+        replanner.check_start(start, tip_mm, whole_per_mm).map_err(
             |StartRefused { reason, nearest_mm, status }| {
                 let target_mm = replanner.target_mm();
                 let nearest = nearest_mm.map(|at| explain_nearest(&at, &target_mm, status));
@@ -102,7 +109,7 @@ impl Goal {
             },
         )?;
         // The path begins in the plane, but the tip may be off the plane.
-        if self.world.slack_mm(tip_mm, clearance_mm) < 0.0 {
+        if replanner.world().slack_mm(tip_mm, clearance_mm) < 0.0 {
             return Err(format!(
                 "the tip is seen at {seen}, off the plane, and nearer to an obstacle than \
                  goal.clearance_mm, {clearance_mm}, or outside goal.workspace_mm"
@@ -142,8 +149,8 @@ pub struct Approach {
     pub path: Option<Path>,
 }
 
-/// The pursuit of a target.
-pub(super) struct Pursuit {
+/// The pursuit of a target: the replanner, and the law that follows its path.
+pub struct Pursuit {
     replanner: Replanner,
     law: BendLaw,
     goal: Goal,
@@ -161,12 +168,12 @@ pub(super) struct Pursuit {
 
 impl Pursuit {
     /// `None` if the control law cannot follow a path.
-    pub(super) fn new(goal: Goal, config: &SessionConfig) -> Option<Self> {
+    pub fn new(goal: Goal, config: &SessionConfig) -> Option<Self> {
         let SessionConfig { needle, control, .. } = config;
         if control.kind != ControlKind::NestedSaturation {
             return None;
         }
-        let stopping_mm = config.stopping_mm();
+        let stopping_mm = config.insertion.stopping_mm(&config.stage);
         Some(Pursuit {
             replanner: goal.replanner().with_stopping_mm(stopping_mm),
             law: BendLaw::new(*needle, control.nested_saturation),
@@ -244,7 +251,10 @@ impl Pursuit {
     }
 
     /// Plans from `estimate` at `depth_mm` on. The command is `None` once the tip has arrived.
-    pub(super) fn step(
+    ///
+    /// # Errors
+    /// The command is the reason, in words, if the run must be stopped.
+    pub fn step(
         &mut self,
         estimate: &Estimate,
         depth_mm: f64,
@@ -324,11 +334,19 @@ mod tests {
         let said = refusal(&["goal.expansions_max=2"]);
         assert!(said.contains("; the nearest point that was reached is"), "{said}");
         assert!(!said.contains(can_help) && !said.contains(reachable), "{said}");
+        let tight =
+            "goal.obstacle=[{ shape=\"sphere\", centre_mm=[0.0, 0.0, 60.0], radius_mm=10.0 }]";
+        let said = refusal(&[tight, "goal.position_mm=[0.0, 20.0, 120.0]"]);
+        assert!(said.contains("set goal.reserve_mm = 0") && said.contains(can_help), "{said}");
+        let said = refusal(&["goal.workspace_mm.max=[50.0, 75.0, 120.1]"]);
+        assert!(said.contains("0.10 mm from a wall") && said.contains("by up to 0."), "{said}");
         for set in [
             "goal.position_mm=[0.0, 1.0, 62.0]",
             "goal.position_mm=[0.0, 0.0, 200.0]",
             "emulator.start.y_mm=90",
             "goal.reserve_mm=40",
+            // Too far for any needle.
+            "insertion.depth_mm=100",
         ] {
             let said = refusal(&[set]);
             assert!(!said.contains(can_help), "{said}");
@@ -364,12 +382,14 @@ mod tests {
         assert!(why.contains("goal.step_expansions_max, 1, was spent"), "{why}");
     }
 
-    /// The start lies on the face z = 0 of the workspace. Only near it may the tip be outside.
+    /// The start lies on the face z = 0 of the workspace. The tip may start a little outside, also off the plane.
     #[test]
-    fn a_tip_outside_the_workspace_is_refused_except_at_the_start() {
+    fn a_tip_that_starts_far_outside_the_workspace_is_refused() {
         let goal = goal(&[]);
-        assert_eq!(goal.check_start(&Vector3::new(0.5, -0.4, -1.9)), Ok(()));
-        let why = goal.check_start(&Vector3::new(0.0, 5.0, -1.9)).unwrap_err();
+        for tip_mm in [[0.5, -0.4, -1.9], [5.0, 5.0, -1.9]] {
+            assert_eq!(goal.check_start(&tip_mm.into()), Ok(()));
+        }
+        let why = goal.check_start(&Vector3::new(0.0, 5.0, -3.1)).unwrap_err();
         assert!(why.contains("outside goal.workspace_mm"), "{why}");
     }
 

@@ -30,7 +30,7 @@ pub use config::{
     HoldConfig, InsertionConfig, InsertionMode, PlaneOutOfReach, Resume, Samples, SessionConfig,
     TrackerConfig,
 };
-pub use goal::{Approach, Goal};
+pub use goal::{Approach, Goal, Pursuit};
 pub use machine::{AxisMove, Input, Machine, OperatorCommand, Output, Progress, STALLED, Session};
 pub use outcome::{Outcome, StageAtEnd};
 pub use peak::{PROFILE_PEAK, rotation_peak};

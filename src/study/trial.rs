@@ -83,7 +83,7 @@ pub fn insert(
         if let Some(error) = refused {
             // The needle goes on until it stands: that may be nearer to an obstacle.
             if session.goal.is_some() {
-                let stopped_mm = due.insertion_mm + session.stopping_mm();
+                let stopped_mm = due.insertion_mm + session.insertion.stopping_mm(&session.stage);
                 needle.insert_to(stopped_mm);
                 let last = step_record(step + 1, stopped_mm, &needle.base, Decision::default());
                 take(&last, &needle.truth(stopped_mm));

@@ -3,7 +3,7 @@
 use super::super::arc::{Arc, Tip};
 use super::super::nearest::sharpest_arc;
 use super::super::path::Path;
-use super::super::search::Problem;
+use super::super::problem::Problem;
 use super::{Replanner, rest_of};
 use crate::math;
 use nalgebra::Vector3;

@@ -49,21 +49,27 @@ pub struct Steer {
 /// Why the insertion must stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
 pub enum StopReason {
-    /// The tip is outside the workspace, or nearer to an obstacle than the clearance.
+    /// The tip is nearer to an obstacle than the clearance.
+    #[display("the tip is nearer to an obstacle than goal.clearance_mm")]
+    TipNearObstacle,
+    /// The tip is outside the workspace.
+    #[display("the tip is outside goal.workspace_mm; widen it, or choose another target")]
+    TipOutside,
+    /// A step straight ahead, or the stop after it, may lead nearer to an obstacle than the clearance.
     #[display(
-        "the tip is nearer to an obstacle than goal.clearance_mm, or outside goal.workspace_mm"
+        "the next step, or a stop after it, may lead nearer to an obstacle than goal.clearance_mm; insert \
+         slower, or raise goal.reserve_mm"
     )]
-    TipNotAllowed,
-    /// A step straight ahead, or the stop after it, may lead there.
+    ObstacleAhead,
+    /// A step straight ahead, or the stop after it, may lead out of the workspace.
     #[display(
-        "the next step, or a stop after it, may lead nearer to an obstacle than goal.clearance_mm, or out of \
-         goal.workspace_mm; insert slower, or raise goal.reserve_mm"
+        "the next step, or a stop after it, may lead out of goal.workspace_mm; insert slower, or widen it"
     )]
-    AheadNotAllowed,
+    WallAhead,
     /// Neither a new path nor the last one leads to the target.
     #[display(
-        "no path to the target is left; a larger goal.curvature_margin or goal.reserve_mm leaves room for a needle \
-         that bends less than needle.radius_mm says"
+        "no path to the target is left; a larger goal.curvature_margin, or around obstacles goal.reserve_mm, \
+         leaves room for a needle that bends less than needle.radius_mm says"
     )]
     NoPath,
 }

@@ -244,7 +244,7 @@ fn a_step_ahead_that_is_nearer_than_the_clearance_is_not_made() {
             let world = world(vec![ball.clone()]);
             Replanner::new(world, problem.clone(), 0.0, None).step(&estimate, 0.0, STEP_MM)
         };
-        assert_eq!(first(0.1), Step::Stop(StopReason::AheadNotAllowed));
+        assert_eq!(first(0.1), Step::Stop(StopReason::ObstacleAhead));
         assert!(matches!(first(0.16), Step::Steer(_)), "{:?}", first(0.16));
     }
 }
@@ -257,7 +257,8 @@ fn a_start_from_which_the_path_is_too_long_is_refused() {
         let problem = Problem { length_max_mm, ..problem.clone() };
         let path = plan(&world(vec![]), &self::problem([0.0, 0.0, 120.0], true)).path;
         let Problem { start, curvature_per_mm, .. } = problem;
-        Replanner::new(world(vec![]), problem, 0.0, path).check_start(start, curvature_per_mm)
+        let mut planner = Replanner::new(world(vec![]), problem, 0.0, path);
+        planner.check_start(start, &start.position_mm, curvature_per_mm)
     };
     assert_eq!(check(120.0), Ok(()));
     assert_eq!(check(119.5), Ok(()), "within the tolerance");
@@ -306,7 +307,7 @@ fn a_tip_that_is_not_finite_stops_the_insertion() {
     let mut planner = Replanner::new(world(vec![]), problem.clone(), 0.0, None);
     let tip = Tip { position_mm: Vector3::new(0.0, f64::NAN, 10.0), ..problem.start };
     let estimate = known(tip, &problem);
-    assert_eq!(planner.step(&estimate, 1.0, STEP_MM), Step::Stop(StopReason::TipNotAllowed));
+    assert_eq!(planner.step(&estimate, 1.0, STEP_MM), Step::Stop(StopReason::TipOutside));
 }
 
 /// No step goes beyond the target, where the obstacle is.
@@ -344,7 +345,7 @@ fn a_tip_at_an_obstacle_stops_the_insertion() {
     let estimate = exact(problem.start);
     let mut planner = Replanner::new(world(vec![ball]), problem, 0.0, None);
     let first = planner.step(&estimate, 0.0, STEP_MM);
-    assert_eq!(first, Step::Stop(StopReason::TipNotAllowed));
+    assert_eq!(first, Step::Stop(StopReason::TipNearObstacle));
 }
 
 /// The path leads past a ball, but at speed the needle would go on toward it after a stop.
@@ -360,7 +361,7 @@ fn the_way_on_after_a_stop_counts() {
         planner.with_stopping_mm(stopping_mm).step(&estimate, 0.0, STEP_MM)
     };
     assert!(matches!(first(0.1), Step::Steer(_)), "{:?}", first(0.1));
-    assert_eq!(first(2.3), Step::Stop(StopReason::AheadNotAllowed));
+    assert_eq!(first(2.3), Step::Stop(StopReason::ObstacleAhead));
 }
 
 /// The ball is half way along a step of 10 mm.
@@ -370,7 +371,7 @@ fn a_thin_obstacle_within_a_step_counts() {
     let problem = problem([0.0, -20.0, 120.0], true);
     let mut planner = Replanner::new(world(vec![ball]), problem.clone(), 0.0, None);
     let first = planner.step(&exact(problem.start), 0.0, 10.0);
-    assert_eq!(first, Step::Stop(StopReason::AheadNotAllowed));
+    assert_eq!(first, Step::Stop(StopReason::ObstacleAhead));
 }
 
 /// However uncertain the estimate is, a tip in an obstacle is not allowed.
@@ -382,7 +383,7 @@ fn doubt_does_not_allow_a_tip_in_an_obstacle() {
     let estimate = TipEstimate { position_sd_mm: 10.0, ..exact(problem.start) };
     let mut planner = Replanner::new(world(vec![ball]), problem, 0.0, None);
     let first = planner.step(&estimate, 0.0, STEP_MM);
-    assert_eq!(first, Step::Stop(StopReason::TipNotAllowed));
+    assert_eq!(first, Step::Stop(StopReason::TipNearObstacle));
 }
 
 /// A target that is suddenly behind the tip was not passed: the run must not end as if it had been.
@@ -449,4 +450,33 @@ fn a_target_that_is_missed_is_not_circled() {
         };
         assert!((1.0..2.2).contains(&error_mm(&end)) && depth_mm < 62.0, "{end:?} {depth_mm}");
     }
+}
+
+/// The needle starts on the wall z = 0 of the workspace, off the plane, and its first estimates scatter about it.
+#[test]
+fn a_start_on_a_wall_and_off_the_plane_is_inside() {
+    let mut world = world(vec![]);
+    world.workspace.min_mm.z = 0.0;
+    let problem = problem([0.0, 0.0, 120.0], true);
+    let start = |off_mm: f64, z_mm: f64| {
+        let position_mm = Vector3::new(off_mm, 0.0, z_mm);
+        let estimate = exact(Tip { position_mm, ..problem.start });
+        Replanner::new(world.clone(), problem.clone(), 0.0, None).step(&estimate, 0.0, STEP_MM)
+    };
+    assert!(matches!(start(5.0, -0.6), Step::Steer(_)), "{:?}", start(5.0, -0.6));
+    assert_eq!(start(5.0, -3.6), Step::Stop(StopReason::TipOutside));
+    assert_eq!(start(f64::NAN, 0.0), Step::Stop(StopReason::TipOutside));
+}
+
+/// The wall is 1 mm ahead, and the target beside the tip.
+#[test]
+fn a_wall_ahead_is_named() {
+    let mut world = world(vec![]);
+    world.workspace.max_mm.z = 21.0;
+    let problem = problem([0.0, 3.0, 20.0], true);
+    let mut planner = Replanner::new(world, problem.clone(), 0.0, None).with_stopping_mm(0.2);
+    let mut tip = problem.start;
+    assert!(matches!(planner.step(&exact(tip), 0.0, STEP_MM), Step::Steer(_)));
+    tip.position_mm.z = 20.5;
+    assert_eq!(planner.step(&exact(tip), 20.5, STEP_MM), Step::Stop(StopReason::WallAhead));
 }

@@ -194,3 +194,17 @@ proptest! {
         }
     }
 }
+
+/// What no path can reach does not make the cells larger. They grow if the needle itself reaches too far.
+#[test]
+fn a_wide_workspace_leaves_the_cells_as_they_are() {
+    let room = 900.0;
+    let mut wide = world(vec![sphere([0.0, 0.0, 60.0], 50.0)]);
+    (wide.workspace.min_mm, wide.workspace.max_mm) =
+        (Vector3::repeat(-room), Vector3::repeat(room));
+    let problem = Problem { expansions_max: 30, ..problem([0.0, 0.0, 135.0], false) };
+    let near = plan(&wide, &Problem { length_max_mm: 140.0, ..problem.clone() });
+    assert_eq!(near.resolution.cell_mm, 2.0);
+    let far = plan(&wide, &Problem { length_max_mm: 800.0, ..problem });
+    assert!(far.resolution.cell_mm > 2.0);
+}
