@@ -74,8 +74,8 @@ impl Grid {
     /// True if the nearest node of `point_mm` is within the radius. The start of a run may be outside the grid.
     fn covers(&self, point_mm: &Vector3<f64>) -> bool {
         (0..3).all(|i| {
-            let along_mm = point_mm[i] - self.first_mm[i];
-            (0.0..=(self.counts[i] - 1) as f64 * self.spacing_mm).contains(&along_mm)
+            let along = (point_mm[i] - self.first_mm[i]) / self.spacing_mm;
+            (-0.5..=self.counts[i] as f64 - 0.5).contains(&along)
         })
     }
 
