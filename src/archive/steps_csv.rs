@@ -29,8 +29,8 @@ impl<'a> StepRow<'a> {
             approach: step.decision.approach.as_ref(),
             estimate: step.decision.estimate.map(|e| coordinates(&e.x_pb)),
             sd: step.decision.estimate.and_then(|e| e.sd),
-            truth: truth.map(|t| coordinates(t.x_pb())),
-            target_true: truth.and_then(|t| t.target_mm().copied()),
+            truth: truth.map(|t| coordinates(&t.x_pb)),
+            target_true: truth.and_then(|t| t.target_mm),
         }
     }
 }
@@ -139,7 +139,7 @@ impl RecordedColumns {
             [Some(x), Some(y), Some(z)] => Some(Vector3::new(x, y, z)),
             _ => None,
         };
-        Some(Truth::new(Pose { rotation, translation }).with_target(target_mm))
+        Some(Truth { x_pb: Pose { rotation, translation }, target_mm })
     }
 }
 
@@ -207,7 +207,7 @@ mod tests {
             ..step()
         };
         let target_mm = Some(Vector3::new(0.0, 8.5, 90.5));
-        let truth = Truth::new(pose(1.0, angles.to_rotation())).with_target(target_mm);
+        let truth = Truth { x_pb: pose(1.0, angles.to_rotation()), target_mm };
         assert_eq!(
             StepRow::new(&full, Some(&truth)).to_string(),
             "7,7.3,7.001,-0.1,0.30000000000000004,1.5,NaN,-inf,1.25,-2.0,1e-9,0.0,0.0,0.0,\
@@ -220,14 +220,14 @@ mod tests {
         let angles = FixedAngles { yaw: 0.25, pitch: 0.5, roll: -3.0 };
         let pose =
             Pose { rotation: angles.to_rotation(), translation: Vector3::new(1.0, 2.0, 3.0) };
-        let truth = Truth::new(pose).with_target(Some(Vector3::new(0.0, 8.5, 90.5)));
+        let truth = Truth { x_pb: pose, target_mm: Some(Vector3::new(0.0, 8.5, 90.5)) };
         let rows = [Some(&truth), None].map(|truth| StepRow::new(&step(), truth).to_string());
         let columns = RecordedColumns::of(&steps_csv_header());
         assert_eq!(columns.time(&rows[0]), Some(step().time));
         let read = columns.truth(&rows[0]).expect("a truth");
-        assert!((read.x_pb().rotation.matrix() - pose.rotation.matrix()).norm() < 1e-14);
-        assert_eq!(read.x_pb().translation, pose.translation);
-        assert_eq!(read.target_mm(), truth.target_mm());
+        assert!((read.x_pb.rotation.matrix() - pose.rotation.matrix()).norm() < 1e-14);
+        assert_eq!(read.x_pb.translation, pose.translation);
+        assert_eq!(read.target_mm, truth.target_mm);
         assert_eq!(columns.truth(&rows[1]), None);
         assert_eq!(columns.0.iter().filter(|column| is_truth_column(column)).count(), 9);
     }

@@ -1,5 +1,6 @@
 //! Emergency messages (CiA 301, 7.2.7; drive codes from CiA 402).
 
+use derive_more::Display;
 use std::fmt;
 
 use super::{Frame, NodeId, cob};
@@ -22,8 +23,9 @@ pub mod error_register {
     pub const MANUFACTURER: u8 = 1 << 7;
 }
 
-/// An emergency error code.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+/// An emergency error code. As text it is `0x8611 following error`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Display)]
+#[display("0x{_0:04X} {}", self.name().unwrap_or("unknown error code"))]
 pub struct EmcyCode(pub u16);
 
 impl EmcyCode {
@@ -67,13 +69,6 @@ impl EmcyCode {
 
 /// A line for each code, sorted. A code that ends in 00 names its class.
 const NAMES: &str = include_str!("emcy_codes.txt");
-
-/// `0x8611 following error`.
-impl fmt::Display for EmcyCode {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "0x{:04X} {}", self.0, self.name().unwrap_or("unknown error code"))
-    }
-}
 
 /// An emergency message: 8 bytes, sent once when an error begins or ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

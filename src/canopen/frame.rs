@@ -1,30 +1,24 @@
 //! Classic CAN frames and the identifiers of CANopen.
 
+use derive_more::Display;
 use std::fmt;
 use std::str::FromStr;
 use thiserror::Error;
 
 /// A CAN identifier. CANopen uses base (11-bit) identifiers only; extended ones are kept so that
 /// foreign frames can be counted and printed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Display)]
 pub enum CanId {
     /// 11-bit identifier, 0 to 0x7FF.
+    #[display("{_0:03X}")]
     Base(u16),
     /// 29-bit identifier, 0 to 0x1FFF_FFFF.
+    #[display("{_0:08X}")]
     Extended(u32),
 }
 
-impl fmt::Display for CanId {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            CanId::Base(id) => write!(f, "{id:03X}"),
-            CanId::Extended(id) => write!(f, "{id:08X}"),
-        }
-    }
-}
-
 /// A CANopen node number, 1 to 127.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Display)]
 pub struct NodeId(u8);
 
 impl NodeId {
@@ -36,12 +30,6 @@ impl NodeId {
     /// The number itself.
     pub const fn get(self) -> u8 {
         self.0
-    }
-}
-
-impl fmt::Display for NodeId {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.fmt(f)
     }
 }
 

@@ -1,9 +1,11 @@
 //! The address of a value in a node's object dictionary.
 
-use std::fmt;
+use derive_more::Display;
 
-/// Index and subindex of an object: the multiplexer of an SDO, the upper half of a PDO mapping.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+/// Index and subindex of an object: the multiplexer of an SDO, the upper half of a PDO mapping. As text it is
+/// `0x6041:00`: both in hexadecimal, as device manuals print them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Display)]
+#[display("0x{index:04X}:{subindex:02X}")]
 pub struct ObjectAddress {
     /// Index, 0x0000 to 0xFFFF.
     pub index: u16,
@@ -18,20 +20,13 @@ impl ObjectAddress {
     }
 }
 
-/// `0x6041:00`: both in hexadecimal, as device manuals print them.
-impl fmt::Display for ObjectAddress {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "0x{:04X}:{:02X}", self.index, self.subindex)
-    }
-}
-
 /// Objects of the communication profile (CiA 301, 7.5.2).
 pub mod communication {
     use super::ObjectAddress;
 
     /// u32: profile number in the lower half.
     pub const DEVICE_TYPE: ObjectAddress = ObjectAddress::new(0x1000, 0);
-    /// u8.
+    /// u8: see [`error_register`](crate::canopen::emcy::error_register).
     pub const ERROR_REGISTER: ObjectAddress = ObjectAddress::new(0x1001, 0);
     /// u32: identifier of SYNC; bit 30 makes the node produce it.
     pub const SYNC_COB_ID: ObjectAddress = ObjectAddress::new(0x1005, 0);

@@ -10,6 +10,7 @@ use crate::session::{Outcome, StageAtEnd};
 use crate::stage::{Axis, DriveReport};
 use crate::study::{OFF_PLANE_LIMIT_MM, PlanStatus};
 use crate::text::{fixed, shell_word};
+use derive_more::Display;
 use std::fmt;
 use std::fs;
 use std::path::Path;
@@ -97,7 +98,7 @@ pub(super) fn after_insertion(
     }
     let depth_mm = depth_mm(config, report);
     let next = match (required(config, &report.stage_at_end), possible_withdrawal(config, report)) {
-        (Some(required), _) => next_stage(required.operation(), "", path, report),
+        (Some(required), _) => next_stage(&required.to_string(), "", path, report),
         (None, Err(_)) if depth_mm.is_none() => next_stage("status", "", path, report),
         (None, Err(_)) => next_review(report)?,
         (None, Ok(withdrawal)) => next_stage("withdraw", &withdrawal.options(), path, report),
@@ -151,7 +152,7 @@ pub(super) fn after_operation(
     };
     let remaining = remaining.filter(|_| position_of(Axis::Insertion).is_some());
     let next = match (required, remaining) {
-        (Some(required), _) => next_stage(required.operation(), "", path, report),
+        (Some(required), _) => next_stage(&required.to_string(), "", path, report),
         (None, Some(remaining)) => next_stage("withdraw", remaining, path, report),
         (None, None) => next_stage("status", "", path, report),
     };
@@ -179,21 +180,13 @@ fn next_stage(operation: &str, options: &str, path: Option<&Path>, report: &RunR
 }
 
 /// An operation of the stage that is required before any other.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
+#[display(rename_all = "lowercase")]
 enum Required {
     /// The drives are not known to stand without power.
     Status,
     /// A drive is in Fault, and a run would not reset it.
     Reset,
-}
-
-impl Required {
-    fn operation(self) -> &'static str {
-        match self {
-            Required::Status => "status",
-            Required::Reset => "reset",
-        }
-    }
 }
 
 fn required(config: &Config, stage: &StageAtEnd) -> Option<Required> {

@@ -33,7 +33,7 @@ use crate::transport::can::CanError;
 use clap::error::{ContextKind, ContextValue};
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use serde_json::{Value, json};
-use std::fmt::{self, Display, Formatter};
+use std::fmt::Display;
 use std::io::{self, ErrorKind};
 use std::path::Path;
 use std::process::ExitCode;
@@ -81,8 +81,9 @@ enum Command {
     Generate(generate::Artifact),
 }
 
-/// Why a command did not succeed.
-#[derive(Debug)]
+/// Why a command did not succeed. Its text is the message, empty if it was printed already.
+#[derive(Debug, derive_more::Display)]
+#[display("{}", self.message.as_deref().unwrap_or_default())]
 struct Failure {
     /// `None` if the command has printed it already.
     message: Option<String>,
@@ -114,13 +115,6 @@ impl Failure {
 
 /// The result of a command, or of a part of one.
 type Result<T, E = Failure> = std::result::Result<T, E>;
-
-/// The message; empty if it was printed already.
-impl Display for Failure {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        f.write_str(self.message.as_deref().unwrap_or_default())
-    }
-}
 
 /// The end of a command that has printed its result: a failure unless `status` is 0.
 fn finish_with(status: u8) -> Result<()> {

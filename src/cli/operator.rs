@@ -121,10 +121,7 @@ fn print(queue: &mut Consumer<String>, latest: &Latest, bar: &ProgressBar) {
         // Read before the queue is emptied: the last line may come just before the queue is closed.
         let is_closed = queue.is_abandoned();
         while let Ok(line) = queue.pop() {
-            match bar.is_hidden() {
-                true => print_stderr(line),
-                false => bar.println(wrapped(&line)),
-            }
+            if bar.is_hidden() { print_stderr(line) } else { bar.println(wrapped(&line)) }
         }
         if is_closed {
             break;

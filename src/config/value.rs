@@ -1,7 +1,6 @@
 //! TOML text as a flat list of dotted keys, each with its value and its line.
 
-use std::fmt;
-
+use derive_more::Display;
 use toml::de::{DeArray, DeTable, DeValue};
 use toml::{Spanned, Table, Value};
 
@@ -10,9 +9,10 @@ use super::reader::is_inside;
 use crate::text::clipped;
 
 /// Where a value was given.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Display)]
 pub enum Origin {
     /// A line of a file, from 1.
+    #[display("{name}:{line}: ")]
     File {
         /// The file's name, as the user gave it.
         name: String,
@@ -20,6 +20,7 @@ pub enum Origin {
         line: usize,
     },
     /// `--set` on the command line.
+    #[display("--set ")]
     Set,
 }
 
@@ -243,14 +244,5 @@ impl Flattener<'_> {
             return "an array of tables".to_owned();
         }
         clipped(&text.split_whitespace().collect::<Vec<_>>().join(" "), 61).into_owned()
-    }
-}
-
-impl fmt::Display for Origin {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Origin::File { name, line } => write!(f, "{name}:{line}: "),
-            Origin::Set => f.write_str("--set "),
-        }
     }
 }

@@ -128,7 +128,7 @@ impl EmulatedTracker {
         self.last = Some((x_ts, repeats));
         let sample = TrackedTip { acquisition_time, x_ts };
         let arrival = acquisition_time + self.model.latency;
-        self.under_way.push_back((arrival, sample, Truth::new(*tip_true)));
+        self.under_way.push_back((arrival, sample, Truth { x_pb: *tip_true, target_mm: None }));
         self.next = acquisition_time + self.model.period;
     }
 
@@ -136,10 +136,7 @@ impl EmulatedTracker {
         let exact = self.x_tp * *tip_true * self.x_bs;
         let is_on_axis = self.x_bs.translation.xy() == Vector2::zeros()
             && self.x_bs.rotation == Rotation3::identity();
-        let rotation = match is_on_axis {
-            true => without_roll(&exact.rotation),
-            false => exact.rotation,
-        };
+        let rotation = if is_on_axis { without_roll(&exact.rotation) } else { exact.rotation };
         let noise_mm = self.model.noise_mm(self.measured);
         self.measured += 1;
         Pose { rotation, translation: exact.translation + noise_mm }
@@ -190,7 +187,7 @@ mod tests {
         assert_eq!(tracker.deliver(Time::from_secs_f64(0.039)), None);
         let (sample, truth) = tracker.deliver(Time::from_secs_f64(0.040)).unwrap();
         assert_eq!(sample.acquisition_time, Time::ZERO);
-        assert_eq!(truth.x_pb(), &pose(1.0));
+        assert_eq!(truth.x_pb, pose(1.0));
     }
 
     #[test]
@@ -219,8 +216,7 @@ mod tests {
             let measured = &samples[n - n % 5];
             assert_eq!(sample.x_ts, measured.0.x_ts);
             assert_eq!(
-                truth.x_pb().translation.z,
-                n as f64,
+                truth.x_pb.translation.z, n as f64,
                 "the true pose at the time of the stamp"
             );
         }

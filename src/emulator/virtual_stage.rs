@@ -198,7 +198,7 @@ impl VirtualStage {
 
     /// The true tip pose at the last call, and the target at `now`.
     pub fn truth(&self, now: Time) -> Truth {
-        Truth::new(*self.tissue.tip_true()).with_target(self.target_true_mm(now))
+        Truth { x_pb: *self.tissue.tip_true(), target_mm: self.target_true_mm(now) }
     }
 
     /// True depth, mm, and rotation, rad, at `now`, relative to the position at power-on.

@@ -254,10 +254,7 @@ impl Task for Answering {
             }
             StageEvent::Feedback(feedback) => {
                 shell.record(Record::Stage(*feedback));
-                match shell.is_running() {
-                    true => self.go_on(shell, feedback),
-                    false => Ok(()),
-                }
+                if shell.is_running() { self.go_on(shell, feedback) } else { Ok(()) }
             }
             _ => Ok(()),
         }

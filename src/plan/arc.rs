@@ -95,10 +95,8 @@ impl Tip {
         let ahead_mm = to_point.dot(&self.heading);
         let across = to_point - self.heading * ahead_mm;
         let off_axis_mm = across.norm();
-        let bend = match off_axis_mm > STRAIGHT_MM {
-            true => across / off_axis_mm,
-            false => self.across()[0],
-        };
+        let is_aside = off_axis_mm > STRAIGHT_MM;
+        let bend = if is_aside { across / off_axis_mm } else { self.across()[0] };
         RelativePoint { off_axis_mm, ahead_mm, bend }
     }
 

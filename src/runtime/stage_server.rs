@@ -75,9 +75,8 @@ impl TipServer {
     fn send_tip(&mut self, tip: &TrackedTip, truth: &Truth) -> io::Result<()> {
         self.send(&self.tool, tip);
         if let Some(file) = &mut self.truth {
-            let p = truth.x_pb().translation;
-            let FixedAngles { yaw, pitch, roll } =
-                FixedAngles::from_rotation(&truth.x_pb().rotation);
+            let p = truth.x_pb.translation;
+            let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(&truth.x_pb.rotation);
             let time_s = tip.acquisition_time.as_secs_f64();
             writeln!(file, "{time_s},{},{},{},{yaw},{pitch},{roll}", p.x, p.y, p.z)?;
         }

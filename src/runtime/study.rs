@@ -209,7 +209,7 @@ mod tests {
             assert_eq!(step.tip_meas_mm.is_some(), short_step.tip_meas_mm.is_some());
             let estimate = |step: &StepRecord| step.decision.estimate.unwrap().x_pb.translation;
             let apart = [
-                truth.x_pb().translation - short_truth.x_pb().translation,
+                truth.x_pb.translation - short_truth.x_pb.translation,
                 estimate(step) - estimate(short_step),
             ];
             for (largest, apart) in largest.iter_mut().zip(apart) {

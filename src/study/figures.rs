@@ -9,13 +9,15 @@ use crate::units::{Time, wrap_angle};
 use derive_more::Display;
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
-use std::fmt;
 
 /// A tip within this distance of the plane counts as in the plane, mm.
 pub const OFF_PLANE_LIMIT_MM: f64 = 1.0;
 
 /// Estimated minus true tip: mm and degrees.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Display)]
+#[display(
+    "x {x_mm:.3} y {y_mm:.3} z {z_mm:.3} mm, yaw {yaw_deg:.2} pitch {pitch_deg:.2} roll {roll_deg:.2} deg"
+)]
 pub struct TipError {
     /// x, mm.
     pub x_mm: f64,
@@ -31,14 +33,6 @@ pub struct TipError {
     pub roll_deg: f64,
 }
 
-impl fmt::Display for TipError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let TipError { x_mm, y_mm, z_mm, yaw_deg, pitch_deg, roll_deg } = self;
-        write!(f, "x {x_mm:.3} y {y_mm:.3} z {z_mm:.3} mm, ")?;
-        write!(f, "yaw {yaw_deg:.2} pitch {pitch_deg:.2} roll {roll_deg:.2} deg")
-    }
-}
-
 impl TipError {
     /// The coordinates, named with their units, in the order of [`TipError::coordinates`].
     pub const COORDINATES: [&str; 6] = ["x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg"];
@@ -46,7 +40,7 @@ impl TipError {
     /// The error of a step's estimate; `None` without an estimate.
     pub fn of(step: &StepRecord, truth: &Truth) -> Option<Self> {
         let estimate = coordinates(&step.decision.estimate.as_ref()?.x_pb);
-        Some(TipError::between(estimate, coordinates(truth.x_pb())))
+        Some(TipError::between(estimate, coordinates(&truth.x_pb)))
     }
 
     /// The error of an estimate, both as x, y, z in mm and yaw, pitch, roll in rad.
@@ -193,7 +187,7 @@ impl RunFigures {
     pub fn take_step(&mut self, step: &StepRecord, truth: Option<&Truth>) {
         let x_est_mm = step.decision.estimate.as_ref().map(|estimate| estimate.x_pb.translation.x);
         self.estimated.extend(x_est_mm.map(|x_mm| (step.insertion_meas_mm, x_mm)));
-        let x_mm = truth.map(|truth| truth.x_pb().translation.x).or(x_est_mm);
+        let x_mm = truth.map(|truth| truth.x_pb.translation.x).or(x_est_mm);
         let error = truth.and_then(|truth| TipError::of(step, truth));
         self.take_scored(step.insertion_meas_mm, x_mm, error);
         self.saturated += usize::from(step.decision.command_saturated);
@@ -202,8 +196,8 @@ impl RunFigures {
         }
         if let Some(approach) = &step.decision.approach {
             let true_mm = |truth: &Truth| {
-                let target_mm = truth.target_mm().unwrap_or(&approach.target_mm);
-                (truth.x_pb().translation - target_mm).norm()
+                let target_mm = truth.target_mm.unwrap_or(approach.target_mm);
+                (truth.x_pb.translation - target_mm).norm()
             };
             self.so_far.target_error_mm = truth.map(true_mm);
             self.so_far.target_error_est_mm = Some(approach.distance_mm);
@@ -322,7 +316,10 @@ mod tests {
         let mut figures = RunFigures::default();
         assert_eq!(figures.plane_missed_by_mm(), None);
         for n in 0..10 {
-            figures.take_step(&step(f64::from(n), 2.5), Some(&Truth::new(Pose::identity())));
+            figures.take_step(
+                &step(f64::from(n), 2.5),
+                Some(&Truth { x_pb: Pose::identity(), target_mm: None }),
+            );
         }
         assert_eq!(figures.plane_missed_by_mm(), Some(2.5));
         assert_eq!(figures.report().off_plane_rms_mm, Some(0.0));
@@ -385,8 +382,10 @@ mod tests {
 
     #[test]
     fn errors_are_estimate_minus_truth() {
-        let truth =
-            Truth::new(Pose { translation: Vector3::new(1.0, 0.0, 2.0), ..Pose::identity() });
+        let truth = Truth {
+            x_pb: Pose { translation: Vector3::new(1.0, 0.0, 2.0), ..Pose::identity() },
+            target_mm: None,
+        };
         let error = TipError::of(&step(2.0, 1.5), &truth).unwrap();
         assert_eq!((error.x_mm, error.z_mm, error.roll_deg), (0.5, 0.0, 0.0));
     }

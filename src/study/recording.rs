@@ -3,8 +3,8 @@
 use crate::geometry::so3;
 use crate::table::{Table, TableError};
 use crate::units::wrap_angle;
+use derive_more::Display;
 use nalgebra::{Rotation3, Vector3};
-use std::fmt;
 
 /// The columns that a recording must have, in any order.
 const REQUIRED: [&str; 5] = ["insertion_mm", "rotation_rad", "x_mm", "y_mm", "z_mm"];
@@ -35,31 +35,23 @@ pub struct RecordedRow {
 }
 
 /// Whether the orientations of a recording turn with the base about the needle's axis.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Display)]
 pub enum RecordedRoll {
     /// They do: they contain the roll.
+    #[display("the orientations turn with the base")]
     Turns,
     /// They do not: they contain only the heading, or never change.
+    #[display("the orientations do not turn with the base")]
     DoesNotTurn,
     /// The base turned by too little to show it.
+    #[display(
+        "the base turned by only {:.0} deg, so the orientations do not show whether they turn with it",
+        base_rad.to_degrees()
+    )]
     Unknown {
         /// The largest turn of the base from its start, rad.
         base_rad: f64,
     },
-}
-
-impl fmt::Display for RecordedRoll {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            RecordedRoll::Turns => f.write_str("the orientations turn with the base"),
-            RecordedRoll::DoesNotTurn => f.write_str("the orientations do not turn with the base"),
-            RecordedRoll::Unknown { base_rad } => write!(
-                f,
-                "the base turned by only {:.0} deg, so the orientations do not show whether they turn with it",
-                base_rad.to_degrees()
-            ),
-        }
-    }
 }
 
 /// A recorded insertion.

@@ -128,14 +128,14 @@ impl TrialScorer {
     pub fn take(&mut self, step: &StepRecord, truth: &Truth) {
         self.figures.take_step(step, Some(truth));
         if let Some(goal) = &mut self.goal {
-            let tip = truth.x_pb();
-            let before = goal.tip_before.replace(*tip).unwrap_or(*tip);
-            let distance_mm = goal.obstacles.distance_on_way_mm(&before, tip);
+            let tip = truth.x_pb;
+            let before = goal.tip_before.replace(tip).unwrap_or(tip);
+            let distance_mm = goal.obstacles.distance_on_way_mm(&before, &tip);
             goal.clearance_mm = goal.clearance_mm.min(distance_mm);
         }
         let depth_mm = step.insertion_meas_mm;
         if let Some(bound) = &mut self.bound {
-            bound.advance(truth.x_pb(), depth_mm, step.rotation_meas_rad);
+            bound.advance(&truth.x_pb, depth_mm, step.rotation_meas_rad);
             if step.tip_positions > 0 {
                 bound.measure(step.tip_positions);
             }
@@ -144,7 +144,7 @@ impl TrialScorer {
             self.bounds.push((depth_mm, TipError::from(bound)));
         }
         let estimate = step.decision.estimate.as_ref();
-        let nees = estimate.and_then(|estimate| nees(estimate, truth.x_pb()));
+        let nees = estimate.and_then(|estimate| nees(estimate, &truth.x_pb));
         self.nees.extend(nees.map(|nees| (depth_mm, nees)));
         if step.tip_meas_mm.is_some() {
             let belief = estimate.and_then(|estimate| estimate.belief);

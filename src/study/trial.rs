@@ -138,7 +138,7 @@ impl<'a> EmulatedNeedle<'a> {
 
     fn truth(&self, insertion_mm: f64) -> Truth {
         let target_mm = self.stage.target.map(|target| target.position_mm(insertion_mm));
-        Truth::new(*self.tissue.tip_true()).with_target(target_mm)
+        Truth { x_pb: *self.tissue.tip_true(), target_mm }
     }
 
     /// Tracks the target at the times of the tip's samples, and before the insertion for as long as its mean

@@ -90,10 +90,7 @@ impl Refusal {
 
 /// `value` with one decimal, a very large one by its power of ten.
 pub(crate) fn short(value: f64) -> String {
-    match value.abs() < 1e6 {
-        true => format!("{value:.1}"),
-        false => format!("{value:.1e}"),
-    }
+    if value.abs() < 1e6 { format!("{value:.1}") } else { format!("{value:.1e}") }
 }
 
 /// What the gates did with the samples so far.

@@ -277,10 +277,10 @@ fn dropouts(times_s: &[f64], interval_s: f64) -> usize {
 /// The median, the upper one of an even number of values; 0 without values.
 fn median(values: &mut [f64]) -> f64 {
     let middle = values.len() / 2;
-    match values.is_empty() {
-        true => 0.0,
-        false => *values.select_nth_unstable_by(middle, f64::total_cmp).1,
+    if values.is_empty() {
+        return 0.0;
     }
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
 /// Mean and variance of `values`.

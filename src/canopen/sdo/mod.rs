@@ -3,6 +3,7 @@
 //! The bench reads and writes values of 1 to 4 bytes, each in one frame (expedited transfer). The server
 //! also sends longer values, such as a device's name, in segments.
 
+use derive_more::Display;
 use std::fmt;
 use std::time::Duration;
 
@@ -59,8 +60,9 @@ pub enum SdoError {
     UnexpectedCommand(u8),
 }
 
-/// The value of an object of 1 to 4 bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// The value of an object of 1 to 4 bytes. As text it is `0x0008`: as many digits as the object has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
+#[display("0x{:0width$X}", self.to_u32(), width = 2 * usize::from(self.len))]
 pub struct SdoValue {
     bytes: [u8; 4],
     len: u8,
@@ -124,13 +126,6 @@ macro_rules! sdo_values {
     };
 }
 sdo_values!(u8, i8, u16, i16, u32, i32);
-
-/// `0x0008`: as many digits as the object has.
-impl fmt::Display for SdoValue {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "0x{:0width$X}", self.to_u32(), width = 2 * usize::from(self.len))
-    }
-}
 
 /// Why a transfer was refused: the 32 bits on the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

@@ -1,13 +1,15 @@
 //! Distances and speeds on the command line: a number and its unit.
 
 use crate::stage::{Axis, CountsRatio};
-use std::fmt;
+use derive_more::Display;
 
 /// Longest distance along each axis, in its unit: the largest limits that the configuration allows.
 const DISTANCE_MAX: [(Axis, f64); 2] = [(Axis::Insertion, 1000.0), (Axis::Rotation, 360_000.0)];
 
-/// A distance along an axis, such as `2mm` or `10deg`; or a speed, the distance a second.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// A distance along an axis, such as `2mm` or `10deg`; or a speed, the distance a second. As text it is written as on
+/// the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Display)]
+#[display("{value}{}", self.axis.unit())]
 pub(in crate::cli) struct Distance {
     /// In the unit of `axis`: mm or deg.
     value: f64,
@@ -68,13 +70,6 @@ impl Distance {
             }
             _ => Ok(distance),
         }
-    }
-}
-
-/// As it is written on the command line.
-impl fmt::Display for Distance {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}{}", self.value, self.axis.unit())
     }
 }
 

@@ -359,10 +359,7 @@ impl Task for InsertTask {
             // A start in doubt is decided first.
             self.accepts_start(shell)?;
         }
-        match is_overdue(self, shell) {
-            true => Err(self.explain_no_tip(shell.now)),
-            false => Ok(()),
-        }
+        if is_overdue(self, shell) { Err(self.explain_no_tip(shell.now)) } else { Ok(()) }
     }
 
     fn deadline(&self, shell: &Shell) -> Time {

@@ -187,7 +187,7 @@ impl Space {
             let (goal, depth_mm) = (self.scene.goal.as_ref(), step.insertion_meas_mm);
             log_approach(stream, goal, approach, estimate.as_ref(), depth_mm)?;
         }
-        if let Some(truth) = truth.map(Truth::x_pb).filter(|x_pb| x_pb.is_finite()) {
+        if let Some(truth) = truth.map(|truth| &truth.x_pb).filter(|x_pb| x_pb.is_finite()) {
             self.truth.log(stream, truth)?;
         }
         let Some(measured_mm) = measured_mm else { return Ok(()) };

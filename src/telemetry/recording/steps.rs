@@ -46,7 +46,7 @@ impl Steps {
             estimate.as_ref().map_or(UNKNOWN, |estimate| coordinates(&estimate.x_pb))
         };
         let mut estimate = of(&step.decision.estimate);
-        let mut truth = known_truth.map_or(UNKNOWN, |t| coordinates(t.x_pb()));
+        let mut truth = known_truth.map_or(UNKNOWN, |t| coordinates(&t.x_pb));
         self.unwrap_roll(&mut estimate);
         self.unwrap_roll(&mut truth);
         let has_truth = known_truth.is_some();

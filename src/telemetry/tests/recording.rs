@@ -68,7 +68,7 @@ fn steps(entries: &[Entry]) -> impl Iterator<Item = (&StepRecord, [f64; 6], [f64
     entries.iter().filter_map(|entry| match (&entry.record, &entry.truth) {
         (Record::Step(step), Some(truth)) => {
             let estimate = step.decision.estimate.map_or([f64::NAN; 6], |e| coordinates(&e.x_pb));
-            Some((step.as_ref(), estimate, coordinates(truth.x_pb())))
+            Some((step.as_ref(), estimate, coordinates(&truth.x_pb)))
         }
         _ => None,
     })

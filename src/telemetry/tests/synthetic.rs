@@ -67,9 +67,9 @@ pub(super) fn spoil(entry: &mut Entry, value: f64) {
                 estimate.x_pb.translation.y = value;
                 estimate.sd = Some([value; 6]);
             }
-            let mut x_pb = *entry.truth.as_ref().unwrap().x_pb();
+            let mut x_pb = entry.truth.as_ref().unwrap().x_pb;
             x_pb.translation.x = value;
-            entry.truth = Some(Truth::new(x_pb));
+            entry.truth = Some(Truth { x_pb, target_mm: None });
         }
         Record::Begun { .. }
         | Record::Input { .. }
@@ -220,7 +220,7 @@ impl Run {
                 ..Decision::default()
             },
         };
-        let truth = Some(Truth::new(self.tip));
+        let truth = Some(Truth { x_pb: self.tip, target_mm: None });
         self.entries.push(Entry { record: Record::Step(Box::new(step)), truth });
     }
 }

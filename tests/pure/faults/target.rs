@@ -167,6 +167,6 @@ fn a_moving_target_is_reached() {
     assert!((end.target_mm.y - 7.0).abs() < 0.7, "{}", end.target_mm);
     assert!(end.distance_mm < 0.7, "{}", end.distance_mm);
     let truth = bench.stage.truth(bench.now);
-    let target_mm = truth.target_mm().expect("it moves");
-    assert!((truth.x_pb().translation - target_mm).norm() < 0.8, "{target_mm}");
+    let target_mm = truth.target_mm.expect("it moves");
+    assert!((truth.x_pb.translation - target_mm).norm() < 0.8, "{target_mm}");
 }
