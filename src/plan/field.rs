@@ -216,4 +216,15 @@ mod tests {
         assert!(places().all(|at_mm| !is_clear(at_mm, 0.1)));
         assert!(places().any(|at_mm| is_clear(at_mm, 0.0)), "so 0 is not allowed");
     }
+
+    /// A run may begin outside the grid, where the nearest node says nothing of an obstacle behind the start.
+    #[test]
+    fn an_obstacle_behind_the_start_counts_outside_the_grid() {
+        let centre_mm = Vector3::new(0.0, 0.0, -4.0);
+        let world = world(vec![Obstacle::Sphere { centre_mm, radius_mm: 1.5 }]);
+        let mut field = Field::new(Cow::Owned(world), 0.1, true);
+        field.world.to_mut().workspace.begin_at(Vector3::zeros(), Vector3::zeros());
+        assert!(field.slack_mm(&Vector3::new(0.0, 0.0, -2.0)) > 0.0);
+        assert!(field.slack_mm(&Vector3::new(0.0, 0.0, -2.9)) < 0.0);
+    }
 }

@@ -31,7 +31,7 @@ impl Problem {
         (from_mm - self.target_mm).norm()
     }
 
-    /// The corners of a box that no path leaves, mm.
+    /// The corners of a box that no path leaves, plane frame, mm.
     pub(super) fn reach_mm(&self) -> [Vector3<f64>; 2] {
         let Problem { start, curvature_per_mm, length_max_mm, .. } = self;
         // Farthest along an axis comes the path that first turns toward it, and then goes straight.
@@ -57,7 +57,7 @@ mod tests {
     use proptest::prelude::*;
 
     proptest! {
-        /// No two arcs lead out of the box, and along each axis some come near to its sides.
+        /// No two arcs of the full curvature lead out of the box.
         #[test]
         fn no_path_leaves_the_box(
             turn in prop::array::uniform3(-3.0..3.0f64), first_mm in 0.0..150.0f64, bends in prop::array::uniform2(-3.2..3.2f64),

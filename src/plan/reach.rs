@@ -79,7 +79,7 @@ mod tests {
         }
     }
 
-    /// The point ahead is 90 mm away, and the arc to the one 30 mm aside is 96 mm long.
+    /// One point is 90 mm straight ahead; the arc to another, 30 mm beside it, is 96 mm long.
     #[test]
     fn a_point_beyond_the_length_that_is_left_is_out_of_reach() {
         let problem = problem([0.0, 0.0, 90.0], true);

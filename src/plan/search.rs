@@ -30,8 +30,8 @@ pub enum Status {
     /// There is no path at this resolution: the search was exhausted.
     #[display("none")]
     None,
-    /// The budget was spent, or in space the share of it of the resolution at which a path was found: there may be a
-    /// path, or a shorter one than the one found.
+    /// The budget was spent; in space, where each resolution has a share of it, that share. There may be a path, or one
+    /// that is shorter than the path found.
     #[display("budget")]
     Budget,
 }
