@@ -401,8 +401,8 @@ fn a_target_behind_the_tip_is_not_arrived_at_before_the_path_ends() {
     assert_eq!(next, Step::Stop(StopReason::NoPath));
 }
 
-/// One estimate says that the needle hardly bends, so no path is found. The needle bends toward the target meanwhile;
-/// the length of that bend does not limit the next path.
+/// One estimate says that the needle hardly bends, so no path is found. The needle goes on toward the target for a
+/// while; the length of that way does not limit the next path.
 #[test]
 fn a_step_without_a_path_does_not_shorten_the_next_path() {
     let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, 1.0, 60.0), radius_mm: 4.0 };
