@@ -288,8 +288,9 @@ impl Replanner {
 
     /// True if a path to the target is left after `turn_mm` straight ahead, the distance that the needle goes while
     /// the base turns once around. That path must end as near to the target as the path of the last step, keeps
-    /// the same distance from obstacles, and may use the whole curvature of `estimate`. If the path of the last
-    /// step ends sooner, the way straight ahead need only be clear.
+    /// the same distance from obstacles, and leaves the curvature margin unused even if that path does not: what
+    /// the turn costs must be made up for. If the path of the last step ends sooner, the way straight ahead need
+    /// only be clear.
     pub fn may_turn(&mut self, estimate: &TipEstimate, turn_mm: f64) -> bool {
         let Some(path) = self.path.as_ref() else { return true };
         let (start, remaining_mm) = (path.start, path.length_mm());
@@ -297,7 +298,7 @@ impl Replanner {
         let straight = Arc { bend: start.across()[0], curvature_per_mm: 0.0, length_mm };
         let after = start.after(&straight);
         let (rest, miss_mm) = (rest_of(path, turn_mm, after), self.miss_mm(path));
-        self.problem.curvature_per_mm = estimate.curvature_per_mm;
+        self.problem.curvature_per_mm = estimate.curvature_per_mm * (1.0 - self.curvature_margin);
         if !self.field.is_clear(&start, &straight) {
             return false;
         }

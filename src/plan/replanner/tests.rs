@@ -94,24 +94,28 @@ fn a_whole_turn_needs_a_path_after_it() {
     let aside = |share: f64| ([0.0, share * reach_mm, 100.0], vec![]);
     let sphere = |y, z| Obstacle::Sphere { centre_mm: Vector3::new(0.0, y, z), radius_mm: 3.0 };
     let ball = |z| sphere(1.0, z);
-    // A turn takes 6 mm of the 100 mm, and with them 12% of the reach.
+    // A turn takes 6 mm of the 100 mm, and with them 12% of the reach; a margin of 0.15 takes 22%.
     let cases = [
-        (([0.0, 0.1, 5.0], vec![]), true),
-        (([0.0, 0.1, 5.0], vec![sphere(-5.05, 5.0)]), false),
-        (aside(0.0), true),
-        (aside(0.8), true),
-        (aside(0.95), false),
-        (([0.0, 0.0, 120.0], vec![ball(45.0)]), true),
-        (([0.0, 0.0, 120.0], vec![ball(34.0)]), false),
+        (([0.0, 0.1, 5.0], vec![]), 0.0, true),
+        (([0.0, 0.1, 5.0], vec![sphere(-5.05, 5.0)]), 0.0, false),
+        (aside(0.0), 0.0, true),
+        (aside(0.8), 0.0, true),
+        (aside(0.95), 0.0, false),
+        (aside(0.6), 0.15, true),
+        (aside(0.7), 0.15, false),
+        (aside(0.8), 0.15, false),
+        (([0.0, 0.0, 120.0], vec![ball(45.0)]), 0.0, true),
+        (([0.0, 0.0, 120.0], vec![ball(34.0)]), 0.0, false),
     ];
-    for ((target_mm, obstacles), may_turn) in cases {
+    for ((target_mm, obstacles), margin, may_turn) in cases {
         let problem = problem(target_mm, true);
-        let mut planner = Replanner::new(world(obstacles.clone()), problem.clone(), 0.0, None);
+        let mut planner = Replanner::new(world(obstacles.clone()), problem.clone(), margin, None);
         let estimate = known(problem.start, &problem);
         let step = planner.step(&estimate, 0.0, STEP_MM);
         let path = planner.path().cloned();
         assert!(path.is_some() && matches!(step, Step::Steer(_)), "{step:?}");
-        assert_eq!(planner.may_turn(&estimate, 6.0), may_turn, "{target_mm:?}, {obstacles:?}");
+        let said = planner.may_turn(&estimate, 6.0);
+        assert_eq!(said, may_turn, "{target_mm:?}, {obstacles:?}, margin {margin}");
         assert_eq!(planner.path(), path.as_ref(), "the plan stays");
         assert_eq!(planner.problem.start, problem.start);
     }
