@@ -34,7 +34,8 @@ pub fn exp(w: &Vector3<f64>) -> Rotation3<f64> {
     exp_and_left_jacobian(w).0
 }
 
-/// [`exp`] and [`left_jacobian`], which share their coefficients.
+/// [`exp`] and the left Jacobian `J_l`, which share their coefficients: `Exp(w + d) ≈ Exp(J_l(w) d) Exp(w)`. `J_l` is
+/// also the translation part of SE(3)'s exponential.
 pub(super) fn exp_and_left_jacobian(w: &Vector3<f64>) -> (Rotation3<f64>, Matrix3<f64>) {
     let (a, b, c) = coefficients(w.norm());
     let w_hat = hat(w);
@@ -59,13 +60,7 @@ pub fn quaternion(rotation: &Rotation3<f64>) -> UnitQuaternion<f64> {
     UnitQuaternion::new_normalize(UnitQuaternion::from_rotation_matrix(rotation).into_inner())
 }
 
-/// The left Jacobian of SO(3), `Exp(w + d) ≈ Exp(J_l(w) d) Exp(w)`. It is also the translation part of SE(3)'s
-/// exponential.
-pub fn left_jacobian(w: &Vector3<f64>) -> Matrix3<f64> {
-    exp_and_left_jacobian(w).1
-}
-
-/// The inverse of [`left_jacobian`], for |w| < 2π.
+/// The inverse of the left Jacobian of SO(3), for |w| < 2π.
 pub fn left_jacobian_inverse(w: &Vector3<f64>) -> Matrix3<f64> {
     let theta = w.norm();
     let w_hat = hat(w);
@@ -112,7 +107,7 @@ mod tests {
 
         #[test]
         fn left_jacobian_times_its_inverse_is_one(w in vector(6.0)) {
-            let product = left_jacobian(&w) * left_jacobian_inverse(&w);
+            let product = exp_and_left_jacobian(&w).1 * left_jacobian_inverse(&w);
             prop_assert!((product - Matrix3::identity()).norm() < 1e-10);
         }
 
@@ -120,7 +115,8 @@ mod tests {
         fn left_jacobian_is_the_derivative_of_exp(w in vector(3.0), d in vector(1.0)) {
             let h = 1e-6;
             let difference = log(&(exp(&(w + d * h)) * exp(&(w - d * h)).inverse())) / (2.0 * h);
-            prop_assert!((difference - left_jacobian(&w) * d).norm() < 1e-8);
+            let jacobian = exp_and_left_jacobian(&w).1;
+            prop_assert!((difference - jacobian * d).norm() < 1e-8);
         }
     }
 
