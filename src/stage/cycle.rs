@@ -304,9 +304,7 @@ impl Stage {
         self.phase = Phase::Stopping { quick, give_up: now + self.config.power.stop_timeout };
         self.emit(StageEvent::Progress(Progress::Stopping));
         for axis in Axis::BOTH {
-            self.drives[axis].next_counts = None;
-            self.drives[axis].watch_standstill();
-            self.drives[axis].reading = Reading::begun(now);
+            self.drives[axis].begin_stop(now, self.sync_count, quick);
         }
     }
 
@@ -371,7 +369,7 @@ impl Stage {
         drive.reading.is_answered = true;
         if object == object::STATUSWORD {
             if let Some(word) = value.at_least(2) {
-                drive.take_statusword(Statusword(word as u16));
+                drive.take_statusword(Statusword(word as u16), self.sync_count);
             }
         } else if let Some(counts) = value.at_least(4) {
             drive.take_position(counts as i32, self.sync_count);

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use super::bring_up::BringUpState;
 use super::cycle::Reading;
+use super::event::{DriveReport, may_have_power};
 use super::standstill::Standstill;
 use super::{Axis, AxisConfig, AxisUse, Commanded, DriveFlag, LimitCheck, StageConfig, Unwrapper};
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
@@ -15,24 +16,6 @@ use crate::units::Time;
 const RESET_TIMEOUT: Duration = Duration::from_millis(500);
 /// The bits that a drive on its way to Operation Enabled keeps once it has shown them.
 const BEFORE_POWER: u16 = Statusword::REMOTE | Statusword::VOLTAGE_ENABLED;
-
-/// A drive's last state and error.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct DriveReport {
-    /// Its state; `None` before its first statusword, or if the profile does not define it.
-    pub state: Option<DriveState>,
-    /// The last error that it reported, unless it has reported its end since.
-    pub error: Option<EmcyCode>,
-    /// It has restarted since its bring-up, and may count its position anew.
-    pub restarted: bool,
-}
-
-impl DriveReport {
-    /// True if the drive has said that its motor may have power.
-    pub fn says_power(&self) -> bool {
-        self.state.is_some() && may_have_power(self.state)
-    }
-}
 
 /// The one reset of a drive that was found in Fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -63,6 +46,9 @@ pub(super) struct Drive {
     /// The SYNC after which the newest position came.
     position_sync: u64,
     pub(super) statusword: Option<Statusword>,
+    /// The SYNC after which it came, and the first SYNC after which it may say that power is off.
+    statusword_sync: u64,
+    off_sync: u64,
     /// The drive's TPDO1 for the last SYNC has come.
     pub(super) fresh: bool,
     /// SYNCs in a row without the drive's TPDO1.
@@ -119,6 +105,8 @@ impl Drive {
             position: Unwrapper::new(0),
             position_sync: 0,
             statusword: None,
+            statusword_sync: 0,
+            off_sync: 0,
             fresh: false,
             missed_in_a_row: 0,
             tpdo_of_wrong_length: None,
@@ -159,7 +147,7 @@ impl Drive {
     pub(super) fn take_tpdo(&mut self, payload: [u8; 6], sync: u64) {
         self.tpdo = payload;
         let [s0, s1, p0, p1, p2, p3] = payload;
-        self.take_statusword(Statusword(u16::from_le_bytes([s0, s1])));
+        self.take_statusword(Statusword(u16::from_le_bytes([s0, s1])), sync);
         self.take_position(i32::from_le_bytes([p0, p1, p2, p3]), sync);
         self.fresh = true;
         self.tpdo_of_wrong_length = None;
@@ -169,9 +157,10 @@ impl Drive {
         }
     }
 
-    /// Takes a statusword, received by PDO or SDO.
-    pub(super) fn take_statusword(&mut self, statusword: Statusword) {
+    /// Takes a statusword, received by PDO or SDO after the SYNC of this number.
+    pub(super) fn take_statusword(&mut self, statusword: Statusword, sync: u64) {
         self.statusword = Some(statusword);
+        self.statusword_sync = sync;
         self.end_reset(statusword.state());
         use DriveState as S;
         self.shown = match statusword.state() {
@@ -468,31 +457,44 @@ impl Drive {
         DriveReport { state, error, restarted: self.restarted }
     }
 
+    /// Begins a stop after the SYNC of this number. In a quick stop the axis is not believed to stand before it can
+    /// have braked, nor a drive that was commanded to switch on to be off by what it said before the stop.
+    pub(super) fn begin_stop(&mut self, now: Time, sync: u64, quick: bool) {
+        self.next_counts = None;
+        let braking = if quick { self.braking_time() } else { Duration::ZERO };
+        self.standstill.watch_braking(self.position.counts(), braking);
+        self.reading = Reading::begun(now);
+        if self.controlword.has(Controlword::SWITCH_ON_BIT) {
+            // The first SYNC carries the stop's controlword, and its TPDO may have been sampled before.
+            self.off_sync = sync + 2;
+        }
+    }
+
+    /// How long the quick stop takes from the commanded speed; in homing mode from the highest homing speed.
+    fn braking_time(&self) -> Duration {
+        let AxisConfig { homing, quick_stop_deceleration, .. } = self.config;
+        let speeds = homing.filter(|_| self.in_homing_mode()).map(|homing| {
+            [homing.speed_switch, homing.speed_zero].into_iter().flatten().fold(0.0, f64::max)
+        });
+        let counts_per_s =
+            self.commanded.step_counts.unsigned_abs() as f64 / self.sync_period.as_secs_f64();
+        let speed = speeds.unwrap_or(counts_per_s / self.limits().scale.counts_per_unit());
+        let braking_s = quick_stop_deceleration.map_or(0.0, |by| speed / by);
+        Duration::try_from_secs_f64(braking_s).unwrap_or(Duration::MAX)
+    }
+
     /// Starts to watch for standstill.
     pub(super) fn watch_standstill(&mut self) {
         self.standstill.watch_from(self.position.counts());
     }
 
-    /// True if the axis was seen to stand, see [`Standstill`].
+    /// See [`Standstill`].
     pub(super) fn stands(&self) -> bool {
         self.standstill.stands()
     }
 
     /// True if the motor has no power, or is losing it.
     pub(super) fn is_off(&self) -> bool {
-        !may_have_power(self.state())
+        !may_have_power(self.state()) && self.statusword_sync >= self.off_sync
     }
-}
-
-/// Whether the motor may have power in `state`, which may be undefined or not known.
-pub fn may_have_power(state: Option<DriveState>) -> bool {
-    matches!(
-        state,
-        None | Some(
-            DriveState::SwitchedOn
-                | DriveState::OperationEnabled
-                | DriveState::QuickStopActive
-                | DriveState::FaultReactionActive
-        )
-    )
 }

@@ -1,8 +1,8 @@
 //! What the stage gives to its caller: frames to send, and events.
 
 use super::{Axis, Identity};
-use crate::canopen::cia402::Statusword;
-use crate::canopen::emcy::Emcy;
+use crate::canopen::cia402::{DriveState, Statusword};
+use crate::canopen::emcy::{Emcy, EmcyCode};
 use crate::canopen::{Frame, ObjectAddress};
 use crate::units::Time;
 use std::time::Duration;
@@ -24,6 +24,37 @@ impl SetPoint {
             Axis::Rotation => self.rotation_rad,
         }
     }
+}
+
+/// A drive's last state and error.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct DriveReport {
+    /// Its state; `None` before its first statusword, or if the profile does not define it.
+    pub state: Option<DriveState>,
+    /// The last error that it reported, unless it has reported its end since.
+    pub error: Option<EmcyCode>,
+    /// It has restarted since its bring-up, and may count its position anew.
+    pub restarted: bool,
+}
+
+impl DriveReport {
+    /// True if the drive has said that its motor may have power.
+    pub fn says_power(&self) -> bool {
+        self.state.is_some() && may_have_power(self.state)
+    }
+}
+
+/// Whether the motor may have power in `state`, which may be undefined or not known.
+pub fn may_have_power(state: Option<DriveState>) -> bool {
+    matches!(
+        state,
+        None | Some(
+            DriveState::SwitchedOn
+                | DriveState::OperationEnabled
+                | DriveState::QuickStopActive
+                | DriveState::FaultReactionActive
+        )
+    )
 }
 
 /// Both axes at one SYNC.

@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use super::bring_up::BringUp;
 use super::config::no_homing;
-use super::drive::{Drive, DriveReport};
+use super::drive::Drive;
+use super::event::DriveReport;
 use super::flood::FloodWatch;
 use super::homing::Homing;
 use super::silence::SilenceTest;

@@ -60,8 +60,10 @@ pub use axis::{Axis, AxisUse, PerAxis};
 pub use bring_up::Identity;
 pub use config::{AxisConfig, BusConfig, PowerConfig, RawSdo, StageConfig};
 pub use dialogue::Dialogue;
-pub use drive::{DriveReport, may_have_power};
-pub use event::{Counters, DriveFlag, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};
+pub use event::{
+    Counters, DriveFlag, DriveReport, Feedback, Ignored, Output, Progress, SetPoint, StageEvent,
+    may_have_power,
+};
 pub use homing::{HomingConfig, Reference};
 pub use limits::{AxisLimits, Commanded, LimitCheck};
 pub use machine::Stage;

@@ -2,7 +2,7 @@
 
 use super::bring_up::{FoundFault, Identity, Object, POLL_PERIOD, Script, optional};
 use super::config::unsigned_counts;
-use super::drive::may_have_power;
+use super::event::may_have_power;
 use super::{Axis, AxisConfig, AxisUse, HomingConfig, Reference, Sign, StageEvent};
 use crate::canopen::cia402::{Controlword, Mode, Statusword, object as drive};
 use crate::canopen::emcy::EmcyCode;

@@ -11,7 +11,7 @@
 use std::time::Duration;
 
 use super::dialogue::{ScriptRunner, Sdo, WithBothDrives};
-use super::drive::may_have_power;
+use super::event::may_have_power;
 use super::standstill::Standstill;
 use super::{Axis, StageConfig, Unwrapper};
 use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};

@@ -20,6 +20,8 @@ pub(super) struct Standstill {
     anchor_counts: i64,
     positions: u32,
     stood: Duration,
+    /// How long the axis still brakes, by what it was commanded. Positions that do not change before are frozen.
+    braking: Duration,
 }
 
 impl Standstill {
@@ -29,7 +31,8 @@ impl Standstill {
         let resolvable = Duration::try_from_secs_f64(COUNTS_MIN / counts_per_s);
         let window = WINDOW_MIN.max(resolvable.unwrap_or(Duration::MAX));
         let band_counts = counts_per_s * window.as_secs_f64();
-        Standstill { window, band_counts, anchor_counts: 0, positions: 0, stood: Duration::ZERO }
+        let (stood, braking) = (Duration::ZERO, Duration::ZERO);
+        Standstill { window, band_counts, anchor_counts: 0, positions: 0, stood, braking }
     }
 
     /// How long the axis must be watched at least, if its position comes once a `period`.
@@ -44,8 +47,15 @@ impl Standstill {
         self.stood = Duration::ZERO;
     }
 
+    /// Begins to watch, from this position on, an axis that brakes for this long.
+    pub(super) fn watch_braking(&mut self, counts: i64, braking: Duration) {
+        self.watch_from(counts);
+        self.braking = braking;
+    }
+
     /// Takes the next position, `elapsed` after the one before.
     pub(super) fn take(&mut self, counts: i64, elapsed: Duration) {
+        self.braking = self.braking.saturating_sub(elapsed);
         if counts.abs_diff(self.anchor_counts) as f64 > self.band_counts {
             return self.watch_from(counts);
         }
@@ -54,7 +64,7 @@ impl Standstill {
     }
 
     pub(super) fn stands(&self) -> bool {
-        self.positions >= POSITIONS_MIN && self.stood >= self.window
+        self.positions >= POSITIONS_MIN && self.stood >= self.window && self.braking.is_zero()
     }
 }
 
@@ -87,5 +97,16 @@ mod tests {
             }
             assert_eq!(stands_after_ms(counts_per_mm, 0.0, 20), Some(window_ms.max(100)));
         }
+    }
+
+    #[test]
+    fn a_position_that_is_frozen_while_the_axis_brakes_is_no_standstill() {
+        let mut standstill = Standstill::new(4646.0);
+        standstill.watch_braking(0, Duration::from_millis(420));
+        let stands = |ms: u64| {
+            standstill.take(0, Duration::from_millis(10));
+            standstill.stands().then_some(ms)
+        };
+        assert_eq!((1..=100).map(|n| 10 * n).find_map(stands), Some(420));
     }
 }

@@ -2,7 +2,7 @@
 //! gives a drive power.
 
 use super::dialogue::{ScriptRunner, Sdo, WithBothDrives};
-use super::drive::may_have_power;
+use super::event::may_have_power;
 use super::{Axis, AxisConfig, HomingConfig, Identity, StageConfig};
 use crate::canopen::NodeId;
 use crate::canopen::cia402::{Controlword, Mode, Statusword, object};

@@ -46,6 +46,8 @@ pub(super) struct TestDrive {
     /// Ignores controlwords in RPDO1, or those by SDO.
     pub(super) ignores_rpdo: bool,
     pub(super) ignores_sdo: bool,
+    /// It reports this position, whatever its own is.
+    pub(super) frozen_at: Option<i32>,
     /// The highest speed in counts a SYNC at which power was taken off.
     pub(super) coasted_from: i32,
     /// SYNCs between Switch On and Switched On, to charge capacitors.
@@ -149,6 +151,7 @@ impl TestDrive {
             ignores_rpdo: false,
             ignores_sdo: false,
             coasted_from: 0,
+            frozen_at: None,
             charge_cycles: 0,
             brake_cycles: 0,
             heartbeat_off: false,
@@ -221,7 +224,7 @@ impl TestDrive {
             self.tpdos_lost -= 1;
         } else {
             let [s0, s1] = self.statusword().0.to_le_bytes();
-            let [p0, p1, p2, p3] = self.counts.to_le_bytes();
+            let [p0, p1, p2, p3] = self.frozen_at.unwrap_or(self.counts).to_le_bytes();
             let tpdo = Frame::new(cob::tpdo1(self.node), &[s0, s1, p0, p1, p2, p3]);
             self.last_tpdo = Some(tpdo);
             self.out.push(tpdo);

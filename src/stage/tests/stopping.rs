@@ -3,6 +3,7 @@
 use super::*;
 use crate::canopen::cia402::DriveState;
 use crate::canopen::nmt::NmtState;
+use std::f64::consts::TAU;
 
 #[test]
 fn quick_stop_brakes_under_power_until_both_axes_stand() {
@@ -18,6 +19,45 @@ fn quick_stop_brakes_under_power_until_both_axes_stand() {
     assert!(bench.insertion.coasted_from <= 3, "power stays on until standstill");
     assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled);
     assert_eq!(bench.insertion.nmt, NmtState::PreOperational);
+}
+
+/// The positions of both axes freeze while they move, and the following error stops the stage.
+#[test]
+fn a_frozen_position_is_no_standstill_while_the_axis_may_brake() {
+    let mut config = config();
+    // 1 count a SYNC each SYNC, by which the drives brake.
+    config.insertion.quick_stop_deceleration = Some(1e4 / f64::from(COUNTS_PER_MM));
+    config.rotation.quick_stop_deceleration = Some(1e4 * TAU / f64::from(COUNTS_PER_TURN));
+    config.power.stop_timeout = Duration::from_secs(60);
+    let mut bench = Bench::new(config);
+    bench.until_feedback();
+    bench.drive_on(50);
+    for drive in [&mut bench.insertion, &mut bench.rotation] {
+        drive.frozen_at = Some(drive.counts);
+    }
+    bench.stage.quick_stop(bench.now);
+    let begun = bench.now;
+    assert!(bench.until_stopped());
+    assert_eq!((bench.insertion.coasted_from, bench.rotation.coasted_from), (0, 0));
+    assert!(bench.now.since(begun) < Duration::from_millis(1400), "the rotation brakes for 1.2 s");
+}
+
+/// It obeyed Switch On, and said before that it was Ready To Switch On.
+#[test]
+fn a_drive_that_falls_silent_as_it_switches_on_is_not_taken_to_be_off() {
+    let mut bench = Bench::new(config());
+    while bench.rotation.state != DriveState::SwitchedOn {
+        bench.step();
+    }
+    bench.rotation.off = true;
+    let stopped = bench.run_until(|event| matches!(event, StageEvent::Stopped { .. }));
+    assert!(matches!(stopped, StageEvent::Stopped { off: false, .. }), "{stopped:?}");
+    assert_eq!(bench.rotation.state, DriveState::SwitchedOn);
+    assert!(
+        bench.sent.iter().filter(|(_, frame)| frame.to_string() == "602#2B40600000000000").count()
+            > 10
+    );
+    assert!(!bench.has_sent("602#2316100100000000"), "it still monitors the bench");
 }
 
 #[test]
