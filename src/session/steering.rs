@@ -105,7 +105,8 @@ impl Steering {
         };
         self.observers().for_each(|observer| observer.correct(tip_meas, independent));
         let innovation_mm = tip_meas.mm() - predicted_mm?;
-        self.whiteness.take(innovation_mm);
+        // As large as that of one position.
+        self.whiteness.take(innovation_mm * f64::from(positions).sqrt());
         Some(innovation_mm)
     }
 
@@ -312,8 +313,9 @@ mod tests {
         }
     }
 
-    /// Standard deviation of x after an arc of 60 mm with `per_mm` positions a mm, each sent `times` times.
-    fn x_sd_mm(per_mm: u32, times: u32) -> f64 {
+    /// Standard deviation of x after an arc of 60 mm with `per_mm` means of `positions` positions a mm, each sent
+    /// `times` times. The noise of a mean is that of `independent` positions.
+    fn x_sd_mm(per_mm: u32, times: u32, positions: u32, independent: u32) -> f64 {
         let config = Config::from_sources(&[], &[]).unwrap().session().unwrap();
         let mut steering = Steering::new(&config).unwrap();
         let sent = per_mm * times;
@@ -321,12 +323,14 @@ mod tests {
         let (mut rng, mut noise) = (Pcg64::seed_from_u64(1), Vector3::zeros());
         for k in 0..60 * sent {
             if k % times == 0 {
-                noise = Vector3::from_fn(|_, _| 2.0 * rng.random::<f64>() - 1.0);
+                let mut draw = || Vector3::from_fn(|_, _| 2.0 * rng.random::<f64>() - 1.0);
+                let sum: Vector3<f64> = (0..independent).map(|_| draw()).sum();
+                noise = sum / f64::from(independent);
             }
             let step_mm = f64::from(sent).recip();
             let bent = f64::from(k) * step_mm * curvature_per_mm;
             let arc_mm = Vector3::new(0.0, bent.cos() - 1.0, bent.sin()) / curvature_per_mm;
-            steering.correct(&TipPosition::new(arc_mm + noise).unwrap(), 1, 0.025);
+            steering.correct(&TipPosition::new(arc_mm + noise).unwrap(), positions, 0.025);
             steering.predict(Increment::new(step_mm, 0.0).unwrap());
         }
         steering.estimate().unwrap().sd.unwrap()[0]
@@ -336,7 +340,14 @@ mod tests {
     #[test]
     fn repeated_positions_do_not_lower_the_standard_deviation() {
         let [repeated, independent] =
-            [(4, 5), (20, 1)].map(|(per_mm, times)| x_sd_mm(per_mm, times));
+            [(4, 5), (20, 1)].map(|(per_mm, times)| x_sd_mm(per_mm, times, 1, 1));
+        assert!(repeated > 1.8 * independent, "{repeated} {independent}");
+    }
+
+    /// Twenty independent positions in a mean lower it by √20.
+    #[test]
+    fn positions_in_a_mean_that_are_not_independent_count_for_less() {
+        let [repeated, independent] = [1, 20].map(|draws| x_sd_mm(1, 1, 20, draws));
         assert!(repeated > 1.8 * independent, "{repeated} {independent}");
     }
 
