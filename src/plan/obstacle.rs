@@ -172,7 +172,7 @@ impl World {
 
     /// The slack without masks. It grows by at most the distance from `point_mm` to another point. With masks it
     /// may grow by more, because the distance to a mask jumps between voxels.
-    pub(super) fn slack_upper_bound_mm(&self, point_mm: &Vector3<f64>, clearance_mm: f64) -> f64 {
+    pub fn slack_upper_bound_mm(&self, point_mm: &Vector3<f64>, clearance_mm: f64) -> f64 {
         let is_exact = |obstacle: &&Obstacle| !matches!(obstacle, Obstacle::Mask(_));
         let exact = self.obstacles.iter().filter(is_exact);
         let distances = exact.map(|obstacle| obstacle.distance_mm(point_mm));
