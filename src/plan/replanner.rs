@@ -305,9 +305,10 @@ impl Replanner {
         if remaining_mm <= turn_mm {
             return true;
         }
-        self.problem.start = after;
+        let length_max_mm = self.problem.length_max_mm;
+        (self.problem.start, self.problem.length_max_mm) = (after, length_max_mm - turn_mm);
         let path_after = self.known(Some(&rest));
-        self.problem.start = start;
+        (self.problem.start, self.problem.length_max_mm) = (start, length_max_mm);
         path_after.is_some_and(|path| self.miss_mm(&path) <= miss_mm + TURN_LOSS_MAX_MM)
     }
 
