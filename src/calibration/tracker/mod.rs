@@ -18,6 +18,8 @@ const DURATION_MIN_S: f64 = 5.0;
 const DRIFT_MAX_MM: f64 = 0.5;
 /// Noise may explain a drift of this many standard errors.
 const DRIFT_ERRORS: f64 = 6.0;
+/// Positions that are received within this share of the mean interval after the one before belong to one burst.
+const BURST_SHARE: f64 = 0.1;
 /// The longest correlation time, as a share of the recording: with a longer one, noise looks like motion.
 const TIME_SHARE_MAX: f64 = 0.05;
 /// A correlation time over this share is refused if the positions wander by more than this, mm RMS.
@@ -145,8 +147,9 @@ impl TrackerFit {
         }
         let mut gaps_s: Vec<f64> = points.windows(2).map(|pair| pair[1].0 - pair[0].0).collect();
         let rate_hz = rate(&gaps_s);
-        // Positions that are received together have no interval between them.
-        gaps_s.retain(|gap_s| *gap_s > 0.0);
+        // Positions of one burst, which are received together or almost so, have no interval between them.
+        let mean_gap_s = duration_s / gaps_s.len() as f64;
+        gaps_s.retain(|gap_s| *gap_s > BURST_SHARE * mean_gap_s);
         let interval_s = median(&mut gaps_s);
         let dropouts = dropouts(&arrivals_s(samples, dated_by), interval_s);
 
@@ -154,7 +157,8 @@ impl TrackerFit {
         let points = without_outliers(points)?;
         let outliers = with_outliers - points.len();
         let detrended = Detrended::of(&points);
-        detrended.check_swing(interval_s)?;
+        let spacing_s = duration_s / (points.len() - 1) as f64;
+        detrended.check_swing(spacing_s)?;
         let residuals = |series| Residuals {
             gaps_s: &detrended.gaps_s,
             series,
@@ -166,7 +170,6 @@ impl TrackerFit {
         let square_mm2 = detrended.residuals_mm.iter().flatten().map(|mm| mm * mm).sum::<f64>();
         let white_mm2 = 3.0 * together.white_sd_mm.value.powi(2);
         let wander_mm = (square_mm2 / points.len() as f64 - white_mm2).max(0.0).sqrt();
-        let spacing_s = duration_s / (points.len() - 1) as f64;
         let axes: [AxisNoise; 3] = std::array::from_fn(|axis| {
             let noise = residuals(&detrended.residuals_mm[axis..=axis]).fit();
             let variance = noise.long_mean_variance_mm2(spacing_s) / detrended.time_square_s2;
@@ -368,7 +371,7 @@ impl Detrended {
 
     /// Refuses positions that swing, as under a breathing hand: after half a period they are on the other
     /// side.
-    fn check_swing(&self, interval_s: f64) -> Result<(), CalibrationError> {
+    fn check_swing(&self, spacing_s: f64) -> Result<(), CalibrationError> {
         let count = self.gaps_s.len();
         let autocovariance_mm2 = |lag: usize| -> f64 {
             let products = |series: &Vec<f64>| -> f64 {
@@ -391,7 +394,7 @@ impl Detrended {
                 "the sensor swings by {:.2} mm with a period of {:.1} s (correlation {correlation:.2} after \
                  half of it, limit {SWING_CORRELATION}); hold it still and record again",
                 square_mm2.sqrt(),
-                2.0 * lag as f64 * interval_s
+                2.0 * lag as f64 * spacing_s
             )));
         }
         Ok(())

@@ -228,18 +228,20 @@ fn samples_without_a_new_position_are_no_dropouts() {
     }
 }
 
-/// Positions are received four at a time, without stamps, so most have the same time as the one before.
+/// Positions are received four at a time, without stamps, at once or this many ns apart.
 #[test]
 fn positions_that_are_received_in_bursts_are_no_dropouts() {
-    let mut samples = rest(NEAR, 7, 1200, still);
-    for (k, sample) in (0i64..).zip(&mut samples) {
-        let burst_time = Time::from_nanos(k / 4 * 100_000_000);
-        (sample.receive_time, sample.source_unix_ns) = (burst_time, None);
+    for apart_ns in [0, 1_000, 50_000, 1_000_000] {
+        let mut samples = rest(NEAR, 7, 1200, still);
+        for (k, sample) in (0i64..).zip(&mut samples) {
+            let time = Time::from_nanos(k / 4 * 100_000_000 + k % 4 * apart_ns);
+            (sample.receive_time, sample.source_unix_ns) = (time, None);
+        }
+        let fit = TrackerFit::of(&samples).unwrap();
+        assert_eq!((fit.positions, fit.dropouts), (1200, 0), "{apart_ns} ns apart");
+        assert!((fit.rate_hz.value - 40.0).abs() < 0.2, "{:?}", fit.rate_hz);
+        assert!((fit.together.sd_mm.value - 0.026).abs() < 0.001, "{fit:?}");
     }
-    let fit = TrackerFit::of(&samples).unwrap();
-    assert_eq!((fit.positions, fit.dropouts), (1200, 0));
-    assert!((fit.rate_hz.value - 40.0).abs() < 0.2, "{:?}", fit.rate_hz);
-    assert!((fit.together.sd_mm.value - 0.026).abs() < 0.001, "{fit:?}");
 }
 
 #[test]
