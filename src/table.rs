@@ -79,6 +79,9 @@ impl Table {
         match (columns.next(), columns.next()) {
             (Some(column), None) => Ok(column),
             (Some(_), Some(_)) => Err(TableError(format!("line 1: column \"{name}\" twice"))),
+            (None, _) if self.header.is_empty() => {
+                Err(TableError(format!("the file is empty; column \"{name}\" is needed")))
+            }
             (None, _) => {
                 let columns = self.header.iter().collect::<Vec<_>>().join(", ");
                 let columns = clipped(&columns, SHOWN_MAX);
@@ -205,7 +208,7 @@ mod tests {
     #[test]
     fn errors_name_the_line_and_the_column() {
         let message = |csv: &str| Table::parse(csv).numbers(["a", "b"]).unwrap_err().to_string();
-        assert_eq!(message(""), "line 1: no column \"a\"; there are ");
+        assert_eq!(message(""), "the file is empty; column \"a\" is needed");
         assert_eq!(message("x,a\n"), "line 1: no column \"b\"; there are x, a");
         for end in ["\n", "\r\n"] {
             let csv = ["a,b", "", "1,2", "", "", "3,inf"].join(end);
