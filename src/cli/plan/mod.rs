@@ -8,7 +8,9 @@ use super::mask::mask_reader;
 use super::output::{print_result, refuse_existing, write_new};
 use super::{Result, STOPPED, finish_with};
 use crate::geometry::FixedAngles;
-use crate::plan::{Answer, Arc, Problem, Status, Tip, World, plan as solve, plan_with_reserve};
+use crate::plan::{
+    Answer, Arc, Obstacle, Problem, Status, Tip, World, plan as solve, plan_with_reserve,
+};
 use crate::text::screen;
 use clap::Args;
 use minijinja::context;
@@ -50,7 +52,8 @@ pub(super) fn plan(arguments: &Arguments) -> Result<()> {
     if let Some(path) = &arguments.out {
         write_new(path, &picture(&world, &problem, &answer)?)?;
     }
-    let text = || screen(include_str!("plan.txt"), &object, context! {});
+    let has_mask = world.obstacles.iter().any(|obstacle| matches!(obstacle, Obstacle::Mask(_)));
+    let text = || screen(include_str!("plan.txt"), &object, context! { has_mask });
     print_result(arguments.json, &object, text)?;
     finish_with(if answer.status == Status::Plan { 0 } else { STOPPED })
 }
