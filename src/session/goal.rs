@@ -399,7 +399,7 @@ mod tests {
     #[test]
     fn a_target_near_a_mask_has_not_moved() {
         let mut goal = goal(&[]);
-        // The target lies in the voxel beside the one that is occupied, at 5.9 mm from its centre.
+        // One voxel is occupied. The target lies in the next one, 5.9 mm from the centre of the occupied one.
         let origin_mm = Vector3::new(-8.0, -10.1, 112.0);
         let occupied: Vec<bool> = (0..125).map(|voxel| voxel == 2 + 4 * 5 + 2 * 25).collect();
         let grid = Pose { translation: origin_mm, ..Pose::identity() };

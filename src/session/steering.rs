@@ -105,7 +105,7 @@ impl Steering {
         };
         self.observers().for_each(|observer| observer.correct(tip_meas, independent));
         let innovation_mm = tip_meas.mm() - predicted_mm?;
-        // As large as that of one position.
+        // The watch expects the noise of one position; a mean of independent ones has √positions less.
         self.whiteness.take(innovation_mm * f64::from(positions).sqrt());
         Some(innovation_mm)
     }

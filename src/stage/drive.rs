@@ -46,7 +46,7 @@ pub(super) struct Drive {
     /// The SYNC after which the newest position came.
     position_sync: u64,
     pub(super) statusword: Option<Statusword>,
-    /// The SYNC after which it came, and the first SYNC after which it may say that power is off.
+    /// The SYNC after which it came. After one before `off_sync` it does not say that power is off.
     statusword_sync: u64,
     off_sync: u64,
     /// The drive's TPDO1 for the last SYNC has come.

@@ -18,7 +18,7 @@ const DURATION_MIN_S: f64 = 5.0;
 const DRIFT_MAX_MM: f64 = 0.5;
 /// Noise may explain a drift of this many standard errors.
 const DRIFT_ERRORS: f64 = 6.0;
-/// Positions that are received within this share of the mean interval after the one before belong to one burst.
+/// A position that comes within this share of the mean interval after the one before belongs to the same burst.
 const BURST_SHARE: f64 = 0.1;
 /// The longest correlation time, as a share of the recording: with a longer one, noise looks like motion.
 const TIME_SHARE_MAX: f64 = 0.05;
@@ -147,7 +147,7 @@ impl TrackerFit {
         }
         let mut gaps_s: Vec<f64> = points.windows(2).map(|pair| pair[1].0 - pair[0].0).collect();
         let rate_hz = rate(&gaps_s);
-        // Positions of one burst, which are received together or almost so, have no interval between them.
+        // The gaps within a burst say nothing about the tracker's interval.
         let mean_gap_s = duration_s / gaps_s.len() as f64;
         gaps_s.retain(|gap_s| *gap_s > BURST_SHARE * mean_gap_s);
         let interval_s = median(&mut gaps_s);

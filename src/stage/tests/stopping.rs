@@ -21,7 +21,7 @@ fn quick_stop_brakes_under_power_until_both_axes_stand() {
     assert_eq!(bench.insertion.nmt, NmtState::PreOperational);
 }
 
-/// The positions of both axes freeze while they move, and the following error stops the stage.
+/// The positions of both axes freeze while they move, and the stage is stopped at once.
 #[test]
 fn a_frozen_position_is_no_standstill_while_the_axis_may_brake() {
     let mut config = config();
