@@ -121,6 +121,19 @@ fn a_whole_turn_needs_a_path_after_it() {
     }
 }
 
+/// The arc to the target is 111.2 mm long. After 6 mm straight ahead another one of 105.9 mm leads there.
+#[test]
+fn a_whole_turn_counts_in_the_length_of_the_path() {
+    for (length_max_mm, may_turn) in [(111.5, false), (112.0, true)] {
+        let problem = Problem { length_max_mm, ..problem([0.0, 41.7, 100.0], true) };
+        let mut planner = Replanner::new(world(vec![]), problem.clone(), 0.0, None);
+        let estimate = known(problem.start, &problem);
+        let step = planner.step(&estimate, 0.0, STEP_MM);
+        assert!(matches!(step, Step::Steer(_)), "{step:?}");
+        assert_eq!(planner.may_turn(&estimate, 6.0), may_turn, "{length_max_mm}");
+    }
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
     /// Targets at up to 90% of what one arc can reach, with the right curvature.
