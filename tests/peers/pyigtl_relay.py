@@ -16,6 +16,14 @@ import numpy as np
 import pyigtl
 
 
+def carried_to_mm(file):
+    """Where the tool is carried to, if it is. The file may go at any moment, also between a question and reading it."""
+    try:
+        return [float(word) for word in file.read_text().split()] if file else None
+    except FileNotFoundError:
+        return None
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--from-host", default="127.0.0.1")
@@ -41,8 +49,8 @@ def main():
     noise = np.random.default_rng(1)
     while time.monotonic() < end:
         message = source.wait_for_message(args.device, timeout=1.0)
-        if message is not None and args.carried and args.carried.exists():
-            place_mm = [float(word) for word in args.carried.read_text().split()]
+        place_mm = carried_to_mm(args.carried)
+        if message is not None and place_mm:
             message.matrix[:3, 3] = noise.normal(place_mm, 0.1)
         if server.is_connected() and message is not None:
             server.send_message(message, wait=False)
