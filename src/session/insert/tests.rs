@@ -292,3 +292,25 @@ fn power_from_another_master_that_the_stop_took_off_is_reported_at_the_end() {
     assert!(at_end.had_power, "{at_end:?}");
     assert_eq!(at_end.unknown, None);
 }
+
+/// Else the runtime would take the time since the SYNC for a stall of the bench.
+#[test]
+fn a_late_answer_to_a_sync_makes_nothing_overdue() {
+    let mut bench = Bench::new(&["insertion.depth_mm=10", "insertion.plane_out_of_reach=insert"]);
+    bench.next_sample = Time::ZERO;
+    while bench.steps.is_empty() {
+        bench.step();
+    }
+    bench.now = bench.session.sync_due();
+    bench.session.handle(bench.now, Input::Tick);
+    while let Some(output) = bench.session.poll() {
+        if let Output::Transmit { frame, .. } = output {
+            bench.stage.handle_frame(bench.now, &frame);
+        }
+    }
+    bench.now = bench.now + Duration::from_millis(8);
+    bench.settle();
+    assert!(bench.session.deadline() >= bench.now);
+    bench.step();
+    assert_eq!(bench.session.outcome(), None);
+}
