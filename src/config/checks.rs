@@ -1,13 +1,9 @@
 //! Checks for contradictions between keys, each of which is valid by itself.
 
-use super::axis_checks;
-use super::goal;
-use super::needle;
 use super::reader::{FIDUCIALS, REGISTRATION, Reader, contradictions};
-use super::study::StudyConfig;
-use super::tracker::{STANDARD_INPUT, TrackerSource};
+use super::tracker::STANDARD_INPUT;
 use super::warnings::section_name;
-use super::{CanInterface, Config};
+use super::{CanInterface, Config, StudyConfig, TrackerSource, axis_checks, goal, needle};
 use crate::emulator::fault::Fault;
 use crate::needle::TorsionConfig;
 use crate::session::rotation_peak;
@@ -26,9 +22,8 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     check_noise(config, reader);
     axis_checks::check(config, reader);
     check_bus(config, reader);
-    check_registration(config, reader);
     check_tracker(config, reader);
-    check_source(config, reader);
+    check_delays(config, reader);
     check_faults(config, reader);
 }
 
@@ -171,19 +166,21 @@ fn check_noise(config: &Config, reader: &mut Reader) {
     }
 }
 
-fn check_bus(config: &Config, reader: &mut Reader) {
-    let nodes = [
-        ("can.bench_node", config.can.bus.bench_node),
-        ("stage.insertion.node", config.stage.insertion.node),
-        ("stage.rotation.node", config.stage.rotation.node),
-    ];
-    for [first, second] in [[0, 1], [0, 2], [1, 2]] {
-        let ((first, node), (second, other)) = (nodes[first], nodes[second]);
-        contradictions! { reader;
-            [first, second] if node == other =>
-                "{second} is {other}, the same as {first}: each node needs its own number";
+/// No two of the nodes at these `keys` have the same number.
+pub(super) fn check_nodes(keys: &[&str], config: &Config, reader: &mut Reader) {
+    for (n, second) in keys.iter().enumerate() {
+        for first in &keys[..n] {
+            let [node, other] = [first, second].map(|key| config.number(key));
+            contradictions! { reader;
+                [first, second] if node == other =>
+                    "{second} is {other}, the same as {first}: each node needs its own number";
+            }
         }
     }
+}
+
+fn check_bus(config: &Config, reader: &mut Reader) {
+    check_nodes(&["can.bench_node", "stage.insertion.node", "stage.rotation.node"], config, reader);
     let (interface, hardware) = (&config.can.interface, config.stage.hardware);
     contradictions! { reader;
         ["stage.hardware", "can.interface"] if hardware && interface.is_for_tests() =>
@@ -199,69 +196,28 @@ fn check_bus(config: &Config, reader: &mut Reader) {
     }
 }
 
+/// The source of tip positions, the keys that only some sources allow, and the registration.
 fn check_tracker(config: &Config, reader: &mut Reader) {
-    let interface = &config.can.interface;
-    let tracker = &config.tracker;
+    if let Err(error) = config.registration_sd_mm() {
+        reader.refuse(&[FIDUCIALS, REGISTRATION], error.to_string());
+    }
+    let (tracker, interface) = (&config.tracker, &config.can.interface);
     let source = tracker.source;
-    let is_emulated = source == TrackerSource::Emulated;
     let is_in_memory = *interface == CanInterface::Memory;
-    let is_recorded = tracker.file.is_some() || source == TrackerSource::Csv;
-    let recording = match source {
-        TrackerSource::Ndjson => ", or a recording as tracker.file",
-        _ => "",
-    };
-    let latency_ms = config.number("tracker.latency_ms");
-    let after_s = config.number("tracker.hold_after_s");
-    // The longest way without a position: latency, tracker period, two SYNCs until the hold begins, braking.
-    let (speed, hold_mm) = (config.insertion.speed_mm_per_s, tracker.hold.after_mm);
-    let braking = tracker.hold.braking_mm_per_s2;
-    let is_seen_here = config.tip_source() == TrackerSource::Emulated;
-    let period_s = if is_seen_here { config.emulator.tracker_rate_hz.recip() } else { 0.0 };
-    let noticed_s = period_s + (latency_ms + 2.0 * f64::from(config.can.bus.sync_ms)) * 1e-3;
-    let least_mm = speed * noticed_s + 0.5 * speed * speed / braking;
-    let [key, brake] = ["tracker.hold_after_mm", "tracker.hold_braking_mm_per_s2"];
+    let [is_emulated, is_ndjson, is_csv] =
+        [TrackerSource::Emulated, TrackerSource::Ndjson, TrackerSource::Csv].map(|it| it == source);
+    let is_recorded = tracker.file.is_some();
+    let file = tracker.file.as_deref().unwrap_or_default();
+    let is_asked = config.is_changed("tracker.request");
+    let or_recording = if is_ndjson { ", or a recording as tracker.file" } else { "" };
     contradictions! { reader;
         ["tracker.source", "can.interface"] if is_emulated && !is_in_memory =>
             "tracker.source is \"emulated\", allowed only with can.interface = \"memory\", which is \
              \"{interface}\": it sees the emulated needle alone. Set tracker.source = \"openigtlink\"";
-        ["tracker.source", "can.interface"] if is_in_memory && !is_emulated && !is_recorded =>
+        ["tracker.source", "can.interface"]
+            if is_in_memory && !is_emulated && !is_recorded && !is_csv =>
             "tracker.source is \"{source}\", but can.interface = \"memory\" is the emulated stage, \
-             which only its own tracker sees: name \"vcan0\" with vcan-stage on it{recording}";
-        ["tracker.latency_ms", "tracker.hold_after_s"] if latency_ms * 1e-3 >= after_s =>
-            "tracker.latency_ms is {latency_ms}, allowed: under tracker.hold_after_s, which is {after_s} s: \
-             no position would be young enough to steer by";
-        [key, "insertion.speed_mm_per_s", brake, "tracker.latency_ms"] if hold_mm <= least_mm =>
-            "{key} is {hold_mm}, allowed: over the {:.3} mm to standstill from {speed} mm/s with {brake} = \
-             {braking} and tracker.latency_ms = {latency_ms}: insert slower or brake harder",
-            (least_mm * 1e3).ceil() / 1e3;
-    }
-
-    let Some(workspace) = &tracker.workspace else { return };
-    let [min_mm, max_mm] = [workspace.min_mm, workspace.max_mm].map(<[f64; 3]>::from);
-    let is_empty = min_mm.iter().zip(max_mm).any(|(&min, max)| min >= max);
-    contradictions! { reader;
-        ["tracker.workspace.min_mm", "tracker.workspace.max_mm"] if is_empty =>
-            "tracker.workspace.min_mm is {min_mm:?}, allowed: each under that of \
-             tracker.workspace.max_mm, which is {max_mm:?}";
-    }
-}
-
-/// Fiducials determine a pose.
-fn check_registration(config: &Config, reader: &mut Reader) {
-    if let Err(error) = config.registration_sd_mm() {
-        reader.refuse(&[FIDUCIALS, REGISTRATION], error.to_string());
-    }
-}
-
-/// Keys that only some sources of tip positions allow.
-fn check_source(config: &Config, reader: &mut Reader) {
-    let tracker = &config.tracker;
-    let source = tracker.source;
-    let is_recorded = tracker.file.is_some();
-    let file = tracker.file.as_deref().unwrap_or_default();
-    let (is_ndjson, is_csv) = (source == TrackerSource::Ndjson, source == TrackerSource::Csv);
-    let is_asked = config.is_changed("tracker.request");
-    contradictions! { reader;
+             which only its own tracker sees: name \"vcan0\" with vcan-stage on it{or_recording}";
         ["tracker.source", "tracker.file"] if is_csv && !is_recorded =>
             "tracker.source is \"csv\", and there is no tracker.file to read";
         ["tracker.file", "tracker.source"] if is_recorded && !is_ndjson && !is_csv =>
@@ -276,6 +232,15 @@ fn check_source(config: &Config, reader: &mut Reader) {
             "tracker.file is \"{file}\", but stage.hardware is true: a recording does not see the needle \
              that would move";
     }
+    if let Some(workspace) = &tracker.workspace {
+        let [min_mm, max_mm] = [workspace.min_mm, workspace.max_mm].map(<[f64; 3]>::from);
+        contradictions! { reader;
+            ["tracker.workspace.min_mm", "tracker.workspace.max_mm"]
+                if !goal::is_box(&workspace.min_mm, &workspace.max_mm) =>
+                "tracker.workspace.min_mm is {min_mm:?}, allowed: each under that of \
+                 tracker.workspace.max_mm, which is {max_mm:?}";
+        }
+    }
     let times = [
         ("tracker.csv.time", Some(&tracker.csv.time)),
         ("tracker.csv.stamp", tracker.csv.stamp.as_ref()),
@@ -285,6 +250,29 @@ fn check_source(config: &Config, reader: &mut Reader) {
             [key] if columns.is_some_and(|columns| columns.named().next().is_none()) =>
                 "{key} names no column, expected the name of one as s, ms, us or ns";
         }
+    }
+}
+
+/// A position comes soon enough to steer by, and to stop before `tracker.hold_after_mm` without one.
+fn check_delays(config: &Config, reader: &mut Reader) {
+    let latency_ms = config.number("tracker.latency_ms");
+    let after_s = config.number("tracker.hold_after_s");
+    // The longest way without a position: latency, tracker period, two SYNCs until the hold begins, braking.
+    let (speed, hold) = (config.insertion.speed_mm_per_s, config.tracker.hold);
+    let (hold_mm, braking) = (hold.after_mm, hold.braking_mm_per_s2);
+    let is_seen_here = config.tip_source() == TrackerSource::Emulated;
+    let period_s = if is_seen_here { config.emulator.tracker_rate_hz.recip() } else { 0.0 };
+    let noticed_s = period_s + (latency_ms + 2.0 * f64::from(config.can.bus.sync_ms)) * 1e-3;
+    let least_mm = speed * noticed_s + 0.5 * speed * speed / braking;
+    let [key, brake] = ["tracker.hold_after_mm", "tracker.hold_braking_mm_per_s2"];
+    contradictions! { reader;
+        ["tracker.latency_ms", "tracker.hold_after_s"] if latency_ms * 1e-3 >= after_s =>
+            "tracker.latency_ms is {latency_ms}, allowed: under tracker.hold_after_s, which is {after_s} s: \
+             no position would be young enough to steer by";
+        [key, "insertion.speed_mm_per_s", brake, "tracker.latency_ms"] if hold_mm <= least_mm =>
+            "{key} is {hold_mm}, allowed: over the {:.3} mm to standstill from {speed} mm/s with {brake} = \
+             {braking} and tracker.latency_ms = {latency_ms}: insert slower or brake harder",
+            (least_mm * 1e3).ceil() / 1e3;
     }
 }
 

@@ -148,7 +148,8 @@ impl ObstacleConfig {
     }
 }
 
-fn is_box(min_mm: &Vector3<f64>, max_mm: &Vector3<f64>) -> bool {
+/// True if each coordinate of `min_mm` is under that of `max_mm`.
+pub(super) fn is_box(min_mm: &Vector3<f64>, max_mm: &Vector3<f64>) -> bool {
     min_mm.zip_map(max_mm, |min, max| min < max).iter().all(|is_less| *is_less)
 }
 

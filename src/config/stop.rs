@@ -1,11 +1,9 @@
 //! The part of a configuration that a stop needs: the bus and the nodes of the two drives. No other error
 //! in the configuration prevents a stop.
 
-use super::can::CanInterface;
-use super::error::ConfigError;
 use super::reader::{Reader, contradictions, is_inside, merge};
 use super::value::{self, Entries};
-use super::{Config, Source};
+use super::{CanInterface, Config, ConfigError, Source, checks};
 use crate::stage;
 
 const INTERFACE: &str = "can.interface";
@@ -71,26 +69,19 @@ impl StopConfig {
         let mut tree = merge(entries);
         let mut reader = Reader::new(tree.clone());
         let config = Config::of(reader.read(Config::KEYS));
-        let interface = config.can.interface;
-        let [insertion, rotation] = [config.stage.insertion.node, config.stage.rotation.node];
         let is_named = reader.is_given(INTERFACE);
-        let has_defaults = is_named && interface.is_virtual();
-        contradictions! { reader;
-            [INTERFACE] if !is_named => "{INTERFACE} is not given, and a stop needs it";
-            [INTERFACE] if is_named && interface == CanInterface::Memory =>
-                "{INTERFACE} is \"memory\", where there is no drive to stop";
-        }
-        for key in NODES {
+        let is_optional = |key| key != INTERFACE && is_named && config.can.interface.is_virtual();
+        for key in NEEDED {
             contradictions! { reader;
-                [key] if !has_defaults && !reader.is_given(key) =>
+                [key] if !is_optional(key) && !reader.is_given(key) =>
                     "{key} is not given, and a stop needs it";
             }
         }
-        let [first, second] = NODES;
         contradictions! { reader;
-            [first, second] if insertion == rotation =>
-                "{second} is {rotation}, the same as {first}: each node needs its own number";
+            [INTERFACE] if is_named && config.can.interface == CanInterface::Memory =>
+                "{INTERFACE} is \"memory\", where there is no drive to stop";
         }
+        checks::check_nodes(&NODES, &config, &mut reader);
         reader.check_found_no_problem_with(&NEEDED)?;
         tree.retain(|key, _| {
             let used = USED.iter().find(|used| key == *used || is_inside(key, used));
@@ -103,11 +94,12 @@ impl StopConfig {
         }
         let valid = Config::of(Reader::new(tree).read(Config::KEYS));
         let mut stage = valid.stage;
-        (stage.insertion.node, stage.rotation.node) = (insertion, rotation);
+        stage.insertion.node = config.stage.insertion.node;
+        stage.rotation.node = config.stage.rotation.node;
         // The coarser the scale, the longer it takes to see that an axis stands.
         let windows = stage::Axis::BOTH.map(|axis| 2 * stage.standstill_window(axis));
         stage.power.stop_timeout = stage.power.stop_timeout.max(windows[0]).max(windows[1]);
-        Ok(StopConfig { interface, stage })
+        Ok(StopConfig { interface: config.can.interface, stage })
     }
 }
 
