@@ -27,7 +27,7 @@ pub(super) struct Arguments {
 pub(super) fn evaluate(arguments: &Arguments) -> Result<()> {
     let observer = arguments.observer.as_ref().map(|kind| format!("observer.kind={kind:?}"));
     let (config, insertions) = arguments.insertions.read(observer)?;
-    let (needle, torsion) = (config.believed_needle()?, config.believed_torsion()?);
+    let (needle, torsion) = config.believed_needle()?;
     let scoring = config.scoring()?;
     let score_once = |observer: &ObserverConfig, recording: &Recording| {
         let mut observer = observer.build(needle, torsion).map_err(|error| error.to_string())?;

@@ -61,11 +61,12 @@ impl Config {
     pub fn session_without_goal(&self) -> Result<SessionConfig, ConfigError> {
         let invariant = self.observer.invariant;
         let mut observers = self.observer.observers();
+        let (needle, needle_torsion) = self.believed_needle()?;
         Ok(SessionConfig {
             x_wp: self.plane,
             insertion: self.insertion,
-            needle: self.believed_needle()?,
-            needle_torsion: self.believed_torsion()?,
+            needle,
+            needle_torsion,
             handedness: InvariantConfig {
                 // Only one of the two places may have the real noise.
                 position_sd_mm: invariant.position_sd_mm.max(self.tracker.to_track().noise_sd_mm),

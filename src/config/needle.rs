@@ -58,20 +58,13 @@ pub(super) fn torsion(config: TorsionConfig, section: &str) -> Result<Torsion, S
 }
 
 impl Config {
-    /// The bench's model of the needle.
+    /// The bench's model of the needle and of the torsion of its shaft.
     ///
     /// # Errors
-    /// Those of [`Needle::new`] and [`Needle::with_tip_ahead`].
-    pub fn believed_needle(&self) -> Result<Needle, ConfigError> {
-        Ok(self.needle.arc.to_needle(self.needle.tip_ahead_mm, "needle")?)
-    }
-
-    /// The bench's model of the torsion of the shaft.
-    ///
-    /// # Errors
-    /// Those of [`Torsion::new`].
-    pub fn believed_torsion(&self) -> Result<Torsion, ConfigError> {
-        Ok(torsion(self.needle.torsion, "needle")?)
+    /// Those of [`Needle::new`], [`Needle::with_tip_ahead`] and [`Torsion::new`].
+    pub fn believed_needle(&self) -> Result<(Needle, Torsion), ConfigError> {
+        let NeedleConfig { arc, tip_ahead_mm, torsion: config, .. } = self.needle;
+        Ok((arc.to_needle(tip_ahead_mm, "needle")?, torsion(config, "needle")?))
     }
 
     /// The disturbance of a path by tracker and tissue, from the settings of the invariant observer.

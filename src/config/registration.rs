@@ -1,7 +1,6 @@
 //! `[tracker.registration]`: the tracker's pose on the bench, given or solved from fiducials.
 
-use super::Config;
-use super::error::ConfigError;
+use super::{Config, ConfigError};
 use crate::calibration::{FiducialPair, RegistrationFit, RegistrationRecord};
 use crate::geometry::Pose;
 use crate::keys::{Field, Kind, Rule, find, over, section, within};
@@ -88,9 +87,8 @@ impl Config {
     /// That standard deviation, mm, for the registration `fit`.
     pub fn registration_sd_of_mm(&self, fit: &RegistrationFit) -> f64 {
         let ends = [0.0, self.insertion.depth_mm].map(|depth_mm| Vector3::z() * depth_mm);
-        ends.map(|p_p_mm| fit.target_sd_mm(&self.plane.transform(&p_p_mm)))
-            .into_iter()
-            .fold(0.0, f64::max)
+        let [start, end] = ends.map(|p_p_mm| fit.target_sd_mm(&self.plane.transform(&p_p_mm)));
+        start.max(end)
     }
 
     /// The calibrated values, as TOML in a canonical form, so that equal texts mean equal calibrations: the
