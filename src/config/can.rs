@@ -1,8 +1,8 @@
 //! `[can]`: the bus and the times of CANopen on it.
 
 use core::net::{Ipv4Addr, SocketAddrV4};
-use std::fmt;
 
+use derive_more::Display;
 use toml::Value;
 
 use crate::canopen::NodeId;
@@ -43,11 +43,13 @@ const BUS: Rule = Rule::Text(
 const UDP_GROUP: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 74, 163, 2), 43_113);
 
 /// A CAN bus by its name.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Display)]
 pub enum CanInterface {
     /// `memory`: inside this process, with the virtual stage on it.
+    #[display("memory")]
     Memory,
     /// `udp`, or `udp:ADDRESS:PORT`: the multicast group of python-can's `udp_multicast`.
+    #[display("{}", if *_0 == UDP_GROUP { "udp".to_owned() } else { format!("udp:{_0}") })]
     Udp(SocketAddrV4),
     /// A network interface of Linux, such as `can0`.
     Socket(String),
@@ -77,17 +79,6 @@ impl CanInterface {
                 group.filter(is_group).map(CanInterface::Udp)
             }
             _ => is_interface(name).then(|| CanInterface::Socket(name.to_owned())),
-        }
-    }
-}
-
-impl fmt::Display for CanInterface {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            CanInterface::Memory => f.pad("memory"),
-            CanInterface::Udp(UDP_GROUP) => f.pad("udp"),
-            CanInterface::Udp(group) => f.pad(&format!("udp:{group}")),
-            CanInterface::Socket(name) => f.pad(name),
         }
     }
 }

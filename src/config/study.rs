@@ -128,8 +128,14 @@ impl Config {
             let start = Pose::take(toml["emulator"].get("start"));
             let target_mm = self.draw_goal(seed, &start, &mut toml["goal"])?;
             if let Some([low, high]) = self.study.target_move_mm {
-                let drift = self.draw_drift(seed, [low, high], &target_mm);
-                toml["emulator"]["target_drift_mm_per_mm"] = array(&drift);
+                let drawn = |number| fraction(seed, DRIFT_DRAWS + number);
+                let move_mm = low + (high - low) * drawn(0);
+                let (sin, cos) = math::sin_cos(TAU * drawn(1));
+                let along = if self.goal.in_plane { 0.0 } else { 2.0 * drawn(2) - 1.0 };
+                let across = (1.0 - along * along).sqrt();
+                let direction = Vector3::new(along, across * sin, across * cos);
+                let drift_mm_per_mm = direction * (move_mm / target_mm.norm());
+                toml["emulator"]["target_drift_mm_per_mm"] = array(&drift_mm_per_mm);
             }
         }
         Ok(Config::of(toml))
@@ -158,21 +164,6 @@ impl Config {
             }
         }
         Ok(())
-    }
-
-    /// Draws how the target of the trial with this seed moves, mm per mm.
-    fn draw_drift(
-        &self,
-        seed: u64,
-        [low, high]: [f64; 2],
-        target_mm: &Vector3<f64>,
-    ) -> Vector3<f64> {
-        let drawn = |number| fraction(seed, DRIFT_DRAWS + number);
-        let move_mm = low + (high - low) * drawn(0);
-        let (sin, cos) = math::sin_cos(TAU * drawn(1));
-        let along = if self.goal.in_plane { 0.0 } else { 2.0 * drawn(2) - 1.0 };
-        let across = (1.0 - along * along).sqrt();
-        Vector3::new(along, across * sin, across * cos) * (move_mm / target_mm.norm())
     }
 
     /// Draws target and obstacles of the trial with this seed, which begins at `start`; returns the target, mm.
@@ -256,16 +247,12 @@ impl Config {
     /// on it, since no estimate can be better than its prior allows.
     pub fn prior(&self) -> Prior {
         let study = &self.study;
-        let variance = |range: Option<[f64; 2]>| {
-            range.map_or(0.0, |[low, high]| (high - low) * (high - low) / 12.0)
-        };
+        let variance =
+            |range: Option<[f64; 2]>| range.map_or(0.0, |[low, high]| (high - low).powi(2) / 12.0);
         let deg2 = |range| variance(range) * 1f64.to_radians().powi(2);
         let curvature_per_mm = self.emulator.arc.curvature_per_mm();
-        let (start_sd, curvature_sd) = self
-            .observer
-            .observers()
-            .next()
-            .map_or_else(Default::default, |steers| steers.start_sd());
+        let steering = self.observer.observers().next();
+        let (start_sd, curvature_sd) = steering.map(|it| it.start_sd()).unwrap_or_default();
         let configured_rad2 =
             Vector3::new(start_sd.yaw, start_sd.pitch, start_sd.roll).map(|sd| sd * sd);
         let angles_rad2 =

@@ -2,9 +2,7 @@
 
 use std::time::Duration;
 
-use super::IDENTITY;
-use super::error::ConfigError;
-use super::registration::RegistrationConfig;
+use super::{ConfigError, IDENTITY, RegistrationConfig};
 use crate::calibration::TipRecord;
 use crate::geometry::{FixedAngles, Pose};
 use crate::keys::{Rule, choice, not_blank, section, within};

@@ -1,7 +1,8 @@
 //! TOML text as a flat list of dotted keys, each with its value and its line.
 
 use derive_more::Display;
-use toml::de::{DeArray, DeTable, DeValue};
+use serde::Deserialize as _;
+use toml::de::{DeArray, DeTable, DeValue, ValueDeserializer};
 use toml::{Spanned, Table, Value};
 
 use super::error::{ConfigError, Problem};
@@ -203,17 +204,13 @@ impl Flattener<'_> {
 
     fn value(&mut self, key: String, spanned: &Spanned<DeValue<'_>>) {
         let value = match spanned.get_ref() {
-            DeValue::String(text) => Value::from(&**text),
-            DeValue::Integer(integer) => {
-                // No key takes an integer of more than 64 bits.
-                let parsed = i64::from_str_radix(integer.as_str(), integer.radix());
-                Value::from(parsed.unwrap_or(i64::MAX))
-            }
+            // Such as 1e999, which is infinite.
             DeValue::Float(float) => Value::from(float.as_str().parse().unwrap_or(f64::NAN)),
-            DeValue::Boolean(boolean) => Value::from(*boolean),
-            DeValue::Datetime(datetime) => Value::from(*datetime),
             DeValue::Array(array) => Value::from(vec![false; array.len()]),
             DeValue::Table(_) => Value::from(Table::new()),
+            // No key takes an integer of more than 64 bits.
+            _ => Value::deserialize(ValueDeserializer::from(spanned.clone()))
+                .unwrap_or(Value::from(i64::MAX)),
         };
         let origin = self.file.map_or(Origin::Set, |name| {
             let (line, _) = position(self.text, spanned.span().start);
