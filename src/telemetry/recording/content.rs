@@ -1,10 +1,8 @@
 //! Logs a run for viewers: to its file, or to the live view.
 
-use super::motion::Motion;
-use super::samples::{Samples, log_refused};
 use super::space::Space;
 use super::states::{Meaning, States, drive_lane};
-use super::steps::Steps;
+use super::tables::{Motion, Samples, Steps, log_refused};
 use super::{Logged, can, document};
 use crate::archive::{Manifest, unix_us_of};
 use crate::session::{Record, Severity};

@@ -59,7 +59,7 @@ pub(super) fn log_goal(stream: &RecordingStream, world: &World, problem: &Proble
                 stream.log_static(path, &block)?;
             }
             Obstacle::Mask(mask) => {
-                let (points_mm, side_mm) = mask_points(mask);
+                let (points_mm, side_mm) = mask_points(mask, MASK_STEP_MM);
                 let points = Points3D::new(points_mm.iter().map(point))
                     .with_colors([LIMIT])
                     .with_radii([side_mm as f32 / 6.0]);
@@ -70,25 +70,18 @@ pub(super) fn log_goal(stream: &RecordingStream, world: &World, problem: &Proble
     Ok(())
 }
 
-/// One occupied voxel's centre of each cube that has one, and the side of the cubes, mm. The cubes are as small as
-/// allowed.
-fn mask_points(mask: &Mask) -> (Vec<Vector3<f64>>, f64) {
-    let mut side_mm = MASK_STEP_MM;
-    let mut points_mm = BTreeMap::new();
-    let mut last = None;
+/// One occupied voxel's centre of each cube that has one, and the side of the cubes, mm: `side_mm`, doubled until
+/// they are few enough.
+fn mask_points(mask: &Mask, side_mm: f64) -> (Vec<Vector3<f64>>, f64) {
+    let (mut points_mm, mut last) = (BTreeMap::new(), None);
     for point_mm in mask.occupied_mm() {
-        let cube = |axis: usize| (point_mm[axis] / side_mm).floor() as i64;
-        let cube = [0, 1, 2].map(cube);
+        let cube = [0, 1, 2].map(|axis| (point_mm[axis] / side_mm).floor() as i64);
         // The next voxel is mostly in the same cube.
-        if last.replace(cube) == Some(cube) {
-            continue;
+        if last.replace(cube) != Some(cube) {
+            points_mm.entry(cube).or_insert(point_mm);
         }
-        points_mm.entry(cube).or_insert(point_mm);
-        while points_mm.len() > MASK_POINTS_MAX {
-            (side_mm, last) = (2.0 * side_mm, None);
-            for (cube, point_mm) in std::mem::take(&mut points_mm) {
-                points_mm.entry(cube.map(|index| index.div_euclid(2))).or_insert(point_mm);
-            }
+        if points_mm.len() > MASK_POINTS_MAX {
+            return mask_points(mask, 2.0 * side_mm);
         }
     }
     (points_mm.into_values().collect(), side_mm)
@@ -178,7 +171,7 @@ mod tests {
     #[test]
     fn a_sheet_of_one_voxel_is_shown() {
         let mask = mask([40, 1, 60], 0.5);
-        let (points_mm, side_mm) = mask_points(&mask);
+        let (points_mm, side_mm) = mask_points(&mask, MASK_STEP_MM);
         assert_eq!(side_mm, MASK_STEP_MM);
         assert!(points_mm.iter().all(|point_mm| mask.distance_mm(point_mm) < 0.0));
         let is_shown = |voxel_mm: Vector3<f64>| {
@@ -189,7 +182,7 @@ mod tests {
 
     #[test]
     fn a_large_mask_is_shown_by_a_bounded_number_of_points() {
-        let (points_mm, side_mm) = mask_points(&mask([60, 60, 60], 10.0));
+        let (points_mm, side_mm) = mask_points(&mask([60, 60, 60], 10.0), MASK_STEP_MM);
         assert_eq!(side_mm, 24.0);
         assert!((MASK_POINTS_MAX / 10..=MASK_POINTS_MAX).contains(&points_mm.len()));
     }

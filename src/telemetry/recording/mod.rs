@@ -13,12 +13,10 @@ mod file;
 mod goal;
 mod layout;
 pub(super) mod live;
-mod motion;
 mod palette;
-mod samples;
 mod space;
 mod states;
-mod steps;
+mod tables;
 
 pub use self::file::Recording;
 
