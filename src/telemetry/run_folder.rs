@@ -57,18 +57,14 @@ impl RunFolder {
     /// [`TelemetryError::Record`] with every file that differs, and [`TelemetryError::File`].
     pub fn verify(&self) -> Result<(), TelemetryError> {
         let files = &self.manifest.files;
+        let sealed = files.keys().map(String::as_str).filter(|name| *name != file::RECORDING);
+        let is_unsealed = |name: &&str| !files.contains_key(*name) && self.dir.join(name).exists();
+        let unsealed =
+            file::TEXT_FILES.into_iter().filter(|_| self.is_closed()).filter(is_unsealed);
+        let config = Some(file::CONFIG).filter(|name| !files.contains_key(*name));
         let mut changes = Vec::new();
-        for (name, seal) in files.iter().filter(|(name, _)| *name != file::RECORDING) {
-            changes.extend(self.change(name, Some(seal.bytes), &seal.sha256)?);
-        }
-        if self.is_closed() {
-            let unsealed = file::TEXT_FILES
-                .into_iter()
-                .filter(|name| !files.contains_key(*name) && self.dir.join(name).exists());
-            changes.extend(unsealed.map(|name| format!("{name} has no seal in the closed record")));
-        }
-        if !files.contains_key(file::CONFIG) {
-            changes.extend(self.change(file::CONFIG, None, &self.manifest.config_sha256)?);
+        for name in sealed.chain(unsealed).chain(config) {
+            changes.extend(self.change(name)?);
         }
         if changes.is_empty() {
             return Ok(());
@@ -85,32 +81,25 @@ impl RunFolder {
     /// # Errors
     /// [`TelemetryError::File`].
     pub fn recording_change(&self) -> Result<Option<String>, TelemetryError> {
-        let name = file::RECORDING;
-        match self.manifest.files.get(name) {
-            Some(seal) => self.change(name, Some(seal.bytes), &seal.sha256),
-            None if self.dir.join(name).exists() => {
-                Ok(Some(format!("{name} has no seal in the manifest")))
-            }
-            None => Ok(Some(format!("{name} is missing"))),
-        }
+        self.change(file::RECORDING)
     }
 
-    /// How the file `name` differs from this hash and, if known, this size; `None` if it is unchanged.
-    fn change(
-        &self,
-        name: &str,
-        bytes: Option<u64>,
-        sha256: &str,
-    ) -> Result<Option<String>, TelemetryError> {
+    /// How the file `name` differs from its seal in the manifest; `None` if it is unchanged. Of the configuration
+    /// without a seal only the hash is known.
+    fn change(&self, name: &str) -> Result<Option<String>, TelemetryError> {
         let Some(now) = seal_of(&self.dir, name)? else {
-            return Ok(Some(format!("{name} is gone")));
+            return Ok(Some(format!("{name} is missing")));
         };
-        Ok(match bytes {
-            Some(bytes) if bytes != now.bytes => Some(format!(
-                "{name} had {bytes} bytes when the record was closed and has {} now",
-                now.bytes
+        let config_sha256 = Some(&self.manifest.config_sha256).filter(|_| name == file::CONFIG);
+        let seal = self.manifest.files.get(name);
+        let sha256 = seal.map(|seal| &seal.sha256).or(config_sha256);
+        Ok(match (seal, sha256) {
+            (_, None) => Some(format!("{name} has no seal in the manifest")),
+            (Some(seal), _) if seal.bytes != now.bytes => Some(format!(
+                "{name} had {} bytes when the record was closed and has {} now",
+                seal.bytes, now.bytes
             )),
-            _ if now.sha256 != sha256 => {
+            (_, Some(sha256)) if *sha256 != now.sha256 => {
                 Some(format!("{name} was edited: its SHA-256 is not the one in manifest.json"))
             }
             _ => None,
@@ -215,9 +204,9 @@ mod tests {
         assert!(said().contains("steps.csv had 7 bytes when the record was closed and has 5 now"));
         fs::remove_file(dir.join(file::STEPS)).unwrap();
         fs::write(dir.join(file::CONFIG), "name = \"y\"\n").unwrap();
-        assert!(said().contains("steps.csv is gone; config.toml was edited"), "{}", said());
+        assert!(said().contains("steps.csv is missing; config.toml was edited"), "{}", said());
         fs::remove_file(dir.join(file::CONFIG)).unwrap();
-        assert!(said().contains("steps.csv is gone; config.toml is gone"), "{}", said());
+        assert!(said().contains("steps.csv is missing; config.toml is missing"), "{}", said());
     }
 
     #[test]
@@ -227,7 +216,7 @@ mod tests {
         run(dir);
         fs::write(dir.join(file::CAN), "").unwrap();
         let said = RunFolder::open(dir).unwrap().verify().unwrap_err().to_string();
-        assert!(said.contains("can.log has no seal in the closed record"), "{said}");
+        assert!(said.contains("can.log has no seal in the manifest"), "{said}");
     }
 
     #[test]

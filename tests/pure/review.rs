@@ -238,7 +238,7 @@ fn without_its_configuration_a_run_is_shown_without_limits() {
         &json["warnings"].to_string(),
         &["config.toml is missing", "the limits are unknown"],
     );
-    assert_all(&json["error"].to_string(), &[&dir, "config.toml is gone"]);
+    assert_all(&json["error"].to_string(), &[&dir, "config.toml is missing"]);
     let other = run(&scratch, &[]);
     let compared = review(&scratch, &[&other, &dir, "--json"]);
     assert_eq!(compared.status, 2);
@@ -404,7 +404,7 @@ fn a_missing_run_rrd_is_made_again_by_repair() {
     let recording = scratch.path().join(&dir).join("run.rrd");
     fs::remove_file(&recording).expect("removed");
     let said = review(&scratch, &[&dir, "--no-html"]);
-    let warning = "warning     run.rrd is gone; make it: needle-bench review ";
+    let warning = "warning     run.rrd is missing; make it: needle-bench review ";
     assert!(said.stdout.contains(warning) && said.stdout.contains(" --repair"), "{}", said.stdout);
     // Nothing is read from it.
     let said = needle_bench(&scratch, &["replay", &dir]);
