@@ -92,7 +92,7 @@ enum Health {
 /// Watches one recording thread.
 #[derive(Debug)]
 pub(super) struct Watch {
-    writer: &'static str,
+    pub(super) writer: &'static str,
     /// The items that it takes.
     items: &'static str,
     silence: Silence,
@@ -109,18 +109,8 @@ impl Watch {
         Watch { writer, items, silence, health, reported_drops: None }
     }
 
-    /// The next change at `now`, if `dropped` items were lost so far because the queue was full. Call this
-    /// until it returns `None`.
-    pub(super) fn look(
-        &mut self,
-        vitals: &Vitals,
-        dropped: u64,
-        now: Instant,
-    ) -> Option<RecordNews> {
-        self.health_news(vitals, now).or_else(|| self.drop_news(dropped, now))
-    }
-
-    fn health_news(&mut self, vitals: &Vitals, now: Instant) -> Option<RecordNews> {
+    /// The change of the thread's health by `now`.
+    pub(super) fn health_news(&mut self, vitals: &Vitals, now: Instant) -> Option<RecordNews> {
         let before_s = self.silence.lasted.as_secs_f64();
         let (writer, lasted) = (self.writer, self.silence.look(vitals, now));
         let health = match vitals.fault() {
@@ -141,7 +131,8 @@ impl Watch {
         Some(if is_failed { RecordNews::Failed(text) } else { RecordNews::Warning(text) })
     }
 
-    fn drop_news(&mut self, dropped: u64, now: Instant) -> Option<RecordNews> {
+    /// What is new at `now`, if `dropped` items were lost so far because the queue was full.
+    pub(super) fn drop_news(&mut self, dropped: u64, now: Instant) -> Option<RecordNews> {
         let (before, is_recent) = self.reported_drops.map_or((0, false), |(drops, time)| {
             (drops, now.saturating_duration_since(time) < DROP_WARNING_INTERVAL)
         });
@@ -189,7 +180,9 @@ mod tests {
             let mut reports = Vec::new();
             for n in 1..=ms / self.every_ms {
                 self.now += Duration::from_millis(self.every_ms);
-                while let Some(news) = self.watch.look(&self.vitals, dropped, self.now) {
+                let health = self.watch.health_news(&self.vitals, self.now);
+                let drops = self.watch.drop_news(dropped, self.now);
+                for news in health.into_iter().chain(drops) {
                     let text = match news {
                         RecordNews::Warning(text) => text,
                         RecordNews::Failed(error) => format!("failed: {error}"),

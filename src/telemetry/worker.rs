@@ -68,7 +68,6 @@ enum Message<T> {
 /// The session thread's handle to a writer thread. A preempted writer never makes the session wait
 /// (docs/decisions/0018-tracker-queue.md).
 pub(super) struct Worker<T> {
-    writer: &'static str,
     queue: Producer<Message<T>>,
     /// Dropped after the queue: its last wake-up shows the writer that the run was abandoned.
     waker: Waker,
@@ -121,12 +120,13 @@ impl<T: Send + 'static> Worker<T> {
         let failed = |error| TelemetryError::writer_failed(writer, error);
         let waker = Waker(thread.map_err(failed)?.thread().clone());
         let (given, dropped) = (0, 0);
-        Ok(Worker { writer, queue, waker, backpressure, given, dropped, vitals, watch, done })
+        Ok(Worker { queue, waker, backpressure, given, dropped, vitals, watch, done })
     }
 
     /// The next change in the writer's health. Call this until it returns `None`.
     pub(super) fn news(&mut self, now: Instant) -> Option<RecordNews> {
-        self.watch.look(&self.vitals, self.dropped, now)
+        let health = self.watch.health_news(&self.vitals, now);
+        health.or_else(|| self.watch.drop_news(self.dropped, now))
     }
 
     /// Gives `item` to the writer, or counts it as dropped.
@@ -186,7 +186,7 @@ impl<T: Send + 'static> Worker<T> {
     ) -> Result<(WriterResult, Option<TelemetryError>), TelemetryError> {
         let (mut is_told, mut is_close_sent) = (false, false);
         let mut silence = Silence::new(Instant::now());
-        let writer = self.writer;
+        let writer = self.watch.writer;
         loop {
             is_close_sent =
                 is_close_sent || self.push(Message::Close(Box::new(manifest.clone()))).is_ok();
