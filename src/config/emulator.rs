@@ -6,7 +6,7 @@ use super::IDENTITY;
 use super::needle::{Arc, TIP_AHEAD};
 use crate::emulator::drive::{Model, Switches};
 use crate::emulator::fault::Fault;
-use crate::emulator::{self, CorrelatedNoise, TrackerModel};
+use crate::emulator::{CorrelatedNoise, TrackerModel, WhiteNoise};
 use crate::geometry::Pose;
 use crate::keys::{Rule, choice, over, section, within};
 use crate::needle::TorsionConfig;
@@ -150,15 +150,11 @@ impl EmulatorConfig {
     /// The model of the emulated tracker.
     pub fn to_tracker(&self) -> TrackerModel {
         let Noise { uniform_mm, sd_mm, correlated_sd_mm, correlation_time } = self.noise;
-        let correlated = correlated_sd_mm.zip(correlation_time);
+        let white = sd_mm.map(WhiteNoise::Gaussian).or(uniform_mm.map(WhiteNoise::Uniform));
+        let correlated = correlated_sd_mm.filter(|sd_mm| *sd_mm > 0.0).zip(correlation_time);
         TrackerModel {
-            noise: match (uniform_mm, sd_mm) {
-                (_, Some(sd_mm)) => emulator::WhiteNoise::Gaussian(sd_mm),
-                (Some(uniform_mm), None) => emulator::WhiteNoise::Uniform(uniform_mm),
-                (None, None) => emulator::WhiteNoise::None,
-            },
+            noise: white.unwrap_or(WhiteNoise::None),
             correlated: correlated
-                .filter(|(sd_mm, _)| *sd_mm > 0.0)
                 .map(|(sd_mm, time)| CorrelatedNoise { sd_mm, time_s: time.as_secs_f64() }),
             seed: self.seed,
             period: Duration::from_secs_f64(1.0 / self.tracker_rate_hz),

@@ -2,11 +2,9 @@
 
 use std::path::Path;
 
-use super::TrackerPreset;
 use super::error::{ConfigError, Problem};
 use super::reader::{FIDUCIALS, REGISTRATION, Tree, is_inside};
 use super::value::{self, Entries, Entry, Origin};
-use crate::keys::Field as _;
 
 /// Reads a file that the configuration names. The error says in words what went wrong.
 pub type ReadFile<'a> = &'a dyn Fn(&Path) -> Result<String, String>;
@@ -58,13 +56,6 @@ const CALIBRATION_FILES: [CalibrationFile; 3] = [
 
 /// Keys of calibration files that are not measured values: overriding one keeps the `fit`.
 const NOT_MEASURED: [&str; 2] = ["tracker.registration.sd_mm", "evaluation"];
-
-/// The entries, of layer number `layer`, of the preset that `entries` name.
-pub(super) fn preset(entries: &Entries, layer: usize) -> Result<Entries, ConfigError> {
-    let named = topmost(entries, "emulator.tracker").map(|entry| &entry.value);
-    let preset = TrackerPreset::take(named);
-    value::parse_file(&preset.to_string(), preset.toml(), layer)
-}
 
 /// Calibration files that cannot be used: for each the keys whose values are therefore unknown, and why.
 pub(super) type Unusable = Vec<(Vec<&'static str>, ConfigError)>;
@@ -156,7 +147,7 @@ fn is_among(key: &str, keys: &[&str]) -> bool {
 }
 
 /// The value of `key` in the highest layer that has it.
-fn topmost<'a>(entries: &'a Entries, key: &str) -> Option<&'a Entry> {
+pub(super) fn topmost<'a>(entries: &'a Entries, key: &str) -> Option<&'a Entry> {
     let named = entries.iter().filter(|(name, _)| name == key);
     named.map(|(_, entry)| entry).max_by_key(|entry| entry.layer)
 }

@@ -258,7 +258,9 @@ fn entries(sources: &[Source<'_>], sets: &[String]) -> Result<Entries, ConfigErr
         }
     }
     ConfigError::unless_empty(problems)?;
-    entries.extend(include::preset(&entries, PRESET)?);
+    let named = include::topmost(&entries, "emulator.tracker").map(|entry| &entry.value);
+    let preset = TrackerPreset::take(named);
+    entries.extend(value::parse_file(&preset.to_string(), preset.toml(), PRESET)?);
     Ok(entries)
 }
 
