@@ -5,7 +5,7 @@ use super::{CanInterface, Config, ConfigError, ReadMask, TrackerSource, rehearsa
 use crate::canopen::ObjectAddress;
 use crate::emulator::drive::DriveConfig;
 use crate::emulator::{TargetModel, VirtualStageConfig};
-use crate::observer::{InvariantConfig, ObserverConfig};
+use crate::observer::InvariantConfig;
 use crate::session::{SessionConfig, TrackerConfig};
 use crate::stage::{AxisConfig, Sign, StageConfig};
 use crate::tracker::AcquisitionClock;
@@ -60,7 +60,6 @@ impl Config {
     /// No registration; values that the needle, the stage or the observers refuse.
     pub fn session_without_goal(&self) -> Result<SessionConfig, ConfigError> {
         let invariant = self.observer.invariant;
-        let mut observers = self.observer.observers();
         let (needle, needle_torsion) = self.believed_needle()?;
         Ok(SessionConfig {
             x_wp: self.plane,
@@ -72,9 +71,8 @@ impl Config {
                 position_sd_mm: invariant.position_sd_mm.max(self.tracker.to_track().noise_sd_mm),
                 ..invariant
             },
-            // The first is the one that steers.
-            observer: observers.next().unwrap_or(ObserverConfig::Invariant(invariant)),
-            shadows: observers.collect(),
+            observer: self.observer.steering(),
+            shadows: self.observer.observers().skip(1).collect(),
             control: self.control,
             goal: None,
             stage: self.to_stage()?,

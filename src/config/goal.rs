@@ -3,11 +3,10 @@
 use super::reader::{Reader, contradictions};
 use super::tracker::FILE;
 use super::value::join;
-use super::{Config, ConfigError, ObserverKind, TrackerSource};
+use super::{Config, ConfigError, TrackerSource};
 use crate::control::ControlKind;
 use crate::geometry::{POSITION, Pose};
 use crate::keys::{Rule, choice, not_blank, over, section, within};
-use crate::observer::Gains;
 use crate::plan::{CLEARANCE_MIN_MM, Obstacle, Problem, Tip, Workspace, World};
 use crate::session::{Goal, TargetTool};
 use crate::text::clipped;
@@ -298,11 +297,7 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     let has_one_tool = config.tip_source() == TrackerSource::Csv;
     let law = config.control.kind;
     let observer = config.observer.kind;
-    let states_sd = match observer {
-        ObserverKind::Invariant => true,
-        ObserverKind::Coupled => config.observer.coupled.gains == Gains::Fading,
-        ObserverKind::FiniteDifference => false,
-    };
+    let states_sd = config.observer.steering().start_sd().is_some();
     let Workspace { min_mm: min, max_mm: max, .. } = goal.workspace_mm;
     let has_size = is_box(&min, &max);
     let has_plane = min.x <= 0.0 && max.x >= 0.0;

@@ -54,14 +54,23 @@ impl ObserverSection {
         kinds
     }
 
+    /// The observer that steers.
+    pub(super) fn steering(&self) -> ObserverConfig {
+        self.of_kind(self.kind)
+    }
+
     /// The observer that steers, then its shadows.
     pub fn observers(&self) -> impl Iterator<Item = ObserverConfig> + '_ {
-        self.kinds().into_iter().map(|kind| match kind {
+        self.kinds().into_iter().map(|kind| self.of_kind(kind))
+    }
+
+    fn of_kind(&self, kind: ObserverKind) -> ObserverConfig {
+        match kind {
             ObserverKind::Invariant => ObserverConfig::Invariant(self.invariant),
             ObserverKind::Coupled => ObserverConfig::Coupled(self.coupled),
             ObserverKind::FiniteDifference => {
                 ObserverConfig::FiniteDifference(self.finite_difference)
             }
-        })
+        }
     }
 }

@@ -251,8 +251,7 @@ impl Config {
             |range: Option<[f64; 2]>| range.map_or(0.0, |[low, high]| (high - low).powi(2) / 12.0);
         let deg2 = |range| variance(range) * 1f64.to_radians().powi(2);
         let curvature_per_mm = self.emulator.arc.curvature_per_mm();
-        let steering = self.observer.observers().next();
-        let (start_sd, curvature_sd) = steering.map(|it| it.start_sd()).unwrap_or_default();
+        let (start_sd, curvature_sd) = self.observer.steering().start_sd().unwrap_or_default();
         let configured_rad2 =
             Vector3::new(start_sd.yaw, start_sd.pitch, start_sd.roll).map(|sd| sd * sd);
         let angles_rad2 =

@@ -158,14 +158,14 @@ impl ObserverConfig {
     }
 
     /// Standard deviations that the observer assumes at the start: of the angles, rad, and of the
-    /// curvature, as a share of it; zeros if it takes them for known.
-    pub fn start_sd(&self) -> (FixedAngles, f64) {
+    /// curvature, as a share of it. `None` for an observer that does not state how well it knows the tip.
+    pub fn start_sd(&self) -> Option<(FixedAngles, f64)> {
         match self {
-            ObserverConfig::Invariant(config) => (config.start_sd, config.curvature_sd),
+            ObserverConfig::Invariant(config) => Some((config.start_sd, config.curvature_sd)),
             ObserverConfig::Coupled(config) if config.gains == Gains::Fading => {
-                (config.start_sd, 0.0)
+                Some((config.start_sd, 0.0))
             }
-            ObserverConfig::Coupled(_) | ObserverConfig::FiniteDifference(_) => Default::default(),
+            ObserverConfig::Coupled(_) | ObserverConfig::FiniteDifference(_) => None,
         }
     }
 
