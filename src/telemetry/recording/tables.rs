@@ -43,7 +43,26 @@ struct Window {
 
 impl Motion {
     pub(super) fn new(scene: &Scene) -> Self {
-        Motion { limits: limits(scene), window: None }
+        let (insertion, rotation) = (&scene.stage.insertion, &scene.stage.rotation);
+        let [insertion_lag_max, rotation_lag_max] = [insertion, rotation]
+            .map(|axis| axis.following_error_limit(scene.stage.bus.sync_period()));
+        let limits = vec![
+            ("insertion_min_mm", insertion.limits.min),
+            ("insertion_max_mm", insertion.limits.max),
+            ("rotation_min_rad", rotation.limits.min),
+            ("rotation_max_rad", rotation.limits.max),
+            ("insertion_speed_max_mm_per_s", insertion.limits.speed_max),
+            ("rotation_speed_min_rad_per_s", -rotation.limits.speed_max),
+            ("rotation_speed_max_rad_per_s", rotation.limits.speed_max),
+            ("insertion_lag_min_mm", -insertion_lag_max),
+            ("insertion_lag_max_mm", insertion_lag_max),
+            ("rotation_lag_min_rad", -rotation_lag_max),
+            ("rotation_lag_max_rad", rotation_lag_max),
+            ("rotation_cmd_min_rad_per_mm", -scene.rotation_max_rad_per_mm),
+            ("rotation_cmd_max_rad_per_mm", scene.rotation_max_rad_per_mm),
+            ("tip_meas_age_max_ms", scene.tip_meas_age_max_s * 1e3),
+        ];
+        Motion { limits, window: None }
     }
 
     pub(super) fn log(&mut self, stream: &RecordingStream, stage: &Feedback) -> Logged {
@@ -83,29 +102,6 @@ impl Motion {
         *window = new_window;
         log_row(stream, "limits", self.limits.iter().copied())
     }
-}
-
-/// The columns of `limits` with their values.
-fn limits(scene: &Scene) -> Vec<(&'static str, f64)> {
-    let (insertion, rotation) = (&scene.stage.insertion, &scene.stage.rotation);
-    let [insertion_lag_max, rotation_lag_max] =
-        [insertion, rotation].map(|axis| axis.following_error_limit(scene.stage.bus.sync_period()));
-    vec![
-        ("insertion_min_mm", insertion.limits.min),
-        ("insertion_max_mm", insertion.limits.max),
-        ("rotation_min_rad", rotation.limits.min),
-        ("rotation_max_rad", rotation.limits.max),
-        ("insertion_speed_max_mm_per_s", insertion.limits.speed_max),
-        ("rotation_speed_min_rad_per_s", -rotation.limits.speed_max),
-        ("rotation_speed_max_rad_per_s", rotation.limits.speed_max),
-        ("insertion_lag_min_mm", -insertion_lag_max),
-        ("insertion_lag_max_mm", insertion_lag_max),
-        ("rotation_lag_min_rad", -rotation_lag_max),
-        ("rotation_lag_max_rad", rotation_lag_max),
-        ("rotation_cmd_min_rad_per_mm", -scene.rotation_max_rad_per_mm),
-        ("rotation_cmd_max_rad_per_mm", scene.rotation_max_rad_per_mm),
-        ("tip_meas_age_max_ms", scene.tip_meas_age_max_s * 1e3),
-    ]
 }
 
 /// Rates are means over this interval.
