@@ -40,7 +40,7 @@ pub(super) fn newest_first(dir: &Path) -> impl Iterator<Item = RunFolder> + use<
     let folders = folders_in(dir).unwrap_or_default().into_iter();
     let mut runs: Vec<RunFolder> = folders.filter_map(|it| RunFolder::open(&it).ok()).collect();
     // The folders are sorted by name, and this sort keeps that order of runs that started at the same time.
-    runs.sort_by(|a, b| a.manifest().started_utc.cmp(&b.manifest().started_utc));
+    runs.sort_by(|a, b| a.manifest.started_utc.cmp(&b.manifest.started_utc));
     runs.into_iter().rev()
 }
 
@@ -58,8 +58,8 @@ pub(super) fn folders_in(dir: &Path) -> io::Result<Vec<PathBuf>> {
 pub(super) fn last_run_on_a_bus(command: &str) -> String {
     let memory = CanInterface::Memory.to_string();
     newest_first(Path::new(RUNS))
-        .filter(|run| run.manifest().bus != memory)
-        .map(|run| run.dir().join(file::CONFIG))
+        .filter(|run| run.manifest.bus != memory)
+        .map(|run| run.dir.join(file::CONFIG))
         .find(|config| config.is_file())
         .map_or(String::new(), |config| {
             format!("\nthe last run on a bus: {command}--config {}", shell_word(config.display()))
@@ -75,12 +75,12 @@ pub(super) fn earlier_run(
 ) -> Option<Earlier> {
     let bus = config.bus().to_string();
     let mut runs = newest_first(Path::new(&config.record.dir));
-    let run = runs.find(|run| run.manifest().bus == bus && is_wanted(run.manifest()))?;
+    let run = runs.find(|run| run.manifest.bus == bus && is_wanted(&run.manifest))?;
     let before = keys(&run.text(file::CONFIG).ok()?).ok()?;
     let now = keys(&config.to_toml().ok()?).ok()?;
     let changed = differences(&before, &now).into_keys();
     Some(Earlier {
-        started_utc: run.manifest().started_utc.clone(),
+        started_utc: run.manifest.started_utc.clone(),
         proof: run.text(file::EVENTS).ok().and_then(|events| proof(&events)),
         changed: changed.filter(|key| is_compared(key)).collect(),
     })
@@ -134,9 +134,9 @@ pub(super) struct ReplayedRun {
 /// Replays the run in the folder `path`.
 pub(super) fn replay_run(path: &Path) -> Result<ReplayedRun> {
     let (folder, config) = open(path)?;
-    let run_config = recorded_run_config(folder.manifest(), &config)?;
+    let run_config = recorded_run_config(&folder.manifest, &config)?;
     let recorded =
-        Recorded { manifest: folder.manifest(), run_config, open: &|name| folder.lines(name) };
+        Recorded { manifest: &folder.manifest, run_config, open: &|name| folder.lines(name) };
     let (mut stage, mut samples) = (Vec::new(), Vec::new());
     let replayed = replay_to(&recorded, None, &mut |record, _| {
         match record {
@@ -271,7 +271,7 @@ fn read_insertion(path: &Path) -> Result<Insertion> {
         path: path.to_owned(),
         text: folder.text(file::TRACKER)?,
         recording: Recording { rows },
-        is_rehearsal: folder.manifest().rehearsal.is_some(),
+        is_rehearsal: folder.manifest.rehearsal.is_some(),
     })
 }
 

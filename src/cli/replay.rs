@@ -36,13 +36,13 @@ pub(super) fn replay(arguments: &Arguments) -> Result<()> {
     refuse_existing(arguments.out.as_deref())?;
     let (folder, config) = open(&arguments.run)?;
     let what_if = what_if(&folder.text(file::CONFIG)?, &arguments.set)?;
-    let run_config = recorded_run_config(folder.manifest(), &config)?;
+    let run_config = recorded_run_config(&folder.manifest, &config)?;
     let observer = match &run_config {
         RunConfig::Insertion(session) => Some(session.observer.name()),
         RunConfig::Operation(_) => None,
     };
     let recorded =
-        Recorded { manifest: folder.manifest(), run_config, open: &|name| folder.lines(name) };
+        Recorded { manifest: &folder.manifest, run_config, open: &|name| folder.lines(name) };
     let begun = Instant::now();
     let replayed =
         run_again(&recorded, what_if).map_err(|error| Failure::bad_input(&arguments.run, error))?;
@@ -52,7 +52,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<()> {
     }
     let mut object = json!({
         "run_dir": arguments.run.display().to_string(),
-        "recorded_by": { "version": folder.manifest().version, "git": folder.manifest().git },
+        "recorded_by": { "version": folder.manifest.version, "git": folder.manifest.git },
         "replayed_by": {
             "version": env!("CARGO_PKG_VERSION"),
             "git": option_env!("NEEDLE_BENCH_GIT"),
@@ -93,7 +93,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<()> {
             rows.push(context! { title, observer, rms, last });
         }
     }
-    let has_truth = folder.manifest().tracker == TrackerSource::Emulated.to_string();
+    let has_truth = folder.manifest.tracker == TrackerSource::Emulated.to_string();
     let more = context! { figures => rows, has_truth };
     let text = || screen(include_str!("replay.txt"), &object, more);
     print_result(arguments.json, &object, text)?;

@@ -113,7 +113,7 @@ fn make_from_text_files(
     reached_ns: &AtomicI64,
 ) -> Result<Option<String>, Box<dyn Error>> {
     let folder = RunFolder::open(dir)?;
-    let manifest = folder.manifest();
+    let manifest = &folder.manifest;
     let open = |name: &str| match folder.lines(name) {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(Lines::new(io::empty())),
         opened => opened,
@@ -274,7 +274,7 @@ mod tests {
         let (time, text) = (Time::from_secs_f64(7.0), "late".to_owned());
         let (lane, severity) = (Lane::Session, Severity::Warning);
         recorder.record(Entry::from(Record::Event { time, lane, severity, text }));
-        let run_dir = recorder.run_dir().to_path_buf();
+        let run_dir = recorder.run_dir.clone();
         recorder.finish(|manifest| manifest.set_outcome(&Outcome::Completed)).unwrap();
         (scratch, run_dir, time)
     }

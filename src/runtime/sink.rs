@@ -100,7 +100,7 @@ impl<'a> Sink<'a> {
         interrupt: &Interrupt,
     ) -> Self {
         if let Ok(recorder) = &recorder {
-            operator.recorded_to(recorder.run_dir());
+            operator.recorded_to(&recorder.run_dir);
         }
         Sink {
             recorder,
@@ -156,7 +156,7 @@ impl<'a> Sink<'a> {
         timing: Option<TimingReport>,
     ) -> RunReport {
         let timing = timing.map(|timing| timing.with_record_times(&self.record_times));
-        let run_dir = self.recorder.as_ref().ok().map(|recorder| recorder.run_dir().to_path_buf());
+        let run_dir = self.recorder.as_ref().ok().map(|recorder| recorder.run_dir.clone());
         let sum_up = |manifest: &mut Manifest| {
             manifest.set_outcome(&outcome);
             manifest.duration_s = Some(end.as_nanos() as f64 / 1e9);

@@ -9,6 +9,7 @@ use super::{Entry, Scene, TelemetryError, folder, utc_text};
 use crate::archive::{DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex, unix_us_of};
 use rtrb::Consumer;
 use std::fs::{self, File};
+use std::iter;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime};
@@ -22,7 +23,8 @@ const MANIFEST_LIMIT: Duration = Duration::from_secs(5);
 
 /// A run folder that is being filled.
 pub struct Recorder {
-    run_dir: PathBuf,
+    /// The run folder.
+    pub run_dir: PathBuf,
     config_toml: String,
     /// The manifest so far, with the failures so far.
     manifest: Manifest,
@@ -81,11 +83,6 @@ impl Recorder {
         discard(&self.run_dir);
     }
 
-    /// The run folder.
-    pub fn run_dir(&self) -> &Path {
-        &self.run_dir
-    }
-
     /// Records `entry`. This takes some microseconds, most of them to wake the writer; with
     /// [`Backpressure::DropAndCount`] it never waits for a disk or a viewer.
     pub fn record(&mut self, entry: Entry) {
@@ -102,10 +99,8 @@ impl Recorder {
     /// 50 ms of the time between two calls count as silence of a thread.
     pub fn news(&mut self) -> Option<RecordNews> {
         let now = Instant::now();
-        let news = self.text.news(now).or_else(|| self.keeper.news(now)).or_else(|| {
-            let problem = self.problems.pop().ok()?;
-            Some(RecordNews::Failed(problem))
-        })?;
+        let news = self.text.news(now).or_else(|| self.keeper.news(now));
+        let news = news.or_else(|| self.problems.pop().ok().map(RecordNews::Failed))?;
         if let RecordNews::Failed(error) = &news {
             self.manifest.faults.push(error.clone());
         }
@@ -162,9 +157,7 @@ impl Recorder {
         match (closed, self.keeper.close(&manifest, MANIFEST_LIMIT)) {
             (Ok(_), Ok((_, None))) => {
                 // The keeper has added these to the manifest that it wrote.
-                while let Ok(problem) = self.problems.pop() {
-                    manifest.faults.push(problem);
-                }
+                manifest.faults.extend(iter::from_fn(|| self.problems.pop().ok()));
                 Ok(manifest)
             }
             (Err(error), _) | (_, Err(error) | Ok((_, Some(error)))) => {

@@ -87,7 +87,7 @@ pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
         false => missing_text(file::STEPS),
     };
     let stop_reason = format!("the bench ended without closing its record; {last_step}");
-    let mut manifest = run.manifest().clone();
+    let mut manifest = run.manifest.clone();
     manifest.set_outcome(&Outcome::Stopped(stop_reason.clone()));
     manifest.counts = Some(counts);
     manifest.faults.extend(cuts.iter().map(|(name, bytes)| cut_text(name, *bytes)));
@@ -107,7 +107,7 @@ pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
 /// # Errors
 /// [`TelemetryError`] if the manifest cannot be read or written.
 pub fn note_recording(dir: &Path, fault: Option<String>) -> Result<(), TelemetryError> {
-    let mut manifest = RunFolder::open(dir)?.manifest().clone();
+    let mut manifest = RunFolder::open(dir)?.manifest;
     manifest.faults.retain(|known| !known.starts_with(file::RECORDING));
     manifest.faults.extend(fault);
     manifest.files.remove(file::RECORDING);
@@ -212,7 +212,7 @@ mod tests {
 
         let run = RunFolder::open(dir).unwrap();
         run.verify().unwrap();
-        let manifest = run.manifest();
+        let manifest = &run.manifest;
         assert_eq!(manifest.outcome, Some(RunOutcome::Stopped));
         assert_eq!(manifest.stop_reason.as_deref(), Some(reason));
         assert!(manifest.repaired_utc.is_some() && manifest.counts == Some(counts));
@@ -237,7 +237,7 @@ mod tests {
         let run = RunFolder::open(&scratch.0).unwrap();
         run.verify().unwrap();
         let missing = "steps.csv is missing".to_owned();
-        assert!(run.manifest().faults.contains(&missing), "{:?}", run.manifest().faults);
+        assert!(run.manifest.faults.contains(&missing), "{:?}", run.manifest.faults);
     }
 
     /// The first repair was interrupted after the cut and before it wrote the manifest.
@@ -248,9 +248,9 @@ mod tests {
         let repaired = repair(&scratch.0).unwrap();
         assert_eq!(repaired.cuts, [("steps.csv".to_owned(), 9)]);
         let run = RunFolder::open(&scratch.0).unwrap();
-        assert!(run.manifest().files.contains_key("steps.csv.cut"));
+        assert!(run.manifest.files.contains_key("steps.csv.cut"));
         let said = cut_text(file::STEPS, 9);
-        assert!(run.manifest().faults.contains(&said), "{:?}", run.manifest().faults);
+        assert!(run.manifest.faults.contains(&said), "{:?}", run.manifest.faults);
     }
 
     #[test]

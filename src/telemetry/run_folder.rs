@@ -10,8 +10,10 @@ use std::path::{Path, PathBuf};
 /// The folder of a run that was recorded, opened for reading. Nothing here writes.
 #[derive(Debug, Clone)]
 pub struct RunFolder {
-    dir: PathBuf,
-    manifest: Manifest,
+    /// The folder's path.
+    pub dir: PathBuf,
+    /// The manifest, as it was when the folder was opened.
+    pub manifest: Manifest,
 }
 
 impl RunFolder {
@@ -34,16 +36,6 @@ impl RunFolder {
             Ok(manifest) => Ok(RunFolder { dir: dir.to_path_buf(), manifest }),
             Err(error) => Err(TelemetryError::record(&path, error)),
         }
-    }
-
-    /// The folder's path.
-    pub fn dir(&self) -> &Path {
-        &self.dir
-    }
-
-    /// The manifest.
-    pub fn manifest(&self) -> &Manifest {
-        &self.manifest
     }
 
     /// True once the record was closed, by the bench or by a repair: then its files are sealed.

@@ -75,7 +75,7 @@ fn record(parent: &Path, entries: impl IntoIterator<Item = Entry>) -> (PathBuf, 
     let mut recorder = recorder(parent, Backpressure::Block);
     entries.into_iter().for_each(|entry| recorder.record(entry));
     assert!(recorder.news().is_none());
-    let run_dir = recorder.run_dir().to_path_buf();
+    let run_dir = recorder.run_dir.clone();
     (run_dir, recorder.finish(completed).unwrap().counts.unwrap())
 }
 
@@ -152,7 +152,7 @@ fn a_run_leaves_every_file() {
     // The seals cover every file and agree with it.
     let run = RunFolder::open(dir).unwrap();
     run.verify().unwrap();
-    let sealed: BTreeSet<String> = run.manifest().files.keys().cloned().collect();
+    let sealed: BTreeSet<String> = run.manifest.files.keys().cloned().collect();
     assert_eq!(sealed.len() + 1, names.len(), "all but the manifest: {sealed:?}");
 }
 
@@ -160,7 +160,7 @@ fn a_run_leaves_every_file() {
 fn a_run_folder_cannot_be_repaired_while_it_is_written() {
     let scratch = Scratch::new("locked");
     let recorder = recorder(&scratch.0, Backpressure::Block);
-    let dir = recorder.run_dir().to_path_buf();
+    let dir = recorder.run_dir.clone();
     let said = repair(&dir).unwrap_err().to_string();
     assert!(said.contains("a bench is still writing this record"), "{said}");
 
@@ -174,7 +174,7 @@ fn a_run_folder_cannot_be_repaired_while_it_is_written() {
     assert_eq!(reason, "the bench ended without closing its record; no step was taken");
     let run = RunFolder::open(&left).unwrap();
     run.verify().unwrap();
-    assert_eq!(run.manifest().files.len(), 6);
+    assert_eq!(run.manifest.files.len(), 6);
 }
 
 #[test]
@@ -189,7 +189,7 @@ fn a_run_that_cannot_begin_leaves_no_folder() {
 fn a_removed_run_folder_is_reported_and_cannot_be_closed() {
     let scratch = Scratch::new("removed");
     let mut recorder = recorder(&scratch.0, Backpressure::DropAndCount);
-    fs::remove_dir_all(recorder.run_dir()).unwrap();
+    fs::remove_dir_all(&recorder.run_dir).unwrap();
     let end = std::time::Instant::now() + Duration::from_secs(60);
     let said = loop {
         assert!(std::time::Instant::now() < end, "no news");
@@ -209,7 +209,7 @@ fn a_record_left_open_stays_locked_while_its_bench_lives() {
     let scratch = Scratch::new("left-locked");
     let recorder = recorder(&scratch.0, Backpressure::DropAndCount);
     let moved = scratch.0.join("moved");
-    fs::rename(recorder.run_dir(), &moved).unwrap();
+    fs::rename(&recorder.run_dir, &moved).unwrap();
     let error = recorder.finish(completed).unwrap_err();
     assert!(error.to_string().contains("No such file"), "{error}");
     let said = repair(&moved).unwrap_err().to_string();
@@ -220,7 +220,7 @@ fn a_record_left_open_stays_locked_while_its_bench_lives() {
 fn the_manifest_of_a_run_that_was_not_closed_has_no_outcome() {
     let scratch = Scratch::new("abandoned");
     let recorder = recorder(&scratch.0, Backpressure::Block);
-    let manifest = fs::read(recorder.run_dir().join("manifest.json")).unwrap();
+    let manifest = fs::read(recorder.run_dir.join("manifest.json")).unwrap();
     let manifest: serde_json::Value = serde_json::from_slice(&manifest).unwrap();
     assert_eq!(manifest["outcome"], serde_json::Value::Null);
     assert_eq!(manifest["ended_utc"], serde_json::Value::Null);

@@ -304,7 +304,7 @@ fn rehearsed_runs_calibrate_the_needle_and_the_file_is_used() {
         let run = said.json()["run_dir"].as_str().unwrap().to_owned();
         // As the record of a run on the rig: that of a rehearsal is refused.
         let dir = scratch.path().join(&run);
-        let manifest = RunFolder::open(&dir).unwrap().manifest().clone();
+        let manifest = RunFolder::open(&dir).unwrap().manifest;
         write_manifest(&dir, &Manifest { rehearsal: None, ..manifest }).unwrap();
         runs.push(run);
     }

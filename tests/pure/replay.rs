@@ -167,7 +167,7 @@ impl Run {
         let config = text(file::CONFIG);
         let config = [Source { name: file::CONFIG, text: &config }];
         let mut run = Run {
-            manifest: folder.manifest().clone(),
+            manifest: folder.manifest.clone(),
             session: Config::from_sources(&config, &[]).expect("valid").session().expect("valid"),
             inputs: text(file::INPUTS),
             can: text(file::CAN),

@@ -91,7 +91,7 @@ fn replay_repeats_a_run_answers_what_if_and_refuses_an_edited_one() {
     std::fs::write(&steps, &recorded).unwrap();
 
     // A killed bench leaves the manifest open.
-    let mut manifest = RunFolder::open(&run_dir).unwrap().manifest().clone();
+    let mut manifest = RunFolder::open(&run_dir).unwrap().manifest;
     manifest.outcome = None;
     manifest.version = "0.0.9".to_owned();
     manifest.files.clear();
@@ -146,7 +146,7 @@ fn every_operation_replays() {
         let json = said.json();
         assert_eq!(json["identical"], true, "{operation:?}: {json} {}", said.stderr);
         assert_ne!(json["frames_sent"], 0, "{operation:?}");
-        let manifest = RunFolder::open(&run_dir).unwrap().manifest().clone();
+        let manifest = RunFolder::open(&run_dir).unwrap().manifest;
         assert_eq!(manifest.operation.unwrap().split('-').next(), Some(operation[0]));
         assert_ne!(json["samples"], 0, "{operation:?} recorded no sample of the tracker: {json}");
     }
@@ -157,7 +157,7 @@ fn a_replay_reports_a_changed_operation() {
     let scratch = Scratch::new();
     let run_dir = operated(&scratch, &["jog", "--axis", "insertion", "--by", "2mm"]);
     let rewrite = |arguments: &[&str]| {
-        let mut manifest = RunFolder::open(&run_dir).unwrap().manifest().clone();
+        let mut manifest = RunFolder::open(&run_dir).unwrap().manifest;
         manifest.arguments = arguments.iter().map(|word| (*word).to_owned()).collect();
         write_manifest(&run_dir, &manifest).unwrap();
     };

@@ -28,8 +28,8 @@ fn review(scratch: &Scratch, arguments: &[&str]) -> Said {
 fn leave_open(scratch: &Scratch, dir: &str) {
     let dir = scratch.path().join(dir);
     let folder = RunFolder::open(&dir).expect("a run folder");
-    let mut open = Manifest::new(&folder.manifest().name, folder.manifest().started_utc.clone());
-    open.config_sha256 = folder.manifest().config_sha256.clone();
+    let mut open = Manifest::new(&folder.manifest.name, folder.manifest.started_utc.clone());
+    open.config_sha256 = folder.manifest.config_sha256.clone();
     write_manifest(&dir, &open).expect("a manifest");
 }
 
@@ -330,7 +330,7 @@ fn all_verdicts_are_kept_and_the_last_counts() {
     let said = review(&scratch, &[&dir]);
     assert_all(&said.stdout, &["whole", "verdict     valid, it was the other run"]);
     let folder = RunFolder::open(&scratch.path().join(&dir)).expect("a sealed record");
-    assert_eq!(folder.manifest().verdicts.len(), 2);
+    assert_eq!(folder.manifest.verdicts.len(), 2);
 }
 
 #[test]

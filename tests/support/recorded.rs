@@ -23,7 +23,7 @@ pub(crate) fn keep(run_dir: &Path, name: &str) {
             std::fs::copy(&path, kept.join(name)).expect("copied");
         }
     }
-    let mut manifest = RunFolder::open(&kept).expect("a run folder").manifest().clone();
+    let mut manifest = RunFolder::open(&kept).expect("a run folder").manifest;
     manifest.files.remove(file::RECORDING);
     write_manifest(&kept, &manifest).expect("written");
 }

@@ -59,7 +59,7 @@ pub(super) fn review(arguments: &Arguments) -> Result<()> {
     if paths.is_empty() {
         let newest = newest_first(Path::new(RUNS)).next();
         let none = || Failure::configuration(format_args!("no run in {RUNS}: name a run folder"));
-        paths.push(newest.ok_or_else(none)?.dir().to_path_buf());
+        paths.push(newest.ok_or_else(none)?.dir);
     }
     let changes_record = arguments.verdict.is_some() || arguments.repair;
     let is_campaign = !changes_record

@@ -44,7 +44,7 @@ fn lines<T>(
     parse: impl Fn(&str) -> Option<T>,
     unreadable: &mut Vec<String>,
 ) -> Vec<T> {
-    let path = folder.dir().join(name);
+    let path = folder.dir.join(name);
     match folder.lines(name).and_then(|lines| lines.parse(parse)) {
         Ok((values, damaged)) => {
             let count = damaged.len();
@@ -93,14 +93,14 @@ pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), TelemetryError> {
         Err(TelemetryError::Record { reason, .. }) => Condition::Changed(reason),
         Err(error) => return Err(error),
     };
-    let figures_of_steps = match record.manifest().figures.is_empty() {
+    let figures_of_steps = match record.manifest.figures.is_empty() {
         true => record.text(file::STEPS).ok().and_then(|text| figures_of_steps(&text)),
         false => None,
     };
     let folder = Folder {
         figures_of_steps,
         dir: path.display().to_string(),
-        manifest: record.manifest().clone(),
+        manifest: record.manifest.clone(),
         condition,
         // If it is missing, the condition says so.
         config_toml: record.text(file::CONFIG).ok(),

@@ -99,7 +99,7 @@ fn a_record_can_be_read_up_to_the_moment_of_a_kill() {
         let run = RunFolder::open(&run_dir).unwrap();
         run.verify().unwrap();
         assert_recording_agrees(&run_dir, STEPS_LOST_MAX);
-        let reason = run.manifest().stop_reason.clone().unwrap();
+        let reason = run.manifest.stop_reason.clone().unwrap();
         assert!(
             reason.starts_with("the bench ended without closing its record; the last step is ")
         );

@@ -33,5 +33,5 @@ fn closed(run_dir: &Path) -> Manifest {
     let run = RunFolder::open(run_dir).unwrap();
     assert!(run.is_closed());
     run.verify().unwrap();
-    run.manifest().clone()
+    run.manifest.clone()
 }
