@@ -1,15 +1,16 @@
 //! Logs a run for viewers: to its file, or to the live view.
 
+use super::document::log_manifest;
 use super::space::Space;
 use super::states::{Meaning, States, drive_lane};
 use super::tables::{Motion, Samples, Steps, log_refused};
-use super::{Logged, can, document};
+use super::{Logged, can};
 use crate::archive::{Manifest, unix_us_of};
 use crate::session::{Record, Severity};
 use crate::telemetry::{Entry, Scene};
 use crate::units::Time;
 use rerun::time::TimeCell;
-use rerun::{DynamicArchetype, RecordingStream, RecordingStreamBuilder, TextDocument, TextLog};
+use rerun::{RecordingStream, RecordingStreamBuilder, TextDocument, TextLog};
 
 /// The application name, by which a viewer groups recordings and keeps their layout.
 pub(super) const APPLICATION: &str = "needle-bench";
@@ -179,27 +180,6 @@ fn level(severity: Severity) -> &'static str {
         Severity::Warning => "WARN",
         Severity::Fault => "ERROR",
     }
-}
-
-/// Logs the manifest as a page, and the outcome as a property.
-pub(super) fn log_manifest(stream: &RecordingStream, manifest: &Manifest) -> Logged {
-    let page = document::manifest(manifest);
-    stream.log_static("manifest", &TextDocument::from_markdown(page))?;
-    let outcome =
-        manifest.outcome.map_or_else(|| "not ended".to_owned(), |outcome| outcome.to_string());
-    let run = [
-        ("version", &manifest.version),
-        ("config_sha256", &manifest.config_sha256),
-        ("bus", &manifest.bus),
-        ("tracker", &manifest.tracker),
-        ("outcome", &outcome),
-    ]
-    .into_iter()
-    .fold(DynamicArchetype::new("run"), |run, (name, text)| {
-        let text = rerun::components::Text::from(text.as_str());
-        run.with_component::<rerun::components::Text>(name, [text])
-    });
-    stream.send_property("run", &run)
 }
 
 #[cfg(test)]

@@ -1,17 +1,34 @@
 //! The manifest, with the run's figures, as a page of the recording.
 
+use super::Logged;
 use crate::archive::Manifest;
+use rerun::components::Text;
+use rerun::{DynamicArchetype, RecordingStream, TextDocument};
 use serde_json::Value;
 use std::fmt::Write as _;
 
-/// The manifest as Markdown, the outcome first.
-pub(super) fn manifest(manifest: &Manifest) -> String {
-    let outcome = match (manifest.outcome, &manifest.stop_reason) {
-        (None, _) => "not ended".to_owned(),
-        (Some(outcome), None) => outcome.to_string(),
-        (Some(outcome), Some(reason)) => format!("{outcome}: {reason}"),
-    };
-    let mut page = format!("# {}: {outcome}\n\n| | |\n|---|---|\n", manifest.name);
+/// Logs the manifest as a page, and the outcome as a property.
+pub(super) fn log_manifest(stream: &RecordingStream, manifest: &Manifest) -> Logged {
+    let outcome = manifest.outcome.map_or("not ended".to_owned(), |outcome| outcome.to_string());
+    stream.log_static("manifest", &TextDocument::from_markdown(page(manifest, &outcome)))?;
+    let run = [
+        ("version", &manifest.version),
+        ("config_sha256", &manifest.config_sha256),
+        ("bus", &manifest.bus),
+        ("tracker", &manifest.tracker),
+        ("outcome", &outcome),
+    ];
+    let run = run.into_iter().fold(DynamicArchetype::new("run"), |run, (name, text)| {
+        run.with_component::<Text>(name, [Text::from(text.as_str())])
+    });
+    stream.send_property("run", &run)
+}
+
+/// The manifest as Markdown, the `outcome` first.
+fn page(manifest: &Manifest, outcome: &str) -> String {
+    let reason =
+        manifest.stop_reason.as_ref().map_or(String::new(), |reason| format!(": {reason}"));
+    let mut page = format!("# {}: {outcome}{reason}\n\n| | |\n|---|---|\n", manifest.name);
     let keys = serde_json::to_value(manifest).unwrap_or_default();
     // The seals are for programs.
     for (key, value) in keys.as_object().into_iter().flatten().filter(|(key, _)| *key != "files") {
@@ -58,7 +75,7 @@ mod tests {
         manifest.note = Some("a | b".to_owned());
         let figures = json!({ "steps": 3, "final_error": { "x_mm": 0.123456, "y_mm": null } });
         manifest.figures = figures.as_object().cloned().unwrap_or_default();
-        let page = super::manifest(&manifest);
+        let page = page(&manifest, "not ended");
         assert!(page.starts_with("# virtual: not ended\n"), "{page}");
         assert!(page.contains("| note | a \\| b |\n"), "{page}");
         let rows = "| figures steps | 3 |\n| figures final_error x_mm | 0.1235 |\n\

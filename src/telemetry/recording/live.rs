@@ -1,6 +1,7 @@
 //! Shows the run to viewers while it goes on. Records that its queue cannot take are dropped and counted.
 
-use super::content::{Content, builder, log_manifest};
+use super::content::{Content, builder};
+use super::document::log_manifest;
 use crate::archive::Manifest;
 use crate::telemetry::worker::{Backpressure, Sink, Worker};
 use crate::telemetry::{Entry, Scene, TelemetryError};
