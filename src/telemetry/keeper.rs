@@ -147,6 +147,7 @@ impl Sink for Folder {
 mod tests {
     use super::*;
     use crate::telemetry::tests::Scratch;
+    use std::sync::atomic::Ordering::Relaxed;
     use std::thread;
     use std::time::Instant;
 
@@ -247,8 +248,8 @@ mod tests {
         assert!(next().contains("steps.csv: No such file"));
         fs::rename(&dir, scratch.0.join("moved")).unwrap();
         assert!(next().contains("run: No such file"));
-        let beats = keeper.vitals.beats();
-        while keeper.vitals.beats() < beats + 3 {
+        let beats = keeper.vitals.beats.load(Relaxed);
+        while keeper.vitals.beats.load(Relaxed) < beats + 3 {
             thread::yield_now();
         }
         assert!(problems.is_empty());

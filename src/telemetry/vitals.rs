@@ -16,29 +16,16 @@ const DROP_WARNING_INTERVAL: Duration = Duration::from_secs(1);
 /// Whether a recording thread works, shared without a lock.
 #[derive(Debug, Default)]
 pub(super) struct Vitals {
-    beats: AtomicU64,
-    fault: OnceLock<String>,
+    /// The number of rounds of its loop so far.
+    pub(super) beats: AtomicU64,
+    /// The first reason why it has failed.
+    pub(super) fault: OnceLock<String>,
 }
 
 impl Vitals {
     /// Called by the thread after each round of its loop.
     pub(super) fn beat(&self) {
         self.beats.fetch_add(1, Ordering::Relaxed);
-    }
-
-    /// The number of rounds so far.
-    pub(super) fn beats(&self) -> u64 {
-        self.beats.load(Ordering::Relaxed)
-    }
-
-    /// Notes that the thread has failed. Only the first reason is kept.
-    pub(super) fn fail(&self, reason: String) {
-        let _ = self.fault.set(reason);
-    }
-
-    /// Why the thread has failed.
-    pub(super) fn fault(&self) -> Option<&str> {
-        self.fault.get().map(String::as_str)
     }
 }
 
@@ -64,7 +51,7 @@ impl Silence {
     /// Looks at the thread at `now`. Returns how long it has shown no sign of life.
     pub(super) fn look(&mut self, vitals: &Vitals, now: Instant) -> Duration {
         let elapsed = now.saturating_duration_since(mem::replace(&mut self.last_look, now));
-        let beats = vitals.beats();
+        let beats = vitals.beats.load(Ordering::Relaxed);
         let is_alive = mem::replace(&mut self.beats, beats) != beats;
         self.lasted = if is_alive { Duration::ZERO } else { self.lasted + elapsed.min(LOOK_MAX) };
         self.lasted
@@ -113,7 +100,7 @@ impl Watch {
     pub(super) fn health_news(&mut self, vitals: &Vitals, now: Instant) -> Option<RecordNews> {
         let before_s = self.silence.lasted.as_secs_f64();
         let (writer, lasted) = (self.writer, self.silence.look(vitals, now));
-        let health = match vitals.fault() {
+        let health = match vitals.fault.get() {
             Some(_) => Health::Failed,
             None if lasted > SILENCE_LIMIT => Health::GivenUp,
             None if lasted > WARN_AFTER => Health::Silent,
@@ -122,7 +109,7 @@ impl Watch {
         if mem::replace(&mut self.health, health) == health {
             return None;
         }
-        let text = match (health, vitals.fault()) {
+        let text = match (health, vitals.fault.get()) {
             (Health::Alive, _) => format!("{writer}: alive again after {before_s:.1} s"),
             (_, Some(reason)) => TelemetryError::writer_failed(writer, reason).to_string(),
             _ => TelemetryError::writer_silent(writer, lasted, SILENCE_LIMIT).to_string(),
@@ -228,8 +215,8 @@ mod tests {
     #[test]
     fn a_fault_is_reported_once() {
         let mut watched = Watched::new(5);
-        watched.vitals.fail("no space left".to_owned());
-        watched.vitals.fail("and again".to_owned());
+        watched.vitals.fault.set("no space left".to_owned()).unwrap();
+        watched.vitals.fault.set("and again".to_owned()).unwrap_err();
         let said = "failed: text files: no space left; what follows is not recorded";
         assert_eq!(watched.reports_of_next(1000, 0), [(5, said.to_owned())]);
     }
@@ -278,7 +265,7 @@ mod tests {
             given_up.starts_with("failed: text files: no sign of life for 5.0 s"),
             "{given_up}"
         );
-        watched.vitals.fail("Input/output error".to_owned());
+        watched.vitals.fault.set("Input/output error".to_owned()).unwrap();
         let said = "failed: text files: Input/output error; what follows is not recorded";
         assert_eq!(watched.reports_of_next(1000, 0), [(5, said.to_owned())]);
     }

@@ -111,7 +111,7 @@ impl<T: Send + 'static> Worker<T> {
             let result =
                 catch_unwind(run).unwrap_or_else(|_| Err("the writer panicked".to_owned()));
             if let Err(reason) = result {
-                of_thread.fail(reason);
+                let _ = of_thread.fault.set(reason);
             }
             // Report first: dropping a failed sink may block.
             let _ = done_tx.send(sink.result());
@@ -153,18 +153,19 @@ impl<T: Send + 'static> Worker<T> {
     fn wait_and_push(&mut self, mut message: Message<T>) -> bool {
         let mut silence = Silence::new(Instant::now());
         while let Err(unsent) = self.push(message) {
-            if self.queue.is_abandoned() || self.vitals.fault().is_some() {
+            if self.queue.is_abandoned() || self.vitals.fault.get().is_some() {
                 return false;
             }
             if silence.look(&self.vitals, Instant::now()) > SILENCE_LIMIT {
                 let limit_s = SILENCE_LIMIT.as_secs_f64();
-                self.vitals.fail(format!("took nothing for {limit_s:.1} s; is the disk stalled?"));
+                let reason = format!("took nothing for {limit_s:.1} s; is the disk stalled?");
+                let _ = self.vitals.fault.set(reason);
                 return false;
             }
             message = unsent;
             thread::sleep(RETRY);
         }
-        self.vitals.fault().is_none()
+        self.vitals.fault.get().is_none()
     }
 
     /// Tells the thread how the run ended, and waits for it at most `limit`, even if items are still queued.
@@ -192,7 +193,7 @@ impl<T: Send + 'static> Worker<T> {
                 is_close_sent || self.push(Message::Close(Box::new(manifest.clone()))).is_ok();
             if let Ok(result) = self.done.recv_timeout(RETRY) {
                 let failed = |reason| TelemetryError::writer_failed(writer, reason);
-                return Ok((result, self.vitals.fault().map(failed)));
+                return Ok((result, self.vitals.fault.get().map(failed)));
             }
             let silent = silence.look(&self.vitals, Instant::now());
             if silent > WARN_AFTER && !std::mem::replace(&mut is_told, true) {
@@ -320,14 +321,14 @@ mod tests {
     fn a_failed_writer_is_reported_and_never_blocks_the_caller() {
         for backpressure in [Backpressure::Block, Backpressure::DropAndCount] {
             let (mut worker, _begun, permit) = gated(2, backpressure);
-            assert_eq!(worker.vitals.fault(), None);
+            assert_eq!(worker.vitals.fault.get(), None);
             (0..2).for_each(|_| worker.give(entry()));
             drop(permit);
             let (left, fault) = worker.close(&Manifest::default(), HOUR).unwrap();
             let said = "gated: no space left; what follows is not recorded";
             assert_eq!(fault.unwrap().to_string(), said);
             assert_eq!(left.entries, 2, "the result of a failed writer");
-            assert_eq!(worker.vitals.fault(), Some("no space left"));
+            assert_eq!(worker.vitals.fault.get().unwrap(), "no space left");
             (0..10).for_each(|_| worker.give(entry()));
             assert_eq!(worker.dropped, 10);
         }
