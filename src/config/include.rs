@@ -79,19 +79,17 @@ pub(super) fn add_calibrations(entries: &mut Entries, read: ReadFile<'_>) -> Unu
 pub(super) fn remove_outdated_fits(tree: &mut Tree) {
     for file in &CALIBRATION_FILES {
         let Some(layer) = tree.get(file.fit).map(|fit| fit.layer) else { continue };
-        if tree.iter().any(|(key, entry)| entry.layer > layer && file.measures(key)) {
+        let is_measured = |key: &str| {
+            (is_among(key, file.holds) || is_among(key, file.instead_of))
+                && !is_among(key, &NOT_MEASURED)
+        };
+        if tree.iter().any(|(key, entry)| entry.layer > layer && is_measured(key)) {
             tree.retain(|key, _| !is_among(key, &[file.fit]));
         }
     }
 }
 
 impl CalibrationFile {
-    /// True for a measured value that the file holds, and for a key that can replace it.
-    fn measures(&self, key: &str) -> bool {
-        (is_among(key, self.holds) || is_among(key, self.instead_of))
-            && !is_among(key, &NOT_MEASURED)
-    }
-
     /// The content of the file, in the layer that names it; nothing if a higher layer replaces it.
     fn content(&self, entries: &Entries, read: ReadFile<'_>) -> Result<Entries, ConfigError> {
         let Some(naming) = topmost(entries, self.key) else { return Ok(Vec::new()) };

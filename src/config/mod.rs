@@ -184,7 +184,7 @@ impl Config {
         include::remove_outdated_fits(&mut tree);
         let mut reader = Reader::new(tree);
         unusable.into_iter().for_each(|(keys, error)| reader.fail_all(keys, error));
-        let config = Config::of(reader.read(Self::KEYS));
+        let config = reader.read();
         checks::check(&config, &mut reader);
         Ok((config, reader.finish()?))
     }

@@ -64,9 +64,9 @@ impl Reader {
         }
     }
 
-    /// Reads the configuration as `keys` declare it. A wrong value is reported, and left out of the result.
-    pub(super) fn read(&mut self, keys: &'static [Key]) -> Value {
-        self.table(&Kind::Table(keys), &[], "", true)
+    /// Reads the configuration. A wrong value is reported; in the result it has a placeholder, such as NaN or 0.
+    pub(super) fn read(&mut self) -> Config {
+        Config::of(self.table(&Kind::Table(Config::KEYS), &[], "", true))
     }
 
     /// Reads the table at `path`; `narrowed` has narrower rules for some keys. If it `has_defaults`, keys that
@@ -118,9 +118,10 @@ impl Reader {
             }
         }
         if let Kind::Either(key, [_, others]) = *kind
-            && self.is_given(&join(path, key))
-            && let Some(Key { name, .. }) =
-                expanded(others, &[]).iter().find(|other| self.is_given(&join(path, other.name)))
+            && self.given(&join(path, key)).is_some()
+            && let Some(Key { name, .. }) = expanded(others, &[])
+                .iter()
+                .find(|other| self.given(&join(path, other.name)).is_some())
         {
             let message = format!("{path}: {key} are given along with {name}: give one of the two");
             self.fail(path, &join(path, key), message);
@@ -230,7 +231,7 @@ impl Reader {
         }
         // A recorded configuration has all defaults in every table.
         let mut defaults = all.iter().filter(|key| key.default.is_some());
-        let is_recorded = defaults.all(|key| self.is_given(&join(table_path, key.name)));
+        let is_recorded = defaults.all(|key| self.given(&join(table_path, key.name)).is_some());
         for key in all.iter().filter(|key| !known.contains(&key.name)) {
             let key_path = join(table_path, key.name);
             let is_allowed = |entry: &Entry| is_recorded && key.default == Some(&entry.source_text);
@@ -298,12 +299,8 @@ impl Reader {
     }
 
     /// The entry of `key`, unless it is a default.
-    fn given(&self, key: &str) -> Option<&Entry> {
+    pub(super) fn given(&self, key: &str) -> Option<&Entry> {
         self.tree.get(key).filter(|entry| entry.layer > 0)
-    }
-
-    pub(super) fn is_given(&self, key: &str) -> bool {
-        self.given(key).is_some()
     }
 
     /// Reports that the source of `keys` is unusable.

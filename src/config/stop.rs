@@ -3,7 +3,7 @@
 
 use super::reader::{Reader, contradictions, is_inside, merge};
 use super::value::{self, Entries};
-use super::{CanInterface, Config, ConfigError, Source, checks};
+use super::{CanInterface, ConfigError, Source, checks};
 use crate::stage;
 
 const INTERFACE: &str = "can.interface";
@@ -68,12 +68,12 @@ impl StopConfig {
     fn read(entries: Entries) -> Result<Self, ConfigError> {
         let mut tree = merge(entries);
         let mut reader = Reader::new(tree.clone());
-        let config = Config::of(reader.read(Config::KEYS));
-        let is_named = reader.is_given(INTERFACE);
+        let config = reader.read();
+        let is_named = reader.given(INTERFACE).is_some();
         let is_optional = |key| key != INTERFACE && is_named && config.can.interface.is_virtual();
         for key in NEEDED {
             contradictions! { reader;
-                [key] if !is_optional(key) && !reader.is_given(key) =>
+                [key] if !is_optional(key) && reader.given(key).is_none() =>
                     "{key} is not given, and a stop needs it";
             }
         }
@@ -92,8 +92,7 @@ impl StopConfig {
                 tree.extend(value::parse_set(coarse, 1)?);
             }
         }
-        let valid = Config::of(Reader::new(tree).read(Config::KEYS));
-        let mut stage = valid.stage;
+        let mut stage = Reader::new(tree).read().stage;
         stage.insertion.node = config.stage.insertion.node;
         stage.rotation.node = config.stage.rotation.node;
         // The coarser the scale, the longer it takes to see that an axis stands.
@@ -123,6 +122,7 @@ fn salvaged(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Config;
     use crate::stage::CountsRatio;
     use std::time::Duration;
 
