@@ -170,7 +170,7 @@ impl Config {
         let unusable = include::add_calibrations(&mut entries, read);
         let (mut config, mut tree) = Config::checked(reader::merge(entries.clone()), unusable)?;
         if config.emulator.rehearse {
-            let implied = rehearsal::layer(&config);
+            let implied = rehearsal::layer(&config).map_err(|error| error.to_string())?;
             entries.extend(value::parse_file("rehearsal", &implied, PRESET)?);
             (config, tree) = Config::checked(reader::merge(entries), Vec::new())?;
         }

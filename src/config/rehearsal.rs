@@ -9,7 +9,7 @@ use crate::emulator::drive::Switches;
 use crate::geometry::coordinates;
 use crate::stage::AxisConfig;
 use crate::tracker::TrackerKind;
-use std::fmt::Write as _;
+use serde_json::json;
 
 /// maxon motor; a drive of this vendor is emulated as an EPOS4.
 const MAXON_VENDOR_ID: u32 = 0xFB;
@@ -19,7 +19,10 @@ const START_PART: f64 = 1.0 / 16.0;
 const START_MAX_MM: f64 = 5.0;
 
 /// The keys of `[emulator]` that a rehearsal derives from the rest of `config`, as TOML.
-pub(super) fn layer(config: &Config) -> String {
+///
+/// # Errors
+/// Not for a configuration that was read.
+pub(super) fn layer(config: &Config) -> Result<String, toml::ser::Error> {
     let (needle, tracker) = (&config.needle, &config.tracker);
     let curvature = needle.arc.curvature_per_mm();
     let depth_mm = config.insertion.depth_mm;
@@ -29,34 +32,24 @@ pub(super) fn layer(config: &Config) -> String {
     let maxon = Some(MAXON_VENDOR_ID);
     let is_epos4 =
         config.stage.insertion.vendor_id == maxon || config.stage.rotation.vendor_id == maxon;
-    let drives = if is_epos4 { "epos4" } else { "generic" };
-    // Both sections have the same keys.
-    let torsion = config.value_at("needle.torsion").map(ToString::to_string).unwrap_or_default();
-    let mut keys = format!(
-        "[emulator]\n\
-         drives = \"{drives}\"\n\
-         homed = true\n\
-         curvature_per_mm = {curvature:?}\n\
-         tip_ahead_mm = {:?}\n\
-         torsion = {torsion}\n\
-         start = {{ x_mm = {start_mm:?}, yaw_deg = 1.0, pitch_deg = 1.0 }}\n\
-         sensor = {{ x_mm = {x:?}, y_mm = {y:?}, z_mm = {z:?}, yaw_deg = {yaw:?}, \
-         pitch_deg = {pitch:?}, roll_deg = {roll:?} }}\n",
-        needle.tip_ahead_mm,
-    );
+    let mut emulator = json!({
+        "drives": if is_epos4 { "epos4" } else { "generic" },
+        "homed": true,
+        "curvature_per_mm": curvature,
+        "tip_ahead_mm": needle.tip_ahead_mm,
+        // Both sections have the same keys.
+        "torsion": config.value_at("needle.torsion"),
+        "start": { "x_mm": start_mm, "yaw_deg": 1.0, "pitch_deg": 1.0 },
+        "sensor": {
+            "x_mm": x, "y_mm": y, "z_mm": z, "yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll,
+        },
+    });
     if config.emulator.tracker == TrackerPreset::Plain {
-        let repeats = u32::from(tracker.kind == TrackerKind::Imaging);
-        let sd_mm = tracker.to_track().noise_sd_mm;
-        let latency_ms = tracker.latency.as_secs_f64() * 1e3;
-        // Writing to a string cannot fail.
-        let _ = writeln!(
-            keys,
-            "noise = {{ sd_mm = {sd_mm:?} }}\n\
-             tracker_latency_ms = {latency_ms:?}\n\
-             tracker_repeats = {repeats}"
-        );
+        emulator["noise"] = json!({ "sd_mm": tracker.to_track().noise_sd_mm });
+        emulator["tracker_latency_ms"] = json!(tracker.latency.as_secs_f64() * 1e3);
+        emulator["tracker_repeats"] = json!(u32::from(tracker.kind == TrackerKind::Imaging));
     }
-    keys
+    toml::to_string(&json!({ "emulator": emulator }))
 }
 
 /// The switches of an axis with `counts_per_unit` counts per mm or rad: those `given`, and the switch that its
