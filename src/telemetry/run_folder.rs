@@ -45,7 +45,7 @@ impl RunFolder {
 
     /// Checks that the sealed files are unchanged, and that in a closed record every text file has a seal. In a
     /// record that was never closed only the configuration is checked. `run.rrd` is not checked
-    /// ([`Self::recording_change`]): it follows from the other files, and nothing is read from it.
+    /// (see [`Self::change`]): it follows from the other files, and nothing is read from it.
     ///
     /// # Errors
     /// [`TelemetryError::Record`] with every file that differs, and [`TelemetryError::File`].
@@ -70,30 +70,28 @@ impl RunFolder {
         Err(TelemetryError::record(&self.dir, reason))
     }
 
-    /// How `run.rrd` differs from the one that the manifest lists; `None` if it does not.
+    /// How the file `name` differs from its seal in the manifest; `None` if it is unchanged. Of the configuration
+    /// without a seal only the hash is known.
     ///
     /// # Errors
     /// [`TelemetryError::File`].
-    pub fn recording_change(&self) -> Result<Option<String>, TelemetryError> {
-        self.change(file::RECORDING)
-    }
-
-    /// How the file `name` differs from its seal in the manifest; `None` if it is unchanged. Of the configuration
-    /// without a seal only the hash is known.
-    fn change(&self, name: &str) -> Result<Option<String>, TelemetryError> {
+    pub fn change(&self, name: &str) -> Result<Option<String>, TelemetryError> {
+        let seal = self.manifest.files.get(name);
+        let config_sha256 = Some(&self.manifest.config_sha256).filter(|_| name == file::CONFIG);
+        let Some(sha256) = seal.map(|seal| &seal.sha256).or(config_sha256) else {
+            let exists = self.dir.join(name).exists();
+            let what = if exists { "has no seal in the manifest" } else { "is missing" };
+            return Ok(Some(format!("{name} {what}")));
+        };
         let Some(now) = seal_of(&self.dir, name)? else {
             return Ok(Some(format!("{name} is missing")));
         };
-        let config_sha256 = Some(&self.manifest.config_sha256).filter(|_| name == file::CONFIG);
-        let seal = self.manifest.files.get(name);
-        let sha256 = seal.map(|seal| &seal.sha256).or(config_sha256);
-        Ok(match (seal, sha256) {
-            (_, None) => Some(format!("{name} has no seal in the manifest")),
-            (Some(seal), _) if seal.bytes != now.bytes => Some(format!(
+        Ok(match seal {
+            Some(seal) if seal.bytes != now.bytes => Some(format!(
                 "{name} had {} bytes when the record was closed and has {} now",
                 seal.bytes, now.bytes
             )),
-            (_, Some(sha256)) if *sha256 != now.sha256 => {
+            _ if *sha256 != now.sha256 => {
                 Some(format!("{name} was edited: its SHA-256 is not the one in manifest.json"))
             }
             _ => None,

@@ -245,7 +245,7 @@ fn close_record(path: &Path, json: bool) -> Result<()> {
 
 /// True if the record in `path` does not have the `run.rrd` that its manifest lists.
 fn lacks_recording(path: &Path) -> Result<bool> {
-    Ok(RunFolder::open(path)?.recording_change()?.is_some())
+    Ok(RunFolder::open(path)?.change(file::RECORDING)?.is_some())
 }
 
 /// Adds a verdict to the manifest of a record that is closed and unchanged.

@@ -30,7 +30,7 @@ pub(super) fn run(path: &Path) -> Result<Run> {
     let events = lines(&record, file::EVENTS, parse_event, &mut unreadable);
     // A record that is not closed has no `run.rrd` yet.
     let is_closed = !matches!(folder.condition, Condition::BeingWritten | Condition::Open);
-    if let Some(change) = record.recording_change()?.filter(|_| is_closed) {
+    if let Some(change) = record.change(file::RECORDING)?.filter(|_| is_closed) {
         let dir = shell_word(path.display());
         unreadable.push(format!("{change}; make it: needle-bench review {dir} --repair"));
     }
