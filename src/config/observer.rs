@@ -1,5 +1,5 @@
 //! `[observer]`: which observer steers, which run alongside, and their settings. To add an observer, add its
-//! kind, its section, and its settings in [`ObserverSection::observers`]. The section has the name of the kind, with `_`
+//! kind, its section, and its settings in `ObserverSection::of_kind`. The section has the name of the kind, with `_`
 //! for `-`; its keys are declared beside the observer.
 
 use crate::geometry::FixedAngles;
@@ -64,6 +64,7 @@ impl ObserverSection {
         self.kinds().into_iter().map(|kind| self.of_kind(kind))
     }
 
+    /// The settings of the observer of this `kind`.
     fn of_kind(&self, kind: ObserverKind) -> ObserverConfig {
         match kind {
             ObserverKind::Invariant => ObserverConfig::Invariant(self.invariant),
