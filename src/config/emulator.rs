@@ -118,14 +118,21 @@ choice! {
 impl TrackerPreset {
     /// The keys that it sets.
     pub(super) fn toml(self) -> &'static str {
-        // In the order of the variants.
-        [
-            "",
-            include_str!("../../bench-config/emulated-trackers/electromagnetic-near.toml"),
-            include_str!("../../bench-config/emulated-trackers/electromagnetic-far.toml"),
-            include_str!("../../bench-config/emulated-trackers/ultrasound.toml"),
-            include_str!("../../bench-config/emulated-trackers/stereo-camera.toml"),
-        ][self as usize]
+        match self {
+            TrackerPreset::Plain => "",
+            TrackerPreset::ElectromagneticNear => {
+                include_str!("../../bench-config/emulated-trackers/electromagnetic-near.toml")
+            }
+            TrackerPreset::ElectromagneticFar => {
+                include_str!("../../bench-config/emulated-trackers/electromagnetic-far.toml")
+            }
+            TrackerPreset::Ultrasound => {
+                include_str!("../../bench-config/emulated-trackers/ultrasound.toml")
+            }
+            TrackerPreset::StereoCamera => {
+                include_str!("../../bench-config/emulated-trackers/stereo-camera.toml")
+            }
+        }
     }
 }
 
