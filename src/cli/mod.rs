@@ -145,8 +145,11 @@ impl From<io::Error> for Failure {
 /// A folder without a run, or with an incomplete run, is bad input; a failing disk is not.
 impl From<TelemetryError> for Failure {
     fn from(error: TelemetryError) -> Self {
-        use TelemetryError::{File, Record};
+        use TelemetryError::{File, NotARun, Record};
         match &error {
+            NotARun { .. } => Failure::configuration(format_args!(
+                "{error}; name a run's own folder (in record.dir: <UTC>-<name>)"
+            )),
             File { source, .. } if source.kind() == ErrorKind::NotFound => {
                 Failure::configuration(error)
             }

@@ -20,10 +20,18 @@ pub enum TelemetryError {
     /// A run cannot be recorded or shown, or recording it failed.
     #[error("{0}")]
     Recording(String),
-    /// The record cannot be used for this: it is none, was edited, is closed already, or is still being written.
+    /// The path is not a run folder.
+    #[error("{path}: not a run folder: {reason}", path = path.display())]
+    NotARun {
+        /// The path that was named.
+        path: PathBuf,
+        /// The reason.
+        reason: String,
+    },
+    /// The record cannot be used for this: it was edited, is closed already, or is still being written.
     #[error("{path}: {reason}", path = path.display())]
     Record {
-        /// The run folder or its manifest, or the path that is no run folder.
+        /// The run folder, or its manifest.
         path: PathBuf,
         /// The reason.
         reason: String,

@@ -20,18 +20,16 @@ impl RunFolder {
     /// Opens `dir` and reads only its manifest.
     ///
     /// # Errors
-    /// [`TelemetryError::Record`] if it is not a run folder, or if its manifest cannot be used.
+    /// [`TelemetryError::NotARun`], and [`TelemetryError::Record`] if its manifest cannot be used.
     pub fn open(dir: &Path) -> Result<Self, TelemetryError> {
-        let not_a_run = |reason: &str| {
-            let hint = "name a run's own folder (in record.dir: <UTC>-<name>)";
-            TelemetryError::record(dir, format!("not a run folder: {reason}; {hint}"))
-        };
+        let not_a_run =
+            |reason: String| TelemetryError::NotARun { path: dir.to_path_buf(), reason };
         if !dir.is_dir() {
             let what = if dir.exists() { "it is a file" } else { "there is nothing of that name" };
-            return Err(not_a_run(what));
+            return Err(not_a_run(what.to_owned()));
         }
         let path = dir.join(file::MANIFEST);
-        let text = read_text(&path).map_err(|e| not_a_run(&format!("{}: {e}", file::MANIFEST)))?;
+        let text = read_text(&path).map_err(|e| not_a_run(format!("{}: {e}", file::MANIFEST)))?;
         match Manifest::from_text(&text) {
             Ok(manifest) => Ok(RunFolder { dir: dir.to_path_buf(), manifest }),
             Err(error) => Err(TelemetryError::record(&path, error)),
@@ -217,11 +215,9 @@ mod tests {
         let said = |path: &Path| RunFolder::open(path).unwrap_err().to_string();
         assert!(said(&scratch.0).contains("not a run folder: manifest.json: No such file"));
         let gone = scratch.0.join("gone");
-        assert!(
-            said(&gone).contains("gone: not a run folder: there is nothing of that name; name")
-        );
+        assert!(said(&gone).ends_with("gone: not a run folder: there is nothing of that name"));
         fs::write(scratch.0.join("f"), "").unwrap();
-        assert!(said(&scratch.0.join("f")).contains("not a run folder: it is a file; name"));
+        assert!(said(&scratch.0.join("f")).ends_with("not a run folder: it is a file"));
         fs::write(scratch.0.join(file::MANIFEST), "{").unwrap();
         assert!(said(&scratch.0).contains("manifest.json: not a run's manifest: EOF"));
     }
