@@ -148,7 +148,14 @@ pub(super) fn replay_run(path: &Path) -> Result<ReplayedRun> {
     });
     match replayed.map_err(|error| Failure::bad_input(path, error))?.difference {
         Some(difference) => {
-            Err(Failure::bad_input(path, format_args!("does not replay: {difference}")))
+            let Manifest { version, git, .. } = &folder.manifest;
+            let git = git.as_ref().map_or(String::new(), |git| format!(" ({git})"));
+            Err(Failure::bad_input(
+                path,
+                format_args!(
+                    "does not replay: {difference}\nuse the version that recorded it: {version}{git}"
+                ),
+            ))
         }
         None => Ok(ReplayedRun { folder, config, stage, samples }),
     }

@@ -133,7 +133,8 @@ pub fn standard_deviations(x_pb: &Pose, covariance: &Matrix6<f64>) -> [f64; 6] {
         1.0,
     );
     let angles = rates * covariance.fixed_view::<3, 3>(3, 3) * rates.transpose();
-    let sd = |variance: f64| variance.max(0.0).sqrt();
+    // NaN stays NaN: it must not pass for certainty.
+    let sd = |variance: f64| if variance < 0.0 { 0.0 } else { variance.sqrt() };
     [
         sd(position[(0, 0)]),
         sd(position[(1, 1)]),
@@ -163,6 +164,12 @@ mod tests {
                 shaft,
             }
         }
+    }
+
+    #[test]
+    fn a_covariance_that_is_not_a_number_gives_no_certainty() {
+        let sd = standard_deviations(&Pose::identity(), &Matrix6::from_element(f64::NAN));
+        assert!(sd.iter().all(|sd| sd.is_nan()), "{sd:?}");
     }
 
     proptest! {

@@ -98,6 +98,8 @@ impl Script {
 
     async fn identify(&self) -> Result<(), String> {
         self.begin("checking its identity");
+        // From here on it is known whether the drive had power, whatever ends the bring-up.
+        self.read_statusword().await?;
         let vendor = self.read_identity(1, self.drive().vendor_id).await?;
         let product = self.read_identity(2, self.drive().product_code).await?;
         self.note(|state| state.identified = true);
@@ -356,8 +358,17 @@ impl Script {
             self.write(max, upper).await?;
             self.write(min, lower).await?;
         }
+        self.clear_offset().await?;
         self.write(drive::TARGET_POSITION, position).await?;
         Ok(position)
+    }
+
+    /// Sets the drive's position offset to 0: one from an earlier use would move the axis as soon as it follows.
+    async fn clear_offset(&self) -> Result<(), String> {
+        match self.sdo.read_optional(drive::POSITION_OFFSET).await?.map(SdoValue::to_u32) {
+            None | Some(0) => Ok(()),
+            Some(_) => self.write(drive::POSITION_OFFSET, 0_i32).await,
+        }
     }
 
     /// The drive's own limits, counts: the soft limits and where the axis stands, widened by the following-error

@@ -1,7 +1,7 @@
 //! The command `needle-bench replay`: runs, operations, what-if questions, refusals.
 
 use super::replay::{operated, replayed, run};
-use crate::support::program::{Said, Scratch};
+use crate::support::program::{Said, Scratch, needle_bench};
 use needle_bench::telemetry::{RunFolder, write_manifest};
 use serde_json::Value;
 use std::path::PathBuf;
@@ -166,6 +166,11 @@ fn a_replay_reports_a_changed_operation() {
     assert_eq!(said.status, 1, "{}", said.stdout);
     let last = said.stdout.lines().last().unwrap();
     assert!(last.starts_with("differs: can.log line "), "{last}");
+    let said = needle_bench(&scratch, &["evaluate", run_dir.to_str().expect("UTF-8")]);
+    assert_eq!(said.status, 2, "{}", said.stdout);
+    assert!(said.stderr.contains("does not replay: can.log line "), "{}", said.stderr);
+    let hint = format!("\nuse the version that recorded it: {}", env!("CARGO_PKG_VERSION"));
+    assert!(said.stderr.contains(&hint), "{}", said.stderr);
     rewrite(&[]);
     let said = replayed(&scratch, &run_dir, &[]);
     assert_eq!(said.status, 2);

@@ -60,6 +60,8 @@ objects! {
     HOMING_SPEED_ZERO = 0x6099:2;
     /// u32, counts per second squared.
     HOMING_ACCELERATION = 0x609a:0;
+    /// i32, counts: the drive adds it to each target in cyclic synchronous position.
+    POSITION_OFFSET = 0x60b0:0;
     /// u8: mantissa of the interpolation period.
     INTERPOLATION_PERIOD_VALUE = 0x60c2:1;
     /// i8: power of ten, in seconds, of the interpolation period.

@@ -32,7 +32,9 @@ impl Axis {
             return;
         }
         let objects = &device.objects;
-        let target = objects.integer(object::TARGET_POSITION) as i32;
+        let [target, offset] = [object::TARGET_POSITION, object::POSITION_OFFSET]
+            .map(|address| objects.integer(address) as i32);
+        let target = target.wrapping_add(offset);
         let allowed = within_limits(target, objects);
         self.target_limited = allowed != target;
         // Positions wrap at 32 bits: this takes the nearest one with the target's value.

@@ -173,17 +173,16 @@ impl CoupledBank {
         }
     }
 
-    /// Starts copies at a measured position, at the rolls that `start` and `start_sd` allow. `log_weight` is that of
-    /// the likeliest of them.
+    /// Starts copies at a measured position with this standard deviation, at the rolls that `start` and `start_sd`
+    /// allow. `log_weight` is that of the likeliest of them.
     fn start_copies(
         &mut self,
         start: &FixedAngles,
         start_sd: &FixedAngles,
-        tip_meas: &TipPosition,
+        (tip_meas, position_sd_mm): (&TipPosition, f64),
         log_weight: f64,
     ) {
         self.since_start_mm = 0.0;
-        let position_sd_mm = self.config.position_sd_mm;
         for (roll, roll_sd, share) in start::rolls(start.roll, start_sd.roll, ROLLS, WEIGHT_MIN) {
             let angles = FixedAngles { roll, ..*start };
             let sd = FixedAngles { roll: roll_sd, ..*start_sd };
@@ -197,17 +196,17 @@ impl CoupledBank {
 
     /// Starts the bank if it is empty. Challenges the last copy if none was started over the memory and the roll was
     /// not known at the start. The challengers' heading is as uncertain as that of the start.
-    fn start_copies_if_due(&mut self, tip_meas: &TipPosition) {
+    fn start_copies_if_due(&mut self, measured: (&TipPosition, f64)) {
         let CoupledConfig { start, start_sd, memory_mm, .. } = self.config;
         match self.bank[..] {
-            [] => self.start_copies(&start, &start_sd, tip_meas, 0.0),
+            [] => self.start_copies(&start, &start_sd, measured, 0.0),
             [ref last]
                 if self.since_start_mm >= memory_mm && !start::is_one_roll(start_sd.roll) =>
             {
                 let angles = FixedAngles::from_rotation(&last.x_pb.rotation);
                 let log_weight = last.log_weight + math::ln(CHALLENGER_WEIGHT);
                 let unknown = FixedAngles { roll: PI, ..start_sd };
-                self.start_copies(&angles, &unknown, tip_meas, log_weight);
+                self.start_copies(&angles, &unknown, measured, log_weight);
             }
             _ => {}
         }
@@ -261,7 +260,9 @@ impl Observer for CoupledBank {
         });
         self.nis = likeliest.1;
         // The bank starts at the first position, and starts again if no copy can explain a position.
-        self.start_copies_if_due(tip_meas);
+        // A mean is better than one position. One position is as good as any, however correlated the next is.
+        let sd_mm = variance_mm2.sqrt().min(self.config.position_sd_mm);
+        self.start_copies_if_due((tip_meas, sd_mm));
         mixture::reduce(&mut self.bank, WEIGHT_MIN);
     }
 

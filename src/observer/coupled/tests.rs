@@ -55,6 +55,17 @@ fn noise(n: f64) -> Vector3<f64> {
     Vector3::new((1.7 * n).sin(), (2.3 * n + 1.0).sin(), (3.1 * n + 2.0).sin()) * 0.14
 }
 
+/// In a stepwise insertion also the first one is a mean.
+#[test]
+fn the_first_position_counts_as_many() {
+    for (independent, sd_mm) in [(25.0, 0.02), (1.0, 0.1), (0.5, 0.1)] {
+        let mut observer = bank(PI);
+        observer.correct(&TipPosition::new(Vector3::zeros()).unwrap(), independent);
+        let sd = observer.estimate_after(&[]).unwrap().sd.unwrap();
+        assert!((sd[0] - sd_mm).abs() < 1e-9, "{sd:?}");
+    }
+}
+
 #[test]
 fn finds_the_pose_from_every_roll() {
     for roll in (0..12).map(|k| f64::from(k) * PI / 6.0 + 0.1) {

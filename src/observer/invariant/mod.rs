@@ -83,7 +83,10 @@ impl Invariant {
             return;
         }
         if self.bank.is_empty() {
-            self.bank = self.config.bank(&self.needle, &self.torsion, tip_meas);
+            // A mean is better than one position. One position is as good as any, however correlated the next is.
+            let position_sd_mm = variance_mm2.sqrt().min(self.config.position_sd_mm);
+            let config = InvariantConfig { position_sd_mm, ..self.config };
+            self.bank = config.bank(&self.needle, &self.torsion, tip_meas);
             return;
         }
         let noise = self.config.process_noise(&self.needle);

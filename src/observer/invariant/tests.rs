@@ -100,6 +100,17 @@ fn finds_the_pose_from_every_roll() {
     }
 }
 
+/// In a stepwise insertion also the first one is a mean.
+#[test]
+fn the_first_position_counts_as_many() {
+    for (independent, sd_mm) in [(25.0, 0.02), (1.0, 0.1), (0.5, 0.1)] {
+        let mut observer = Invariant::new(needle(), Torsion::default(), config());
+        observer.correct(&TipPosition::new(Vector3::zeros()).unwrap(), independent);
+        let sd = observer.estimate().unwrap().sd.unwrap();
+        assert!((sd[0] - sd_mm).abs() < 1e-9, "{sd:?}");
+    }
+}
+
 #[test]
 fn reports_the_roll_as_unknown_at_first() {
     let rigid = Torsion::default();

@@ -87,6 +87,16 @@ fn both_axes_are_enabled_at_one_sync_and_nothing_moves() {
     assert_eq!(first(0x201), first(0x202));
 }
 
+/// The drive adds 0x60B0 to each target.
+#[test]
+fn a_position_offset_from_an_earlier_use_does_not_move_the_axis() {
+    let mut bench = Bench::new(config());
+    bench.rotation.set(0x60b0, 0, 500_i32);
+    bench.until_ready();
+    bench.run_for(Duration::from_millis(200));
+    assert_eq!((bench.rotation.counts, bench.rotation.value(0x60b0, 0)), (-20, 0));
+}
+
 #[test]
 fn positions_count_from_the_configured_zero() {
     let mut config = config();
@@ -249,6 +259,20 @@ fn a_drive_that_has_power_when_its_bring_up_is_stopped_is_reported_with_power() 
     assert!(!bench.until_stopped());
     let reports = bench.stage.drive_reports();
     assert!(reports.insertion.says_power() && !reports.rotation.says_power());
+}
+
+/// The other drive is not the configured one, so the bring-up ends before the identity of this one is confirmed. It is
+/// not written to.
+#[test]
+fn a_drive_left_enabled_is_reported_although_the_other_is_refused_at_once() {
+    let mut config = config();
+    config.rotation.vendor_id = Some(VENDOR + 1);
+    let mut bench = Bench::new(config);
+    bench.insertion.state = DriveState::OperationEnabled;
+    assert!(bench.until_fault().contains("is this the drive of the configuration?"));
+    assert!(!bench.until_stopped());
+    assert!(bench.stage.drive_reports().insertion.says_power());
+    assert!(!bench.has_sent("601#2"), "written to");
 }
 
 #[test]

@@ -117,6 +117,7 @@ impl TestDrive {
             (at(0x6099, 1), 100_u32.into()),
             (at(0x6099, 2), 10_u32.into()),
             (at(0x609a, 0), 1000_u32.into()),
+            (at(0x60b0, 0), 0_i32.into()),
             (at(0x60c2, 1), 1_u8.into()),
             (at(0x60c2, 2), (-3_i8).into()),
             (at(0x6502, 0), 0x3a5_u32.into()),
@@ -238,7 +239,10 @@ impl TestDrive {
         let speed = self.step.abs();
         self.step = match self.state {
             DriveState::OperationEnabled if self.is_homing_mode() => self.home(),
-            DriveState::OperationEnabled => self.target.wrapping_sub(self.counts),
+            DriveState::OperationEnabled => {
+                let demand = self.target.wrapping_add(self.value(0x60b0, 0) as i32);
+                demand.wrapping_sub(self.counts)
+            }
             DriveState::QuickStopActive => self.step - self.step.signum(),
             _ => 0,
         };

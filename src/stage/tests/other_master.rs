@@ -96,7 +96,7 @@ fn two_senders_of_one_tpdo1_are_a_fault_after_two_syncs() {
 /// The second drive may answer later than the first. Nothing is written to either, but power off.
 #[test]
 fn two_drives_of_one_node_number_are_a_fault_before_power() {
-    for (delay_ms, later_ms, extra) in [(0, 0, 5), (1, 0, 5), (100, 0, 5), (2, 3, 4)] {
+    for (delay_ms, later_ms, extra) in [(0, 0, 6), (1, 0, 6), (100, 0, 6), (2, 3, 5)] {
         let mut bench = Bench::new(config());
         bench.twin_later = Some(Duration::from_millis(later_ms));
         bench.sdo_delay = Duration::from_millis(delay_ms);
