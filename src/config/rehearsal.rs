@@ -21,7 +21,7 @@ const START_MAX_MM: f64 = 5.0;
 /// The keys of `[emulator]` that a rehearsal derives from the rest of `config`, as TOML.
 ///
 /// # Errors
-/// Not for a configuration that was read.
+/// Never for a configuration that was read.
 pub(super) fn layer(config: &Config) -> Result<String, toml::ser::Error> {
     let (needle, tracker) = (&config.needle, &config.tracker);
     let curvature = needle.arc.curvature_per_mm();

@@ -244,6 +244,16 @@ fn targets_are_reached_exactly_one_period_later() {
 }
 
 #[test]
+fn the_position_offset_is_added_to_each_target() {
+    let mut bench = Bench::enabled_at(1000);
+    bench.write(object::POSITION_OFFSET, &(-20_i32).to_le_bytes());
+    bench.cycle(0x0f, 1000);
+    assert_eq!(bench.position(), 980.0);
+    bench.cycle(0x0f, 1030);
+    assert_eq!(bench.position(), 1010.0);
+}
+
+#[test]
 fn a_sync_that_is_1_ms_early_ends_the_period() {
     let mut bench = Bench::enabled_at(0);
     for target in [100, 200, 300] {

@@ -5,6 +5,7 @@ use super::*;
 use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::DriveState;
 use crate::canopen::nmt::{NmtState, heartbeat_frame};
+use crate::canopen::sdo::AbortCode;
 
 /// The fault of a bring-up after `setup`. Nothing was powered.
 pub(super) fn fault_of(config: StageConfig, setup: impl FnOnce(&mut Bench)) -> String {
@@ -95,6 +96,28 @@ fn a_position_offset_from_an_earlier_use_does_not_move_the_axis() {
     bench.until_ready();
     bench.run_for(Duration::from_millis(200));
     assert_eq!((bench.rotation.counts, bench.rotation.value(0x60b0, 0)), (-20, 0));
+}
+
+/// CiA leaves it to the manufacturer whether a drive has it, and when it may be read.
+#[test]
+fn a_drive_that_does_not_give_its_position_offset_is_brought_up() {
+    let object = ObjectAddress::new(0x60b0, 0);
+    let mut bench = Bench::new(config());
+    bench.insertion.objects.remove(&object);
+    bench.rotation.refused = Some((object, AbortCode::UNSUPPORTED_ACCESS));
+    bench.until_ready();
+}
+
+#[test]
+fn a_drive_that_keeps_its_position_offset_or_is_silent_about_it_gets_no_power() {
+    let object = ObjectAddress::new(0x60b0, 0);
+    let fault = fault_of(config(), |bench| {
+        bench.insertion.set(0x60b0, 0, 500_i32);
+        bench.insertion.forgets = Some(object);
+    });
+    assert!(fault.contains("0x60B0:00: expected 0x00000000, received 0x000001F4"), "{fault}");
+    let fault = fault_of(config(), |bench| bench.insertion.mute = Some((object, u32::MAX)));
+    assert!(fault.contains("0x60B0:00: no SDO reply within 150 ms"), "{fault}");
 }
 
 #[test]

@@ -240,8 +240,9 @@ impl TestDrive {
         self.step = match self.state {
             DriveState::OperationEnabled if self.is_homing_mode() => self.home(),
             DriveState::OperationEnabled => {
-                let demand = self.target.wrapping_add(self.value(0x60b0, 0) as i32);
-                demand.wrapping_sub(self.counts)
+                let offset =
+                    self.objects.get(&at(0x60b0, 0)).map_or(0, |value| value.to_u32() as i32);
+                self.target.wrapping_add(offset).wrapping_sub(self.counts)
             }
             DriveState::QuickStopActive => self.step - self.step.signum(),
             _ => 0,

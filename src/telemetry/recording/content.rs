@@ -1,9 +1,11 @@
 //! Logs a run for viewers: to its file, or to the live view.
 
 use super::document::log_manifest;
+use super::motion::Motion;
+use super::samples::{Samples, log_refused};
 use super::space::Space;
 use super::states::{Meaning, States, drive_lane};
-use super::tables::{Motion, Samples, Steps, log_refused};
+use super::steps::Steps;
 use super::{Logged, can};
 use crate::archive::{Manifest, unix_us_of};
 use crate::session::{Record, Severity};

@@ -13,10 +13,12 @@ mod file;
 mod goal;
 mod layout;
 pub(super) mod live;
+mod motion;
 mod palette;
+mod samples;
 mod space;
 mod states;
-mod tables;
+mod steps;
 
 pub use self::file::Recording;
 
