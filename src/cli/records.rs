@@ -6,19 +6,17 @@ use super::output::print_stderr;
 use super::perform::scene;
 use super::stage::Motion;
 use super::{Failure, Result};
-use crate::archive::{Manifest, file, proof};
-use crate::config::{CanInterface, Config, Source};
+use crate::archive::{Dropped, Manifest, TrackerTimes, file, proof, unix_us_of};
+use crate::config::{CanInterface, Config, GoalKind, Source};
 use crate::operation::RunConfig;
 use crate::preflight::Earlier;
-use crate::replay::{Recorded, replay_to};
-use crate::review::{differences, keys};
+use crate::review::{differences, keys, parse_frame, positions_at_sync};
 use crate::runtime::{Describe, RecordedRun};
-use crate::session::{Record, SampleRecord};
 use crate::stage::SetPoint;
 use crate::study::{RecordedRow, Recording};
 use crate::telemetry::RunFolder;
 use crate::text::shell_word;
-use crate::tracker::{Registration, Sample, check_recorded};
+use crate::tracker::{Registration, Sample, check_recorded, ndjson};
 use crate::units::Time;
 use clap::Args;
 use std::io;
@@ -32,8 +30,9 @@ pub(super) const RUNS: &str = "runs";
 const RECORDINGS_TOML: (&str, &str) =
     ("bench-config/recordings.toml", include_str!("../../bench-config/recordings.toml"));
 
-/// Smallest distance between two rows of a run, mm: a hold gives one row.
-const ROWS_APART_MM: f64 = 0.05;
+/// Smallest distance between two rows of a run, mm: a hold gives one row, and 40 positions a second at 2 mm/s are
+/// all used.
+const ROWS_APART_MM: f64 = 0.04;
 
 /// The runs in `dir`, the newest first. A folder's name does not count: it may be a copy, or renamed.
 pub(super) fn newest_first(dir: &Path) -> impl Iterator<Item = RunFolder> + use<> {
@@ -121,44 +120,54 @@ pub(super) fn recorded_run_config(manifest: &Manifest, config: &Config) -> Resul
     Ok(motion.plan(config)?.into())
 }
 
-/// The stage and the tracker in a recorded run.
-pub(super) struct ReplayedRun {
+/// What stage and tracker measured in a recorded run.
+pub(super) struct RunMeasurements {
     folder: RunFolder,
     pub(super) config: Config,
     /// Where the stage was at each SYNC.
     pub(super) stage: Vec<(Time, SetPoint)>,
-    /// What the tracker sent.
-    pub(super) samples: Vec<SampleRecord>,
+    /// What the tracker sent of the tip.
+    pub(super) samples: Vec<RecordedSample>,
 }
 
-/// Replays the run in the folder `path`.
-pub(super) fn replay_run(path: &Path) -> Result<ReplayedRun> {
+/// A sample of a recorded run.
+pub(super) struct RecordedSample {
+    /// Its line in the file, from 1.
+    line: usize,
+    /// When the tip was there, if the sample was accepted.
+    acquisition_time: Option<Time>,
+    pub(super) received: Sample,
+}
+
+/// Reads what stage and tracker measured in the run in the folder `path`, which any version may have recorded.
+pub(super) fn read_run(path: &Path) -> Result<RunMeasurements> {
     let (folder, config) = open(path)?;
-    let run_config = recorded_run_config(&folder.manifest, &config)?;
-    let recorded =
-        Recorded { manifest: &folder.manifest, run_config, open: &|name| folder.lines(name) };
-    let (mut stage, mut samples) = (Vec::new(), Vec::new());
-    let replayed = replay_to(&recorded, None, &mut |record, _| {
-        match record {
-            Record::Stage(feedback) => stage.push((feedback.time, feedback.measured)),
-            Record::Sample(sample) => samples.push(sample),
-            _ => {}
-        }
-        Ok(())
-    });
-    match replayed.map_err(|error| Failure::bad_input(path, error))?.difference {
-        Some(difference) => {
-            let Manifest { version, git, .. } = &folder.manifest;
-            let git = git.as_ref().map_or(String::new(), |git| format!(" ({git})"));
-            Err(Failure::bad_input(
-                path,
-                format_args!(
-                    "does not replay: {difference}\nuse the version that recorded it: {version}{git}"
-                ),
-            ))
-        }
-        None => Ok(ReplayedRun { folder, config, stage, samples }),
+    if let Some(Dropped { text_files: dropped @ 1.., .. }) = folder.manifest.dropped {
+        let why = format!("{dropped} records were dropped while it was recorded, so it has gaps");
+        return Err(Failure::bad_input(path, why));
     }
+    let started_utc = &folder.manifest.started_utc;
+    let started_us = unix_us_of(started_utc).ok_or_else(|| {
+        Failure::bad_input(path, format_args!("{}: {started_utc:?} is no time", file::MANIFEST))
+    })?;
+    let lines = |name: &str| {
+        let failed = |error| Failure::io(&path.join(name), error);
+        folder.lines(name).and_then(Iterator::collect::<io::Result<Vec<_>>>).map_err(failed)
+    };
+    let (frames, samples) = (lines(file::CAN)?, lines(file::TRACKER)?);
+    let frames = frames.iter().filter_map(|line| parse_frame(line));
+    let stage = positions_at_sync(frames, started_us, &config.to_stage()?);
+    let target = config.goal.tool.as_deref().filter(|_| config.goal.kind == GoalKind::Target);
+    let sample = |(line, text): (usize, &String)| {
+        let times = TrackerTimes::parse(text)?;
+        (!target.is_some_and(|tool| times.is_of(tool))).then_some(RecordedSample {
+            line,
+            acquisition_time: times.acquisition_time_ns.map(Time::from_nanos),
+            received: ndjson::recorded(line as u64, text).ok()?,
+        })
+    };
+    let samples = (1..).zip(&samples).filter_map(sample).collect();
+    Ok(RunMeasurements { folder, config, stage, samples })
 }
 
 /// Where the stage was at `time`, interpolated between two SYNCs; `None` before the first and after the last.
@@ -264,12 +273,8 @@ fn read_insertion(path: &Path) -> Result<Insertion> {
         let recording = Recording::parse(&text).map_err(|error| Failure::bad_input(path, error))?;
         return Ok(Insertion { path: path.to_owned(), text, recording, is_rehearsal: false });
     }
-    let ReplayedRun { folder, config, stage, samples } = replay_run(path)?;
-    let registration = config.tracker.to_registration()?;
-    let acquired = (1..)
-        .zip(samples)
-        .filter_map(|(line, sample)| Some((line, sample.acquisition_time?, sample.received)));
-    let rows = rows(&stage, &registration, acquired);
+    let RunMeasurements { folder, config, stage, samples } = read_run(path)?;
+    let rows = rows(&stage, &config.tracker.to_registration()?, samples);
     if rows.is_empty() {
         let why = "no position was accepted while the needle was inserted";
         return Err(Failure::bad_input(path, why));
@@ -282,28 +287,30 @@ fn read_insertion(path: &Path) -> Result<Insertion> {
     })
 }
 
-/// Rows of the tip on the bench and of the stage at that time. `samples` are lines, acquisition times and samples;
-/// one gives a row only if the needle is deeper by [`ROWS_APART_MM`] than at the row before.
+/// Rows of the tip on the bench and of the stage at that time. An accepted sample gives a row only if the needle
+/// is deeper by [`ROWS_APART_MM`] than at the row before.
 fn rows(
     stage: &[(Time, SetPoint)],
     registration: &Registration,
-    samples: impl Iterator<Item = (usize, Time, Sample)>,
+    samples: Vec<RecordedSample>,
 ) -> Vec<RecordedRow> {
     let mut rows: Vec<RecordedRow> = Vec::new();
-    for (line, time, sample) in samples {
-        let Some(measured) = position_at(stage, time) else { continue };
+    for RecordedSample { line, acquisition_time, received } in samples {
+        let Some(measured) = acquisition_time.and_then(|time| position_at(stage, time)) else {
+            continue;
+        };
         let next_mm =
             rows.last().map_or(f64::NEG_INFINITY, |row| row.insertion_meas_mm + ROWS_APART_MM);
         if measured.insertion_mm < next_mm {
             continue;
         }
-        let Ok(position_meas_mm) = registration.tip_mm(&sample) else { continue };
+        let Ok(position_meas_mm) = registration.tip_mm(&received) else { continue };
         rows.push(RecordedRow {
             line,
             insertion_meas_mm: measured.insertion_mm,
             rotation_meas_rad: measured.rotation_rad,
             position_meas_mm,
-            sensor_orientation: registration.rotation(&sample),
+            sensor_orientation: registration.rotation(&received),
         });
     }
     rows
@@ -322,10 +329,10 @@ mod tests {
             (Time::from_secs_f64(s), SetPoint { insertion_mm, rotation_rad: 0.0 })
         };
         let receive_time = Time::from_secs_f64(1.0);
-        let sample = Sample { receive_time, ..Sample::valid("Tip", Vector3::zeros()) };
+        let received = Sample { receive_time, ..Sample::valid("Tip", Vector3::zeros()) };
         let registration = Registration::new(Pose::identity());
-        let seen = [(4, receive_time, sample)].into_iter();
-        let rows = rows(&[at(0.0, 0.0), at(2.0, 4.0)], &registration, seen);
+        let sample = RecordedSample { line: 4, acquisition_time: Some(receive_time), received };
+        let rows = rows(&[at(0.0, 0.0), at(2.0, 4.0)], &registration, vec![sample]);
         assert_eq!((rows[0].line, rows[0].insertion_meas_mm), (4, 2.0));
     }
 

@@ -14,7 +14,7 @@ mod summary;
 pub use campaign::{Campaign, Line};
 pub use compare::{Comparison, differences, keys};
 pub use figures::figures_of_steps;
-pub use motion::{Motion, parse_frame};
+pub use motion::{Motion, TimedFrame, parse_frame, positions_at_sync};
 pub use report::{GENERATOR, html};
 pub use run::{Condition, Folder, Run, parse_event};
 pub use summary::{to_json, to_text};

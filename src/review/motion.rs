@@ -3,13 +3,14 @@
 use super::run::Folder;
 use crate::archive::{CandumpLine, unix_us_of};
 use crate::canopen::{Frame, NodeId, cob};
-use crate::stage::{Axis, PerAxis, StageConfig, Unwrapper};
+use crate::stage::{Axis, AxisConfig, PerAxis, Scale, SetPoint, StageConfig, Unwrapper};
+use crate::units::Time;
 
 /// Minimum time between two points of a curve, s.
 const POINT_EVERY_S: f64 = 0.02;
 
 /// The time of a frame of `can.log`, UTC, µs since 1970, and the frame.
-pub(super) type TimedFrame = (i64, Frame);
+pub type TimedFrame = (i64, Frame);
 
 /// Times, s since the start of the run, with positions in mm or degrees.
 pub(super) type Course = Vec<(f64, f64)>;
@@ -43,8 +44,63 @@ impl Motion {
     }
 }
 
-/// The positions of `axis` in the PDOs with the identifier `cob_id` of its node. The bench maps the counts
-/// after two bytes in both PDOs.
+/// Where the stage was at each SYNC of the run that started at `started_us` (UTC, µs since 1970) after which both
+/// axes sent their position. Without a configured zero an axis counts from its first position.
+pub fn positions_at_sync(
+    frames: impl IntoIterator<Item = TimedFrame>,
+    started_us: i64,
+    stage: &StageConfig,
+) -> Vec<(Time, SetPoint)> {
+    let mut axes = PerAxis::from_fn(|axis| Readings::new(axis, stage.axis(axis), cob::tpdo1));
+    let mut positions = Vec::new();
+    let mut sync_us = None;
+    let mut seen = PerAxis::from_fn(|_| None);
+    for (unix_us, frame) in frames {
+        if frame.cob_id() == Some(cob::SYNC) {
+            (sync_us, seen) = (Some(unix_us), PerAxis::from_fn(|_| None));
+        }
+        for axis in Axis::BOTH {
+            seen[axis] = axes[axis].take(&frame).or(seen[axis]);
+        }
+        if let (Some(insertion_mm), Some(rotation_rad)) = (seen.insertion, seen.rotation)
+            && let Some(sync_us) = sync_us.take()
+        {
+            let since_ns = sync_us.saturating_sub(started_us).saturating_mul(1000);
+            positions.push((Time::from_nanos(since_ns), SetPoint { insertion_mm, rotation_rad }));
+        }
+    }
+    positions
+}
+
+/// The positions that PDOs of one axis carry. The bench maps the counts after two bytes, in RPDO1 and in TPDO1.
+struct Readings<'a> {
+    axis: Axis,
+    config: &'a AxisConfig,
+    pdo_id: u16,
+    unwrapper: Option<(Unwrapper, Scale)>,
+}
+
+impl<'a> Readings<'a> {
+    /// Reads the PDOs with the identifier `cob_id` of the axis's node.
+    fn new(axis: Axis, config: &'a AxisConfig, cob_id: fn(NodeId) -> u16) -> Self {
+        Readings { axis, config, pdo_id: cob_id(config.node), unwrapper: None }
+    }
+
+    /// The position in `frame`, mm or rad; `None` if it is another frame.
+    fn take(&mut self, frame: &Frame) -> Option<f64> {
+        let &[_, _, c0, c1, c2, c3] = frame.data() else { return None };
+        if frame.cob_id() != Some(self.pdo_id) {
+            return None;
+        }
+        let reading = i32::from_le_bytes([c0, c1, c2, c3]);
+        let (unwrapper, scale) = self.unwrapper.get_or_insert_with(|| {
+            (Unwrapper::new(reading), self.config.scale(self.axis, reading.into()))
+        });
+        Some(scale.value(unwrapper.unwrap(reading)))
+    }
+}
+
+/// The positions of `axis` in the PDOs with the identifier `cob_id` of its node.
 fn course(
     frames: &[TimedFrame],
     started_us: i64,
@@ -52,20 +108,13 @@ fn course(
     axis: Axis,
     cob_id: fn(NodeId) -> u16,
 ) -> Course {
-    let config = stage.axis(axis);
-    let pdo_id = Some(cob_id(config.node));
-    let pdos = frames.iter().filter(|(_, frame)| frame.cob_id() == pdo_id);
-    let mut unwrapper = None::<Unwrapper>;
-    let mut scale = None;
+    let mut readings = Readings::new(axis, stage.axis(axis), cob_id);
     let mut course = Course::new();
-    for (unix_us, frame) in pdos {
-        let &[_, _, c0, c1, c2, c3] = frame.data() else { continue };
-        let reading = i32::from_le_bytes([c0, c1, c2, c3]);
-        let position = unwrapper.get_or_insert(Unwrapper::new(reading)).unwrap(reading);
-        let scale = scale.get_or_insert_with(|| config.scale(axis, position));
+    for (unix_us, frame) in frames {
+        let Some(position) = readings.take(frame) else { continue };
         let time_s = unix_us.saturating_sub(started_us) as f64 * 1e-6;
         if course.last().is_none_or(|(last_s, _)| time_s - last_s >= POINT_EVERY_S) {
-            course.push((time_s, axis.in_unit(scale.value(position)).0));
+            course.push((time_s, axis.in_unit(position).0));
         }
     }
     course
@@ -74,6 +123,7 @@ fn course(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Config;
     use crate::review::run::tests::run;
 
     /// From 110 ms on the first axis reports 0, 1 and 2 mm. A heartbeat and a frame of another length have no
@@ -106,5 +156,37 @@ mod tests {
         assert!(motion.measured.rotation.is_empty());
         folder.config_toml = None;
         assert_eq!(Motion::new(&frames, &folder), Motion::default());
+    }
+
+    /// A SYNC counts if both axes answer before the next one, and only their first answers.
+    #[test]
+    fn a_position_belongs_to_the_sync_before_it() {
+        let frame = |(ms, id, counts): (i64, u16, i32)| {
+            let [a, b, c, d] = counts.to_le_bytes();
+            let data: &[u8] = if id == cob::SYNC { &[] } else { &[0x37, 0x02, a, b, c, d] };
+            (5_000_000 + 1000 * ms, Frame::new(id, data))
+        };
+        let stage = Config::from_sources(&[], &[]).unwrap().to_stage().unwrap();
+        let [insertion, rotation] = Axis::BOTH.map(|axis| cob::tpdo1(stage.axis(axis).node));
+        let frames = [
+            (1, insertion, 900),
+            (10, cob::SYNC, 0),
+            (11, insertion, 1000),
+            (12, rotation, 7),
+            (13, insertion, 5000),
+            (20, cob::SYNC, 0),
+            (21, rotation, 7),
+            (30, cob::SYNC, 0),
+            (31, rotation, 7),
+            (32, insertion, 1200),
+        ];
+        let positions = positions_at_sync(frames.map(frame), 5_000_000, &stage);
+        let times: Vec<i64> = positions.iter().map(|(time, _)| time.as_nanos()).collect();
+        assert_eq!(times, [10_000_000, 30_000_000]);
+        let scale = stage.axis(Axis::Insertion).scale(Axis::Insertion, 0);
+        for ((_, at), counts) in positions.iter().zip([1000, 1200]) {
+            assert_eq!(at.insertion_mm, scale.value(counts));
+            assert_eq!(at.rotation_rad, 0.0);
+        }
     }
 }

@@ -7,7 +7,7 @@ use crate::cli::arguments::Configured;
 use crate::cli::ending::status;
 use crate::cli::output::{print_stderr, refuse_existing, write_new};
 use crate::cli::perform::Options;
-use crate::cli::records::{ReplayedRun, position_at, replay_run};
+use crate::cli::records::{RunMeasurements, position_at, read_run};
 use crate::cli::stage::{load_stage, perform, sensor_off_axis};
 use crate::cli::tracker::{Listener, listen};
 use crate::cli::{Failure, Result, finish_with};
@@ -234,7 +234,7 @@ pub(super) fn record_turn(
             config.emulator.rotation_start_deg = position.rotation_rad.to_degrees();
         }
         if let Some(run_dir) = &report.run_dir {
-            rows.extend(rows_of(replay_run(run_dir)?));
+            rows.extend(rows_of(read_run(run_dir)?));
         }
     }
     let has_orientation = rows.iter().all(|row| row.len() == COLUMNS.len());
@@ -252,8 +252,8 @@ pub(super) fn record_turn(
 
 /// Rows of the base's rotation, the sensor's position and, if the tracker gives it, its orientation. The rotation
 /// is taken at the receipt less the latency, not at the tracker's stamp: the fit needs only its direction.
-fn rows_of(turn: ReplayedRun) -> Vec<Vec<f64>> {
-    let ReplayedRun { config, stage, samples, .. } = turn;
+fn rows_of(turn: RunMeasurements) -> Vec<Vec<f64>> {
+    let RunMeasurements { config, stage, samples, .. } = turn;
     let gate = config.tracker.to_unregistered_gate();
     let mut rows: Vec<Vec<f64>> = Vec::new();
     for sample in samples.into_iter().map(|sample| sample.received) {
