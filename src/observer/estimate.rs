@@ -92,6 +92,19 @@ impl Estimate {
         Some(position_covariance(&self.x_pb, &belief.covariance))
     }
 
+    /// Standard deviations in the worst direction, to first order: of the position, mm, and of the heading, rad.
+    /// `None` for observers that carry no covariance, and for one that is not finite.
+    pub fn worst_sd(&self) -> Option<(f64, f64)> {
+        let covariance = self.belief.as_ref()?.covariance;
+        let position = covariance.fixed_view::<3, 3>(0, 0).into_owned();
+        // The heading is the tip's z axis: a turn about it does not count.
+        let heading = covariance.fixed_view::<2, 2>(3, 3).into_owned();
+        covariance.iter().all(|value| value.is_finite()).then(|| {
+            let sd = |variance: f64| variance.max(0.0).sqrt();
+            (sd(position.symmetric_eigenvalues().max()), sd(heading.symmetric_eigenvalues().max()))
+        })
+    }
+
     /// The share of a turn that a law may command: 1 if the hypotheses agree on the roll, down to
     /// `1 - caution` if they do not agree at all. It is 1 if the observer states no uncertainty.
     pub fn demand_gain(&self, caution: f64) -> f64 {
@@ -172,7 +185,35 @@ mod tests {
         assert!(sd.iter().all(|sd| sd.is_nan()), "{sd:?}");
     }
 
+    #[test]
+    fn a_covariance_that_is_not_finite_has_no_worst_direction() {
+        for value in [f64::NAN, f64::INFINITY] {
+            let covariance = Matrix6::from_diagonal_element(value);
+            let belief = Belief { covariance, ..Belief::certain(0.01, Shaft::RIGID) };
+            assert_eq!(Estimate::of_belief(Pose::identity(), belief).worst_sd(), None);
+        }
+    }
+
     proptest! {
+        /// For the covariance e eᵀ the worst directions are those in which e moves the tip and its heading.
+        #[test]
+        fn the_worst_direction_is_that_of_the_error(
+            yaw in -3.0..3.0f64, pitch in -1.5..1.5f64, roll in -3.0..3.0f64,
+            e in prop::array::uniform6(-1.0..1.0f64),
+        ) {
+            let rotation = FixedAngles { yaw, pitch, roll }.to_rotation();
+            let x_pb = Pose { rotation, translation: Vector3::zeros() };
+            let e = Vector6::from(e);
+            let covariance = e * e.transpose();
+            let belief = Belief { covariance, ..Belief::certain(0.01, Shaft::RIGID) };
+            let (position_mm, heading_rad) = Estimate::of_belief(x_pb, belief).worst_sd().unwrap();
+            let h = 1e-6;
+            let moved = x_pb * Pose::exp(&Twist::from_vector(&(e * h)));
+            let turned = (moved.rotation * Vector3::z()).cross(&(rotation * Vector3::z())).norm();
+            prop_assert!((position_mm - moved.translation.norm() / h).abs() < 1e-3);
+            prop_assert!((heading_rad - turned / h).abs() < 1e-3);
+        }
+
         /// For the covariance e eᵀ the deviations are the changes of the coordinates along e.
         #[test]
         fn standard_deviations_are_those_of_the_coordinates(

@@ -145,6 +145,9 @@ pub struct Approach {
     pub clearance_mm: f64,
     /// Distance from the target at the end of the path, mm.
     pub error_mm: f64,
+    /// Its standard deviation, mm: that of the position, and that of the heading over the rest of the path, in
+    /// their worst directions, as if nothing more were corrected. `None` if the observer states none.
+    pub error_sd_mm: Option<f64>,
     /// The path from here to where the insertion ends.
     pub path: Option<Path>,
 }
@@ -237,7 +240,9 @@ impl Pursuit {
         let distance_mm = (tip.translation - target_mm).norm();
         let before = self.tip_before.replace(tip).unwrap_or(tip);
         let clearance_mm = self.goal.world.distance_on_way_mm(&before, &tip);
-        Approach { target_mm, distance_mm, clearance_mm, error_mm: distance_mm, path: None }
+        let error_sd_mm = estimate.worst_sd().map(|(position_sd_mm, _)| position_sd_mm);
+        let error_mm = distance_mm;
+        Approach { target_mm, distance_mm, clearance_mm, error_mm, error_sd_mm, path: None }
     }
 
     /// The approach at a step that stops the run: the needle may go on a little, straight ahead.
@@ -261,8 +266,7 @@ impl Pursuit {
         depth_mm: f64,
         step_mm: f64,
     ) -> (Approach, Result<Option<Command>, String>) {
-        let sd = estimate.sd.filter(|sd| sd.iter().all(|sd| sd.is_finite()));
-        let Some([x, y, z, yaw, pitch, _]) = sd else {
+        let Some((position_sd_mm, heading_sd_rad)) = estimate.worst_sd() else {
             let unknown = "goal: the observer does not state how well it knows the tip";
             return (self.stopped(estimate), Err(unknown.to_owned()));
         };
@@ -274,8 +278,8 @@ impl Pursuit {
             tip: Tip { position_mm: estimate.x_pb.translation, heading },
             // An estimate above the configured curvature may be chance.
             curvature_per_mm: curvature_per_mm.clamp(0.1 * nominal_per_mm, nominal_per_mm),
-            position_sd_mm: x.max(y).max(z),
-            heading_sd_rad: yaw.max(pitch),
+            position_sd_mm,
+            heading_sd_rad,
         };
         let inserted_mm = depth_mm - self.planned_at_mm;
         self.planned_at_mm = depth_mm;
@@ -294,7 +298,10 @@ impl Pursuit {
                 };
                 let command = self.law.command(estimate, &bend, step_mm);
                 let path = self.replanner.path().cloned();
-                let approach = Approach { error_mm: steer.error_mm, path, ..end };
+                let left_mm = path.as_ref().map_or(0.0, Path::length_mm);
+                let swing_sd_mm = heading_sd_rad * left_mm;
+                let error_sd_mm = Some((position_sd_mm.powi(2) + swing_sd_mm.powi(2)).sqrt());
+                let approach = Approach { error_mm: steer.error_mm, error_sd_mm, path, ..end };
                 (approach, command.map(Some).map_err(|error| format!("control: {error}")))
             }
             Step::Arrived { .. } => (self.end(estimate), Ok(None)),

@@ -5,7 +5,6 @@ use super::chart::{
     VALUE_MAX,
 };
 use crate::archive::RunOutcome;
-use crate::math;
 use crate::review::figures::{BLIND_DEPTH, Limits, OFF_PLANE, TARGET_DEPTH, TIP_AGE};
 use crate::review::run::Run;
 use crate::stage::Axis;
@@ -68,23 +67,10 @@ fn off_plane(run: &Run, limits: &Limits) -> Chart {
     chart
 }
 
-/// The predicted distance from the target at the end of the path, with a band of ± 2 standard deviations. These
-/// combine that of the position and that of the heading over the rest of the path, and ignore later corrections.
+/// The predicted distance from the target at the end of the path, with a band of ± 2 standard deviations.
 fn target_error(run: &Run, limits: &Limits) -> Chart {
     let (depth, error) = (depth(run), column(run, "target_error_pred_mm"));
-    let largest = |names: &[&str]| {
-        let columns = names.iter().map(|name| column(run, name));
-        columns.reduce(|a, b| a.iter().zip(b).map(|(a, b)| Some(a.as_ref()?.max(b?))).collect())
-    };
-    let position = largest(&["x_sd_mm", "y_sd_mm", "z_sd_mm"]).unwrap_or_default();
-    let heading = largest(&["yaw_sd_rad", "pitch_sd_rad"]).unwrap_or_default();
-    let path_left = column(run, "path_left_mm");
-    let sd = position.iter().zip(&heading).zip(&path_left);
-    // A step without a path is the end.
-    let sd_mm = |mm: Option<f64>, rad: Option<f64>, left_mm: Option<f64>| {
-        Some(math::hypot(mm?, rad? * left_mm.unwrap_or(0.0)))
-    };
-    let sd: Column = sd.map(|((mm, rad), left_mm)| sd_mm(*mm, *rad, *left_mm)).collect();
+    let sd = column(run, "target_error_pred_sd_mm");
     let mut layers = vec![
         band("prediction ± 2 σ", &depth, &error, &sd, f64::INFINITY, 0.0),
         line("prediction", ESTIMATE, points(&depth, &error)),

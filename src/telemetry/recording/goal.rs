@@ -151,8 +151,14 @@ mod tests {
         let (stream, storage) = RecordingStreamBuilder::new("test").memory().unwrap();
         log_goal(&stream, &goal.0, &goal.1).unwrap();
         let target_mm = Vector3::new(0.0, 3.0, 92.0);
-        let approach =
-            Approach { target_mm, distance_mm: 92.0, clearance_mm: 9.0, error_mm: 0.0, path: None };
+        let approach = Approach {
+            target_mm,
+            distance_mm: 92.0,
+            clearance_mm: 9.0,
+            error_mm: 0.0,
+            error_sd_mm: None,
+            path: None,
+        };
         log_approach(&stream, Some(&goal), &approach, None, 0.0).unwrap();
         stream.flush_blocking().unwrap();
         let mut moved_mm = Vec::new();

@@ -6,7 +6,6 @@ use crate::archive::{STEP_COLUMNS, StepRow, is_truth_column};
 use crate::emulator::Truth;
 use crate::geometry::coordinates;
 use crate::observer::Estimate;
-use crate::plan::Path;
 use crate::session::StepRecord;
 use crate::units::wrap_angle;
 use rerun::RecordingStream;
@@ -99,13 +98,10 @@ impl Steps {
     }
 }
 
-/// The predicted error at the target minus and plus two standard deviations, mm. These combine that of the
-/// position and that of the heading over the rest of the path, and ignore later corrections.
+/// The predicted error at the target minus and plus two standard deviations, mm.
 fn target_band(step: &StepRecord) -> Option<[(String, f64); 2]> {
     let approach = step.decision.approach.as_ref()?;
-    let [x, y, z, yaw, pitch, _] = step.decision.estimate?.sd?;
-    let left_mm = approach.path.as_ref().map_or(0.0, Path::length_mm);
-    let sd_mm = x.max(y).max(z).hypot(yaw.max(pitch) * left_mm);
+    let sd_mm = approach.error_sd_mm?;
     let [low_mm, high_mm] = [-2.0, 2.0].map(|sds| (approach.error_mm + sds * sd_mm).max(0.0));
     Some([("target_error_low_mm".to_owned(), low_mm), ("target_error_high_mm".to_owned(), high_mm)])
 }

@@ -101,8 +101,14 @@ fn a_disabled_drive_is_shown_as_disabled() {
 fn the_distance_to_a_target_is_shown() {
     let mut screen = inserted();
     let target_mm = Vector3::new(0.0, 20.0, 100.0);
-    let approach =
-        Approach { target_mm, distance_mm: 61.2, clearance_mm: 5.0, error_mm: 0.12, path: None };
+    let approach = Approach {
+        target_mm,
+        distance_mm: 61.2,
+        clearance_mm: 5.0,
+        error_mm: 0.12,
+        error_sd_mm: None,
+        path: None,
+    };
     screen.take(&Record::Step(Box::new(StepRecord {
         decision: Decision { approach: Some(approach), ..Decision::default() },
         ..StepRecord::default()
