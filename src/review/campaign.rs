@@ -95,7 +95,11 @@ impl Campaign {
             groups.entry((label, has_truth)).or_default().push((folder, keys));
         }
         if let Some(key) = by.filter(|key| !known.is_empty() && !known.contains(*key)) {
-            let hint = nearest_key(key, known.iter().map(String::as_str));
+            let inside = format!("{key}.");
+            let hint = match known.iter().find(|known| known.starts_with(&inside)) {
+                Some(known) => format!("{key} is a table: name one of its keys, such as {known}"),
+                None => nearest_key(key, known.iter().map(String::as_str)),
+            };
             return Err(format!("--by {key}: no configuration of these runs has that key; {hint}"));
         }
         let kinds = groups.keys().cloned().collect::<BTreeSet<_>>();
@@ -234,11 +238,15 @@ fn row(folder: &Folder) -> [String; 8] {
     let figures = folder.figures();
     let depth_mm = figures.as_ref().map(|figures| figures.insertion_mm);
     let figures = figures.unwrap_or_default();
-    let outcome = manifest.outcome.map_or_else(|| "not closed".to_owned(), |o| o.to_string());
+    let outcome = match (folder.condition == Condition::BeingWritten, manifest.outcome) {
+        (true, _) => "going on".to_owned(),
+        (false, None) => "not closed".to_owned(),
+        (false, Some(outcome)) => outcome.to_string(),
+    };
     let incomplete = if folder.is_incomplete() { ", incomplete" } else { "" };
     let verdict = manifest.verdict().map(|verdict| verdict.verdict.to_string());
     [
-        folder.dir.clone(),
+        escaped(&folder.dir).into_owned(),
         fixed(depth_mm, 1),
         fixed(figures.off_plane_rms_mm, 3),
         fixed(figures.settling_mm, 0),

@@ -1,6 +1,6 @@
 //! The figures of a run, with their limits.
 
-use super::run::{Folder, Run};
+use super::run::{Condition, Folder, Run};
 use crate::archive::{RunOutcome, StepsTable};
 use crate::config::{Config, ConfigError, GoalKind};
 use crate::stage::Axis;
@@ -112,6 +112,7 @@ pub(super) fn limits(config: &Config) -> Result<Limits, ConfigError> {
 /// The figures of a run with their limits. An operation of the stage has fewer.
 fn figures(folder: &Folder, report: Option<&FigureReport>, limits: &Limits) -> Vec<Figure> {
     let is_insertion = folder.manifest.operation.is_none();
+    let has_ended = folder.condition != Condition::BeingWritten;
     let values = serde_json::to_value(report).unwrap_or_default();
     let of_report = |&(key, label, unit, decimals): &(&'static str, &str, _, _)| Figure {
         key: key.to_owned(),
@@ -119,7 +120,7 @@ fn figures(folder: &Folder, report: Option<&FigureReport>, limits: &Limits) -> V
         unit,
         decimals,
         value: values[key].as_f64(),
-        limit: limits.get(key).copied().filter(|_| is_insertion || key != DEPTH),
+        limit: limits.get(key).copied().filter(|_| is_insertion && has_ended || key != DEPTH),
     };
     let mut all: Vec<Figure> = FIGURES.iter().map(of_report).collect();
     // An open record's manifest may not name the bus. The last step may have no estimate.

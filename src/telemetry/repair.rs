@@ -60,16 +60,16 @@ fn cut_text(name: &str, bytes: u64) -> String {
 pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
     RunFolder::open(dir)?;
     let Some(_lock) = folder::lock(dir)? else {
-        let reason = "a bench is still writing this record; wait for it, or end it with Ctrl-C";
+        let reason = "a bench is still writing this record, or another repair has it; wait for it, or end it with Ctrl-C";
         return Err(TelemetryError::record(dir, reason));
     };
     // The bench may have closed the record before the lock was taken.
     let run = RunFolder::open(dir)?;
+    run.verify()?;
     if run.is_closed() {
         let reason = "the record is closed: there is nothing to repair";
         return Err(TelemetryError::record(dir, reason));
     }
-    run.verify()?;
     let (mut lines, mut cuts, mut missing) = (BTreeMap::new(), Vec::new(), Vec::new());
     for name in file::TEXT_FILES {
         let cut = cut_last_line(dir, name).map_err(TelemetryError::file(&dir.join(name)));

@@ -181,6 +181,9 @@ fn a_campaign_lists_counted_and_excluded_runs() {
     );
     let by = review(&scratch, &["runs", "--by", "emulator.seed"]).stdout;
     assert_all(&by, &["emulator.seed = 3: 1 run", "emulator.seed = 4: 1 run"]);
+    let said = review(&scratch, &["runs", "--by", "goal"]);
+    assert_eq!(said.status, 2);
+    assert_all(&said.stderr, &["goal is a table: name one of its keys, such as goal.clearance_mm"]);
     // Three folders are a campaign too.
     let three = review(&scratch, &[&runs[1], &runs[2], &runs[3], "--json"]).json();
     assert_eq!((&three["counted"], three["runs"].as_array().map(Vec::len)), (&2.into(), Some(3)));
@@ -475,7 +478,13 @@ fn bad_records_and_verdicts_are_refused() {
     let said = review(&scratch, &[whole]);
     assert_eq!(said.status, 2);
     assert_all(&said.stdout, &[": edited", "steps.csv was edited", "off plane"]);
-    screens += &refusals(&scratch, &[&["review", whole, "--verdict", "valid", "--reason", "x"]]);
+    screens += &refusals(
+        &scratch,
+        &[
+            &["review", whole, "--verdict", "valid", "--reason", "x"],
+            &["review", whole, "--repair"],
+        ],
+    );
     insta::assert_snapshot!(screens);
 }
 
