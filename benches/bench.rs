@@ -22,6 +22,7 @@ use needle_bench::tracker::openigtlink::{Body, Message, Quaternion, Tool, encode
 use needle_bench::tracker::{Event, Protocol, Reader, Sample, Validity};
 use needle_bench::units::Time;
 use std::hint::black_box;
+use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
 
 /// Increments per millimetre at 2 mm/s and a SYNC period of 10 ms.
@@ -190,7 +191,10 @@ fn study(c: &mut Criterion) {
     for threads in [1, 2] {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
         group.bench_function(format!("{threads} threads, mm"), |b| {
-            b.iter(|| pool.install(|| study.trials(&seeds, &timetable, &|| ())).expect("trials"));
+            b.iter(|| {
+                pool.install(|| study.trials(&seeds, &timetable, &|| ControlFlow::Continue(())))
+                    .expect("trials")
+            });
         });
     }
     group.finish();

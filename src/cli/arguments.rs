@@ -5,6 +5,8 @@ use super::{Failure, Result};
 use crate::config::{Config, SEED_MAX, Source};
 use crate::runtime::{RealTime, enter_real_time};
 use clap::Args;
+use std::fs::File;
+use std::io::Read as _;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::thread;
@@ -95,12 +97,21 @@ pub(super) fn text_of(path: &Path) -> Result<String> {
     read_text(path).map_err(|error| Failure::bad_input(path, error))
 }
 
+/// A file that the arguments name has at most so many bytes; an hour of a tracker at 250 Hz has about as many.
+const TEXT_MAX: u64 = 300_000_000;
+
 /// The text of the file `path`, or why it cannot be read.
 fn read_text(path: &Path) -> Result<String, String> {
     if path.is_dir() {
         return Err("cannot be read: it is a folder; name a file in it".to_owned());
     }
-    let bytes = std::fs::read(path).map_err(|error| format!("cannot be read: {error}"))?;
+    let mut bytes = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(TEXT_MAX + 1).read_to_end(&mut bytes));
+    read.map_err(|error| format!("cannot be read: {error}"))?;
+    if bytes.len() as u64 > TEXT_MAX {
+        let mb = TEXT_MAX / 1_000_000;
+        return Err(format!("has more than {mb} MB: is it the file that was meant? or cut it up"));
+    }
     let valid_len = std::str::from_utf8(&bytes).map_or_else(|error| error.valid_up_to(), str::len);
     // A text file has no zero byte, although UTF-8 allows it.
     let zero = bytes[..valid_len].iter().position(|byte| *byte == 0);

@@ -56,6 +56,13 @@ fn read_mask(path: &Path, crc32: Option<u32>, pose: &Pose) -> Result<Obstacle, S
         return Err("its header turns or mirrors the voxels; resample it along x, y, z".to_owned());
     }
     check_voxel_size(&header)?;
+    if !(header.scl_slope.is_finite() && header.scl_inter.is_finite()) {
+        return Err(format!(
+            "its header scales the voxels by {} and adds {} (scl_slope, scl_inter), allowed: finite numbers; correct \
+             the header",
+            header.scl_slope, header.scl_inter
+        ));
+    }
     check_data_type(&header)?;
     let [_, x, y, z, ..] = header.pixdim.map(f64::from);
     let spacing_mm = Vector3::new(x, y, z);
@@ -161,14 +168,16 @@ pub(super) fn file_crc32(path: &Path) -> io::Result<u32> {
 
 /// Why an image cannot be read.
 fn reason(error: &NiftiError) -> String {
-    let why = match error {
-        NiftiError::Io(error) if error.kind() == io::ErrorKind::NotFound => {
-            return error.to_string();
+    match error {
+        NiftiError::Io(error) if error.kind() == io::ErrorKind::NotFound => error.to_string(),
+        NiftiError::Io(error) if error.kind() == io::ErrorKind::UnexpectedEof => {
+            "no NIfTI image, or the file is cut off; copy it again".to_owned()
         }
-        NiftiError::Io(error) => error.to_string(),
-        error => error.to_string(),
-    };
-    format!("no NIfTI image can be read: {why}")
+        NiftiError::IncompatibleLength(..) => {
+            "the image is cut off: its header announces more voxels; copy it again".to_owned()
+        }
+        error => format!("no NIfTI image can be read: {error}"),
+    }
 }
 
 /// The largest part of a voxel's side that may point along another axis.

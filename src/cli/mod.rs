@@ -29,6 +29,7 @@ mod virtual_stage;
 use self::output::{print_stderr, print_stdout};
 use crate::config::ConfigError;
 use crate::telemetry::TelemetryError;
+use crate::text::escaped;
 use crate::transport::can::CanError;
 use clap::error::{ContextKind, ContextValue};
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
@@ -104,13 +105,18 @@ impl Failure {
 
     /// The content of the file or folder `path` is wrong.
     fn bad_input(path: &Path, error: impl Display) -> Self {
-        Failure::configuration(format_args!("{}: {error}", path.display()))
+        Failure::configuration(format_args!("{}: {error}", shown(path)))
     }
 
     /// The system cannot read or write the file `path`.
     fn io(path: &Path, error: impl Display) -> Self {
-        Failure::environment(format_args!("{}: {error}", path.display()))
+        Failure::environment(format_args!("{}: {error}", shown(path)))
     }
+}
+
+/// `path` in one line.
+fn shown(path: &Path) -> String {
+    escaped(&path.to_string_lossy()).into_owned()
 }
 
 /// The result of a command, or of a part of one.
@@ -196,7 +202,10 @@ pub fn bench() -> ExitCode {
     let bench = bench.unwrap_or_else(|error| {
         let error = with_suggestion(error);
         if error.use_stderr() && is_json {
-            let _ = print_stdout(json!({ "error": error.to_string().trim_end() }));
+            let text = error.to_string();
+            let what = text.split("\n\n").next().unwrap_or_default();
+            let words = what.trim_start_matches("error: ").split_whitespace().collect::<Vec<_>>();
+            let _ = print_stdout(json!({ "error": words.join(" ") }));
         }
         error.exit()
     });

@@ -1,12 +1,12 @@
 //! Output to stdout, stderr and new files; either stream may be closed or broken.
 
-use super::{Failure, Result};
+use super::{Failure, Result, STOPPED, finish_with};
 use crate::text::{is_unprintable, wrapped};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use serde::Serialize;
-use serde_json::Value;
+use serde_json::{Value, json};
 use std::fmt::Display;
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{self, ErrorKind, Write};
 use std::os::fd::AsFd;
 use std::path::Path;
@@ -43,6 +43,28 @@ pub(super) fn print_result(
     }
 }
 
+/// As [`print_result`], after a step that may have failed: the result is printed all the same, the failure with it
+/// and on stderr.
+pub(super) fn print_result_despite(
+    failed: Result<()>,
+    json: bool,
+    object: &impl Serialize,
+    text: impl FnOnce() -> Result<String, minijinja::Error>,
+) -> Result<()> {
+    let Err(Failure { message: Some(message), status }) = failed else {
+        print_result(json, object, text)?;
+        return failed;
+    };
+    let object = serde_json::to_value(object).map_err(Failure::environment)?;
+    let (key, ended) = match status {
+        STOPPED => ("stop_reason", "stopped"),
+        _ => ("error", "error"),
+    };
+    print_result(json, &merged(object, &json!({ key: message })), text)?;
+    print_stderr(format_args!("{ended}: {message}"));
+    finish_with(status)
+}
+
 /// `object` with the fields of `more`.
 pub(super) fn merged(mut object: Value, more: &Value) -> Value {
     for (key, value) in more.as_object().into_iter().flatten() {
@@ -56,22 +78,28 @@ pub(super) fn print_wrapped(text: impl Display) -> Result<()> {
     print_stdout(wrapped(&text.to_string()))
 }
 
-/// Writes a new file. A file that exists is not overwritten.
+/// Writes a new file. A file that exists is not overwritten, and none is left that holds only a part of `text`.
 pub(super) fn write_new(path: &Path, text: &str) -> Result<()> {
-    let written = File::create_new(path).and_then(|mut file| file.write_all(text.as_bytes()));
+    let written = File::create_new(path).map(|mut file| file.write_all(text.as_bytes()));
+    let written = written.and_then(|written| {
+        written.inspect_err(|_| {
+            let _ = fs::remove_file(path);
+        })
+    });
     written.map_err(|error| match error.kind() {
-        ErrorKind::AlreadyExists => already_exists(path),
+        ErrorKind::AlreadyExists => Failure::bad_input(
+            path,
+            "exists, and is not overwritten; name another file, or remove it",
+        ),
         _ => Failure::io(path, format_args!("cannot be written: {error}")),
     })
 }
 
-/// Refuses to write a file that exists, before there is anything to write.
-pub(super) fn refuse_existing(path: Option<&Path>) -> Result<()> {
-    path.filter(|path| path.exists()).map_or(Ok(()), |path| Err(already_exists(path)))
-}
-
-fn already_exists(path: &Path) -> Failure {
-    Failure::bad_input(path, "exists, and is not overwritten; name another file, or remove it")
+/// Refuses a file that exists, or that cannot be written, before there is anything to write.
+pub(super) fn refuse_unwritable(path: Option<&Path>) -> Result<()> {
+    let Some(path) = path else { return Ok(()) };
+    write_new(path, "")?;
+    fs::remove_file(path).map_err(|error| Failure::io(path, error))
 }
 
 /// Writes `text`, made [`plain`], its long lines broken, and a line end to stderr; errors are ignored.
@@ -98,7 +126,6 @@ pub(super) fn plain(text: impl Display, kept: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use serde_json::json;
 
     #[test]
     fn a_pipe_without_a_reader_is_recognised() {

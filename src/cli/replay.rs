@@ -1,6 +1,6 @@
 //! `needle-bench replay`: runs a recorded session again and compares the results.
 
-use super::output::{print_result, print_stderr, refuse_existing, write_new};
+use super::output::{print_result_despite, print_stderr, refuse_unwritable, write_new};
 use super::records::{open, recorded_run_config};
 use super::{Failure, Result, STOPPED, finish_with};
 use crate::archive::file;
@@ -33,7 +33,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn replay(arguments: &Arguments) -> Result<()> {
-    refuse_existing(arguments.out.as_deref())?;
+    refuse_unwritable(arguments.out.as_deref())?;
     let (folder, config) = open(&arguments.run)?;
     let what_if = what_if(&folder.text(file::CONFIG)?, &arguments.set)?;
     let run_config = recorded_run_config(&folder.manifest, &config)?;
@@ -47,9 +47,10 @@ pub(super) fn replay(arguments: &Arguments) -> Result<()> {
     let replayed =
         run_again(&recorded, what_if).map_err(|error| Failure::bad_input(&arguments.run, error))?;
     let speed = replayed.duration_s / begun.elapsed().as_secs_f64();
-    if let Some(path) = &arguments.out {
-        write_new(path, &replayed.steps_csv())?;
-    }
+    let written = match &arguments.out {
+        Some(path) => write_new(path, &replayed.steps_csv()),
+        None => Ok(()),
+    };
     let mut object = json!({
         "run_dir": arguments.run.display().to_string(),
         "recorded_by": { "version": folder.manifest.version, "git": folder.manifest.git },
@@ -96,7 +97,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<()> {
     let has_truth = folder.manifest.tracker == TrackerSource::Emulated.to_string();
     let more = context! { figures => rows, has_truth };
     let text = || screen(include_str!("replay.txt"), &object, more);
-    print_result(arguments.json, &object, text)?;
+    print_result_despite(written, arguments.json, &object, text)?;
     finish_with(replayed.difference.map_or(0, |_| STOPPED))
 }
 

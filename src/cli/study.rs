@@ -2,11 +2,11 @@
 
 use super::arguments::{Configured, parse_seed};
 use super::mask::mask_reader;
-use super::output::{print_result, refuse_existing, write_new};
-use super::{Failure, Result};
+use super::output::{print_result_despite, refuse_unwritable, write_new};
+use super::{Failure, Result, STOPPED};
 use crate::config::Config;
 use crate::geometry::coordinates;
-use crate::runtime::Study;
+use crate::runtime::{Interrupt, Study};
 use crate::session::PlaneOutOfReach;
 use crate::study::{StudySummary, TipError, TrialResult, trial_seed};
 use crate::text::{screen, shell_word};
@@ -15,6 +15,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use minijinja::context;
 use nalgebra::Vector3;
 use serde::Serialize;
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -48,7 +49,7 @@ pub(super) struct Arguments {
 
 pub(super) fn study(arguments: &Arguments) -> Result<()> {
     let config = arguments.configured.load(None)?;
-    refuse_existing(arguments.out.as_deref())?;
+    refuse_unwritable(arguments.out.as_deref())?;
     if !config.is_emulated() {
         return Err(Failure::configuration(format!(
             "can.interface is \"{}\": a study needs the emulated needle, can.interface = \"memory\"",
@@ -69,6 +70,7 @@ pub(super) fn study(arguments: &Arguments) -> Result<()> {
     let seeds: Vec<u64> =
         (0..u64::from(arguments.trials)).map(|trial| trial_seed(arguments.seed, trial)).collect();
 
+    let interrupt = Interrupt::listen().map_err(Failure::environment)?;
     let style = ProgressStyle::with_template("{bar:40.cyan/blue} {pos} of {len} trials  {eta}");
     let style = style.unwrap_or_else(|_| ProgressStyle::default_bar());
     let bar = ProgressBar::new(seeds.len() as u64).with_style(style);
@@ -76,7 +78,10 @@ pub(super) fn study(arguments: &Arguments) -> Result<()> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let begun = Instant::now();
     let trials = pool.map_err(Failure::environment)?.install(|| {
-        let on_trial_done = || bar.inc(1);
+        let on_trial_done = || {
+            bar.inc(1);
+            if interrupt.is_raised() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        };
         if arguments.through_session {
             study.run_through_sessions(&seeds, &on_trial_done)
         } else {
@@ -86,12 +91,16 @@ pub(super) fn study(arguments: &Arguments) -> Result<()> {
     let elapsed_s = begun.elapsed().as_secs_f64();
     bar.finish_and_clear();
     let trials = trials.map_err(Failure::configuration)?;
-    if let Some(path) = &arguments.out {
-        write_csv(path, &trials, &config)?;
-    }
     let inserted_mm: f64 = trials.iter().map(|trial| trial.figures.insertion_mm).sum();
     let summary = StudySummary::of(&trials)
         .ok_or_else(|| Failure::configuration("a study needs at least one trial"))?;
+    let written = match &arguments.out {
+        Some(path) => write_csv(path, &trials, &config),
+        None => Ok(()),
+    };
+    let is_whole = trials.len() == seeds.len();
+    let ended =
+        written.and_then(|()| if is_whole { Ok(()) } else { Err(interrupted(&trials, &seeds)) });
     let report = Report { summary: &summary, insertion_mm_per_second: inserted_mm / elapsed_s };
     let more = context! {
         depth_mm => config.insertion.depth_mm,
@@ -102,7 +111,13 @@ pub(super) fn study(arguments: &Arguments) -> Result<()> {
         repeat => repeat_command(&arguments.configured, config.insertion.plane_out_of_reach),
     };
     let text = || screen(include_str!("study.txt"), &report, more);
-    print_result(arguments.json, &report, text)
+    print_result_despite(ended, arguments.json, &report, text)
+}
+
+fn interrupted(trials: &[TrialResult], seeds: &[u64]) -> Failure {
+    let (done, all) = (trials.len(), seeds.len());
+    let text = format!("interrupted after {done} of {all} trials; the figures are of these {done}");
+    Failure { message: Some(text), status: STOPPED }
 }
 
 /// The command that repeats a trial, without its seed. A run refuses a plane out of reach, which a study counts.
@@ -173,6 +188,8 @@ fn trial_row(
         ("torsion_half_width_deg", Some(torsion.half_width_rad.to_degrees())),
         ("torsion_half_width_deg_per_mm", Some(torsion.half_width_rad_per_mm.to_degrees())),
         ("torsion_offset_deg", Some(torsion.offset_rad.to_degrees())),
+        ("torsion_creep_mm", Some(torsion.creep_mm)),
+        ("torsion_creep_mm_per_mm", Some(torsion.creep_mm_per_mm)),
         ("insertion_mm", Some(figures.insertion_mm)),
         ("off_plane_rms_mm", figures.off_plane_rms_mm),
         ("settling_mm", figures.settling_mm),

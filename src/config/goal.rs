@@ -177,16 +177,27 @@ impl Config {
         let GoalConfig { reserve_mm, step_expansions_max, .. } = self.goal;
         let curvature_margin = self.goal.curvature_margin();
         let tool = self.target_tool(problem.target_mm)?;
-        let wall_mm = world.workspace.depth_mm(&problem.target_mm);
-        let stopping_mm = self.insertion.stopping_mm(&self.stage);
-        if (0.0..stopping_mm).contains(&wall_mm) {
-            return Ok(Err(format!(
-                "goal: the target is {wall_mm:.2} mm from a wall of goal.workspace_mm, and a needle that is stopped \
-                 goes on by up to {stopping_mm:.2} mm; widen goal.workspace_mm, or insert slower"
-            )));
+        if let Err(why) = self.check_wall(&world, &problem) {
+            return Ok(Err(why));
         }
         let goal = Goal::new(world, problem, reserve_mm, curvature_margin, step_expansions_max);
         Ok(goal.map(|goal| Some(Goal { tool, ..goal })))
+    }
+
+    /// Refuses a target so near to a wall of the workspace that a run which is stopped there could go beyond it.
+    ///
+    /// # Errors
+    /// Both distances, in words.
+    pub fn check_wall(&self, world: &World, problem: &Problem) -> Result<(), String> {
+        let wall_mm = world.workspace.depth_mm(&problem.target_mm);
+        let stopping_mm = self.insertion.stopping_mm(&self.stage);
+        match (0.0..stopping_mm).contains(&wall_mm) {
+            true => Err(format!(
+                "goal: the target is {wall_mm:.2} mm from a wall of goal.workspace_mm, and a needle that is stopped \
+                 goes on by up to {stopping_mm:.2} mm; widen goal.workspace_mm, or insert slower"
+            )),
+            false => Ok(()),
+        }
     }
 
     /// The tool that marks the target, if one is configured.

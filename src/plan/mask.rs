@@ -2,6 +2,7 @@
 
 use crate::geometry::Pose;
 use nalgebra::Vector3;
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 
 /// The signed distance field of occupied voxels. Clones share it.
@@ -19,7 +20,7 @@ impl Mask {
     /// The most voxels that a mask may have: 256 in each direction.
     pub const VOXELS_MAX: usize = 1 << 24;
     /// A smaller voxel is not in mm.
-    const SPACING_MIN_MM: f64 = 0.01;
+    const SPACING_MM: RangeInclusive<f64> = 0.01..=100.0;
 
     /// The mask of `size` voxels, `spacing_mm` apart. `occupied` tells which voxels are occupied, with the first
     /// coordinate running fastest. `x_pg` is the pose of the grid in the plane frame.
@@ -57,7 +58,7 @@ impl Mask {
     /// Checks the `size` and the spacing of a mask, and returns its number of voxels.
     ///
     /// # Errors
-    /// If there are too many voxels or none, or the spacing is under 0.01 mm.
+    /// If there are too many voxels or none, or the spacing is not between 0.01 and 100 mm.
     pub fn voxel_count(size: [usize; 3], spacing_mm: &Vector3<f64>) -> Result<usize, String> {
         let voxels = size.iter().try_fold(1usize, |product, count| product.checked_mul(*count));
         let voxels = voxels.unwrap_or(usize::MAX);
@@ -67,12 +68,13 @@ impl Mask {
                 "the mask has {x} x {y} x {z} voxels, allowed: 1 to {max} in all; crop or resample it"
             ));
         }
-        let least_mm = Self::SPACING_MIN_MM;
-        if !spacing_mm.iter().all(|mm| mm.is_finite() && *mm >= least_mm) {
-            let [x, y, z] = (*spacing_mm).into();
+        if !spacing_mm.iter().all(|mm| Self::SPACING_MM.contains(mm)) {
+            // The header has single precision.
+            let [x, y, z] = <[f64; 3]>::from(*spacing_mm).map(|mm| mm as f32);
             return Err(format!(
-                "the mask's voxels are {x} x {y} x {z} mm, allowed: {least_mm} or more; set pixdim in its \
-                 header, in mm"
+                "the mask's voxels are {x:?} x {y:?} x {z:?} mm, allowed: {} to {}; set pixdim in its header, in mm",
+                Self::SPACING_MM.start(),
+                Self::SPACING_MM.end()
             ));
         }
         Ok(voxels)
@@ -266,8 +268,8 @@ mod tests {
             ]
             .join("\n"),
             @r"
-        the mask's voxels are 0 x 0 x 0 mm, allowed: 0.01 or more; set pixdim in its header, in mm
-        the mask's voxels are NaN x NaN x NaN mm, allowed: 0.01 or more; set pixdim in its header, in mm
+        the mask's voxels are 0.0 x 0.0 x 0.0 mm, allowed: 0.01 to 100; set pixdim in its header, in mm
+        the mask's voxels are NaN x NaN x NaN mm, allowed: 0.01 to 100; set pixdim in its header, in mm
         the mask has 9 values for 2 x 2 x 2 voxels
         the mask has 0 x 2 x 2 voxels, allowed: 1 to 16777216 in all; crop or resample it
         the mask has 512 x 512 x 400 voxels, allowed: 1 to 16777216 in all; crop or resample it

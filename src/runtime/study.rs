@@ -8,6 +8,8 @@ use crate::study::{Prior, Timetable, TimetableBuilder, TrialResult, TrialScorer,
 use crate::units::Time;
 use nalgebra::Vector3;
 use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
+use std::ops::ControlFlow;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Noise of the insertion that makes the timetable: negligible, but no two positions are equal, since the
 /// bench refuses positions that repeat.
@@ -31,13 +33,16 @@ pub struct Study<'a> {
 /// reached.
 pub(super) type DrawnGoal = Result<Option<Goal>, String>;
 
+/// Called after each trial, by several threads.
+pub(super) type TrialDone<'a> = &'a (dyn Fn() -> ControlFlow<()> + Sync);
+
 impl Study<'_> {
-    /// Runs the trials with these seeds, in parallel; calls `done` after each. The results are in the order of
-    /// the seeds.
+    /// Runs the trials with these seeds, in parallel, and calls `done` after each. Once that breaks, no trial
+    /// begins any more. The results are in the order of the seeds.
     ///
     /// # Errors
     /// The session or the emulator refuses its configuration.
-    pub fn run(&self, seeds: &[u64], done: &(dyn Fn() + Sync)) -> Result<Vec<TrialResult>, String> {
+    pub fn run(&self, seeds: &[u64], done: TrialDone<'_>) -> Result<Vec<TrialResult>, String> {
         let Some(&first) = seeds.first() else { return Ok(Vec::new()) };
         self.trials(seeds, &self.timetable(first)?, done)
     }
@@ -50,7 +55,7 @@ impl Study<'_> {
         &self,
         seeds: &[u64],
         timetable: &Timetable,
-        done: &(dyn Fn() + Sync),
+        done: TrialDone<'_>,
     ) -> Result<Vec<TrialResult>, String> {
         self.run_trials(seeds, done, |session, stage, score| {
             let take = |step: &_, truth: &_| score.take(step, truth);
@@ -66,7 +71,7 @@ impl Study<'_> {
     pub fn run_through_sessions(
         &self,
         seeds: &[u64],
-        done: &(dyn Fn() + Sync),
+        done: TrialDone<'_>,
     ) -> Result<Vec<TrialResult>, String> {
         self.run_trials(seeds, done, |session, stage, score| {
             self.whole_session(session, stage, |record, truth| {
@@ -81,11 +86,15 @@ impl Study<'_> {
     fn run_trials(
         &self,
         seeds: &[u64],
-        done: &(dyn Fn() + Sync),
+        done: TrialDone<'_>,
         insert: impl Fn(SessionConfig, VirtualStageConfig, &mut TrialScorer) -> Result<Outcome, String>
         + Sync,
     ) -> Result<Vec<TrialResult>, String> {
+        let is_over = AtomicBool::new(false);
         let trial = |&seed: &u64| {
+            if is_over.load(Ordering::Relaxed) {
+                return Ok(None);
+            }
             let stage = self.draw_stage(seed)?;
             let goal = (self.goal)(seed).map_err(|reason| refused_trial(seed, &reason))?;
             let result = match goal {
@@ -98,10 +107,10 @@ impl Study<'_> {
                     score.finish(outcome)
                 }
             };
-            done();
-            Ok(result)
+            is_over.fetch_or(done().is_break(), Ordering::Relaxed);
+            Ok(Some(result))
         };
-        seeds.par_iter().map(trial).collect()
+        seeds.par_iter().filter_map(|seed| trial(seed).transpose()).collect()
     }
 
     fn draw_stage(&self, seed: u64) -> Result<VirtualStageConfig, String> {

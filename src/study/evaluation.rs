@@ -330,6 +330,22 @@ mod tests {
         assert_eq!(recording.roll(), None, "it has no orientations");
     }
 
+    /// A base rotation of the wrong sign or unit: a roll scored against it would look like a bad observer.
+    #[test]
+    fn orientations_that_turn_otherwise_than_the_base_are_not_scored() {
+        let r_sb = mount(Vector3::z(), Vector3::x()).unwrap();
+        for (factor, share) in [(-1.0, -1.5..-0.5), (57.3, -0.2..0.2)] {
+            let mut recording = recording(&r_sb);
+            recording.rows.iter_mut().for_each(|row| row.rotation_meas_rad *= factor);
+            match recording.roll() {
+                Some(RecordedRoll::Otherwise { share: found }) => {
+                    assert!(share.contains(&found), "{found}");
+                }
+                found => panic!("{found:?}"),
+            }
+        }
+    }
+
     /// An observer that counts its calls and always predicts the origin.
     struct Counter {
         corrections: usize,

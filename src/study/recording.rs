@@ -14,9 +14,9 @@ const SAME_MAX_RAD: f64 = 1e-3;
 /// Once the base has turned by this much, rad, the orientations show whether they turn with it: no needle bends by
 /// half of this, and no shaft holds back half of it.
 const TURNED_RAD: f64 = 2.5;
-/// After a smaller turn, orientations turn with the base if they do so by at least this share of it, ...
+/// Orientations turn with the base if they do so by at least this share of it, ...
 const FOLLOWED_SHARE: f64 = 0.3;
-/// ... and by at least this, rad: a bend of 30 deg about a sensor tilted by 10 deg looks like a roll of 5 deg.
+/// ... and after a smaller turn by at least this, rad: a bend of 30 deg about a sensor tilted by 10 deg looks like a roll of 5 deg.
 const FOLLOWED_MIN_RAD: f64 = 0.12;
 
 /// One row of a recording, in the recording's own frame.
@@ -51,6 +51,14 @@ pub enum RecordedRoll {
     Unknown {
         /// The largest turn of the base from its start, rad.
         base_rad: f64,
+    },
+    /// They turn, but not as the base does.
+    #[display(
+        "the orientations turn by {share:.1} times the base; is rotation_rad in rad, and its sign right?"
+    )]
+    Otherwise {
+        /// Turn of the orientations over that of the base, by least squares.
+        share: f64,
     },
 }
 
@@ -90,13 +98,13 @@ impl Recording {
     /// with five degrees of freedom measures only the heading, so its orientations do not turn with the base about
     /// the needle's axis. A tracker without orientations may send the same one in every row.
     ///
-    /// After a small turn the answer is the slope of the sensor's roll over the base's turn, by least squares over
-    /// all rows: it averages the noise, and a shaft that twists makes it smaller than 1.
+    /// The share is the slope of the sensor's roll over the base's turn, by least squares over all rows: it averages
+    /// the noise, and a shaft that twists makes it smaller than 1.
     pub fn roll(&self) -> Option<RecordedRoll> {
         let first = &self.rows[0];
         let first_orientation = first.sensor_orientation.filter(|_| self.rows.len() > 1)?;
         let axis = self.axis();
-        let (mut is_fixed, mut roll_rad) = (true, 0.0);
+        let (mut is_fixed, mut turn_rad, mut roll_rad) = (true, 0.0, 0.0);
         let (mut turns_rad, mut rolls_rad) = (vec![0.0], vec![0.0]);
         for (last, row) in self.rows.iter().zip(&self.rows[1..]) {
             let (before, now) = (last.sensor_orientation?, row.sensor_orientation?);
@@ -104,20 +112,23 @@ impl Recording {
             // A change of heading is no roll, however large the needle's bend makes it.
             roll_rad += so3::log(&(before.inverse() * now)).dot(&axis);
             rolls_rad.push(roll_rad);
-            turns_rad.push(wrap_angle(row.rotation_meas_rad - first.rotation_meas_rad));
+            turn_rad += wrap_angle(row.rotation_meas_rad - last.rotation_meas_rad);
+            turns_rad.push(turn_rad);
         }
-        let base_rad = turns_rad.iter().fold(0.0f64, |largest, turn| largest.max(turn.abs()));
-        let largest_rad =
-            rolls_rad.iter().fold(0.0f64, |largest, roll| largest.max(wrap_angle(*roll).abs()));
-        let slope = slope(&turns_rad, &rolls_rad).abs();
+        let largest =
+            |angles: &[f64]| angles.iter().map(|a| wrap_angle(*a).abs()).fold(0.0, f64::max);
+        let (base_rad, largest_rad) = (largest(&turns_rad), largest(&rolls_rad));
+        let share = slope(&turns_rad, &rolls_rad);
         Some(match base_rad > TURNED_RAD {
             _ if is_fixed => RecordedRoll::DoesNotTurn,
             true if largest_rad < 0.5 * TURNED_RAD => RecordedRoll::DoesNotTurn,
+            true if share < FOLLOWED_SHARE => RecordedRoll::Otherwise { share },
             true => RecordedRoll::Turns,
-            false if slope >= FOLLOWED_SHARE && slope * base_rad >= FOLLOWED_MIN_RAD => {
-                RecordedRoll::Turns
+            false if share.abs() < FOLLOWED_SHARE || share.abs() * base_rad < FOLLOWED_MIN_RAD => {
+                RecordedRoll::Unknown { base_rad }
             }
-            false => RecordedRoll::Unknown { base_rad },
+            false if share < 0.0 => RecordedRoll::Otherwise { share },
+            false => RecordedRoll::Turns,
         })
     }
 

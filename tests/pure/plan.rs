@@ -103,6 +103,13 @@ fn plan_reports_the_reserve_of_a_run() {
     assert!(words.contains(&format!(" run is refused: {refusal} ")), "{}", said.stdout);
     let run = needle_bench(&scratch, &[&["run", "goal.toml", "--json"], &reserve[..]].concat());
     assert!(run.status == 2 && run.json()["error"].to_string().contains(refusal), "{}", run.stdout);
+    // The target is 0.1 mm from a wall, and a stop at 2 mm/s takes 0.13 mm.
+    let wall = ["--set", "goal.workspace_mm.max=[50.0, 75.0, 120.1]"];
+    let (_, json) = plan(&scratch, BALL, &wall);
+    let refusal = json["run_refusal"].as_str().unwrap();
+    assert!(refusal.contains("0.10 mm from a wall"), "{refusal}");
+    let run = needle_bench(&scratch, &[&["run", "goal.toml", "--json"], &wall[..]].concat());
+    assert!(run.status == 2 && run.json()["error"].to_string().contains(refusal), "{}", run.stdout);
     let clear = BALL.split("[[goal").next().unwrap();
     let (_, json) = plan(&scratch, clear, &[]);
     assert_eq!([&json["run_reserve_mm"], &json["run_refusal"]], [&Value::Null; 2]);
@@ -340,6 +347,8 @@ fn a_file_that_is_not_a_mask_is_refused() {
     negative[42..44].copy_from_slice(&(-2i16).to_le_bytes());
     let mut two_lengths = nifti([2, 2, 2], [1.0; 3], &[1; 16]);
     two_lengths[72..74].copy_from_slice(&16i16.to_le_bytes());
+    let mut unscaled = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
+    unscaled[112..116].copy_from_slice(&f32::NAN.to_le_bytes());
     let images = [
         b"no image".to_vec(),
         pair,
@@ -359,6 +368,8 @@ fn a_file_that_is_not_a_mask_is_refused() {
         vec![0x1f, 0x8b, 8, 0],
         nifti([50, 50, 120], [1.0; 3], &[1; 300_000]),
         two_lengths,
+        nifti([2, 2, 2], [1e30; 3], &[1; 8]),
+        unscaled,
     ];
     let mut screens = refusals(&scratch, &[&["check", "goal.toml"]]);
     for image in images {
@@ -397,7 +408,7 @@ fn a_damaged_compressed_mask_is_refused() {
         std::fs::write(scratch.path().join("mask.nii.gz"), bytes).unwrap();
         let said = needle_bench(&scratch, &["plan", "goal.toml"]);
         assert_eq!(said.status, status, "{}{}", said.stdout, said.stderr);
-        let is_named = said.stderr.contains("mask.nii.gz: no NIfTI image can be read: ");
+        let is_named = said.stderr.contains("mask.nii.gz: no NIfTI image");
         assert_eq!(is_named, status != 0, "{}", said.stderr);
     }
 }

@@ -1,6 +1,9 @@
 //! The command `needle-bench study`.
 
 use crate::support::program::{Scratch, needle_bench, refusals};
+use serde_json::Value;
+use std::process::{Command, Stdio};
+use std::time::Duration;
 
 const COORDINATES: [&str; 6] = ["x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg"];
 const DEPTH: &str = "insertion={ depth_mm = 30, plane_out_of_reach = \"insert\" }";
@@ -219,4 +222,67 @@ fn a_known_roll_at_the_start_can_be_studied() {
     let said = needle_bench(&scratch, &[&["study", "--trials", "2", "--json"], &sets[..]].concat());
     assert_eq!(said.status, 0, "{}", said.stderr);
     assert_eq!(said.json()["failed"], serde_json::json!([]));
+}
+
+/// A file that cannot be written is refused before any trial. One that fails later does not take the result with it.
+#[test]
+fn an_output_that_cannot_be_written_costs_no_result() {
+    let scratch = Scratch::new();
+    let study = ["study", "--trials", "20", "--set", "insertion.depth_mm=20", "--out"];
+    let said = needle_bench(&scratch, &[&study[..], &["gone/x.csv"]].concat());
+    assert_eq!((said.status, said.stdout.as_str()), (3, ""), "{}", said.stderr);
+    assert!(said.stderr.contains("gone/x.csv: cannot be written: No such file"), "{}", said.stderr);
+    // The CSV of 20 trials is longer than 512 bytes, the most that a file may have here.
+    let bench = env!("CARGO_BIN_EXE_needle-bench");
+    let script =
+        format!("trap '' XFSZ; ulimit -f 1; exec {bench} {} x.csv --json", study.join(" "));
+    let output = Command::new("dash")
+        .args(["-c", &script])
+        .current_dir(scratch.path())
+        .output()
+        .expect("dash starts");
+    let json: Value = serde_json::from_slice(&output.stdout).expect("one JSON object");
+    assert_eq!((output.status.code(), &json["trials"]), (Some(3), &20.into()));
+    assert!(
+        json["error"].to_string().contains("x.csv: cannot be written: File too large"),
+        "{json}"
+    );
+    assert!(!scratch.path().join("x.csv").exists());
+}
+
+/// Ctrl-C ends a study with the figures of the trials that are done.
+#[test]
+fn an_interrupted_study_reports_the_trials_that_are_done() {
+    let scratch = Scratch::new();
+    let mut study = Command::new(env!("CARGO_BIN_EXE_needle-bench"))
+        .args(["study", "--trials", "1000000", "--set", "insertion.depth_mm=20"])
+        .args(["--out", "x.csv", "--json"])
+        .current_dir(scratch.path())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the program starts");
+    let pid = study.id();
+    // The output file is tried before the signals are listened for; only a signal after that ends in order.
+    let listens = || {
+        let status = std::fs::read_to_string(format!("/proc/{pid}/status")).expect("a process");
+        let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:")).expect("a mask");
+        u64::from_str_radix(caught.trim(), 16).expect("a mask") & 2 != 0
+    };
+    while !listens() {
+        assert_eq!(study.try_wait().expect("a process"), None);
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let signalled = Command::new("kill").args(["-INT", &pid.to_string()]).status();
+    assert!(signalled.expect("kill starts").success());
+    let ended = study.wait_with_output().expect("it ends");
+    let json: Value = serde_json::from_slice(&ended.stdout).expect("one JSON object");
+    let (done, stderr) =
+        (json["trials"].as_u64().expect("a number"), String::from_utf8_lossy(&ended.stderr));
+    let reason = format!("interrupted after {done} of 1000000 trials");
+    assert_eq!(ended.status.code(), Some(1), "{stderr}");
+    assert!(json["stop_reason"].to_string().contains(&reason), "{json}");
+    assert!(stderr.contains(&format!("stopped: {reason}")), "{stderr}");
+    let rows = std::fs::read_to_string(scratch.path().join("x.csv")).expect("the rows");
+    assert_eq!(rows.lines().count() as u64, done + 1);
 }

@@ -89,16 +89,15 @@ pub(super) struct RecordedInsertion {
 }
 
 impl RecordedInsertion {
-    /// The insertion with these rows; `number` counts from 1, `r_sa` is the shaft frame A in the sensor
-    /// frame.
+    /// The insertion `name` with these rows; `r_sa` is the shaft frame A in the sensor frame.
     pub(super) fn of(
-        number: usize,
+        name: &str,
         rows: &[PosedRow],
         r_sa: &Rotation3<f64>,
     ) -> Result<Self, CalibrationError> {
         let too_short = |depth_mm: f64| {
             needle_error(format!(
-                "insertion {number} is {depth_mm:.1} mm deep, at least {DEPTH_MIN_MM:.0} needed; \
+                "{name} is {depth_mm:.1} mm deep, at least {DEPTH_MIN_MM:.0} needed; \
                  leave it out"
             ))
         };
@@ -114,9 +113,8 @@ impl RecordedInsertion {
             depth_mm += deeper_mm;
             let turn = so3::log(&(last.orientation.inverse() * row.orientation));
             steps.push(Step {
-                base: Increment::new(deeper_mm, row.rotation_rad - last.rotation_rad).map_err(
-                    |error| needle_error(format!("insertion {number}, line {}: {error}", row.line)),
-                )?,
+                base: Increment::new(deeper_mm, row.rotation_rad - last.rotation_rad)
+                    .map_err(|error| needle_error(format!("{name}, line {}: {error}", row.line)))?,
                 tip_turn_rad: turn.dot(&axis),
                 position_mm: r_ao * (row.position_mm - first.position_mm),
             });

@@ -38,11 +38,15 @@ fn needle_error(reason: impl Display) -> CalibrationError {
 
 impl NeedleFit {
     /// The needle of `insertions`, each with its rows in the order recorded. `noise` is that of the
-    /// positions and the paths.
+    /// positions and the paths; `name` is what an error calls an insertion, by its index.
     ///
     /// # Errors
     /// The insertions do not determine the needle.
-    pub fn of(insertions: &[Vec<PosedRow>], noise: &PathNoise) -> Result<Self, CalibrationError> {
+    pub fn of(
+        insertions: &[Vec<PosedRow>],
+        name: impl Fn(usize) -> String,
+        noise: &PathNoise,
+    ) -> Result<Self, CalibrationError> {
         if insertions.len() < INSERTIONS_MIN {
             return Err(needle_error(format!(
                 "{} insertions, at least {INSERTIONS_MIN} needed: their scatter gives the \
@@ -55,7 +59,7 @@ impl NeedleFit {
         let tracks = insertions
             .iter()
             .enumerate()
-            .map(|(index, rows)| RecordedInsertion::of(index + 1, rows, &r_sa))
+            .map(|(index, rows)| RecordedInsertion::of(&name(index), rows, &r_sa))
             .collect::<Result<Vec<_>, _>>()?;
         Ok(NeedleFit {
             insertions: insertions.len(),

@@ -61,9 +61,14 @@ const CREEPING: TorsionConfig = TorsionConfig {
     creep_mm_per_mm: 0.006,
 };
 
+/// The names of the insertions: a.csv, b.csv, ...
+fn name(index: usize) -> String {
+    ["a.csv", "b.csv", "c.csv"].get(index).map_or_else(String::new, |&name| name.to_owned())
+}
+
 #[test]
 fn the_parameters_of_a_known_needle_are_found() {
-    let fit = NeedleFit::of(&recorded(CREEPING, 0.01), &NOISE).unwrap();
+    let fit = NeedleFit::of(&recorded(CREEPING, 0.01), name, &NOISE).unwrap();
     let axis = mount() * Vector3::z();
     assert!((fit.axis - axis).norm() < 1e-3, "{fit:?}");
     let bend = fit.bend;
@@ -88,7 +93,7 @@ fn the_band_of_a_known_needle_is_found() {
         creep_mm: 0.3,
         creep_mm_per_mm: 0.0,
     };
-    let found = NeedleFit::of(&recorded(banded, 0.01), &NOISE).unwrap().torsion;
+    let found = NeedleFit::of(&recorded(banded, 0.01), name, &NOISE).unwrap().torsion;
     let TorsionConfig { half_width_rad, half_width_rad_per_mm, offset_rad, creep_mm, .. } =
         found.torsion;
     assert!((half_width_rad - 0.3).abs() < 0.01, "{found:?}");
@@ -101,16 +106,14 @@ fn the_band_of_a_known_needle_is_found() {
 #[test]
 fn insertions_that_determine_no_needle_are_refused() {
     let mut rows = recorded(CREEPING, 0.0);
-    let message = |rows: &[Vec<PosedRow>]| NeedleFit::of(rows, &NOISE).unwrap_err().to_string();
+    let message =
+        |rows: &[Vec<PosedRow>]| NeedleFit::of(rows, name, &NOISE).unwrap_err().to_string();
     assert_eq!(
         message(&rows[..2]),
         "needle: 2 insertions, at least 3 needed: their scatter gives the standard errors"
     );
     rows[1].truncate(100);
-    assert_eq!(
-        message(&rows),
-        "needle: insertion 2 is 5.0 mm deep, at least 20 needed; leave it out"
-    );
+    assert_eq!(message(&rows), "needle: b.csv is 5.0 mm deep, at least 20 needed; leave it out");
     let mut shallow = recorded(CREEPING, 0.0);
     shallow.iter_mut().for_each(|rows| rows.truncate(60));
     assert_eq!(
@@ -120,13 +123,16 @@ fn insertions_that_determine_no_needle_are_refused() {
     let mut huge = recorded(CREEPING, 0.0);
     huge[0][5].rotation_rad = 1e300;
     assert!(
-        message(&huge).contains("insertion 1, line 7: rotation increment"),
+        message(&huge).contains("needle: a.csv, line 7: rotation increment"),
         "{}",
         message(&huge)
     );
     let mut degrees = recorded(CREEPING, 0.0);
     degrees.iter_mut().flatten().for_each(|row| row.rotation_rad = row.rotation_rad.to_degrees());
     assert!(message(&degrees).contains("is rotation_rad in rad"), "{}", message(&degrees));
+    let mut mirrored = recorded(CREEPING, 0.0);
+    mirrored.iter_mut().flatten().for_each(|row| row.rotation_rad = -row.rotation_rad);
+    assert!(message(&mirrored).contains("rotation_rad in rad"), "{}", message(&mirrored));
     for rows in &mut rows {
         for row in rows {
             row.orientation = Rotation3::identity();
@@ -181,7 +187,7 @@ fn few_insertions_do_not_look_more_alike_than_they_are() {
 
 #[test]
 fn a_fit_that_no_needle_has_is_refused() {
-    let fit = NeedleFit::of(&recorded(CREEPING, 0.0), &NOISE).unwrap().torsion;
+    let fit = NeedleFit::of(&recorded(CREEPING, 0.0), name, &NOISE).unwrap().torsion;
     assert_eq!(fit.fault(), None);
     let wide = TorsionConfig { half_width_rad: 111.5, ..CREEPING };
     let why = "the torsion fits with half_width_deg = 6388.5 (limits 0 to 720)";

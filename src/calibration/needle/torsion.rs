@@ -3,7 +3,7 @@
 use super::insertion::{ENTRY_MM, RecordedInsertion};
 use super::{CalibrationError, Part, jackknife_covariance, needle_error};
 use crate::keys::Range;
-use crate::needle::{NeedleError, Play, Torsion, TorsionConfig};
+use crate::needle::{Play, Torsion, TorsionConfig};
 use nalgebra::{SMatrix, SVector};
 
 /// w₀, w₁, c, L₀, L₁: half-width of the band and its growth with depth, offset, creep and its growth.
@@ -39,7 +39,7 @@ pub struct TorsionFit {
 
 fn undetermined() -> CalibrationError {
     needle_error(
-        "the insertions do not determine the shaft's torsion: is rotation_rad in rad, are the rows in their order, \
+        "the insertions do not determine the torsion: is rotation_rad in rad, its sign right, are the rows in order, \
          and does the base turn both ways, by more than the tip lags, at several depths?",
     )
 }
@@ -55,8 +55,9 @@ fn config(p: &Parameters) -> TorsionConfig {
 }
 
 /// Roll predicted by the torsion `p` minus the recorded roll, at each row of `insertion`.
-fn residuals(insertion: &RecordedInsertion, p: &Parameters) -> Result<Vec<f64>, NeedleError> {
-    let torsion = Torsion::new(config(p))?;
+fn residuals(insertion: &RecordedInsertion, p: &Parameters) -> Result<Vec<f64>, CalibrationError> {
+    // A fit that runs away finds no needle.
+    let torsion = Torsion::new(config(p)).map_err(|_| undetermined())?;
     let (mut play, mut base_rad, mut tip_rad) = (Play::default(), 0.0, 0.0);
     let mut residuals = Vec::with_capacity(insertion.steps.len());
     for step in &insertion.steps {
@@ -78,7 +79,7 @@ struct Linearised {
 }
 
 impl Linearised {
-    fn at(p: &Parameters, insertion: &RecordedInsertion) -> Result<Self, NeedleError> {
+    fn at(p: &Parameters, insertion: &RecordedInsertion) -> Result<Self, CalibrationError> {
         let residuals_at_p = residuals(insertion, p)?;
         let mut columns = Vec::with_capacity(PARAMETERS);
         for (k, &step) in DERIVATIVE_STEP.iter().enumerate() {
@@ -158,7 +159,7 @@ impl TorsionFit {
     fn fit(insertions: &[RecordedInsertion], has_band: bool) -> Result<Self, CalibrationError> {
         let linearise = |p: &Parameters| {
             let parts = insertions.iter().map(|insertion| Linearised::at(p, insertion));
-            parts.collect::<Result<Vec<_>, _>>().map_err(needle_error)
+            parts.collect::<Result<Vec<_>, _>>()
         };
         let cost = |parts: &[Linearised]| parts.iter().map(|part| part.cost).sum();
         let mut p = Parameters::from(START);
@@ -217,7 +218,7 @@ impl TorsionFit {
         let spread = (offsets.map(|off| off * off).sum::<f64>() / (n - 1.0)).sqrt();
         let mut count = 0;
         for insertion in insertions {
-            count += residuals(insertion, &p).map_err(needle_error)?.len();
+            count += residuals(insertion, &p)?.len();
         }
         let squares: f64 = parts.iter().map(|part| part.cost).sum();
         Ok(TorsionFit {

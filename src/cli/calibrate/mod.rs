@@ -8,7 +8,7 @@ pub(super) mod tracker;
 
 use self::recordings::{collect_fiducials, record_turn};
 use super::arguments::{Configured, number_in, text_of};
-use super::output::{merged, print_stderr, print_stdout, refuse_existing, write_new};
+use super::output::{merged, print_stderr, print_stdout, refuse_unwritable, write_new};
 use super::records::{Insertion, Insertions};
 use super::{Failure, Result};
 use crate::archive::sha256_hex;
@@ -26,11 +26,17 @@ use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::time::SystemTime;
 
-/// Student's t for a two-sided 95% interval, by the number of insertions from 3 on: standard errors from so few
-/// are themselves uncertain.
-const STUDENT_T_95: [f64; 8] = [4.3, 3.2, 2.8, 2.6, 2.4, 2.4, 2.3, 2.3];
-/// The same for more insertions than the table has.
-const STUDENT_T_95_MANY: f64 = 2.2;
+/// Student's t for a two-sided 95% interval from so many insertions, at least 3: standard errors from a few are
+/// themselves uncertain.
+fn student_t_95(insertions: usize) -> f64 {
+    const FROM_3: [f64; 8] = [4.3, 3.2, 2.8, 2.6, 2.4, 2.4, 2.3, 2.3];
+    match insertions {
+        ..=10 => FROM_3[insertions.saturating_sub(3)],
+        11..=14 => 2.2,
+        15..=28 => 2.1,
+        29.. => 2.0,
+    }
+}
 
 /// Default limit of the RMS distance from the circle, mm.
 const RMS_MAX_MM: f64 = 0.5;
@@ -120,9 +126,9 @@ pub(super) fn calibrate(calibration: &Calibration) -> Result<()> {
 }
 
 impl Output {
-    /// Refuses a file that exists, before anything is measured.
-    pub(super) fn refuse_existing(&self) -> Result<()> {
-        refuse_existing(self.out.as_deref())
+    /// Refuses a file that exists, or that cannot be written, before anything is measured.
+    pub(super) fn refuse_unwritable(&self) -> Result<()> {
+        refuse_unwritable(self.out.as_deref())
     }
 
     /// Writes the result: `json` for programs, and two templates for the values of `json` and `more`: the
@@ -131,15 +137,22 @@ impl Output {
     fn write(&self, json: &Value, more: Shown, summary: &str, toml: Option<&str>) -> Result<()> {
         let show = |template| screen(template, json, more.clone()).map_err(Failure::environment);
         print_stderr(show(summary)?);
-        match (toml, &self.out) {
-            (Some(toml), Some(path)) => write_new(path, &(show(toml)? + "\n"))?,
-            (Some(toml), None) if !self.json => print_stdout(show(toml)?)?,
-            (Some(_), None) => {}
-            (None, _) => print_stderr(
-                "rehearsal   emulated drives and tracker: no calibration of the rig, nothing is written",
-            ),
+        if self.json {
+            print_stdout(json)?;
         }
-        if self.json { print_stdout(json) } else { Ok(()) }
+        let Some(toml) = toml else {
+            print_stderr(
+                "rehearsal   emulated drives and tracker: no calibration of the rig, nothing is written",
+            );
+            return Ok(());
+        };
+        let toml = show(toml)?;
+        let written = self.out.as_deref().map(|path| write_new(path, &format!("{toml}\n")));
+        // A result that cannot be written is not lost.
+        if !self.json && !matches!(written, Some(Ok(()))) {
+            print_stdout(toml)?;
+        }
+        written.unwrap_or(Ok(()))
     }
 }
 
@@ -171,7 +184,7 @@ fn angles_json(rotation: &Rotation3<f64>) -> Value {
 
 /// Curvature, bevel zero, sensor tilt and torsion from insertions.
 fn needle(insertions: &Insertions, output: &Output) -> Result<()> {
-    output.refuse_existing()?;
+    output.refuse_unwritable()?;
     let (config, insertions) = insertions.read(None)?;
     if let Some(Insertion { path, .. }) = insertions.iter().find(|run| run.is_rehearsal) {
         let why = "a rehearsal, whose needle is emulated: calibrate from runs on the rig";
@@ -179,7 +192,9 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<()> {
     }
     let posed_rows = insertions.iter().map(posed_rows).collect::<Result<Vec<_>, _>>()?;
     check_roll(&insertions)?;
-    let fit = NeedleFit::of(&posed_rows, &config.path_noise()).map_err(Failure::configuration)?;
+    let name = |index: usize| insertions[index].path.display().to_string();
+    let fit = NeedleFit::of(&posed_rows, name, &config.path_noise());
+    let fit = fit.map_err(Failure::configuration)?;
     let mut file = insertions[0].path.display().to_string();
     if insertions.len() > 1 {
         file += &format!(" and {} more", insertions.len() - 1);
@@ -206,7 +221,7 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<()> {
             "bend_axis": <[f64; 3]>::from(fit.bend.bend_axis),
         },
     });
-    let student_t = STUDENT_T_95.get(fit.insertions - 3).unwrap_or(&STUDENT_T_95_MANY);
+    let student_t = student_t_95(fit.insertions);
     let more = context! { student_t, overlay => to_toml(&overlay)? };
     let toml = Some(include_str!("needle.toml"));
     output.write(&overlay, more, include_str!("needle.txt"), toml)
@@ -243,6 +258,7 @@ fn check_roll(insertions: &[Insertion]) -> Result<()> {
             RecordedRoll::Unknown { .. } if !has_any_roll => {
                 "turn the base by more while inserting"
             }
+            RecordedRoll::Otherwise { .. } => return Err(Failure::bad_input(path, roll)),
             _ => continue,
         };
         return Err(Failure::bad_input(path, format_args!("{roll}; {next}")));
@@ -265,7 +281,7 @@ fn torsion_json(torsion: &TorsionConfig) -> Value {
 fn registration(arguments: &RegistrationArguments) -> Result<()> {
     let path = &arguments.file;
     let config = arguments.configured.load(None)?;
-    arguments.output.refuse_existing()?;
+    arguments.output.refuse_unwritable()?;
     if arguments.collect {
         collect_fiducials(path, &arguments.configured)?;
     }
@@ -307,7 +323,7 @@ fn tip(arguments: &TipArguments) -> Result<()> {
             "--rehearse writes no calibration, since its needle and tracker are emulated: leave --out out",
         ));
     }
-    arguments.output.refuse_existing()?;
+    arguments.output.refuse_unwritable()?;
     let (text, noise_sd_mm) = match arguments.run {
         true => record_turn(path, &arguments.configured, arguments.rehearse)?,
         false if arguments.configured.is_given() => {

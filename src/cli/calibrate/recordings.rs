@@ -5,7 +5,7 @@
 use crate::calibration::{FiducialPair, RegistrationFit};
 use crate::cli::arguments::Configured;
 use crate::cli::ending::status;
-use crate::cli::output::{print_stderr, refuse_existing, write_new};
+use crate::cli::output::{print_stderr, refuse_unwritable, write_new};
 use crate::cli::perform::Options;
 use crate::cli::records::{RunMeasurements, position_at, read_run};
 use crate::cli::stage::{load_stage, perform, sensor_off_axis};
@@ -221,7 +221,7 @@ pub(super) fn record_turn(
     rehearse: bool,
 ) -> Result<(String, f64)> {
     // A rehearsal does not write it.
-    refuse_existing(Some(path).filter(|_| !rehearse))?;
+    refuse_unwritable(Some(path).filter(|_| !rehearse))?;
     let configured = configured.clone().rehearsed(rehearse);
     let (mut config, _) = load_stage(configured, rehearse, sensor_off_axis)?;
     let mut rows = Vec::new();

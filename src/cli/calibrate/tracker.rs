@@ -41,7 +41,7 @@ pub(in crate::cli) struct Arguments {
 }
 
 pub(super) fn calibrate(arguments: &Arguments) -> Result<()> {
-    arguments.output.refuse_existing()?;
+    arguments.output.refuse_unwritable()?;
     let path = &arguments.file;
     let config = arguments.configured.load(None)?;
     let text = text_of(path)?;
@@ -62,7 +62,7 @@ pub(in crate::cli) struct RestArguments {
 }
 
 pub(in crate::cli) fn rest(arguments: &RestArguments) -> Result<()> {
-    arguments.output.refuse_existing()?;
+    arguments.output.refuse_unwritable()?;
     let mut listener = listen(&arguments.configured, false)?;
     let source = source_label(&listener.config);
     print_stderr(format_args!(

@@ -5,7 +5,7 @@ mod picture;
 use self::picture::picture;
 use super::arguments::Configured;
 use super::mask::mask_reader;
-use super::output::{print_result, refuse_existing, write_new};
+use super::output::{print_result_despite, refuse_unwritable, write_new};
 use super::{Result, STOPPED, finish_with};
 use crate::geometry::FixedAngles;
 use crate::plan::{
@@ -35,13 +35,15 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn plan(arguments: &Arguments) -> Result<()> {
-    refuse_existing(arguments.out.as_deref())?;
+    refuse_unwritable(arguments.out.as_deref())?;
     let (config, _) = arguments.configured.load_with_warnings()?;
     let (world, problem) = config.to_plan(&mask_reader(arguments.configured.path()))?;
     let begun = Instant::now();
     let answer = solve(&world, &problem);
     let seconds = begun.elapsed().as_secs_f64();
-    let run_path = plan_with_reserve(&world, &problem, config.goal.reserve_mm, &answer);
+    let run_path = config.check_wall(&world, &problem);
+    let run_path = run_path
+        .and_then(|()| plan_with_reserve(&world, &problem, config.goal.reserve_mm, &answer));
     let run_seconds = begun.elapsed().as_secs_f64() - seconds;
     let mut object = to_json(&world, &problem, &answer, seconds);
     let with_obstacles = run_path.as_ref().ok().filter(|_| !world.obstacles.is_empty());
@@ -49,12 +51,13 @@ pub(super) fn plan(arguments: &Arguments) -> Result<()> {
     object["run_seconds"] = json!(answer.path.as_ref().map(|_| run_seconds));
     object["run_refusal"] = json!(run_path.err());
     object["curvature_margin"] = json!(config.goal.curvature_margin());
-    if let Some(path) = &arguments.out {
-        write_new(path, &picture(&world, &problem, &answer)?)?;
-    }
+    let drawn = match &arguments.out {
+        Some(path) => write_new(path, &picture(&world, &problem, &answer)?),
+        None => Ok(()),
+    };
     let has_mask = world.obstacles.iter().any(|obstacle| matches!(obstacle, Obstacle::Mask(_)));
     let text = || screen(include_str!("plan.txt"), &object, context! { has_mask });
-    print_result(arguments.json, &object, text)?;
+    print_result_despite(drawn, arguments.json, &object, text)?;
     finish_with(if answer.status == Status::Plan { 0 } else { STOPPED })
 }
 

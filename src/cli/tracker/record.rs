@@ -4,7 +4,7 @@ use super::listen;
 use crate::archive::tracker_line;
 use crate::cli::arguments::{Configured, number_in};
 use crate::cli::calibrate::tracker::{POSITION, QUATERNION, RECEIVED, STAMP};
-use crate::cli::output::{print_stderr, refuse_existing};
+use crate::cli::output::{print_stderr, refuse_unwritable};
 use crate::cli::{Failure, Result};
 use crate::session::SampleRecord;
 use crate::tracker::Sample;
@@ -86,7 +86,7 @@ impl Recording {
 pub(super) fn record(arguments: &RecordArguments) -> Result<()> {
     let path = &arguments.file;
     let is_csv = path.extension().is_some_and(|ending| ending == "csv");
-    refuse_existing(Some(path))?;
+    refuse_unwritable(Some(path))?;
     let mut listener = listen(&arguments.configured, false)?;
     let gate = listener.config.tracker.to_unregistered_gate();
     let (mut recording, mut written, mut invalid) = (None, 0u64, 0u64);

@@ -175,7 +175,8 @@ fn unknown_torsion_is_not_taken_for_wrong_handedness() {
         stage: &stage,
         goal: &|_| Ok(Ok(None)),
     };
-    let trials = study.run(&[952_217_226_505_735], &|| ()).unwrap();
+    let trials =
+        study.run(&[952_217_226_505_735], &|| std::ops::ControlFlow::Continue(())).unwrap();
     assert_eq!(trials[0].outcome, Outcome::Completed);
 }
 
