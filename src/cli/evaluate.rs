@@ -37,7 +37,7 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<()> {
         match recording.roll() {
             None | Some(RecordedRoll::Turns) => {}
             Some(why) => {
-                print_stderr(format_args!("warning: {}: {why}: no roll is scored", path.display()))
+                print_stderr(format_args!("warning: {}: no roll is scored: {why}", path.display()))
             }
         }
     }

@@ -95,8 +95,8 @@ fn no_roll_is_scored_against_headings_after_a_small_turn() {
     let (posed, heading) = (evaluate("posed.csv"), evaluate("heading.csv"));
     assert!(posed.json()["roll_rms_deg"]["median"].is_f64(), "{}", posed.stdout);
     assert!(heading.json()["roll_rms_deg"]["median"].is_null(), "{}", heading.stdout);
-    let warning = "warning: heading.csv: the base turned by only 115 deg, so the orientations do not show whether \
-                   they turn with it: no roll is scored";
+    let warning = "warning: heading.csv: no roll is scored: the base turned by only 115 deg, so the orientations do \
+                   not show whether they turn with it";
     assert!(heading.stderr.contains(warning), "{}", heading.stderr);
     assert!(!posed.stderr.contains("no roll is scored"), "{}", posed.stderr);
 }
