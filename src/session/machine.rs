@@ -12,6 +12,7 @@ use crate::stage::{Axis, Counters, Stage, StageConfig, StageEvent};
 use crate::tracker::{Event, GateCounts};
 use crate::units::Time;
 use derive_more::Display;
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 /// The stop reason begins with this if the bench itself stalled for longer than [`Machine::stall_max`]. The
@@ -166,6 +167,8 @@ pub trait Machine {
 pub struct Session {
     shell: Shell,
     task: Box<dyn Task>,
+    /// How often the CAN controller has warned, by the words of the warning.
+    bus_warnings: BTreeMap<String, u64>,
 }
 
 impl Session {
@@ -183,7 +186,8 @@ impl Session {
 
     /// `task` on `stage`, begun at `now`.
     pub(crate) fn begin(stage: Stage, config: StageConfig, task: Box<dyn Task>, now: Time) -> Self {
-        let mut session = Session { shell: Shell::new(stage, config, now), task };
+        let mut session =
+            Session { shell: Shell::new(stage, config, now), task, bus_warnings: BTreeMap::new() };
         session.shell.record(Record::Begun { time: now });
         session.shell.enter(State::Preparing);
         session.task.begin(&mut session.shell);
@@ -195,6 +199,20 @@ impl Session {
     /// The moves of an operation, one for each axis that moved.
     pub fn moves(&self) -> &[AxisMove] {
         self.task.moves()
+    }
+
+    /// Reports a warning of the CAN controller the 1st, 2nd, 4th, 8th … time: a bad contact gives thousands a
+    /// second. Numbers in it, such as error counters, make no other warning of it.
+    fn report_bus_warning(&mut self, text: String) {
+        let words: String = text.chars().filter(|c| !c.is_ascii_digit()).collect();
+        let count = self.bus_warnings.entry(words).or_default();
+        *count += 1;
+        let text = match *count {
+            1 => text,
+            count if count.is_power_of_two() => format!("{text} ({count} times)"),
+            _ => return,
+        };
+        self.shell.report(Lane::Stage, Severity::Warning, text);
     }
 
     fn permit_power(&mut self) {
@@ -266,7 +284,7 @@ impl Machine for Session {
                 self.task.take_frame(&self.shell, &frame);
             }
             Input::BusFault(reason) => self.shell.stop(format!("can: {reason}")),
-            Input::BusWarning(text) => self.shell.report(Lane::Stage, Severity::Warning, text),
+            Input::BusWarning(text) => self.report_bus_warning(text),
             Input::Tracker(event) => self.task.take_tracker_event(&mut self.shell, event),
             Input::Stop(reason) => self.shell.stop(reason),
             Input::Operator(command) => self.take_operator(command),

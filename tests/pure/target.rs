@@ -162,6 +162,41 @@ fn a_moving_target_is_reached_and_the_run_replays() {
     assert_eq!(replayed.status, 0, "{}", replayed.stdout);
 }
 
+/// It is reached at speed then, and the needle must not stop at once.
+#[test]
+fn a_target_that_comes_toward_the_tip_is_braked_for() {
+    let scratch = Scratch::new();
+    for seed in ["5", "10", "11"] {
+        let said = needle_bench(
+            &scratch,
+            &[
+                "run",
+                &repository("bench-config/target.toml"),
+                "--json",
+                "--quiet",
+                "--set",
+                "goal.tool=TargetToTracker",
+                "--set",
+                "emulator.target_drift_mm_per_mm=[0.0, 0.0, -0.05]",
+                "--set",
+                &format!("emulator.seed={seed}"),
+            ],
+        );
+        assert_eq!(said.json()["plan_status"], "arrived", "{}", said.stderr);
+        assert!(number(&said.json(), "target_error_mm") < 0.5, "{}", said.stdout);
+        let log = std::fs::read_to_string(said.run_dir(&scratch).join("can.log")).unwrap();
+        let targets: Vec<i64> = log
+            .lines()
+            .filter_map(|line| line.split_once(" 201#")?.1.get(4..12))
+            .map(|hex| i64::from(u32::from_str_radix(hex, 16).unwrap().swap_bytes().cast_signed()))
+            .collect();
+        let steps: Vec<i64> = targets.windows(2).map(|pair| pair[1] - pair[0]).collect();
+        let most = steps.windows(2).map(|pair| (pair[1] - pair[0]).abs()).max().unwrap();
+        // 10 mm/s² by the peak of a profile is 5.2 counts a SYNC per SYNC, and the targets are rounded.
+        assert!(targets.len() > 4000 && most <= 7, "seed {seed}: {most} counts");
+    }
+}
+
 #[test]
 fn an_unreachable_target_is_refused_before_power() {
     for (set, reason) in [

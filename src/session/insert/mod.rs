@@ -235,7 +235,13 @@ impl InsertTask {
             return Err(reason);
         }
         let Some(rotation_rad_per_mm) = rotation_cmd_rad_per_mm else {
-            shell.complete();
+            if insertion.profile.is_at_rest() {
+                shell.complete();
+            } else {
+                // A target that comes toward the tip is reached at speed: the needle brakes first.
+                self.progress.depth_mm = insertion.end_at(at.insertion_mm);
+                insertion.steer(0.0);
+            }
             return Ok(());
         };
         if let Some(end_mm) = end_mm {

@@ -293,6 +293,21 @@ fn power_from_another_master_that_the_stop_took_off_is_reported_at_the_end() {
     assert_eq!(at_end.unknown, None);
 }
 
+/// They would fill the record and the screen.
+#[test]
+fn repeated_warnings_of_the_bus_are_counted() {
+    let mut bench = Bench::new(&[]);
+    for n in 0..1000 {
+        let text = format!("bus error; error counters: tx={n}, rx=0");
+        bench.session.handle(bench.now, Input::BusWarning(text));
+    }
+    bench.session.handle(bench.now, Input::BusWarning("error passive".to_owned()));
+    bench.settle();
+    let of = |text: &str| bench.events.iter().filter(|event| event.contains(text)).count();
+    assert_eq!((of("bus error"), of("error passive")), (10, 1));
+    assert_eq!(of("tx=511, rx=0 (512 times)"), 1, "{:?}", bench.events);
+}
+
 /// Else the runtime would take the time since the SYNC for a stall of the bench.
 #[test]
 fn a_late_answer_to_a_sync_makes_nothing_overdue() {
