@@ -15,6 +15,10 @@ use std::time::Duration;
 
 /// Interval at which a drive that does not obey is commanded again by SDO.
 const REPEAT_PERIOD: Duration = Duration::from_millis(100);
+/// A position becomes the first target of an axis if it differs from the one before by at most this part of the
+/// following-error window, or by this many counts: otherwise one of the two readings is wrong, or the axis moves.
+const STEADY_PART: f64 = 0.02;
+const STEADY_COUNTS: f64 = 2.0;
 /// Least interval of the requests by SDO to a drive that sends no TPDO.
 const READ_PERIOD: Duration = Duration::from_millis(30);
 
@@ -201,6 +205,14 @@ impl Stage {
                 "{axis}: not in operation enabled within {timeout_ms} ms (no TPDO1 was heard), check \
                  cable and the drive"
             )
+        } else if let Some(axis) = Axis::BOTH
+            .into_iter()
+            .find(|axis| !self.drives[*axis].is_armed() && !self.is_steady(*axis))
+        {
+            format!(
+                "{axis}: its position still changed from one SYNC to the next after {timeout_ms} ms without a \
+                 target; does the axis move, or is its encoder faulty?"
+            )
         } else if let Some(axis) = first(&|drive| !drive.is_enabled()) {
             let statusword = self.drives[axis].statusword.unwrap_or_default();
             format!(
@@ -237,7 +249,10 @@ impl Stage {
         let both_on = self.drives.all(|drive| {
             matches!(drive.state(), Some(DriveState::SwitchedOn | DriveState::OperationEnabled))
         });
-        if both_on && !self.drives.all(Drive::is_armed) {
+        let is_steady = self.drives.all(|drive| drive.fresh)
+            && Axis::BOTH.into_iter().all(|axis| self.is_steady(axis));
+        self.before_power_counts = PerAxis::from_fn(|axis| self.drives[axis].commanded.counts);
+        if both_on && is_steady && !self.drives.all(Drive::is_armed) {
             for axis in Axis::BOTH {
                 if let Err(limit) = self.drives[axis].arm() {
                     let fault = format!(
@@ -249,6 +264,14 @@ impl Stage {
             }
         }
         self.lead_to_enabled();
+    }
+
+    /// True if the position of `axis`, which has no target yet, is that of the SYNC before.
+    fn is_steady(&self, axis: Axis) -> bool {
+        let (drive, config) = (&self.drives[axis], self.config.axis(axis));
+        let window = config.following_error_window() * config.scale(axis, 0).counts_per_unit();
+        let moved_counts = drive.commanded.counts.abs_diff(self.before_power_counts[axis]) as f64;
+        moved_counts <= STEADY_COUNTS.max(STEADY_PART * window)
     }
 
     /// Sets the controlwords that lead both drives one step on.

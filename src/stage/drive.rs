@@ -37,7 +37,7 @@ pub(super) struct Drive {
     pub(super) purpose: AxisUse,
     /// Scale and limits, once the drive is [armed](Self::arm).
     armed: Option<LimitCheck>,
-    commanded: Commanded,
+    pub(super) commanded: Commanded,
     /// The target for the next SYNC; without one the axis is held.
     pub(super) next_counts: Option<i64>,
     /// RPDO1 as it was sent since the last SYNC.

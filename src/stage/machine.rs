@@ -76,6 +76,8 @@ pub struct Stage {
     faulted: bool,
     /// The bench is silent on purpose, see [`Stage::fall_silent`].
     pub(super) silence_test: Option<SilenceTest>,
+    /// The positions at the last SYNC before power, counts.
+    pub(super) before_power_counts: PerAxis<i64>,
     /// The axes may be given power, see [`Stage::permit_power`].
     pub(super) power_permitted: bool,
     pub(super) counters: Counters,
@@ -131,6 +133,7 @@ impl Stage {
             repeat_due: Time::NEVER,
             faulted: false,
             silence_test: None,
+            before_power_counts: PerAxis::from_fn(|_| 0),
             power_permitted: true,
             counters: Counters::default(),
             flood: FloodWatch::new(now),

@@ -187,3 +187,39 @@ fn drives_enabled_just_as_the_timeout_ends_are_a_fault_that_says_so() {
         "both drives were enabled only as 3000 ms ended; raise stage.enable_timeout_s"
     );
 }
+
+/// It would become a target, and the axis would go there as soon as it has power.
+#[test]
+fn one_wrong_position_as_power_comes_on_moves_no_axis() {
+    for wrong_after in 0..12 {
+        let mut bench = Bench::new(config());
+        bench.until_progress(Progress::Enabling);
+        bench.run_for(Duration::from_millis(10 * wrong_after));
+        bench.rotation.frozen_at = Some(-20 + 2000);
+        bench.run_for(Duration::from_millis(10));
+        bench.rotation.frozen_at = None;
+        bench.until_ready();
+        let enabling = bench.sent.iter().filter_map(|(_, frame)| match frame.data() {
+            [0x0F, 0, target @ ..] if frame.cob_id() == Some(cob::rpdo1(bench.rotation.node)) => {
+                Some(i32::from_le_bytes(target.try_into().expect("4 bytes")))
+            }
+            _ => None,
+        });
+        let targets: Vec<i32> = enabling.collect();
+        assert!(!targets.is_empty() && targets.iter().all(|target| *target == -20), "{targets:?}");
+        assert_eq!(bench.rotation.counts, -20, "{wrong_after}");
+    }
+}
+
+#[test]
+fn an_axis_whose_position_does_not_rest_gets_no_target() {
+    let mut bench = Bench::new(config());
+    bench.until_progress(Progress::Enabling);
+    for n in 0..400 {
+        bench.rotation.frozen_at = Some(-20 + 1500 * (n % 2));
+        bench.run_for(Duration::from_millis(10));
+    }
+    let fault = bench.until_fault();
+    assert!(fault.starts_with("rotation: its position still changed"), "{fault}");
+    assert_eq!(bench.rotation.counts, -20);
+}
