@@ -16,7 +16,8 @@ const SAME_MAX_RAD: f64 = 1e-3;
 const TURNED_RAD: f64 = 2.5;
 /// Orientations turn with the base if they do so by at least this share of it, ...
 const FOLLOWED_SHARE: f64 = 0.3;
-/// ... and after a smaller turn by at least this, rad: a bend of 30 deg about a sensor tilted by 10 deg looks like a roll of 5 deg.
+/// ... and after a smaller turn by at least this, rad: a bend of 30 deg about a sensor tilted by 10 deg looks like a
+/// roll of 5 deg.
 const FOLLOWED_MIN_RAD: f64 = 0.12;
 
 /// One row of a recording, in the recording's own frame.

@@ -8,7 +8,9 @@ pub(super) mod tracker;
 
 use self::recordings::{collect_fiducials, record_turn};
 use super::arguments::{Configured, number_in, text_of};
-use super::output::{merged, print_stderr, print_stdout, refuse_unwritable, write_new};
+use super::output::{
+    merged, print_result_despite, print_stderr, print_stdout, refuse_unwritable, write_new,
+};
 use super::records::{Insertion, Insertions};
 use super::{Failure, Result};
 use crate::archive::sha256_hex;
@@ -137,22 +139,24 @@ impl Output {
     fn write(&self, json: &Value, more: Shown, summary: &str, toml: Option<&str>) -> Result<()> {
         let show = |template| screen(template, json, more.clone()).map_err(Failure::environment);
         print_stderr(show(summary)?);
-        if self.json {
-            print_stdout(json)?;
-        }
-        let Some(toml) = toml else {
+        let toml = toml.map(show).transpose()?;
+        let written = match (&toml, &self.out) {
+            (Some(toml), Some(path)) => write_new(path, &format!("{toml}\n")),
+            _ => Ok(()),
+        };
+        if toml.is_none() {
             print_stderr(
                 "rehearsal   emulated drives and tracker: no calibration of the rig, nothing is written",
             );
-            return Ok(());
-        };
-        let toml = show(toml)?;
-        let written = self.out.as_deref().map(|path| write_new(path, &format!("{toml}\n")));
-        // A result that cannot be written is not lost.
-        if !self.json && !matches!(written, Some(Ok(()))) {
-            print_stdout(toml)?;
         }
-        written.unwrap_or(Ok(()))
+        if self.json {
+            return print_result_despite(written, true, json, || Ok(String::new()));
+        }
+        // A result that cannot be written is not lost.
+        match toml.filter(|_| self.out.is_none() || written.is_err()) {
+            Some(toml) => print_stdout(toml).and(written),
+            None => written,
+        }
     }
 }
 

@@ -123,6 +123,10 @@ impl InsertTask {
                 (None, Some(off)) if self.is_seen(now) => {
                     return Err(format!("tracker: the {lost} is seen again, but {off}; {end}"));
                 }
+                (None, None) if tracker.hold.resume == Resume::Operator && self.is_seen(now) => {
+                    let nobody = "but the operator did not resume (tracker.hold_timeout_s)";
+                    return Err(format!("tracker: the {lost} is seen again, {nobody}; {end}"));
+                }
                 _ => (end, found.as_ref().map_or(first, |(_, trouble)| trouble)),
             }
         } else {
