@@ -291,6 +291,14 @@ impl Insertion {
         self.config.depth_mm
     }
 
+    /// Ends the insertion where braking from now on ends, with no step before that depth. Returns it, mm.
+    pub(crate) fn end_now(&mut self) -> f64 {
+        let depth_mm = self.end_at(0.0);
+        self.next_step = self.next_step.max(self.last_step);
+        self.steer(0.0);
+        depth_mm
+    }
+
     /// Sets the rotation rate from the present set-point on, and lets the needle move on to the
     /// next step, or to the full depth.
     pub(crate) fn steer(&mut self, rotation_rad_per_mm: f64) {
@@ -348,6 +356,32 @@ mod tests {
             let miss = insertion.explain_miss(off_mm).expect("words");
             assert!(miss.ends_with("(limit 0.050, insertion.arrival_mm)"), "{miss}");
         }
+    }
+
+    /// From 5 mm/s the needle brakes over 1.25 mm, with a step of 1 mm on the way; a step there would plan again.
+    #[test]
+    fn an_insertion_that_ends_early_has_one_step_more_where_it_stands() {
+        let sets = ["insertion.speed_mm_per_s=5".to_owned()];
+        let config = Config::from_sources(&[], &sets).unwrap().session().unwrap().insertion;
+        let at = SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 };
+        let mut insertion = Insertion::new(config, at, at);
+        insertion.is_seen = true;
+        let period = Duration::from_millis(10);
+        let (mut ends_mm, mut last_mm) = (None, Vec::new());
+        for k in 0..2000_u32 {
+            let depth_mm = insertion.profile.position_mm();
+            if let Some(due) = insertion.take_due_step(Time::ZERO + period * k, depth_mm) {
+                match ends_mm {
+                    Some(_) => last_mm.push((due.is_last, depth_mm)),
+                    None if due.step == 20 => ends_mm = Some(insertion.end_now()),
+                    None => insertion.steer(0.0),
+                }
+            }
+            insertion.advance(period);
+        }
+        let ends_mm = ends_mm.expect("step 20");
+        assert!((21.2..21.3).contains(&ends_mm), "{ends_mm}");
+        assert!(matches!(last_mm[0], (true, mm) if (mm - ends_mm).abs() < 2e-3), "{last_mm:?}");
     }
 
     /// At 1 mm a step the needle stands for longer than it moves at full speed.

@@ -166,7 +166,7 @@ fn a_moving_target_is_reached_and_the_run_replays() {
 #[test]
 fn a_target_that_comes_toward_the_tip_is_braked_for() {
     let scratch = Scratch::new();
-    for seed in ["5", "10", "11"] {
+    for (seed, speed) in [("5", "2"), ("10", "2"), ("11", "2"), ("6", "6")] {
         let said = needle_bench(
             &scratch,
             &[
@@ -180,6 +180,8 @@ fn a_target_that_comes_toward_the_tip_is_braked_for() {
                 "emulator.target_drift_mm_per_mm=[0.0, 0.0, -0.05]",
                 "--set",
                 &format!("emulator.seed={seed}"),
+                "--set",
+                &format!("insertion.speed_mm_per_s={speed}"),
             ],
         );
         assert_eq!(said.json()["plan_status"], "arrived", "{}", said.stderr);
@@ -193,7 +195,7 @@ fn a_target_that_comes_toward_the_tip_is_braked_for() {
         let steps: Vec<i64> = targets.windows(2).map(|pair| pair[1] - pair[0]).collect();
         let most = steps.windows(2).map(|pair| (pair[1] - pair[0]).abs()).max().unwrap();
         // 10 mm/s² by the peak of a profile is 5.2 counts a SYNC per SYNC, and the targets are rounded.
-        assert!(targets.len() > 4000 && most <= 7, "seed {seed}: {most} counts");
+        assert!(targets.len() > 1000 && most <= 7, "seed {seed}: {most} counts");
     }
 }
 

@@ -235,12 +235,10 @@ impl InsertTask {
             return Err(reason);
         }
         let Some(rotation_rad_per_mm) = rotation_cmd_rad_per_mm else {
-            if insertion.profile.is_at_rest() {
-                shell.complete();
-            } else {
-                // A target that comes toward the tip is reached at speed: the needle brakes first.
-                self.progress.depth_mm = insertion.end_at(at.insertion_mm);
-                insertion.steer(0.0);
+            // A target that comes toward the tip is reached at speed: the needle brakes first.
+            match due.is_last || insertion.profile.is_at_rest() {
+                true => shell.complete(),
+                false => self.progress.depth_mm = insertion.end_now(),
             }
             return Ok(());
         };
