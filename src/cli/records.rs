@@ -151,7 +151,10 @@ pub(super) fn read_run(path: &Path) -> Result<RunMeasurements> {
         Failure::bad_input(path, format_args!("{}: {started_utc:?} is no time", file::MANIFEST))
     })?;
     let lines = |name: &str| {
-        let failed = |error| Failure::io(&path.join(name), error);
+        let failed = |error: io::Error| match error.kind() {
+            io::ErrorKind::NotFound => Failure::bad_input(&path.join(name), error),
+            _ => Failure::io(&path.join(name), error),
+        };
         folder.lines(name).and_then(Iterator::collect::<io::Result<Vec<_>>>).map_err(failed)
     };
     let (frames, samples) = (lines(file::CAN)?, lines(file::TRACKER)?);
@@ -294,14 +297,17 @@ fn rows(
     registration: &Registration,
     samples: Vec<RecordedSample>,
 ) -> Vec<RecordedRow> {
-    let mut rows: Vec<RecordedRow> = Vec::new();
+    let (mut rows, mut start_mm) = (Vec::<RecordedRow>::new(), None);
     for RecordedSample { line, acquisition_time, received } in samples {
         let Some(measured) = acquisition_time.and_then(|time| position_at(stage, time)) else {
             continue;
         };
-        let next_mm =
-            rows.last().map_or(f64::NEG_INFINITY, |row| row.insertion_meas_mm + ROWS_APART_MM);
-        if measured.insertion_mm < next_mm {
+        let start_mm = *start_mm.get_or_insert(measured.insertion_mm);
+        let before_mm = rows.last().map_or(start_mm, |row| row.insertion_meas_mm);
+        if rows.len() < 2 && measured.insertion_mm < start_mm + ROWS_APART_MM {
+            // While the bench waits the tip may move: the insertion begins where it was last.
+            rows.clear();
+        } else if measured.insertion_mm < before_mm + ROWS_APART_MM {
             continue;
         }
         let Ok(position_meas_mm) = registration.tip_mm(&received) else { continue };
@@ -334,6 +340,25 @@ mod tests {
         let sample = RecordedSample { line: 4, acquisition_time: Some(receive_time), received };
         let rows = rows(&[at(0.0, 0.0), at(2.0, 4.0)], &registration, vec![sample]);
         assert_eq!((rows[0].line, rows[0].insertion_meas_mm), (4, 2.0));
+    }
+
+    /// The tip is moved by 5 mm before the needle is inserted.
+    #[test]
+    fn an_insertion_begins_at_the_last_position_before_it() {
+        let at = |s: f64, insertion_mm: f64| {
+            (Time::from_secs_f64(s), SetPoint { insertion_mm, rotation_rad: 0.0 })
+        };
+        let stage = [at(0.0, 0.0), at(2.0, 0.0), at(3.0, 1.0)];
+        let sample = |line: usize, s: f64, x_mm: f64| RecordedSample {
+            line,
+            acquisition_time: Some(Time::from_secs_f64(s)),
+            received: Sample::valid("Tip", Vector3::x() * x_mm),
+        };
+        // Then a position each 0.03 mm.
+        let begun = (3..=22).map(|n| sample(n, 2.0 + 0.03 * (n - 2) as f64, 5.0));
+        let samples = [sample(1, 0.5, 0.0), sample(2, 1.5, 5.0)].into_iter().chain(begun);
+        let rows = rows(&stage, &Registration::new(Pose::identity()), samples.collect());
+        assert_eq!((rows[0].line, rows[0].position_meas_mm.x, rows.len()), (3, 5.0, 10));
     }
 
     #[test]

@@ -60,7 +60,8 @@ pub fn positions_at_sync(
             (sync_us, seen) = (Some(unix_us), PerAxis::from_fn(|_| None));
         }
         for axis in Axis::BOTH {
-            seen[axis] = axes[axis].take(&frame).or(seen[axis]);
+            let reading = axes[axis].take(&frame);
+            seen[axis] = seen[axis].or(reading);
         }
         if let (Some(insertion_mm), Some(rotation_rad)) = (seen.insertion, seen.rotation)
             && let Some(sync_us) = sync_us.take()
@@ -172,8 +173,8 @@ mod tests {
             (1, insertion, 900),
             (10, cob::SYNC, 0),
             (11, insertion, 1000),
-            (12, rotation, 7),
-            (13, insertion, 5000),
+            (12, insertion, 5000),
+            (13, rotation, 7),
             (20, cob::SYNC, 0),
             (21, rotation, 7),
             (30, cob::SYNC, 0),
