@@ -20,7 +20,7 @@ impl Mask {
     /// The most voxels that a mask may have: 256 in each direction.
     pub const VOXELS_MAX: usize = 1 << 24;
     /// A smaller voxel is not in mm.
-    const SPACING_MM: RangeInclusive<f64> = 0.01..=100.0;
+    const SPACING_MM: RangeInclusive<f32> = 0.01..=100.0;
 
     /// The mask of `size` voxels, `spacing_mm` apart. `occupied` tells which voxels are occupied, with the first
     /// coordinate running fastest. `x_pg` is the pose of the grid in the plane frame.
@@ -68,9 +68,10 @@ impl Mask {
                 "the mask has {x} x {y} x {z} voxels, allowed: 1 to {max} in all; crop or resample it"
             ));
         }
-        if !spacing_mm.iter().all(|mm| Self::SPACING_MM.contains(mm)) {
-            // The header has single precision.
-            let [x, y, z] = <[f64; 3]>::from(*spacing_mm).map(|mm| mm as f32);
+        // The header has single precision.
+        let sides_mm = <[f64; 3]>::from(*spacing_mm).map(|mm| mm as f32);
+        if !sides_mm.iter().all(|mm| Self::SPACING_MM.contains(mm)) {
+            let [x, y, z] = sides_mm;
             return Err(format!(
                 "the mask's voxels are {x:?} x {y:?} x {z:?} mm, allowed: {} to {}; set pixdim in its header, in mm",
                 Self::SPACING_MM.start(),
@@ -249,6 +250,13 @@ mod tests {
         let mask =
             Mask::new([2, 2, 2], Vector3::repeat(1.0), &[false; 8], &Pose::identity()).unwrap();
         assert!(mask.distance_mm(&Vector3::zeros()) > 1e5);
+    }
+
+    #[test]
+    fn the_smallest_and_the_largest_voxels_are_allowed() {
+        for mm in [0.01f32, 100.0] {
+            assert_eq!(Mask::voxel_count([2; 3], &Vector3::repeat(mm.into())), Ok(8));
+        }
     }
 
     #[test]

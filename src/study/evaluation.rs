@@ -334,7 +334,12 @@ mod tests {
     #[test]
     fn orientations_that_turn_otherwise_than_the_base_are_not_scored() {
         let r_sb = mount(Vector3::z(), Vector3::x()).unwrap();
-        for (factor, share) in [(-1.0, -1.5..-0.5), (57.3, -0.2..0.2)] {
+        for (factor, share) in [
+            (-1.0, -1.5..-0.5),
+            (57.3, -0.2..0.2),
+            (0.5, 1.8..2.5),
+            (std::f64::consts::TAU.recip(), 5.0..7.0),
+        ] {
             let mut recording = recording(&r_sb);
             recording.rows.iter_mut().for_each(|row| row.rotation_meas_rad *= factor);
             match recording.roll() {

@@ -16,6 +16,8 @@ const SAME_MAX_RAD: f64 = 1e-3;
 const TURNED_RAD: f64 = 2.5;
 /// Orientations turn with the base if they do so by at least this share of it, ...
 const FOLLOWED_SHARE: f64 = 0.3;
+/// ... and by at most this: no shaft turns the tip more than the base, and the noise of a small turn is averaged.
+const FOLLOWED_MAX: f64 = 1.8;
 /// ... and after a smaller turn by at least this, rad: a bend of 30 deg about a sensor tilted by 10 deg looks like a
 /// roll of 5 deg.
 const FOLLOWED_MIN_RAD: f64 = 0.12;
@@ -123,12 +125,14 @@ impl Recording {
         Some(match base_rad > TURNED_RAD {
             _ if is_fixed => RecordedRoll::DoesNotTurn,
             true if largest_rad < 0.5 * TURNED_RAD => RecordedRoll::DoesNotTurn,
-            true if share < FOLLOWED_SHARE => RecordedRoll::Otherwise { share },
+            true if !(FOLLOWED_SHARE..=FOLLOWED_MAX).contains(&share) => {
+                RecordedRoll::Otherwise { share }
+            }
             true => RecordedRoll::Turns,
             false if share.abs() < FOLLOWED_SHARE || share.abs() * base_rad < FOLLOWED_MIN_RAD => {
                 RecordedRoll::Unknown { base_rad }
             }
-            false if share < 0.0 => RecordedRoll::Otherwise { share },
+            false if !(0.0..=FOLLOWED_MAX).contains(&share) => RecordedRoll::Otherwise { share },
             false => RecordedRoll::Turns,
         })
     }
