@@ -86,7 +86,7 @@ impl InsertTask {
         shell.enter(self.tracking.state(shell.now));
     }
 
-    /// Refuses an insertion that would run into a soft limit, before the axes have power.
+    /// Refuses an insertion from here that would run into a soft limit.
     fn check_depth(&self, shell: &Shell, at: SetPoint) -> Result<(), String> {
         let depth_mm = self.config.insertion.depth_mm;
         let end = SetPoint { insertion_mm: at.insertion_mm + depth_mm, ..at };
@@ -136,6 +136,8 @@ impl InsertTask {
             return Ok(());
         }
         let (measured, held) = (feedback.measured, feedback.commanded);
+        // The axes may have been moved by hand since they were located.
+        self.check_depth(shell, held)?;
         let mut insertion = Insertion::new(self.config.insertion, measured, held);
         match &self.hold {
             None => shell.enter(State::Inserting),

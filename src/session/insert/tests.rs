@@ -24,6 +24,8 @@ struct Bench {
     behind_mm: Option<f64>,
     /// RPDO1 and SDO requests do not reach the insertion drive.
     is_deaf: bool,
+    /// By how many counts the insertion axis was moved by hand.
+    moved_counts: i32,
     events: Vec<String>,
     steps: Vec<StepRecord>,
 }
@@ -44,6 +46,7 @@ impl Bench {
             samples: 0,
             behind_mm: None,
             is_deaf: false,
+            moved_counts: 0,
             events: Vec::new(),
             steps: Vec::new(),
         }
@@ -56,6 +59,7 @@ impl Bench {
                     Output::Transmit { frame, .. } => {
                         let is_lost = matches!(frame.cob_id(), Some(0x201 | 0x601));
                         if !(self.is_deaf && is_lost) {
+                            let frame = moved(&frame, 0x201, -self.moved_counts);
                             self.stage.handle_frame(self.now, &frame);
                         }
                     }
@@ -66,6 +70,7 @@ impl Bench {
             }
             match self.stage.poll() {
                 Some(StageOutput::Frame(frame)) => {
+                    let frame = moved(&frame, 0x181, self.moved_counts);
                     self.session.handle(self.now, Input::Frame(frame));
                 }
                 Some(_) => {}
@@ -142,6 +147,18 @@ impl Bench {
     }
 }
 
+/// The frame with the position in it, which follows the status- or controlword, moved; `frame` itself if it has
+/// another COB-ID.
+fn moved(frame: &Frame, cob_id: u16, counts: i32) -> Frame {
+    match *frame.data() {
+        [a, b, ref position @ ..] if frame.cob_id() == Some(cob_id) => {
+            let position = i32::from_le_bytes(position.try_into().unwrap()) + counts;
+            Frame::new(cob_id, &[&[a, b], &position.to_le_bytes()[..]].concat())
+        }
+        _ => *frame,
+    }
+}
+
 const CONFIGURED: &str = "both drives are configured";
 const ENABLING: &str = "enabling both axes";
 const TARGET: &str = "TargetToTracker";
@@ -210,6 +227,20 @@ fn a_start_that_has_moved_out_of_reach_begins_no_insertion() {
         let had_power = bench.events.iter().any(|text| text.contains(ENABLING));
         assert_eq!(had_power, is_powered, "{:?}", bench.events);
     }
+}
+
+/// The bench waits for the tip meanwhile.
+#[test]
+fn an_axis_that_was_moved_by_hand_begins_no_insertion_past_its_limit() {
+    let mut bench = Bench::new(&["insertion.depth_mm=300"]);
+    bench.run_until(CONFIGURED);
+    bench.moved_counts = 12 * 4646;
+    bench.next_sample = bench.now;
+    let reason = bench.reason();
+    let expected =
+        "stage: insertion: 312.000 mm is over the limit of 310.000 mm (stage.insertion.max_mm)";
+    assert!(reason.starts_with(expected), "{reason}");
+    assert!(bench.steps.is_empty());
 }
 
 /// The mean of the positions is within reach, but the tip is not: it has gone on since.
