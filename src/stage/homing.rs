@@ -5,7 +5,7 @@ use super::limits::SPEED;
 use super::machine::Phase;
 use super::{Axis, Stage, StageEvent};
 use crate::canopen::cia402::{Controlword, Statusword};
-use crate::keys::{choice, over, section, within};
+use crate::keys::{Rule, choice, over, section, within};
 use crate::units::Time;
 use std::time::Duration;
 
@@ -45,8 +45,8 @@ section! {
         /// until the axis stands one second after the start.
         timeout as "timeout_s": Duration [within(2.0, 3600.0)];
         /// The statusword bit that says that the axis is homed: 12 by the standard (valid only in homing
-        /// mode), 15 on some drives.
-        homed_bit: u8 [within(8.0, 15.0)];
+        /// mode), or one that the standard leaves to the maker (15 on some drives).
+        homed_bit: u8 [Rule::Integers(&[8, 12, 14, 15])];
     }
 }
 
