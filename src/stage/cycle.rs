@@ -268,10 +268,20 @@ impl Stage {
 
     /// True if the position of `axis`, which has no target yet, is that of the SYNC before.
     fn is_steady(&self, axis: Axis) -> bool {
-        let (drive, config) = (&self.drives[axis], self.config.axis(axis));
+        let counts = self.drives[axis].commanded.counts;
+        self.is_same_place(axis, counts, self.before_power_counts[axis])
+    }
+
+    /// True if `axis`, which has its first target, is no longer there.
+    pub(super) fn is_off_first_target(&self, axis: Axis) -> bool {
+        let drive = &self.drives[axis];
+        !self.is_same_place(axis, drive.commanded.counts, drive.position.counts())
+    }
+
+    fn is_same_place(&self, axis: Axis, a_counts: i64, b_counts: i64) -> bool {
+        let config = self.config.axis(axis);
         let window = config.following_error_window() * config.scale(axis, 0).counts_per_unit();
-        let moved_counts = drive.commanded.counts.abs_diff(self.before_power_counts[axis]) as f64;
-        moved_counts <= STEADY_COUNTS.max(STEADY_PART * window)
+        a_counts.abs_diff(b_counts) as f64 <= STEADY_COUNTS.max(STEADY_PART * window)
     }
 
     /// Sets the controlwords that lead both drives one step on.

@@ -42,7 +42,7 @@ pub(super) struct Drive {
     pub(super) next_counts: Option<i64>,
     /// RPDO1 as it was sent since the last SYNC.
     sent_ahead: Option<Frame>,
-    position: Unwrapper,
+    pub(super) position: Unwrapper,
     /// The SYNC after which the newest position came.
     position_sync: u64,
     pub(super) statusword: Option<Statusword>,

@@ -210,6 +210,12 @@ impl Stage {
             format!("following error reported by the drive; target minus position is {off}")
         } else if must_follow && let Some(fault) = drive.following_error_fault() {
             fault
+        } else if enabling && !must_follow && self.is_off_first_target(axis) {
+            let off = axis.shown(drive.following_error());
+            format!(
+                "the axis left its first target before the drive was enabled, target minus position is {off}; \
+                 does it sag, or is it pushed?"
+            )
         } else {
             return;
         };

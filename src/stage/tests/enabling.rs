@@ -198,7 +198,8 @@ fn one_wrong_position_as_power_comes_on_moves_no_axis() {
         bench.rotation.frozen_at = Some(-20 + 2000);
         bench.run_for(Duration::from_millis(10));
         bench.rotation.frozen_at = None;
-        bench.until_ready();
+        // After the axis has its target the wrong position is a fault.
+        bench.run_until(|event| matches!(event, StageEvent::Ready | StageEvent::Fault(_)));
         let enabling = bench.sent.iter().filter_map(|(_, frame)| match frame.data() {
             [0x0F, 0, target @ ..] if frame.cob_id() == Some(cob::rpdo1(bench.rotation.node)) => {
                 Some(i32::from_le_bytes(target.try_into().expect("4 bytes")))
@@ -206,7 +207,8 @@ fn one_wrong_position_as_power_comes_on_moves_no_axis() {
             _ => None,
         });
         let targets: Vec<i32> = enabling.collect();
-        assert!(!targets.is_empty() && targets.iter().all(|target| *target == -20), "{targets:?}");
+        assert!(targets.iter().all(|target| *target == -20), "{targets:?}");
+        assert!(!targets.is_empty() || bench.fault().is_some());
         assert_eq!(bench.rotation.counts, -20, "{wrong_after}");
     }
 }
@@ -222,4 +224,22 @@ fn an_axis_whose_position_does_not_rest_gets_no_target() {
     let fault = bench.until_fault();
     assert!(fault.starts_with("rotation: its position still changed"), "{fault}");
     assert_eq!(bench.rotation.counts, -20);
+}
+
+/// Its brake is still closed, or nothing holds it yet. It would go back at once as the drive is enabled.
+#[test]
+fn an_axis_that_moves_while_its_drive_takes_long_to_enable_is_a_fault() {
+    let mut bench = Bench::new(config());
+    bench.rotation.brake_cycles = 50;
+    bench.until_progress(Progress::Enabling);
+    while !bench.has_sent("202#0F00") {
+        bench.step();
+    }
+    bench.run_for(Duration::from_millis(100));
+    bench.rotation.counts += 2000;
+    let fault = bench.until_fault();
+    assert!(fault.starts_with("rotation: the axis left its first target before"), "{fault}");
+    bench.until_stopped();
+    assert_eq!(bench.rotation.counts, 1980);
+    assert!(!bench.events.contains(&StageEvent::Ready));
 }
