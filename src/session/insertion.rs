@@ -191,8 +191,10 @@ impl Insertion {
     ) -> Result<(), String> {
         let goal_mm = self.profile.goal_mm();
         let (here_mm, settle) = match self.config.mode {
-            // Step 0 waits for a measurement, not for the axis.
-            InsertionMode::Continuous if self.next_step == 0 => return Ok(()),
+            // Step 0 is taken wherever the axis is said to have arrived.
+            InsertionMode::Continuous if self.next_step == 0 => {
+                (self.config.arrival_mm, Duration::ZERO)
+            }
             InsertionMode::Continuous => (DUE_TOLERANCE_MM, Duration::ZERO),
             InsertionMode::Stepwise => (self.config.arrival_mm, self.config.settle),
         };
@@ -222,10 +224,17 @@ impl Insertion {
         let goal_mm = self.step_depth_mm(self.next_step);
         let measurement = match self.config.mode {
             InsertionMode::Continuous => {
-                // Step 0 is taken at rest, with the first measurement.
-                let waiting = self.next_step == 0 && !self.is_seen;
-                let near_enough = self.has_nearly_arrived(time, insertion_meas_mm);
-                if waiting || insertion_meas_mm < goal_mm - DUE_TOLERANCE_MM && !near_enough {
+                let is_due = match self.next_step {
+                    // At rest, with the first measurement.
+                    0 => self.is_seen && self.off_mm(insertion_meas_mm) <= self.config.arrival_mm,
+                    // The needle is never deeper than its set-point: a depth that says so is wrong.
+                    _ => {
+                        let depth_mm = insertion_meas_mm.min(self.profile.position_mm());
+                        depth_mm >= goal_mm - DUE_TOLERANCE_MM
+                            || self.has_nearly_arrived(time, insertion_meas_mm)
+                    }
+                };
+                if !is_due {
                     return None;
                 }
                 self.newest.take()

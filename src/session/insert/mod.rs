@@ -101,9 +101,11 @@ impl InsertTask {
     /// Both drives have answered a SYNC: pair, estimate, decide, command.
     fn take_feedback(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
         let cut_mm = self.history.newest().map_or(f64::NEG_INFINITY, |point| point.insertion_mm);
+        // A wrong reading must not count as cut until the needle is there.
+        let deepest_mm = feedback.commanded.insertion_mm + self.config.insertion.arrival_mm;
         let point = StagePoint {
             time: feedback.time,
-            insertion_mm: feedback.measured.insertion_mm.max(cut_mm),
+            insertion_mm: feedback.measured.insertion_mm.min(deepest_mm).max(cut_mm),
             rotation_rad: feedback.measured.rotation_rad,
         };
         self.history.push(point)?;

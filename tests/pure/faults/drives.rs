@@ -1,11 +1,14 @@
 //! Faults of the drives.
 
 use crate::support::bench::{Bench, configured, is_frame};
+use crate::support::program::{Scratch, needle_bench};
 use crate::support::stop::{Stop, documented, stopped};
 use needle_bench::canopen::cia402::{DriveState, Statusword};
 use needle_bench::canopen::emcy::{Emcy, EmcyCode};
 use needle_bench::canopen::{Frame, NodeId};
 use needle_bench::emulator::fault::{Fault, FaultKind};
+use serde_json::{Value, json};
+use std::fs;
 use std::time::Duration;
 
 const TPDOS: [u16; 2] = [0x181, 0x182];
@@ -216,6 +219,65 @@ fn a_depth_that_is_never_quite_reached() {
         "insertion: stands at 29.9139 mm, 0.0861 mm from the 30.000 mm commanded (limit 0.050), \
          for 2.0 s; does the drive hold its target?",
     );
+}
+
+/// A run of `depth_mm` whose insertion drive once reports a position with bit 3 of this byte wrong, at `at_s`.
+fn wrong_once(scratch: &Scratch, depth_mm: u32, at_s: f64, byte: u8, sets: &[&str]) -> Value {
+    let insertion =
+        format!("insertion={{ depth_mm = {depth_mm}, plane_out_of_reach = \"insert\" }}");
+    let fault = format!(
+        "emulator.fault=[{{ kind = \"corrupt\", at_s = {at_s}, frames = \"pdo\", axis = \"insertion\", \
+         byte = {byte}, mask = 8, count = 1 }}]"
+    );
+    let mut arguments = vec!["run", "--json", "--set", &insertion, "--set", &fault];
+    sets.iter().for_each(|set| arguments.extend(["--set", set]));
+    needle_bench(scratch, &arguments).json()
+}
+
+/// As it begins, by 1.7 µm, and shortly before its end, by 0.44 mm.
+#[test]
+fn one_wrong_depth_neither_blocks_nor_ends_an_insertion() {
+    let scratch = Scratch::new();
+    for (at_s, byte) in [(0.165, 2), (1.625, 3), (1.655, 3)] {
+        let run = wrong_once(&scratch, 3, at_s, byte, &[]);
+        let depth_mm = run["insertion_mm"].as_f64().expect("a number");
+        assert_eq!((&run["outcome"], &run["steps"]), (&json!("completed"), &json!(4)), "{run}");
+        assert!((depth_mm - 3.0).abs() < 0.01, "{run}");
+    }
+}
+
+#[test]
+fn a_wrong_depth_as_the_insertion_begins_stops_it() {
+    let run = wrong_once(&Scratch::new(), 3, 0.165, 3, &[]);
+    let reason = run["stop_reason"].as_str().expect("stopped");
+    assert!(
+        reason.starts_with("insertion: stands at -0.4408 mm, 0.4408 mm from the 0.000"),
+        "{run}"
+    );
+    assert_eq!(run["steps"], 0, "{run}");
+}
+
+/// The tip falls silent, after 120 positions. A wrong depth shortly before is not taken for a depth at which the tip
+/// was seen.
+#[test]
+fn one_wrong_depth_hides_no_blind_insertion() {
+    let scratch = Scratch::new();
+    let seen = wrong_once(&scratch, 8, 100.0, 3, &[]);
+    let run_dir = scratch.path().join(seen["run_dir"].as_str().expect("recorded"));
+    let samples = fs::read_to_string(run_dir.join("tracker.ndjson")).expect("recorded");
+    let first: Vec<&str> = samples.lines().take(120).collect();
+    let file = scratch.write("silent.ndjson", &(first.join("\n") + "\n"));
+    let file = format!("tracker.file=\"{}\"", file.display());
+    let registration = "tracker.registration={ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, \
+                        pitch_deg = 0.0, roll_deg = 0.0 }";
+    let sets = ["tracker.source=ndjson", &file, "tracker.hold_after_s=2", registration];
+    let [without, with] = [100.0, 2.965].map(|at_s| {
+        let run = wrong_once(&scratch, 8, at_s, 3, &sets);
+        let reason = run["stop_reason"].as_str().expect("stopped");
+        assert!(reason.contains("to brake (limit 1.00)"), "{run}");
+        run["insertion_mm"].as_f64().expect("a number")
+    });
+    assert!(with - without < 0.1, "{without} {with}");
 }
 
 /// Clears `bits` in the insertion drive's statusword: the run stops for `reason`.
