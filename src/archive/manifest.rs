@@ -201,7 +201,7 @@ pub struct Manifest {
 #[derive(Debug, Error)]
 pub enum ManifestError {
     /// Not JSON, or a key is missing or wrong.
-    #[error("not a run's manifest: {0}")]
+    #[error("not a run's manifest: {0} (restore it from a copy)")]
     NotAManifest(#[from] serde_json::Error),
     /// Written in the format of another version of the bench.
     #[error(
@@ -214,7 +214,7 @@ pub enum ManifestError {
         version: String,
     },
     /// Edited since it was written.
-    #[error("edited since the bench wrote it: its seal does not fit")]
+    #[error("edited since the bench wrote it: its seal does not fit (restore it from a copy)")]
     Edited,
 }
 
@@ -339,11 +339,17 @@ mod tests {
     fn a_foreign_edited_or_newer_manifest_is_refused_with_the_reason() {
         let text = manifest().to_text().unwrap();
         let cases = [
-            ("{}".to_owned(), "not a run's manifest: missing field `format`"),
-            ("step,time_s".to_owned(), "not a run's manifest: expected value at line 1 column 1"),
+            (
+                "{}".to_owned(),
+                "not a run's manifest: missing field `format` (restore it from a copy)",
+            ),
+            (
+                "step,time_s".to_owned(),
+                "not a run's manifest: expected value at line 1 column 1 (restore it from a copy)",
+            ),
             (
                 text.replace("31.2", "31.3"),
-                "edited since the bench wrote it: its seal does not fit",
+                "edited since the bench wrote it: its seal does not fit (restore it from a copy)",
             ),
             (
                 text.replace("\"format\": 2", "\"format\": 3"),

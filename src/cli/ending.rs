@@ -36,6 +36,10 @@ pub(super) fn ending(config: &Config, report: &RunReport) -> String {
     let mut lines = Vec::new();
     match &report.record {
         Err(error) if report.run_dir.is_none() => lines.push(format!("record      none: {error}")),
+        Err(error) if !run_dir.exists() => lines.push(format!(
+            "record      {dir} is no longer there: {error}; if it was renamed, close it under its new name: \
+             needle-bench review FOLDER --repair"
+        )),
         Err(error) => lines.push(format!(
             "record      {dir}, left open: {error}; close it: needle-bench review {word} --repair"
         )),
@@ -168,7 +172,7 @@ fn next_review(report: &RunReport) -> Option<String> {
 /// The line with the next command, an `operation` of the stage with `options`.
 fn next_stage(operation: &str, options: &str, path: Option<&Path>, report: &RunReport) -> String {
     let recorded = report.run_dir.as_ref().map(|dir| dir.join(file::CONFIG));
-    match path.map(Path::to_path_buf).or(recorded) {
+    match path.map(Path::to_path_buf).or(recorded.filter(|path| path.exists())) {
         Some(path) => {
             let path = shell_word(path.display());
             format!("next        needle-bench stage {operation} {path}{options}")

@@ -296,20 +296,23 @@ impl Job<'_> {
     /// Serves the run to viewers if an address is given, and prints the command that shows it.
     fn serve(&self, recorder: &mut Recorder) -> Result<()> {
         let Some(address) = self.options.live else { return Ok(()) };
-        recorder.serve(address, &scene(self.config)?).map_err(Failure::environment)?;
+        recorder
+            .serve(address, &scene(self.config, self.motion.is_some())?)
+            .map_err(Failure::environment)?;
         print_stderr(format_args!("live        rerun rerun+http://{address}/proxy"));
         Ok(())
     }
 }
 
-/// What the viewer shows for a run of `config` besides its records.
-pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
+/// What the viewer shows for a run of `config` besides its records. A motion must not wait for a mask.
+pub(super) fn scene(config: &Config, is_motion: bool) -> Result<Scene, ConfigError> {
     Ok(Scene {
         x_wp: config.plane,
         insertion_mm: config.insertion.depth_mm,
         curvature_per_mm: config.needle.arc.curvature_per_mm(),
         goal: match config.goal.kind {
             GoalKind::Plane => None,
+            GoalKind::Target if is_motion => config.to_plan(&mask_reader(None)).ok(),
             GoalKind::Target => Some(config.to_plan(&mask_reader(None))?),
         },
         truth: config.knows_truth(),

@@ -99,7 +99,8 @@ pub(super) fn describe(config: Config) -> Describe {
     Box::new(move |manifest| {
         let run_config =
             recorded_run_config(manifest, &config).map_err(|failure| failure.to_string())?;
-        Ok(RecordedRun { run_config, scene: scene(&config)?, config_toml: config.to_toml()? })
+        let scene = scene(&config, manifest.operation.is_some())?;
+        Ok(RecordedRun { run_config, scene, config_toml: config.to_toml()? })
     })
 }
 

@@ -38,8 +38,8 @@ pub(super) struct Arguments {
     /// Write a CSV row for each trial.
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Make each insertion through drives and CAN frames: slower. The result is the same, except that a start is
-    /// also refused if no path leads to the target from the tip's measured position.
+    /// Make each insertion through drives and CAN frames: slower, and with what only those do: gates on the tip's
+    /// positions, whole counts, and a refused start if no path leads to the target from the measured tip.
     #[arg(long)]
     through_session: bool,
     /// Number of threads, by default the number of processors.

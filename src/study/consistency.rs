@@ -9,6 +9,8 @@ use serde::Serialize;
 const FREEDOM: f64 = 6.0;
 /// Degrees of freedom of a position.
 const POSITION_FREEDOM: f64 = 3.0;
+/// Trials that differ by more than bounds of this times the freedom are too different to be judged.
+const SPREAD_MAX: f64 = 10.0;
 /// 95 % of a normal distribution lie within this many standard deviations.
 const WITHIN_95: f64 = 1.96;
 /// The same of Student's t with 1, 2 … degrees of freedom.
@@ -92,7 +94,9 @@ impl Consistency {
             [_] => f64::INFINITY,
             _ => student_95(values.len() - 1) * spread / (values.len() as f64 - 1.0).sqrt(),
         };
-        Self::judge(values, freedom - within, freedom + within)
+        let judged = Self::judge(values, (freedom - within).max(0.0), freedom + within)?;
+        let verdict = judged.verdict.filter(|_| within <= SPREAD_MAX * freedom);
+        Some(Consistency { verdict, ..judged })
     }
 
     fn judge(values: &[f64], lo95: f64, hi95: f64) -> Option<Self> {
@@ -145,6 +149,12 @@ mod tests {
     use crate::geometry::Twist;
     use crate::observer::{Belief, Shaft};
     use nalgebra::{Matrix6, Vector6};
+
+    #[test]
+    fn trials_too_different_to_be_judged_have_no_verdict() {
+        let judged = Consistency::of_innovations(&[1.0, 9000.0, 20.0]).unwrap();
+        assert_eq!((judged.verdict, judged.lo95), (None, 0.0));
+    }
 
     #[test]
     fn one_trial_is_never_judged() {

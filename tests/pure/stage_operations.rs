@@ -479,3 +479,15 @@ fn moves_keep_to_the_acceleration_of_their_axis() {
         assert_eq!((said.status, said.stderr.as_str()), (0, ""), "{operation:?}: {}", said.stdout);
     }
 }
+
+/// Its record has no obstacle, and is complete without.
+#[test]
+fn a_motion_needs_no_mask() {
+    let scratch = Scratch::new();
+    let goal = "[goal]\nkind = \"target\"\nposition_mm = [0, 0, 90]\n[[goal.obstacle]]\nshape = \"mask\"\n\
+                file = \"gone.nii\"\n[goal.obstacle.pose]\nx_mm = 0\ny_mm = 20\nz_mm = 40\n";
+    scratch.write("goal.toml", goal);
+    let said = stage(&scratch, &["jog", "goal.toml", "--axis", "insertion", "--by", "1mm", "-q"]);
+    assert_eq!((said.status, said.stderr.as_str()), (0, ""), "{}", said.screen());
+    assert!(said.stdout.contains("look at it: rerun"), "{}", said.stdout);
+}

@@ -170,6 +170,16 @@ fn a_run_with_the_seed_of_a_trial_repeats_it() {
     }
 }
 
+#[test]
+fn trials_that_were_stopped_have_no_distance() {
+    let sets = ["--set", "study.curvature_error=[-0.9,9]", "--set", DEPTH];
+    let study = ["study", "--trials", "3", "--through-session"];
+    let said = needle_bench(&Scratch::new(), &[&study[..], &sets].concat());
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    let line = "off plane   stopped at the median, stopped at 95%, stopped the worst";
+    assert!(said.stdout.contains(line), "{}", said.stdout);
+}
+
 /// The record has the parameters that were drawn.
 #[test]
 fn the_record_of_a_drawn_run_repeats_it() {

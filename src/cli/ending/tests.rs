@@ -33,11 +33,18 @@ fn a_record_left_open_is_named_with_what_closes_it() {
     let mut report = report(Outcome::Completed, &[]);
     let source = std::io::ErrorKind::NotFound.into();
     report.record = Err(TelemetryError::File { path: "runs/a/manifest.json".into(), source });
-    let text = ending(&Config::from_sources(&[], &[]).unwrap(), &report);
+    let mut said = |run_dir: &str| {
+        report.run_dir = Some(PathBuf::from(run_dir));
+        ending(&Config::from_sources(&[], &[]).unwrap(), &report)
+    };
+    let text = said("src");
     let lines: Vec<&str> = text.lines().collect();
-    assert!(lines[0].starts_with("record      runs/a, left open: "), "{text}");
-    assert!(lines[0].ends_with("; close it: needle-bench review runs/a --repair"), "{text}");
+    assert!(lines[0].starts_with("record      src, left open: "), "{text}");
+    assert!(lines[0].ends_with("; close it: needle-bench review src --repair"), "{text}");
     assert_eq!(lines[1], "completed");
+    let text = said("runs/gone");
+    assert!(text.starts_with("record      runs/gone is no longer there: "), "{text}");
+    assert!(text.contains("needle-bench review FOLDER --repair\ncompleted"), "{text}");
 }
 
 /// A withdrawal goes on without a record, and the command that finishes it has no recorded configuration to name.

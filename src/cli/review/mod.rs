@@ -257,8 +257,8 @@ fn add_verdict(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> R
     // The lock covers reading and writing of the manifest; otherwise two verdicts at once would
     // lose one.
     let Some(_lock) = lock(path).map_err(Failure::environment)? else {
-        let why = "another program is using this record; try again";
-        return Err(Failure::environment(format_args!("{}: {why}", path.display())));
+        let why = "a bench is still writing this record, or another program has it; wait for it";
+        return Err(Failure::bad_input(path, why));
     };
     let (_, Folder { dir, condition, mut manifest, .. }) = read::open(path)?;
     let why = match condition {

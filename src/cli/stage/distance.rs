@@ -45,7 +45,9 @@ impl Distance {
         match axis {
             _ if self.axis != axis => {
                 let unit = axis.unit();
-                Err(format!("the {axis} axis does not move by {self}: give {unit}, as in 10{unit}"))
+                Err(format!(
+                    "{self} is not for the {axis} axis: give {unit}, or {unit}/s for a speed"
+                ))
             }
             Axis::Insertion => Ok(self.value),
             Axis::Rotation => Ok(self.value.to_radians()),
@@ -111,9 +113,9 @@ mod tests {
         assert_eq!(distance(2.0, MM).along(MM), Ok(2.0));
         assert_eq!(distance(180.0, DEG).along(DEG), Ok(std::f64::consts::PI));
         let error = distance(2.0, MM).along(DEG).unwrap_err();
-        assert_eq!(error, "the rotation axis does not move by 2mm: give deg, as in 10deg");
+        assert_eq!(error, "2mm is not for the rotation axis: give deg, or deg/s for a speed");
         let error = distance(2.0, DEG).along(MM).unwrap_err();
-        assert_eq!(error, "the insertion axis does not move by 2deg: give mm, as in 10mm");
+        assert_eq!(error, "2deg is not for the insertion axis: give mm, or mm/s for a speed");
     }
 
     #[test]

@@ -202,7 +202,8 @@ fn a_moved_run_folder_stops_the_run_safely_and_can_be_repaired() {
     assert!(reason.starts_with("stopped: record: run folder: "), "{reason}");
     assert!(reason.contains("No such file"), "{reason}");
     stage.assert_it_stands();
-    assert!(bench.stdout.contains("left open: "), "{}", bench.stdout);
+    assert!(bench.stdout.contains(" is no longer there: "), "{}", bench.stdout);
+    assert!(bench.stdout.contains(", CONFIG and its --set as before"), "{}", bench.stdout);
     repair(&moved);
     assert!(closed(&moved).counts.unwrap().steps > 3);
 }
