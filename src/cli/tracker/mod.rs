@@ -65,11 +65,6 @@ pub(super) fn open_tracker(
     if let Some(replay) = load_replay(tracker, clock.now())? {
         return Ok(Link::replay(replay, &settings, now));
     }
-    if config.tip_source() == TrackerSource::Emulated {
-        return Err(Failure::configuration(
-            "tracker.source = \"emulated\" belongs to can.interface = \"memory\"",
-        ));
-    }
     if tracker.is_standard_input() {
         return Ok(Link::read(std::io::stdin(), "standard input", settings, now));
     }
