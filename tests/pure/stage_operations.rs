@@ -485,7 +485,8 @@ fn moves_keep_to_the_acceleration_of_their_axis() {
 fn a_motion_needs_no_mask() {
     let scratch = Scratch::new();
     let goal = "[goal]\nkind = \"target\"\nposition_mm = [0, 0, 90]\n[[goal.obstacle]]\nshape = \"mask\"\n\
-                file = \"gone.nii\"\n[goal.obstacle.pose]\nx_mm = 0\ny_mm = 20\nz_mm = 40\n";
+                file = \"gone.nii\"\n[goal.obstacle.pose]\nx_mm = 0\ny_mm = 20\nz_mm = 40\nyaw_deg = 0\n\
+                pitch_deg = 0\nroll_deg = 0\n";
     scratch.write("goal.toml", goal);
     let said = stage(&scratch, &["jog", "goal.toml", "--axis", "insertion", "--by", "1mm", "-q"]);
     assert_eq!((said.status, said.stderr.as_str()), (0, ""), "{}", said.screen());

@@ -258,7 +258,7 @@ fn add_verdict(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> R
     // lose one.
     let Some(_lock) = lock(path).map_err(Failure::environment)? else {
         let why = "a bench is still writing this record, or another program has it; wait for it";
-        return Err(Failure::bad_input(path, why));
+        return Err(Failure::environment(format_args!("{}: {why}", path.display())));
     };
     let (_, Folder { dir, condition, mut manifest, .. }) = read::open(path)?;
     let why = match condition {
