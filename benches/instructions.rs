@@ -58,7 +58,7 @@ fn instructions(part: &str, kind: &str, insertions: u32) -> Option<u64> {
 
 /// Runs the steps of one insertion. The true needle takes few of the counted instructions, as many for every kind.
 fn insert(session: &SessionConfig, start: u32) {
-    let mut steering = Steering::new(session).expect("valid");
+    let mut steering = Steering::new(session);
     let roll = f64::from(start);
     let mut tip = Pose {
         rotation: FixedAngles { yaw: 0.1, pitch: 0.1, roll }.to_rotation(),

@@ -30,7 +30,7 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<()> {
     let (needle, torsion) = config.believed_needle()?;
     let scoring = config.scoring()?;
     let score_once = |observer: &ObserverConfig, recording: &Recording| {
-        let mut observer = observer.build(needle, torsion).map_err(|error| error.to_string())?;
+        let mut observer = observer.build(needle, torsion);
         evaluate_observer(observer.as_mut(), recording, &scoring)
     };
     for Insertion { path, recording, .. } in &insertions {

@@ -80,7 +80,6 @@ pub(super) fn run(arguments: &Arguments) -> Result<()> {
     // The record names each mask by its absolute path and checksum, for a replay to find and check it.
     config = configured.completed(&config, |mask| file_crc32(mask).ok());
     let session = config.session_reading(&mask_reader(None))?;
-    session.check().map_err(Failure::configuration)?;
     let preflight = if arguments.rehearse {
         before_rehearsal(&config, &arguments.configured.load(None)?, arguments.quiet)
     } else {

@@ -60,7 +60,6 @@ pub(super) fn study(arguments: &Arguments) -> Result<()> {
     let mut session = config.session_without_goal()?;
     session.shadows.clear();
     session.insertion.plane_out_of_reach = PlaneOutOfReach::Insert;
-    session.check().map_err(Failure::configuration)?;
     let drawn = |seed| config.drawn(seed).map_err(|error| error.to_string());
     let stage = |seed| drawn(seed)?.virtual_stage().map_err(|error| error.to_string());
     let read_mask = mask_reader(arguments.configured.path());

@@ -6,7 +6,6 @@ use crate::keys::{section, within};
 use crate::needle::{Increment, Needle, TipPosition};
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use std::collections::VecDeque;
-use thiserror::Error;
 
 section! {
     /// `[observer.finite_difference]`.
@@ -19,11 +18,6 @@ section! {
 
 /// At most about this many positions are kept per baseline.
 const POSITIONS_PER_BASELINE: f64 = 1000.0;
-
-/// The baseline is not a finite distance over 0.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-#[error("baseline {0} mm: allowed are finite distances over 0")]
-pub struct BaselineError(pub f64);
 
 /// Rotation from three measured positions, `R = [p′×p″/(κv³), −p″/(κv²), p′/v]` (paper Eq. 2
 /// with the powers of v that the print drops).
@@ -58,21 +52,15 @@ struct Measured {
 
 impl FiniteDifference {
     /// An observer with the given distance between the positions that it differences.
-    ///
-    /// # Errors
-    /// [`BaselineError`] if the distance is not finite and over 0.
-    pub fn new(needle: Needle, baseline_mm: f64) -> Result<Self, BaselineError> {
-        if !(baseline_mm.is_finite() && baseline_mm > 0.0) {
-            return Err(BaselineError(baseline_mm));
-        }
-        Ok(FiniteDifference {
+    pub fn new(needle: Needle, baseline_mm: f64) -> Self {
+        FiniteDifference {
             needle,
             baseline_mm,
             depth_mm: 0.0,
             carried: Pose::identity(),
             positions: VecDeque::new(),
             tip: None,
-        })
+        }
     }
 
     /// The index of the newest position at least `distance_mm` before `depth_mm`.
@@ -157,7 +145,7 @@ mod tests {
         fn recovers_the_frame_without_noise(yaw in -3.0..3.0f64, pitch in -1.2..1.2f64, roll in -3.0..3.0f64, omega in -0.02..0.02f64) {
             let needle = Needle::new(1.0 / 122.0).unwrap();
             let mut truth = Pose { rotation: FixedAngles { yaw, pitch, roll }.to_rotation(), translation: Vector3::zeros() };
-            let mut observer = FiniteDifference::new(needle, 2.0).unwrap();
+            let mut observer = FiniteDifference::new(needle, 2.0);
             let increment = Increment::new(0.5, 0.5 * omega).unwrap();
             for n in 0..40 {
                 if n % 2 == 0 {
@@ -178,7 +166,7 @@ mod tests {
             let needle = Needle::new(1.0 / 122.0).unwrap();
             let estimate = |parts: u32| {
                 let mut truth = Pose::identity();
-                let mut observer = FiniteDifference::new(needle, 3.0).unwrap();
+                let mut observer = FiniteDifference::new(needle, 3.0);
                 let part = 1.0 / f64::from(parts);
                 let increment = Increment::new(part, omega * part).unwrap();
                 for _ in 0..20 {
@@ -197,7 +185,7 @@ mod tests {
 
         #[test]
         fn stays_finite(steps in prop::collection::vec((0.0..3.0f64, -7.0..7.0f64, prop::array::uniform3(-1e6..1e6f64)), 1..80)) {
-            let mut observer = FiniteDifference::new(Needle::new(0.01).unwrap(), 2.0).unwrap();
+            let mut observer = FiniteDifference::new(Needle::new(0.01).unwrap(), 2.0);
             for (insertion, rotation, position) in steps {
                 observer.predict(Increment::new(insertion, rotation).unwrap());
                 observer.correct(&TipPosition::new(Vector3::from(position)).unwrap(), 1.0);
@@ -210,7 +198,7 @@ mod tests {
     #[test]
     fn few_positions_of_a_slow_needle_are_kept() {
         let needle = Needle::new(0.01).unwrap();
-        let mut observer = FiniteDifference::new(needle, 10.0).unwrap();
+        let mut observer = FiniteDifference::new(needle, 10.0);
         for n in 1..=5000 {
             observer.predict(Increment::new(2e-4, 0.0).unwrap());
             let depth_mm = f64::from(n) * 2e-4;
@@ -223,7 +211,7 @@ mod tests {
     #[test]
     fn has_no_estimate_before_three_positions_a_baseline_apart() {
         let needle = Needle::new(0.01).unwrap();
-        let mut observer = FiniteDifference::new(needle, 1.0).unwrap();
+        let mut observer = FiniteDifference::new(needle, 1.0);
         let mut truth = Pose::identity();
         let increment = Increment::new(1.0, 0.0).unwrap();
         for _ in 0..2 {
@@ -239,23 +227,11 @@ mod tests {
     /// A straight path has no normal, so there is no frame.
     #[test]
     fn a_straight_path_gives_no_frame() {
-        let mut observer = FiniteDifference::new(Needle::new(0.0).unwrap(), 1.0).unwrap();
+        let mut observer = FiniteDifference::new(Needle::new(0.0).unwrap(), 1.0);
         for n in 0..10 {
             observer.correct(&TipPosition::new(Vector3::new(0.0, 0.0, f64::from(n))).unwrap(), 1.0);
             observer.predict(Increment::new(1.0, 0.0).unwrap());
         }
         assert!(observer.estimate().is_none());
-    }
-
-    #[test]
-    fn a_baseline_not_over_0_is_refused() {
-        for baseline_mm in [0.0, -1.0, f64::INFINITY, f64::NAN] {
-            let refused = FiniteDifference::new(Needle::new(0.01).unwrap(), baseline_mm);
-            let text = refused.unwrap_err().to_string();
-            assert_eq!(
-                text,
-                format!("baseline {baseline_mm} mm: allowed are finite distances over 0")
-            );
-        }
     }
 }

@@ -17,9 +17,9 @@ mod mixture;
 mod start;
 mod whiteness;
 
-pub use coupled::{Coupled, CoupledConfig, CoupledError, Gains};
+pub use coupled::{Coupled, CoupledConfig, Gains};
 pub use estimate::{Belief, Estimate, Shaft, Slack, standard_deviations};
-pub use finite_difference::{BaselineError, FiniteDifference, FiniteDifferenceConfig};
+pub use finite_difference::{FiniteDifference, FiniteDifferenceConfig};
 pub use handedness::{HandednessWatch, ROLL_JUDGED_SD_MAX_RAD, StreamContradiction};
 pub use invariant::{Invariant, InvariantConfig, NoiseConfig};
 pub use whiteness::{PositionNoise, Whiteness};
@@ -55,17 +55,6 @@ pub enum Divergence {
         /// The limit.
         limit: f64,
     },
-}
-
-/// Why an observer refused its configuration.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-pub enum ObserverError {
-    /// The coupled observer.
-    #[error("coupled: {0}")]
-    Coupled(#[from] CoupledError),
-    /// The observer by finite differences.
-    #[error("finite-difference: {0}")]
-    FiniteDifference(#[from] BaselineError),
 }
 
 /// An observer of the tip's pose. It has no estimate before the first [`correct`](Self::correct), since it takes
@@ -115,21 +104,14 @@ pub enum ObserverConfig {
 
 impl ObserverConfig {
     /// Builds the observer.
-    ///
-    /// # Errors
-    /// [`ObserverError`] if the observer refuses its parameters.
-    pub fn build(
-        &self,
-        needle: Needle,
-        torsion: Torsion,
-    ) -> Result<Box<dyn Observer>, ObserverError> {
-        Ok(match *self {
+    pub fn build(&self, needle: Needle, torsion: Torsion) -> Box<dyn Observer> {
+        match *self {
             ObserverConfig::Invariant(config) => Box::new(Invariant::new(needle, torsion, config)),
-            ObserverConfig::Coupled(config) => config.build(needle)?,
+            ObserverConfig::Coupled(config) => config.build(needle),
             ObserverConfig::FiniteDifference(config) => {
-                Box::new(FiniteDifference::new(needle, config.baseline_mm)?)
+                Box::new(FiniteDifference::new(needle, config.baseline_mm))
             }
-        })
+        }
     }
 
     /// The same observer with the roll at the start unknown; `None` if the observer must know it.

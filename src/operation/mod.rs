@@ -111,7 +111,7 @@ impl RunConfig {
     /// The run as a session that begins at `now`.
     ///
     /// # Errors
-    /// An observer or the stage refuses its configuration.
+    /// The stage refuses its configuration.
     pub fn begin(self, now: Time) -> Result<Session, String> {
         match self {
             RunConfig::Insertion(config) => Session::new(*config, now),

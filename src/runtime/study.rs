@@ -59,7 +59,7 @@ impl Study<'_> {
     ) -> Result<Vec<TrialResult>, String> {
         self.run_trials(seeds, done, |session, stage, score| {
             let take = |step: &_, truth: &_| score.take(step, truth);
-            insert(&session, &stage, timetable, take).map_err(|error| error.to_string())
+            Ok(insert(&session, &stage, timetable, take))
         })
     }
 
@@ -204,7 +204,7 @@ mod tests {
         assert_eq!(outcome, Outcome::Completed);
         let timetable = study.timetable(seed).unwrap();
         let take = |step: &StepRecord, truth: &Truth| short.push((step.clone(), *truth));
-        let outcome = insert(&session, &stage(seed).unwrap(), &timetable, take).unwrap();
+        let outcome = insert(&session, &stage(seed).unwrap(), &timetable, take);
         assert_eq!(outcome, Outcome::Completed);
         [whole, short]
     }

@@ -40,18 +40,6 @@ pub struct SessionConfig {
 }
 
 impl SessionConfig {
-    /// Checks the configuration as [`Session::new`](super::Session::new) does, before a run folder is made.
-    ///
-    /// # Errors
-    /// As [`Session::new`](super::Session::new).
-    pub fn check(&self) -> Result<(), String> {
-        for observer in std::iter::once(&self.observer).chain(&self.shadows) {
-            let built = observer.build(self.needle, self.needle_torsion);
-            built.map_err(|error| format!("observer: {error}"))?;
-        }
-        self.stage.validate().map_err(|error| format!("stage: {error}"))
-    }
-
     /// Checks that the depth suffices to reach the plane from a tip at `tip_mm`, plane frame, and that a path leads
     /// from there to the target, if there is one.
     ///

@@ -4,7 +4,6 @@ use super::config::SessionConfig;
 use super::steering::{Decision, Steering};
 use crate::geometry::Pose;
 use crate::needle::{Increment, Needle, TipPosition};
-use crate::observer::ObserverError;
 use crate::tracker::{GateName, Prediction, Refusal, StageHistory, StageIncrement};
 use crate::units::Time;
 use nalgebra::{Matrix3, Vector3};
@@ -101,9 +100,9 @@ impl PredictedTip {
 }
 
 impl Estimation {
-    pub(crate) fn new(config: &SessionConfig) -> Result<Self, ObserverError> {
-        Ok(Estimation {
-            steering: Steering::new(config)?,
+    pub(crate) fn new(config: &SessionConfig) -> Self {
+        Estimation {
+            steering: Steering::new(config),
             observed_to: None,
             needle: config.needle,
             predicted: None,
@@ -113,7 +112,7 @@ impl Estimation {
             spacing_s: f64::INFINITY,
             watched_to: None,
             batch: Batch::default(),
-        })
+        }
     }
 
     /// Predicts every observer along `history` to the measurement and corrects it there. A measurement

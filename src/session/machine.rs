@@ -175,10 +175,10 @@ impl Session {
     /// An insertion that begins at `now`.
     ///
     /// # Errors
-    /// If an observer or the stage refuses its configuration.
+    /// If the stage refuses its configuration.
     pub fn new(config: SessionConfig, now: Time) -> Result<Self, String> {
         let stage_config = config.stage.clone();
-        let task = InsertTask::new(config, now).map_err(|error| format!("observer: {error}"))?;
+        let task = InsertTask::new(config, now);
         let stage = Stage::new(stage_config.clone(), now);
         let stage = stage.map_err(|error| format!("stage: {error}"))?;
         Ok(Session::begin(stage, stage_config, Box::new(task), now))

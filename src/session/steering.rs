@@ -4,7 +4,7 @@ use super::config::{Samples, SessionConfig};
 use super::goal::{Approach, Pursuit};
 use crate::control::{Command, Controller};
 use crate::needle::{Increment, TipPosition};
-use crate::observer::{Estimate, HandednessWatch, Observer, ObserverError, Whiteness};
+use crate::observer::{Estimate, HandednessWatch, Observer, ObserverConfig, Whiteness};
 use nalgebra::Vector3;
 
 /// The observers of a run and its control law.
@@ -50,17 +50,11 @@ pub struct Decision {
 
 impl Steering {
     /// The observers and the law that `config` names.
-    ///
-    /// # Errors
-    /// [`ObserverError`] if an observer refuses its parameters.
-    pub fn new(config: &SessionConfig) -> Result<Self, ObserverError> {
-        let shadows = config
-            .shadows
-            .iter()
-            .map(|shadow| {
-                Ok((shadow.name().to_owned(), shadow.build(config.needle, config.needle_torsion)?))
-            })
-            .collect::<Result<_, ObserverError>>()?;
+    pub fn new(config: &SessionConfig) -> Self {
+        let build =
+            |observer: &ObserverConfig| observer.build(config.needle, config.needle_torsion);
+        let shadows = config.shadows.iter();
+        let shadows = shadows.map(|shadow| (shadow.name().to_owned(), build(shadow))).collect();
         let mut handedness =
             HandednessWatch::new(config.needle, config.needle_torsion, config.handedness);
         if !config.tracker.judges_stream {
@@ -68,8 +62,8 @@ impl Steering {
         }
         let position_sd_mm = config.handedness.position_sd_mm;
         let observer_sd_mm = config.observer.position_sd_mm().unwrap_or(position_sd_mm);
-        Ok(Steering {
-            observer: config.observer.build(config.needle, config.needle_torsion)?,
+        Steering {
+            observer: build(&config.observer),
             shadows,
             control: config.control.build(config.needle),
             pursuit: config.goal.clone().and_then(|goal| Pursuit::new(goal, config)),
@@ -80,7 +74,7 @@ impl Steering {
                 .with_noise(config.tracker.noise, observer_sd_mm),
             is_noise_configured: config.tracker.noise.is_some(),
             step_mm: config.insertion.step_mm,
-        })
+        }
     }
 
     /// Advances every observer by one measured increment.
@@ -255,7 +249,7 @@ mod tests {
         let mut steering = Steering {
             observer: Box::new(Lost(None)),
             control: Box::new(Still),
-            ..Steering::new(&config).unwrap()
+            ..Steering::new(&config)
         };
         for is_last in [false, true] {
             let decision = steering.decide(&[], is_last);
@@ -277,10 +271,8 @@ mod tests {
         let config = with_target();
         let translation = Vector3::new(0.0, 0.0, 110.0);
         let estimate = Estimate::of_pose(Pose { translation, ..Pose::identity() });
-        let mut steering = Steering {
-            observer: Box::new(Lost(Some(estimate))),
-            ..Steering::new(&config).unwrap()
-        };
+        let mut steering =
+            Steering { observer: Box::new(Lost(Some(estimate))), ..Steering::new(&config) };
         let decision = steering.decide(&[], false);
         assert!(decision.refused.is_some());
         assert_eq!(decision.approach.expect("an approach").distance_mm, 10.0);
@@ -306,7 +298,7 @@ mod tests {
             (Some(Estimate { sd: Some([f64::NAN; 6]), ..unsure }), not_stated),
         ] {
             let observer = Box::new(Sure(estimate));
-            let mut steering = Steering { observer, ..Steering::new(&config).unwrap() };
+            let mut steering = Steering { observer, ..Steering::new(&config) };
             let decision = steering.decide(&[], false);
             assert_eq!(decision.rotation_cmd_rad_per_mm, None);
             assert_eq!(decision.refused.as_deref(), Some(why));
@@ -317,7 +309,7 @@ mod tests {
     /// `times` times. The noise of a mean is that of `independent` positions.
     fn x_sd_mm(per_mm: u32, times: u32, positions: u32, independent: u32) -> f64 {
         let config = Config::from_sources(&[], &[]).unwrap().session().unwrap();
-        let mut steering = Steering::new(&config).unwrap();
+        let mut steering = Steering::new(&config);
         let sent = per_mm * times;
         let curvature_per_mm = config.needle.curvature_per_mm();
         let (mut rng, mut noise) = (Pcg64::seed_from_u64(1), Vector3::zeros());
@@ -357,7 +349,7 @@ mod tests {
         let sd_mm = |noise| {
             let mut config = Config::from_sources(&[], &[]).unwrap().session().unwrap();
             config.tracker.noise = noise;
-            let mut steering = Steering::new(&config).unwrap();
+            let mut steering = Steering::new(&config);
             for _ in 0..40 {
                 steering.correct(&TipPosition::new(Vector3::zeros()).unwrap(), 1, 0.025);
             }

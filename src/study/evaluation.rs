@@ -296,10 +296,8 @@ mod tests {
             start: FixedAngles::default(),
             position_sd_mm: 0.1,
         };
-        let mut observers: [Box<dyn Observer>; 2] = [
-            Box::new(Coupled::new(needle, config).unwrap()),
-            Box::new(FiniteDifference::new(needle, 2.0).unwrap()),
-        ];
+        let mut observers: [Box<dyn Observer>; 2] =
+            [Box::new(Coupled::new(needle, config)), Box::new(FiniteDifference::new(needle, 2.0))];
         for observer in &mut observers {
             let score =
                 evaluate(observer.as_mut(), &recording(&r_sb), &scoring(r_sb, 1.0, 8.0)).unwrap();
@@ -323,7 +321,7 @@ mod tests {
             row.sensor_orientation = Some(Rotation3::identity());
         }
         assert_eq!(recording.roll(), Some(RecordedRoll::DoesNotTurn));
-        let mut observer = FiniteDifference::new(Needle::new(0.0125).unwrap(), 2.0).unwrap();
+        let mut observer = FiniteDifference::new(Needle::new(0.0125).unwrap(), 2.0);
         let score = evaluate(&mut observer, &recording, &scoring(r_sb, 1.0, 8.0)).unwrap();
         assert!(score.roll_rms_deg.is_none() && score.position_rms_mm.is_some(), "{score:?}");
         recording.rows.iter_mut().for_each(|row| row.sensor_orientation = None);
@@ -407,7 +405,7 @@ mod tests {
     fn a_row_beyond_any_needle_is_refused_by_its_line() {
         let r_sb = mount(Vector3::z(), Vector3::x()).unwrap();
         let needle = Needle::new(0.0125).unwrap();
-        let mut observer = FiniteDifference::new(needle, 2.0).unwrap();
+        let mut observer = FiniteDifference::new(needle, 2.0);
         let error =
             evaluate(&mut observer, &straight(&[0.0, 1.0, 1e308]), &scoring(r_sb, 1.0, 0.0))
                 .unwrap_err();

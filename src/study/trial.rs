@@ -4,7 +4,6 @@ use super::base_path::BasePath;
 use super::timetable::{SampleDue, Timetable};
 use crate::emulator::{TargetModel, Tissue, Truth, VirtualStageConfig};
 use crate::needle::TipPosition;
-use crate::observer::ObserverError;
 use crate::session::{
     Decision, MovingMean, Outcome, SessionConfig, Steering, StepRecord, TargetTool,
 };
@@ -20,16 +19,13 @@ use nalgebra::Vector3;
 /// the drives (their motion is taken as commanded; in a whole session it differs by at most an
 /// encoder count), the bus, the stamps, and the tracker's gates, which refuse one position in a
 /// thousand under white noise.
-///
-/// # Errors
-/// [`ObserverError`] if an observer refuses its parameters.
 pub fn insert(
     session: &SessionConfig,
     stage: &VirtualStageConfig,
     timetable: &Timetable,
     mut take: impl FnMut(&StepRecord, &Truth),
-) -> Result<Outcome, ObserverError> {
-    let mut steering = Steering::new(session)?;
+) -> Outcome {
+    let mut steering = Steering::new(session);
     let mut needle = EmulatedNeedle::new(stage);
     let (mut observed_mm, mut watched_mm) = (0.0, 0.0);
     let interval_s = stage.tracker.interval().as_secs_f64();
@@ -88,7 +84,7 @@ pub fn insert(
                 let last = step_record(step + 1, stopped_mm, &needle.base, Decision::default());
                 take(&last, &needle.truth(stopped_mm));
             }
-            return Ok(Outcome::Stopped(error.to_string()));
+            return Outcome::Stopped(error.to_string());
         }
         if let Some(rate_rad_per_mm) = command {
             needle.base.set_rate(due.command_mm, rate_rad_per_mm);
@@ -100,7 +96,7 @@ pub fn insert(
         let braking_rad =
             quick_stop_deceleration.map_or(0.0, |by| speed * speed.abs() / (2.0 * by));
         if let Err(error) = limits.check_range(Axis::Rotation, rotation_rad + braking_rad) {
-            return Ok(Outcome::Stopped(format!("stage: {error}")));
+            return Outcome::Stopped(format!("stage: {error}"));
         }
         if command.is_none() {
             break;
@@ -114,7 +110,7 @@ pub fn insert(
             break;
         }
     }
-    Ok(Outcome::Completed)
+    Outcome::Completed
 }
 
 /// The true needle of `stage` and its base.

@@ -47,7 +47,7 @@ fn insert(seed: u64, noise_mm: f64, rate_per_mm: f64) -> Insertion {
         caution: 0.5,
         rotation_max_rad_per_mm: 20f64.to_radians(),
     };
-    let mut observer = Coupled::new(needle, observer).unwrap();
+    let mut observer = Coupled::new(needle, observer);
     let mut law = FeedbackLinearization::new(needle, law);
     let mut rng = Pcg64::seed_from_u64(seed);
     let (mut off_plane, mut rolls, mut error_at_end) = (Vec::new(), Vec::new(), 0.0);

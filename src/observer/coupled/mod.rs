@@ -13,7 +13,6 @@ use crate::geometry::FixedAngles;
 use crate::keys::{Rule, choice, over, section, within};
 use crate::needle::Needle;
 use bank::CoupledBank;
-use thiserror::Error;
 
 /// The effect of a pole faster than 1 per mm decays within a sample.
 const POLE: Rule = over(0.0, 1.0);
@@ -62,32 +61,12 @@ section! {
     }
 }
 
-/// Why a coupled observer was refused.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-pub enum CoupledError {
-    /// The path of a straight needle does not depend on its roll.
-    #[error(
-        "needle curvature is 0: roll cannot be observed from the positions of a straight needle"
-    )]
-    StraightNeedle,
-    /// A pole is not a finite rate over 0.
-    #[error("observer pole {0} per mm: allowed are finite rates over 0")]
-    Pole(f64),
-    /// The start lies outside the paper's local coordinates.
-    #[error("observer start pitch {:.1} deg: allowed is under 85 deg in magnitude", .0.to_degrees())]
-    StartPitch(f64),
-}
-
 impl CoupledConfig {
     /// Builds the observer.
-    ///
-    /// # Errors
-    /// As [`Coupled::new`].
-    pub fn build(self, needle: Needle) -> Result<Box<dyn Observer>, CoupledError> {
-        let placed = Coupled::new(needle, self)?;
-        Ok(match self.gains {
-            Gains::Placed => Box::new(placed),
+    pub fn build(self, needle: Needle) -> Box<dyn Observer> {
+        match self.gains {
+            Gains::Placed => Box::new(Coupled::new(needle, self)),
             Gains::Fading => Box::new(CoupledBank::new(needle, self)),
-        })
+        }
     }
 }

@@ -1,7 +1,7 @@
 //! The paper's coupled observer (Section 5.4): a Luenberger observer on the reduced space feeding
 //! one on the fibre, in discrete predict and correct form.
 
-use super::{CoupledConfig, CoupledError};
+use super::CoupledConfig;
 use crate::geometry::FixedAngles;
 use crate::math;
 use crate::needle::{Fibre, Increment, Needle, Reduced, TipPosition};
@@ -89,24 +89,10 @@ impl State {
 }
 
 impl Coupled {
-    /// An observer for a needle of known curvature.
-    ///
-    /// # Errors
-    /// [`CoupledError`] for a straight needle, a pole that is not a decay rate, or a start pitch
-    /// outside the local coordinates.
-    pub fn new(needle: Needle, config: CoupledConfig) -> Result<Self, CoupledError> {
-        if needle.curvature_per_mm() == 0.0 {
-            return Err(CoupledError::StraightNeedle);
-        }
-        let poles = config.reduced_poles_per_mm.iter().chain(&config.fibre_poles_per_mm);
-        if let Some(&pole) = poles.clone().find(|pole| !(pole.is_finite() && **pole > 0.0)) {
-            return Err(CoupledError::Pole(pole));
-        }
-        let pitch = config.start.pitch;
-        if !pitch.is_finite() || pitch.abs() > 85f64.to_radians() {
-            return Err(CoupledError::StartPitch(pitch));
-        }
-        Ok(Coupled { needle, config, state: None, since_correction: Transition::NONE })
+    /// An observer for a needle of known curvature, which is not straight: the path of a straight needle does not
+    /// depend on its roll.
+    pub fn new(needle: Needle, config: CoupledConfig) -> Self {
+        Coupled { needle, config, state: None, since_correction: Transition::NONE }
     }
 
     /// The gain L that gives `(I − L C) Φ` the configured poles over `depth_mm`, by Ackermann's
@@ -223,7 +209,7 @@ mod tests {
     }
 
     fn observer() -> Coupled {
-        Coupled::new(needle(), config()).unwrap()
+        Coupled::new(needle(), config())
     }
 
     fn tip(x: f64, yaw: f64, pitch: f64, roll: f64) -> Pose {
@@ -243,7 +229,7 @@ mod tests {
         for spacing_mm in [0.1, 1.0, 3.0] {
             let mut poles = config();
             poles.reduced_poles_per_mm = [0.05, 0.08, 0.11];
-            let observer = Coupled::new(needle(), poles).unwrap();
+            let observer = Coupled::new(needle(), poles);
             let gain = observer.reduced_gain(spacing_mm).unwrap();
             let k = needle().curvature_per_mm();
             let (sin, cos) = (k * spacing_mm).sin_cos();
@@ -297,7 +283,7 @@ mod tests {
             let half_turn = if far { std::f64::consts::PI } else { 0.0 };
             let mut truth = tip(x, yaw, pitch, half_turn + roll);
             let start = FixedAngles { roll: half_turn, ..FixedAngles::default() };
-            let mut observer = Coupled::new(needle(), CoupledConfig { start, ..config() }).unwrap();
+            let mut observer = Coupled::new(needle(), CoupledConfig { start, ..config() });
             observer.correct(&measured(truth.translation), 1.0);
             let mut control = crate::control::FeedbackLinearization::new(needle(), crate::control::FeedbackLinearizationConfig {
                 poles_per_mm: [0.05; 3], roll_demand_max_rad: 1.0, caution: 0.5, rotation_max_rad_per_mm: 0.35 });
@@ -341,17 +327,5 @@ mod tests {
         let before = observer.estimate();
         observer.correct(&measured(Vector3::new(5.0, 5.0, 5.0)), 1.0);
         assert_eq!(observer.estimate(), before);
-    }
-
-    #[test]
-    fn a_straight_needle_a_zero_pole_and_a_steep_start_are_refused() {
-        let straight = Needle::new(0.0).unwrap();
-        assert_eq!(Coupled::new(straight, config()).unwrap_err(), CoupledError::StraightNeedle);
-        let mut bad = config();
-        bad.fibre_poles_per_mm[1] = 0.0;
-        assert_eq!(Coupled::new(needle(), bad).unwrap_err(), CoupledError::Pole(0.0));
-        let mut bad = config();
-        bad.start.pitch = 1.5;
-        assert_eq!(Coupled::new(needle(), bad).unwrap_err(), CoupledError::StartPitch(1.5));
     }
 }

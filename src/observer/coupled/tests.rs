@@ -139,7 +139,7 @@ fn the_fading_gains_settle_to_the_placed_ones() {
         Vector3::new(x_mm, pitch_rad, roll_rad)
     };
     let fading = change(&mut bank(0.3));
-    let placed = change(&mut Coupled::new(needle(), config(FixedAngles::default())).unwrap());
+    let placed = change(&mut Coupled::new(needle(), config(FixedAngles::default())));
     for (fading, placed) in fading.iter().zip(&placed) {
         assert!((fading / placed - 1.0).abs() < 0.1, "{fading} {placed}");
     }

@@ -19,7 +19,7 @@ use super::task::Task;
 use super::tracking::{Tracking, Trouble};
 use super::{OperatorCommand, Progress, tracker_news};
 use crate::geometry::coordinates;
-use crate::observer::{Estimate, ObserverError};
+use crate::observer::Estimate;
 use crate::stage::{Feedback, SetPoint, StageEvent};
 use crate::text::clipped;
 use crate::tracker::{Event, GateCounts, StageHistory, StagePoint};
@@ -56,10 +56,8 @@ pub(super) struct InsertTask {
 }
 
 impl InsertTask {
-    /// # Errors
-    /// If an observer refuses its configuration.
-    pub(super) fn new(config: SessionConfig, now: Time) -> Result<Self, ObserverError> {
-        Ok(InsertTask {
+    pub(super) fn new(config: SessionConfig, now: Time) -> Self {
+        InsertTask {
             begun: now,
             start: Start::Unknown,
             tracking: Tracking::new(&config),
@@ -69,7 +67,7 @@ impl InsertTask {
                 .and_then(|goal| goal.tool.clone())
                 .map(|tool| TargetTracking::new(tool, &config.tracker, &config.x_wp)),
             history: StageHistory::new(history_points(&config)),
-            estimation: Estimation::new(&config)?,
+            estimation: Estimation::new(&config),
             insertion: None,
             hold: None,
             ended_hold: None,
@@ -77,7 +75,7 @@ impl InsertTask {
             catch_up_to: None,
             progress: Progress { depth_mm: config.insertion.depth_mm, ..Progress::default() },
             config,
-        })
+        }
     }
 
     /// Records what the tracking has to report, and its state.
