@@ -58,10 +58,10 @@ section! {
         /// How far to insert from where the run starts, mm.
         depth_mm: f64 [over(0.0, 1000.0)] = 250.0, at_most("stage.insertion.max_mm");
         /// Speed of the insertion, mm/s.
-        speed_mm_per_s: f64 [over(0.0, 100.0)] = 2.0,
+        speed_mm_per_s: f64 [within(0.01, 100.0)] = 2.0,
             at_most("stage.insertion.speed_max_mm_per_s");
         /// Acceleration and braking of the insertion, mm/s². A stop must brake as hard, to keep a soft limit.
-        acceleration_mm_per_s2: f64 [over(0.0, 1000.0)] = 10.0,
+        acceleration_mm_per_s2: f64 [within(0.01, 1000.0)] = 10.0,
             at_most("stage.insertion.quick_stop_deceleration_mm_per_s2");
         /// How the needle advances.
         mode: InsertionMode = "continuous";
