@@ -6,9 +6,9 @@
 # Installs what is missing (apt packages as root or with sudo; a Python environment under
 # ~/.cache/needle-bench), then: shell scripts, formatting, licences where cargo-deny is there, the tests
 # on real SocketCAN, in virtual machines where this kernel has no vcan, and all other tests. The tests in real
-# time mostly wait, so those on SocketCAN and those on the host run at the same time; clippy, documentation and
-# the tests in virtual time run when the processors have nothing else to do. Stops at the first failure.
-# With CI=true a test that lacks something fails.
+# time mostly wait, so those on SocketCAN and those on the host run at the same time (not in an emulated computer);
+# clippy, documentation and the tests in virtual time run when the processors have nothing else to do. Stops at the
+# first failure; one of what runs beside shows when its turn comes. With CI=true a test that lacks something fails.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PATH=$PATH:$HOME/.cargo/bin

@@ -94,6 +94,12 @@ impl Insertion {
         from_origin(self.origin_cmd, at)
     }
 
+    /// The deepest measured position of the stage that is believed while its target is `commanded`, mm.
+    pub(crate) fn deepest_stage_mm(&self, commanded: SetPoint) -> f64 {
+        let depth_mm = self.commanded(commanded).insertion_mm + self.config.arrival_mm;
+        self.origin_meas.insertion_mm + depth_mm
+    }
+
     /// Depth of step `step`, mm.
     fn step_depth_mm(&self, step: u32) -> f64 {
         (f64::from(step) * self.config.step_mm).min(self.config.depth_mm)
@@ -191,7 +197,7 @@ impl Insertion {
     ) -> Result<(), String> {
         let goal_mm = self.profile.goal_mm();
         let (here_mm, settle) = match self.config.mode {
-            // Step 0 is taken wherever the axis is said to have arrived.
+            // Step 0 needs the axis only near to where the insertion began.
             InsertionMode::Continuous if self.next_step == 0 => {
                 (self.config.arrival_mm, Duration::ZERO)
             }
@@ -227,7 +233,7 @@ impl Insertion {
                 let is_due = match self.next_step {
                     // At rest, with the first measurement.
                     0 => self.is_seen && self.off_mm(insertion_meas_mm) <= self.config.arrival_mm,
-                    // The needle is never deeper than its set-point: a depth that says so is wrong.
+                    // A depth beyond the set-point may be a wrong reading: it makes no step due.
                     _ => {
                         let depth_mm = insertion_meas_mm.min(self.profile.position_mm());
                         depth_mm >= goal_mm - DUE_TOLERANCE_MM

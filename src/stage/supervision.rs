@@ -214,7 +214,7 @@ impl Stage {
             let off = axis.shown(drive.following_error());
             format!(
                 "the axis left its first target before the drive was enabled, target minus position is {off}; \
-                 does it sag, or is it pushed?"
+                 does it sag, is it pushed, or does the drive find its commutation?"
             )
         } else {
             return;

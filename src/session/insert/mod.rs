@@ -99,8 +99,10 @@ impl InsertTask {
     /// Both drives have answered a SYNC: pair, estimate, decide, command.
     fn take_feedback(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
         let cut_mm = self.history.newest().map_or(f64::NEG_INFINITY, |point| point.insertion_mm);
-        // A wrong reading must not count as cut until the needle is there.
-        let deepest_mm = feedback.commanded.insertion_mm + self.config.insertion.arrival_mm;
+        // A wrong reading must not count as cut until the needle is there. In a stop the axis passes its last target.
+        let inserting = self.insertion.as_ref().filter(|_| shell.is_running());
+        let deepest_mm = inserting
+            .map_or(f64::INFINITY, |insertion| insertion.deepest_stage_mm(feedback.commanded));
         let point = StagePoint {
             time: feedback.time,
             insertion_mm: feedback.measured.insertion_mm.min(deepest_mm).max(cut_mm),
@@ -209,7 +211,9 @@ impl InsertTask {
         let Decision { estimate, rotation_cmd_rad_per_mm, command_saturated, .. } = decision;
         let refused = decision.refused.clone();
         let path = decision.approach.as_ref().and_then(|approach| approach.path.as_ref());
-        let end_mm = path.map(|path| at.insertion_mm + path.length_mm());
+        // The path begins at the estimate, which was carried along the history.
+        let estimated_mm = history.newest().map(|point| insertion.depth_mm(point.insertion_mm));
+        let end_mm = estimated_mm.zip(path).map(|(from_mm, path)| from_mm + path.length_mm());
         let observer = match &estimate {
             None => State::NoEstimate,
             Some(estimate) if !estimate.is_roll_known() => State::RollUnknown,

@@ -191,6 +191,7 @@ fn drives_enabled_just_as_the_timeout_ends_are_a_fault_that_says_so() {
 /// It would become a target, and the axis would go there as soon as it has power.
 #[test]
 fn one_wrong_position_as_power_comes_on_moves_no_axis() {
+    let (mut ready, mut faults) = (0, 0);
     for wrong_after in 0..12 {
         let mut bench = Bench::new(config());
         bench.until_progress(Progress::Enabling);
@@ -208,9 +209,16 @@ fn one_wrong_position_as_power_comes_on_moves_no_axis() {
         });
         let targets: Vec<i32> = enabling.collect();
         assert!(targets.iter().all(|target| *target == -20), "{targets:?}");
-        assert!(!targets.is_empty() || bench.fault().is_some());
         assert_eq!(bench.rotation.counts, -20, "{wrong_after}");
+        match bench.fault() {
+            None => ready += 1,
+            Some(fault) => {
+                assert!(fault.starts_with("rotation: the axis left its first target"), "{fault}");
+                faults += 1;
+            }
+        }
     }
+    assert!(ready > 0 && faults > 0, "{ready} {faults}");
 }
 
 #[test]

@@ -280,6 +280,20 @@ fn one_wrong_depth_hides_no_blind_insertion() {
     assert!(with - without < 0.1, "{without} {with}");
 }
 
+/// The path begins at the estimate, which does not believe such a depth.
+#[test]
+fn one_wrong_depth_at_the_last_plan_moves_no_end() {
+    let scratch = Scratch::new();
+    let goal = "goal={ kind = \"target\", position_mm = [0, 0, 60] }";
+    let law = "control.kind=nested-saturation";
+    let [without, with] = [100.0, 30.285].map(|at_s| {
+        let run = wrong_once(&scratch, 70, at_s, 3, &[goal, law]);
+        assert_eq!(run["outcome"], "completed", "{run}");
+        run["insertion_mm"].as_f64().expect("a number")
+    });
+    assert!((with - without).abs() < 0.1, "{without} {with}");
+}
+
 /// Clears `bits` in the insertion drive's statusword: the run stops for `reason`.
 fn without_bits(test: &str, bits: u16, reason: &str) {
     let stops = stopped(&[], |bench| bench.change_tpdo(move |word, counts| (word & !bits, counts)));
@@ -394,6 +408,19 @@ fn a_drive_that_stands_off_its_target() {
         let last = bench.steps().last().expect("steps");
         assert_eq!(last.step, 30);
         assert!((last.insertion_meas_mm - 30.0).abs() < 0.01, "{}", last.insertion_meas_mm);
+        // The offset is no wrong reading: the tip is paired with depths that have none.
+        for step in bench.steps().skip(1) {
+            let (Some(depth_mm), Some(age_s)) = (step.tip_meas_insertion_mm, step.tip_meas_age_s)
+            else {
+                continue;
+            };
+            let speed: f64 = mm_per_s.parse().expect("a number");
+            let expected_mm = step.insertion_meas_mm - speed * age_s;
+            assert!(
+                (depth_mm - expected_mm).abs() < 0.013 || step.step == 30,
+                "{depth_mm} {expected_mm}"
+            );
+        }
     }
 }
 
