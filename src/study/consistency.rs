@@ -9,7 +9,7 @@ use serde::Serialize;
 const FREEDOM: f64 = 6.0;
 /// Degrees of freedom of a position.
 const POSITION_FREEDOM: f64 = 3.0;
-/// Trials that differ by more than bounds of this times the freedom are too different to be judged.
+/// Trials whose bounds are wider than this many times the freedom differ too much to be judged.
 const SPREAD_MAX: f64 = 10.0;
 /// 95 % of a normal distribution lie within this many standard deviations.
 const WITHIN_95: f64 = 1.96;

@@ -234,6 +234,8 @@ fn a_start_that_has_moved_out_of_reach_begins_no_insertion() {
 fn an_axis_that_was_moved_by_hand_begins_no_insertion_past_its_limit() {
     let mut bench = Bench::new(&["insertion.depth_mm=300"]);
     bench.run_until(CONFIGURED);
+    // Where the axes stand is checked at the first answers, and the axis is moved after that.
+    bench.run_for(Duration::from_millis(500));
     bench.moved_counts = 12 * 4646;
     bench.next_sample = bench.now;
     let reason = bench.reason();

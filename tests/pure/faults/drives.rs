@@ -294,6 +294,21 @@ fn one_wrong_depth_at_the_last_plan_moves_no_end() {
     assert!((with - without).abs() < 0.1, "{without} {with}");
 }
 
+/// It goes 1.8 mm past its last target, as it should: the tip there is no jump.
+#[test]
+fn the_way_of_a_quick_stop_refuses_no_tip() {
+    let sets = [
+        "insertion={ depth_mm = 100, speed_mm_per_s = 6 }",
+        "stage.insertion.quick_stop_deceleration_mm_per_s2=10",
+        "emulator.fault=[{ kind = \"drive-fault\", at_s = 3, axis = \"rotation\", code = 0x2310 }]",
+    ];
+    let sets = sets.iter().flat_map(|set| ["--set", *set]);
+    let arguments: Vec<&str> = ["run", "--quiet"].into_iter().chain(sets).collect();
+    let said = needle_bench(&Scratch::new(), &arguments);
+    assert_eq!(said.status, 1, "{}", said.screen());
+    assert!(said.stdout.contains(" accepted, 0 refused\n"), "{}", said.stdout);
+}
+
 /// Clears `bits` in the insertion drive's statusword: the run stops for `reason`.
 fn without_bits(test: &str, bits: u16, reason: &str) {
     let stops = stopped(&[], |bench| bench.change_tpdo(move |word, counts| (word & !bits, counts)));
@@ -386,7 +401,8 @@ fn a_drive_that_stands_off_its_target() {
     let cases = [302, -302, 139, -139].map(|counts| [(counts, "1", 47), (counts, "2", 93)]);
     for (offset_counts, mm_per_s, step_counts) in cases.into_iter().flatten() {
         let speed = format!("insertion.speed_mm_per_s={mm_per_s}");
-        let mut bench = Bench::new(configured(&["insertion.depth_mm=30", &speed]));
+        let mut bench =
+            Bench::new(configured(&["insertion.depth_mm=30", "insertion.arrival_mm=0.02", &speed]));
         bench.change_tpdo(move |word, counts| {
             let enabled = Statusword(word).state() == Some(DriveState::OperationEnabled);
             (word, counts - if enabled { offset_counts } else { 0 })
@@ -408,7 +424,7 @@ fn a_drive_that_stands_off_its_target() {
         let last = bench.steps().last().expect("steps");
         assert_eq!(last.step, 30);
         assert!((last.insertion_meas_mm - 30.0).abs() < 0.01, "{}", last.insertion_meas_mm);
-        // The offset is no wrong reading: the tip is paired with depths that have none.
+        // The offset is no wrong reading: the tip is paired with depths without it. At the end the needle brakes.
         for step in bench.steps().skip(1) {
             let (Some(depth_mm), Some(age_s)) = (step.tip_meas_insertion_mm, step.tip_meas_age_s)
             else {
