@@ -55,14 +55,13 @@ const STOPPING: [(&str, &[i16], &str); 4] = [
     ),
     (
         "quick_stop_option",
-        &[1, 2, 3, 5, 6, 7],
-        "1 to 3, or 5 to 7 to stay in quick stop: 0 coasts, and others are reserved or of the maker's \
-         own (605A)",
+        &[2, 3, 6, 7],
+        "2 or 3, or 6 or 7 to stay in quick stop: 0 coasts, 1 and 5 brake by 6084, which is not set (605A)",
     ),
     (
         "fault_reaction_option",
-        &[1, 2, 3],
-        "1 to 3: 0 coasts, and others are reserved or of the maker's own (605E)",
+        &[2, 3],
+        "2 or 3: 0 coasts, 1 brakes by 6084, which is not set (605E)",
     ),
 ];
 

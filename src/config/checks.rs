@@ -14,6 +14,7 @@ pub(super) const ROTATION_ACCELERATION_MAX: &str = "stage.rotation.acceleration_
 pub(super) fn check(config: &Config, reader: &mut Reader) {
     check_limits(config, reader);
     check_step(config, reader);
+    check_missed_feedback(config, reader);
     goal::check(config, reader);
     check_rotation(config, reader);
     check_torsion("needle", config.needle.torsion, reader);
@@ -58,6 +59,21 @@ fn check_step(config: &Config, reader: &mut Reader) {
         ["insertion.step_mm", "insertion.speed_mm_per_s", "can.sync_ms"] if per_sync > step =>
             "insertion.step_mm is {step}, allowed: at least what insertion.speed_mm_per_s = {speed} \
              moves in can.sync_ms = {sync_ms}, which is {per_sync}";
+    }
+}
+
+/// A real drive may leave SYNCs without an answer for no longer than it may leave out its heartbeat.
+fn check_missed_feedback(config: &Config, reader: &mut Reader) {
+    let [missed, period, timeout] =
+        ["can.missed_feedback_max", "can.sync_ms", "can.heartbeat_timeout_ms"];
+    let [missed_max, period_ms, timeout_ms] =
+        [missed, period, timeout].map(|key| config.number(key));
+    contradictions! { reader;
+        [missed, period, timeout, "stage.hardware"]
+            if config.stage.hardware && missed_max * period_ms > timeout_ms =>
+            "{missed} is {missed_max}, allowed with stage.hardware: up to {}, as {timeout} is {timeout_ms} \
+             and {period} {period_ms}",
+            rounded_down(timeout_ms / period_ms, 0);
     }
 }
 

@@ -5,7 +5,7 @@ use super::machine::Phase;
 use super::supervision::refused_to_switch_on;
 use super::{Axis, Feedback, PerAxis, Progress, SetPoint, Stage, StageEvent};
 use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};
-use crate::canopen::nmt::NmtState;
+use crate::canopen::nmt::{NmtCommand, NmtState};
 use crate::canopen::sdo::codec::ServerFrame;
 use crate::canopen::sdo::{SdoReply, SdoRequest};
 use crate::canopen::sync::sync_frame;
@@ -19,6 +19,9 @@ const REPEAT_PERIOD: Duration = Duration::from_millis(100);
 /// following-error window, or by this many counts: otherwise one of the two readings is wrong, or the axis moves.
 const STEADY_PART: f64 = 0.02;
 const STEADY_COUNTS: f64 = 2.0;
+/// A drive whose answer to the first SYNC does not come before the next is due may have begun late, or may answer
+/// late. It gets another SYNC when the answers to those before must have come.
+const DRAIN: Duration = Duration::from_millis(250);
 /// Least interval of the requests by SDO to a drive that sends no TPDO.
 const READ_PERIOD: Duration = Duration::from_millis(30);
 
@@ -43,7 +46,11 @@ impl Stage {
         self.check_unexplained_faults(now);
         self.judge_feedback(now);
         match self.phase {
-            Phase::Standby { give_up, located } => self.stand_by(now, give_up, located),
+            Phase::Standby { give_up, located } => {
+                if !self.stand_by(now, give_up, located) {
+                    return;
+                }
+            }
             Phase::Enabling { give_up } => self.enable(now, give_up),
             Phase::Ready | Phase::Homing(_) => {
                 self.drives.insertion.advance_target();
@@ -68,11 +75,13 @@ impl Stage {
             if let Some(rpdo) = self.drives[axis].rpdo_due() {
                 self.send(rpdo);
             }
-            self.drives[axis].fresh = false;
         }
         self.send(sync_frame());
         self.sync_time = now;
         self.sync_count += 1;
+        for axis in Axis::BOTH {
+            self.drives[axis].answers.begin(self.sync_count);
+        }
     }
 
     /// Takes both answers to this SYNC, once both have come. The stage is ready only when the heartbeats of
@@ -111,43 +120,33 @@ impl Stage {
         SetPoint { insertion_mm: position(insertion), rotation_rad: position(rotation) }
     }
 
-    /// Counts SYNCs that were not answered by both drives, once both have answered one. Too many in a row stop
-    /// the stage.
+    /// Counts SYNCs that were not answered by both drives, once both have answered one in time. Too many in a row
+    /// stop the stage, and so do too many in all.
     fn judge_feedback(&mut self, now: Time) {
-        if !self.both_heard() {
-            return;
-        }
+        let is_located = !matches!(self.phase, Phase::Standby { located: false, .. });
         let missed_max = u32::from(self.config.bus.missed_feedback_max);
         for axis in Axis::BOTH {
-            let may_be_missed = self.has_noticed_silence(axis);
-            let drive = &mut self.drives[axis];
-            let missed = drive.missed_in_a_row.saturating_add(1);
-            drive.missed_in_a_row = if drive.fresh || may_be_missed { 0 } else { missed };
-            if let Some((syncs, frame)) = drive.count_conflict()
-                && syncs > missed_max
-            {
-                let fault = format!(
-                    "{axis}: two TPDO1 that differ after each of {syncs} SYNCs in a row, the second \
-                     {frame}; does another node have the same ID, or does the drive answer late?"
-                );
-                return self.fail(now, fault);
+            let may_be_silent = !is_located || self.may_leave_operational(axis);
+            if let Some(fault) = self.drives[axis].answers.judge(missed_max, may_be_silent) {
+                return self.fail(now, format!("{axis}: {fault}"));
             }
         }
-        if !self.drives.all(|drive| drive.fresh) {
-            self.counters.feedback_missed += 1;
-        }
-        if self.drives.all(|drive| drive.missed_in_a_row == 0) {
-            self.missed_in_a_row = 0;
+        if !is_located {
             return;
         }
-        self.missed_in_a_row = self.missed_in_a_row.saturating_add(1);
+        if !self.drives.all(|drive| drive.answers.fresh) {
+            self.counters.feedback_missed += 1;
+        }
+        let all_answered = self.drives.all(|drive| drive.answers.missed_in_a_row == 0);
+        let missed = self.missed_in_a_row.saturating_add(1);
+        self.missed_in_a_row = if all_answered { 0 } else { missed };
         if self.missed_in_a_row > missed_max {
             let syncs = self.missed_in_a_row;
             // Name the drive that has missed more: the other may have missed only this SYNC.
             let PerAxis { insertion, rotation } = &self.drives;
-            let is_rotation = rotation.missed_in_a_row > insertion.missed_in_a_row;
+            let is_rotation = rotation.answers.missed_in_a_row > insertion.answers.missed_in_a_row;
             let axis = if is_rotation { Axis::Rotation } else { Axis::Insertion };
-            let fault = match self.drives[axis].tpdo_of_wrong_length {
+            let fault = match self.drives[axis].answers.wrong_length {
                 Some(bytes) => format!(
                     "TPDO1 of {bytes} bytes after {syncs} SYNCs in a row, 6 are mapped; does \
                      another node have the same ID, or another tool map it?"
@@ -156,7 +155,12 @@ impl Stage {
                     "no TPDO1 for {syncs} SYNCs in a row, check bus load, cable and the drive"
                 ),
             };
-            self.fail_drive(now, axis, &fault);
+            return self.fail_drive(now, axis, &fault);
+        }
+        for axis in Axis::BOTH {
+            if let Some(fault) = self.drives[axis].answers.fault_of_owed(missed_max) {
+                self.fail_drive(now, axis, &fault);
+            }
         }
     }
 
@@ -164,15 +168,21 @@ impl Stage {
         self.drives.all(|drive| drive.statusword.is_some())
     }
 
-    /// Reports where the axes stand, and begins to enable them once they may have power.
-    fn stand_by(&mut self, now: Time, give_up: Time, located: bool) {
-        if !self.both_heard() {
-            if now >= give_up {
-                self.fail_enabling(now);
-            }
-            return;
-        }
+    /// Reports where the axes stand, and begins to enable them once they may have power. Returns whether the next
+    /// SYNC may be sent.
+    fn stand_by(&mut self, now: Time, give_up: Time, located: bool) -> bool {
         if !located {
+            let prompt = self.sync_time + self.config.bus.sync_period().mul_f64(1.5);
+            if now >= prompt || !self.drives.all(|drive| drive.answers.fresh) {
+                if now >= give_up {
+                    self.fail_enabling(now);
+                    return true;
+                }
+                for axis in Axis::BOTH {
+                    self.drives[axis].answers.fresh = false;
+                }
+                return self.sync_count == 0 || now >= self.sync_time + DRAIN;
+            }
             self.phase = Phase::Standby { give_up, located: true };
             self.emit(StageEvent::Located(self.positions(Drive::commanded)));
         }
@@ -182,10 +192,11 @@ impl Stage {
             // The drives are armed in a later cycle: until then the caller may refuse to go on from here.
             self.lead_to_enabled();
         }
+        true
     }
 
     /// Enabling has timed out: names a drive that is not in NMT Operational, else one that was not heard, else one
-    /// that is not enabled, else one without a heartbeat.
+    /// that answers late, else one that is not enabled, else one without a heartbeat.
     fn fail_enabling(&mut self, now: Time) {
         let timeout_ms = self.config.power.enable_timeout.as_millis();
         let first = |fails: &dyn Fn(&Drive) -> bool| {
@@ -204,6 +215,12 @@ impl Stage {
             format!(
                 "{axis}: not in operation enabled within {timeout_ms} ms (no TPDO1 was heard), check \
                  cable and the drive"
+            )
+        } else if matches!(self.phase, Phase::Standby { located: false, .. }) {
+            format!(
+                "in {timeout_ms} ms the drives did not both answer one SYNC before the next was due ({} ms): \
+                 their positions would be too old; what delays frames on the bus?",
+                self.config.bus.sync_ms
             )
         } else if let Some(axis) = Axis::BOTH
             .into_iter()
@@ -249,7 +266,7 @@ impl Stage {
         let both_on = self.drives.all(|drive| {
             matches!(drive.state(), Some(DriveState::SwitchedOn | DriveState::OperationEnabled))
         });
-        let is_steady = self.drives.all(|drive| drive.fresh)
+        let is_steady = self.drives.all(|drive| drive.answers.fresh)
             && Axis::BOTH.into_iter().all(|axis| self.is_steady(axis));
         self.before_power_counts = PerAxis::from_fn(|axis| self.drives[axis].commanded.counts);
         if both_on && is_steady && !self.drives.all(Drive::is_armed) {
@@ -306,7 +323,8 @@ impl Stage {
             self.emit(StageEvent::Progress(Progress::Disabling));
             if quick {
                 // A drive does not leave Quick Stop Active by Shutdown.
-                self.command_also_by_sdo(now, Controlword::DISABLE_VOLTAGE);
+                self.set_controlwords(Controlword::DISABLE_VOLTAGE);
+                self.send_controlwords(now, |_| true);
             } else {
                 self.set_controlwords(Controlword::SHUTDOWN);
             }
@@ -353,21 +371,41 @@ impl Stage {
             _ => return,
         }
         self.begin_stop(now, true);
-        self.command_also_by_sdo(now, Controlword::QUICK_STOP);
+        self.set_controlwords(Controlword::QUICK_STOP);
+        // A set-point that was sent ahead would enable a drive again at the next SYNC, on which this RPDO1 is sent
+        // once more.
+        for axis in Axis::BOTH {
+            self.send(self.drives[axis].rpdo_now());
+        }
+        self.send_controlwords(now, |_| true);
     }
 
-    /// Sets the controlword of both drives, and sends it by SDO at once too: a drive that has left Operational
-    /// takes no PDOs.
-    fn command_also_by_sdo(&mut self, now: Time, controlword: Controlword) {
-        self.set_controlwords(controlword);
-        self.send_controlwords(now, |_| true);
+    /// True during a quick stop, until power is off.
+    pub(super) fn is_quick_stopping(&self) -> bool {
+        matches!(
+            self.phase,
+            Phase::Stopping { quick: true, .. } | Phase::Disabling { quick: true, .. }
+        )
+    }
+
+    /// In a quick stop: stops by SDO alone a drive that is enabled, since set-points that are late on the bus may
+    /// enable it again and again. In Pre-operational it takes no RPDO1.
+    pub(super) fn cut_off(&mut self, axis: Axis) {
+        self.drives[axis].is_cut_off = true;
+        self.send_nmt(NmtCommand::EnterPreOperational, axis);
+        self.send_controlword(axis, self.drives[axis].controlword);
+    }
+
+    /// True if the drive may be in another NMT state than Operational, and send no TPDO1.
+    pub(super) fn may_leave_operational(&self, axis: Axis) -> bool {
+        self.has_noticed_silence(axis) || self.drives[axis].is_cut_off
     }
 
     /// While the stage stops, reads the statusword and the position of a drive that sends no TPDO, such as
     /// one that has left Operational: in turn, each after the answer to the other.
     fn read_by_sdo(&mut self, now: Time, axis: Axis) {
         let stops = matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. });
-        if !stops || self.drives[axis].fresh {
+        if !stops || self.drives[axis].answers.fresh {
             return;
         }
         let Reading { object, sent, is_answered } = self.drives[axis].reading;
@@ -411,15 +449,12 @@ impl Stage {
 
     /// In a quick stop: commands the drives that `disobey` again, at intervals.
     fn repeat_by_sdo(&mut self, now: Time, disobey: impl Fn(&Drive) -> bool) {
-        let quick = matches!(
-            self.phase,
-            Phase::Stopping { quick: true, .. } | Phase::Disabling { quick: true, .. }
-        );
-        if quick && now >= self.repeat_due {
+        if self.is_quick_stopping() && now >= self.repeat_due {
             self.send_controlwords(now, disobey);
         }
     }
 
+    /// Sends its controlword by SDO to each drive of `to`: one that has left Operational takes no PDOs.
     fn send_controlwords(&mut self, now: Time, to: impl Fn(&Drive) -> bool) {
         self.repeat_due = now + REPEAT_PERIOD;
         for axis in Axis::BOTH {

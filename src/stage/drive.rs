@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use super::answers::Answers;
 use super::bring_up::BringUpState;
 use super::cycle::Reading;
 use super::event::{DriveReport, may_have_power};
@@ -14,6 +15,8 @@ use crate::units::Time;
 
 /// Longest time from Fault Reset to the end of the fault.
 const RESET_TIMEOUT: Duration = Duration::from_millis(500);
+/// The first SYNC of a stop carries its controlword, and the TPDO1 after that may have been sampled before.
+const STOP_SYNCS: u64 = 2;
 /// The bits that a drive on its way to Operation Enabled keeps once it has shown them.
 const BEFORE_POWER: u16 = Statusword::REMOTE | Statusword::VOLTAGE_ENABLED;
 
@@ -49,22 +52,15 @@ pub(super) struct Drive {
     /// The SYNC after which it came. After one before `off_sync` it does not say that power is off.
     statusword_sync: u64,
     off_sync: u64,
-    /// The drive's TPDO1 for the last SYNC has come.
-    pub(super) fresh: bool,
-    /// SYNCs in a row without the drive's TPDO1.
-    pub(super) missed_in_a_row: u32,
-    /// The length, bytes, of a TPDO1 that came since the last one that was taken.
-    pub(super) tpdo_of_wrong_length: Option<usize>,
+    /// The SYNC after which the last stop began.
+    stop_sync: u64,
+    pub(super) answers: Answers,
+    /// In this stop the bench has sent its node to Pre-operational, in which it takes no RPDO1.
+    pub(super) is_cut_off: bool,
     sequence: EnableSequence,
     reset: FaultReset,
     /// SYNCs that the drive has stayed in a state that it is commanded to leave.
     transition_syncs: u32,
-    /// The payload of the TPDO1 taken for the last SYNC.
-    tpdo: [u8; 6],
-    /// A second TPDO1 after the last SYNC, with another payload.
-    second_tpdo: Option<Frame>,
-    /// SYNCs in a row with such a second TPDO1.
-    conflicts: u32,
     /// Bit 11 (internal limit active) was set in the last statusword.
     was_limited: bool,
     /// How often bit 11 was set anew.
@@ -107,15 +103,12 @@ impl Drive {
             statusword: None,
             statusword_sync: 0,
             off_sync: 0,
-            fresh: false,
-            missed_in_a_row: 0,
-            tpdo_of_wrong_length: None,
+            stop_sync: 0,
+            answers: Answers::default(),
+            is_cut_off: false,
             sequence: EnableSequence::default(),
             reset: FaultReset::None,
             transition_syncs: 0,
-            tpdo: [0; 6],
-            second_tpdo: None,
-            conflicts: 0,
             was_limited: false,
             limited: 0,
             shown: 0,
@@ -145,12 +138,9 @@ impl Drive {
 
     /// Takes the payload of TPDO1 after a SYNC, as [`plan::TPDO1`](super::plan::TPDO1) maps it.
     pub(super) fn take_tpdo(&mut self, payload: [u8; 6], sync: u64) {
-        self.tpdo = payload;
         let [s0, s1, p0, p1, p2, p3] = payload;
         self.take_statusword(Statusword(u16::from_le_bytes([s0, s1])), sync);
         self.take_position(i32::from_le_bytes([p0, p1, p2, p3]), sync);
-        self.fresh = true;
-        self.tpdo_of_wrong_length = None;
         // Until the drive follows its target, the target follows the drive.
         if self.armed.is_none() || self.in_homing_mode() {
             self.commanded = Commanded { counts: self.position.counts(), step_counts: 0 };
@@ -190,8 +180,13 @@ impl Drive {
 
     /// RPDO1 with the present target; `None` if this very frame was sent ahead of the SYNC.
     pub(super) fn rpdo_due(&mut self) -> Option<Frame> {
-        let rpdo = self.rpdo(self.commanded.counts);
+        let rpdo = self.rpdo_now();
         (self.sent_ahead.take() != Some(rpdo)).then_some(rpdo)
+    }
+
+    /// RPDO1 with the present target, which replaces one that was sent ahead of the SYNC.
+    pub(super) fn rpdo_now(&self) -> Frame {
+        self.rpdo(self.commanded.counts)
     }
 
     /// RPDO1, as [`plan::RPDO1`](super::plan::RPDO1) maps it.
@@ -206,7 +201,7 @@ impl Drive {
     /// The controlword one step nearer to Operation Enabled; the last step is to be sent only together with
     /// the other drive's. One rising edge of Fault Reset leads a drive out of the Fault that it was found in.
     pub(super) fn next_controlword(&mut self) -> Controlword {
-        let Some(statusword) = self.statusword.filter(|_| self.fresh) else {
+        let Some(statusword) = self.statusword.filter(|_| self.answers.fresh) else {
             return self.controlword;
         };
         if let FaultReset::Sent(syncs) = &mut self.reset {
@@ -265,21 +260,6 @@ impl Drive {
             if is_commanded_on { self.transition_syncs.saturating_add(1) } else { 0 };
         let waited = self.sync_period.saturating_mul(self.transition_syncs);
         self.statusword.filter(|_| waited > timeout)
-    }
-
-    /// Notes a second TPDO1 after one SYNC, if it differs from the first.
-    pub(super) fn note_second_tpdo(&mut self, frame: &Frame, payload: [u8; 6]) {
-        if self.fresh && payload != self.tpdo {
-            self.second_tpdo = Some(*frame);
-        }
-    }
-
-    /// To be called once a SYNC. If a second TPDO1 differed from the first after it, returns for how many
-    /// SYNCs in a row that was so, and the newest second TPDO1.
-    pub(super) fn count_conflict(&mut self) -> Option<(u32, Frame)> {
-        let second = self.second_tpdo.take();
-        self.conflicts = if second.is_some() { self.conflicts.saturating_add(1) } else { 0 };
-        second.map(|frame| (self.conflicts, frame))
     }
 
     /// To be called for each statusword while the drive must follow. True if it shows anew that a limit inside the
@@ -461,12 +441,12 @@ impl Drive {
     /// have braked, nor a drive that was commanded to switch on to be off by what it said before the stop.
     pub(super) fn begin_stop(&mut self, now: Time, sync: u64, quick: bool) {
         self.next_counts = None;
+        self.stop_sync = sync;
         let braking = if quick { self.braking_time() } else { Duration::ZERO };
         self.standstill.watch_braking(self.position.counts(), braking);
         self.reading = Reading::begun(now);
         if self.controlword.has(Controlword::SWITCH_ON_BIT) {
-            // The first SYNC carries the stop's controlword, and its TPDO may have been sampled before.
-            self.off_sync = sync + 2;
+            self.off_sync = sync + STOP_SYNCS;
         }
     }
 
@@ -491,6 +471,11 @@ impl Drive {
     /// See [`Standstill`].
     pub(super) fn stands(&self) -> bool {
         self.standstill.stands()
+    }
+
+    /// True if the drive is in Operation Enabled although it has had time to take the command to stop.
+    pub(super) fn disobeys_stop(&self) -> bool {
+        self.is_enabled() && self.statusword_sync >= self.stop_sync + STOP_SYNCS
     }
 
     /// True if the motor has no power, or is losing it.

@@ -254,7 +254,7 @@ impl Stage {
         if let Some(why) = not_ready {
             return Err(format!("the stage takes no set-points {why}"));
         }
-        if !self.drives.all(|drive| drive.fresh) {
+        if !self.drives.all(|drive| drive.answers.fresh) {
             return Err(format!(
                 "the positions at SYNC {} have not arrived; older ones must not be used",
                 self.sync_count

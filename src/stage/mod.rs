@@ -35,6 +35,7 @@
 //! there is a second sender, which is a fault. A drive whose every answer is late by a whole period cannot be
 //! distinguished from one that is on time.
 
+mod answers;
 mod axis;
 mod bring_up;
 mod config;

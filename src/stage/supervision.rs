@@ -96,7 +96,7 @@ impl Stage {
                 let ms = self.config.bus.heartbeat_timeout_ms;
                 format!("no heartbeat for {ms} ms, is the drive powered and on the bus?")
             }
-            HeartbeatEvent::State(_) if self.has_noticed_silence(axis) => return,
+            HeartbeatEvent::State(_) if self.may_leave_operational(axis) => return,
             HeartbeatEvent::State(state) if state != NmtState::Operational && !may_be_old => {
                 let fault =
                     format!("NMT state {state} instead of operational, is there another master?");
@@ -133,18 +133,21 @@ impl Stage {
 
     pub(super) fn handle_tpdo(&mut self, now: Time, axis: Axis, frame: &Frame) {
         let Ok(payload) = frame.data().try_into() else {
-            self.drives[axis].tpdo_of_wrong_length = Some(frame.data().len());
+            self.drives[axis].answers.wrong_length = Some(frame.data().len());
             return self.ignore(Ignored::WrongLength, frame);
         };
-        if !self.sync_runs() || self.sync_count == 0 || self.drives[axis].fresh {
-            self.drives[axis].note_second_tpdo(frame, payload);
+        let may_answer = self.sync_runs() && self.sync_count > 0;
+        if !may_answer || !self.drives[axis].answers.take(frame, payload) {
             return self.ignore(Ignored::Unexpected, frame);
         }
         self.flood.frames -= 1;
         let previous = self.drives[axis].state();
         self.drives[axis].take_tpdo(payload, self.sync_count);
         self.check_statusword(now, axis, previous);
-        if self.drives.all(|drive| drive.fresh) {
+        if self.is_quick_stopping() && self.drives[axis].disobeys_stop() {
+            self.cut_off(axis);
+        }
+        if self.drives.all(|drive| drive.answers.fresh) {
             self.handle_feedback(now);
         }
     }

@@ -189,7 +189,8 @@ pub(crate) fn a_drive_that_ignores_every_command_to_power_off_is_reported(buses:
     assert!((run.stands_at_mm - 3.0).abs() < 0.01, "{}", run.stands_at_mm);
     let first = |what| run.first(what).time_s;
     let shutdown_s = first("controlword 0x0006 by RPDO lost");
-    for (word, after_s) in [("0x0002", 2.0), ("0x0000", 4.0)] {
+    // Before the second quick stop its node leaves Operational. Then this drive stops by itself (6007).
+    for (word, after_s, is_repeated) in [("0x0002", 2.0, false), ("0x0000", 2.25, true)] {
         let what = format!("controlword {word} by SDO lost");
         let times_s: Vec<f64> = run
             .relay
@@ -206,6 +207,7 @@ pub(crate) fn a_drive_that_ignores_every_command_to_power_off_is_reported(buses:
             Buses::Udp => (0.2, 15),
             Buses::Vcan => (3.0, 10),
         };
+        let least = if is_repeated { least } else { 1 };
         assert!((least..=20).contains(&times_s.len()), "{times_s:?}");
         let late_s = times_s[0] - shutdown_s - after_s;
         assert!((-0.2..late_max_s).contains(&late_s), "{times_s:?}");

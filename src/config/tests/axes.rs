@@ -182,8 +182,8 @@ fn options_by_which_a_real_drive_would_not_stop_are_refused() {
     for (key, allowed, refused_values) in [
         ("abort_connection_option", &[1, 2, 3][..], &[-1, 0, 4][..]),
         ("communication_error_behaviour", &[0, 2], &[1, 3]),
-        ("quick_stop_option", &[1, 2, 3, 5, 6, 7], &[-1, 0, 4, 8]),
-        ("fault_reaction_option", &[1, 2, 3], &[-1, 0, 4]),
+        ("quick_stop_option", &[2, 3, 6, 7], &[-1, 0, 1, 4, 5, 8]),
+        ("fault_reaction_option", &[2, 3], &[-1, 0, 1, 4]),
     ] {
         let set = |value| format!("stage.rotation.{key}={value}");
         for value in allowed {

@@ -101,6 +101,13 @@ fn contradictory_keys_are_refused_with_both_values() {
          \"openigtlink\""
     );
     assert_eq!(
+        refused(RIG, &["can.missed_feedback_max=11"]),
+        "--set can.missed_feedback_max is 11, allowed with stage.hardware: up to 10, as \
+         can.heartbeat_timeout_ms is 100 and can.sync_ms 10"
+    );
+    loaded(RIG, &["can.missed_feedback_max=10"]);
+    loaded("", &["can.missed_feedback_max=11"]);
+    assert_eq!(
         set_refusal(&["can.interface=vcan0"]),
         "--set can.interface: tracker.source is \"emulated\", allowed only with can.interface = \
          \"memory\", which is \"vcan0\": it sees the emulated needle alone. Set tracker.source = \

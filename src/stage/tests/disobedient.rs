@@ -33,8 +33,9 @@ fn a_drive_that_keeps_its_power_at_the_end_is_a_fault() {
     assert_eq!(bench.rotation.state, DriveState::SwitchOnDisabled);
 }
 
-/// The stage repeats quick stop, then Disable Voltage, every 100 ms until the timeout. The drive goes on to
-/// monitor the bench's heartbeat, which may still stop it.
+/// The stage sends quick stop again after the second TPDO1 that shows that it is not obeyed, with the node out of
+/// Operational, and then every 100 ms; after the timeout Disable Voltage. The drive goes on to monitor the bench's
+/// heartbeat, which may still stop it.
 #[test]
 fn a_drive_that_ignores_commands_gets_them_again_and_keeps_its_watchdog() {
     let mut bench = Bench::ready();
@@ -46,12 +47,13 @@ fn a_drive_that_ignores_commands_gets_them_again_and_keeps_its_watchdog() {
     let end = bench.run_until(|event| matches!(event, StageEvent::Stopped { .. }));
     assert_eq!(end, StageEvent::Stopped { standing: false, off: false });
     let words = by_sdo(&bench);
-    for (after, word) in [(0, 0x02), (2000, 0x00)] {
-        let of_word = words.iter().filter(|(_, other)| *other == word);
-        let ms: Vec<u128> = of_word.map(|(time, _)| time.as_millis()).collect();
-        let wanted: Vec<u128> = (0..20).map(|n| after + n * 100).collect();
-        assert_eq!(ms, wanted, "0x{word:02X}");
-    }
+    let sent_ms = |word: u8| -> Vec<u128> {
+        words.iter().filter(|(_, other)| *other == word).map(|(at, _)| at.as_millis()).collect()
+    };
+    let every_100_ms = |from: u128| (0..20).map(move |n| from + n * 100);
+    let quick_stops = [0, 10].into_iter().chain(every_100_ms(0).skip(1)).collect::<Vec<_>>();
+    assert_eq!(sent_ms(0x02), quick_stops);
+    assert_eq!(sent_ms(0x00), every_100_ms(2000).collect::<Vec<_>>());
     assert_ne!(bench.insertion.value(0x1016, 1), 0);
     assert_eq!(bench.rotation.value(0x1016, 1), 0);
 }
@@ -86,8 +88,8 @@ fn a_quick_stop_that_was_not_obeyed_is_sent_again() {
     bench.insertion.ignores_sdo = false;
     assert!(bench.until_stopped(), "standstill is reported");
     let words: Vec<(u128, u8)> = by_sdo(&bench).iter().map(|(t, w)| (t.as_millis(), *w)).collect();
-    assert_eq!(words[..2], [(0, 0x02), (100, 0x02)]);
-    assert_eq!((words[2].1, words.len()), (0x00, 3));
+    assert_eq!(words[..3], [(0, 0x02), (20, 0x02), (100, 0x02)]);
+    assert_eq!((words[3].1, words.len()), (0x00, 4));
 }
 
 /// The fault when an enabled drive clears `bits` that it has set so far.

@@ -43,6 +43,8 @@ pub(super) struct TestDrive {
     /// Bits that are set in the statusword, and then bits that are cleared.
     pub(super) extra_bits: u16,
     pub(super) clear_bits: u16,
+    /// Before each SYNC this RPDO1 arrives late, after the newest one.
+    pub(super) stale_rpdo: Option<(u16, i32)>,
     /// Ignores controlwords in RPDO1, or those by SDO.
     pub(super) ignores_rpdo: bool,
     pub(super) ignores_sdo: bool,
@@ -149,6 +151,7 @@ impl TestDrive {
             forgets: None,
             extra_bits: 0,
             clear_bits: 0,
+            stale_rpdo: None,
             ignores_rpdo: false,
             ignores_sdo: false,
             coasted_from: 0,
@@ -230,7 +233,7 @@ impl TestDrive {
             self.last_tpdo = Some(tpdo);
             self.out.push(tpdo);
         }
-        if let Some((controlword, target)) = self.rpdo {
+        if let Some((controlword, target)) = self.stale_rpdo.or(self.rpdo) {
             if !self.ignores_rpdo {
                 self.command(controlword);
             }
@@ -297,6 +300,7 @@ impl TestDrive {
             (S::Fault, _) if reset && !self.keeps_its_fault => S::SwitchOnDisabled,
             (state @ (S::Fault | S::FaultReactionActive | S::NotReadyToSwitchOn), _) => state,
             (S::OperationEnabled, 0x02 | 0x03) => S::QuickStopActive,
+            (S::QuickStopActive, 0x0f) if self.value(0x605a, 0) >= 5 => S::OperationEnabled,
             (state @ S::QuickStopActive, 0x02 | 0x03 | 0x06 | 0x07 | 0x0f) => state,
             (_, 0x00 | 0x02 | 0x03) => S::SwitchOnDisabled,
             _ if self.safety_open => S::SwitchOnDisabled,

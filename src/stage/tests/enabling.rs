@@ -251,3 +251,29 @@ fn an_axis_that_moves_while_its_drive_takes_long_to_enable_is_a_fault() {
     assert_eq!(bench.rotation.counts, 1980);
     assert!(!bench.events.contains(&StageEvent::Ready));
 }
+
+/// Something on the bus delays them from the start. They would be taken for answers to later SYNCs.
+#[test]
+fn answers_that_come_after_the_next_sync_is_due_get_no_power() {
+    for late_ms in [15, 95, 195] {
+        let mut bench = Bench::new(config());
+        bench.tpdo_delay = Duration::from_millis(late_ms);
+        let fault = bench.until_fault();
+        let expected =
+            "in 3000 ms the drives did not both answer one SYNC before the next was due (10 ms): ";
+        assert!(fault.starts_with(expected), "{late_ms} ms: {fault}");
+        assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled);
+    }
+}
+
+#[test]
+fn a_drive_that_begins_to_answer_late_is_no_fault() {
+    let mut bench = Bench::new(config());
+    bench.rotation.tpdos_lost = 2;
+    bench.tpdo_delay = Duration::from_millis(9);
+    bench.until_ready();
+    let syncs = bench.sent.iter().filter(|(_, frame)| frame.to_string() == "080#");
+    let times: Vec<Time> = syncs.map(|(time, _)| *time).take(4).collect();
+    let gaps: Vec<u128> = times.windows(2).map(|pair| pair[1].since(pair[0]).as_millis()).collect();
+    assert_eq!(gaps, [250, 250, 10]);
+}

@@ -116,8 +116,9 @@ struct Bench {
     rotation: TestDrive,
     /// All frames that the stage has sent.
     sent: Vec<(Time, Frame)>,
-    /// SDO answers arrive so much later, and these still have to.
+    /// SDO answers, and TPDO1, arrive so much later, and these still have to.
     sdo_delay: Duration,
+    tpdo_delay: Duration,
     /// A second drive has the node number of the insertion drive. It answers each SDO request as that one does, so
     /// much later.
     twin_later: Option<Duration>,
@@ -142,6 +143,7 @@ impl Bench {
             stage,
             sent: Vec::new(),
             sdo_delay: Duration::ZERO,
+            tpdo_delay: Duration::ZERO,
             twin_later: None,
             delayed: VecDeque::new(),
             events: Vec::new(),
@@ -169,7 +171,12 @@ impl Bench {
                         let is_sdo_of = |id: u8| answer.cob_id() == Some(cob::sdo_tx(node(id)));
                         let is_sdo = is_sdo_of(1) || is_sdo_of(2);
                         let twin = self.twin_later.filter(|_| is_sdo_of(1));
-                        let own = if is_sdo { self.sdo_delay } else { Duration::ZERO };
+                        let is_tpdo_of = |id: u8| answer.cob_id() == Some(cob::tpdo1(node(id)));
+                        let own = match answer {
+                            _ if is_sdo => self.sdo_delay,
+                            _ if is_tpdo_of(1) || is_tpdo_of(2) => self.tpdo_delay,
+                            _ => Duration::ZERO,
+                        };
                         for delay in
                             [Some(own), twin.map(|later| own + later)].into_iter().flatten()
                         {

@@ -21,6 +21,55 @@ fn quick_stop_brakes_under_power_until_both_axes_stand() {
     assert_eq!(bench.insertion.nmt, NmtState::PreOperational);
 }
 
+/// The controlwords of the RPDO1 that were sent to the insertion drive.
+fn rpdos(bench: &Bench) -> Vec<u8> {
+    let rpdo = |(_, frame): &(Time, Frame)| match (frame.cob_id(), frame.data()) {
+        (Some(0x201), [controlword, ..]) => Some(*controlword),
+        _ => None,
+    };
+    bench.sent.iter().filter_map(rpdo).collect()
+}
+
+/// The drive would take it at the next SYNC, and leave Quick Stop Active for Operation Enabled (CiA 402, transition
+/// 16).
+#[test]
+fn a_set_point_that_was_sent_ahead_is_replaced_as_a_stop_begins() {
+    let mut bench = Bench::ready();
+    bench.drive_on(20);
+    bench.command(0.21, 0.21).expect("within limits");
+    bench.settle();
+    bench.sent.clear();
+    bench.stage.quick_stop(bench.now);
+    bench.settle();
+    assert_eq!(rpdos(&bench), [0x02], "at once");
+    assert_eq!(bench.insertion.state, DriveState::QuickStopActive, "by SDO");
+    // It may be lost, so it is sent again with the SYNC.
+    bench.run_for(Duration::from_millis(15));
+    assert_eq!(rpdos(&bench)[..2], [0x02, 0x02]);
+    assert_eq!(bench.insertion.state, DriveState::QuickStopActive);
+    assert!(!bench.has_sent("000#8001"));
+}
+
+/// Something on the bus holds frames back. What it passes on enables the drive again, each time.
+#[test]
+fn a_drive_that_late_set_points_enable_again_is_stopped_by_sdo_alone() {
+    let mut bench = Bench::ready();
+    bench.drive_on(20);
+    bench.insertion.stale_rpdo = Some((0x0f, bench.insertion.counts));
+    bench.stage.quick_stop(bench.now);
+    let (begun, mut enabled_ms) = (bench.now, Vec::new());
+    while !bench.events.iter().any(|event| matches!(event, StageEvent::Stopped { .. })) {
+        bench.step();
+        if bench.insertion.state == DriveState::OperationEnabled {
+            enabled_ms.push(bench.now.since(begun).as_millis());
+        }
+    }
+    assert!(enabled_ms.iter().all(|ms| *ms < 20), "{enabled_ms:?}");
+    assert!(!enabled_ms.is_empty());
+    assert_eq!(bench.fault(), None, "it was stopped without a fault");
+    assert!(bench.events.contains(&StageEvent::Stopped { standing: true, off: true }));
+}
+
 /// The positions of both axes freeze while they move, and the stage is stopped at once.
 #[test]
 fn a_frozen_position_is_no_standstill_while_the_axis_may_brake() {

@@ -16,7 +16,7 @@ fn an_internal_limit_is_reported_once() {
 #[test]
 fn one_lost_tpdo1_is_tolerated_and_two_in_a_row_stop_both_axes() {
     let mut bench = Bench::ready();
-    for missed in 1..=3 {
+    for missed in 1..=2 {
         bench.rotation.tpdos_lost = 1;
         bench.run_for(Duration::from_millis(50));
         assert_eq!(bench.stage.counters().feedback_missed, missed);
@@ -31,6 +31,44 @@ fn one_lost_tpdo1_is_tolerated_and_two_in_a_row_stop_both_axes() {
     assert!(bench.until_stopped());
     assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled);
     assert_eq!(bench.rotation.nmt, NmtState::PreOperational);
+}
+
+/// A TPDO1 that is lost now and then is no fault.
+#[test]
+fn answers_that_are_lost_again_and_again_are_a_fault() {
+    let mut bench = Bench::ready();
+    let lose = |bench: &mut Bench| {
+        bench.rotation.tpdos_lost = 1;
+        bench.run_for(Duration::from_millis(50));
+    };
+    for _ in 0..3 {
+        lose(&mut bench);
+    }
+    for _ in 0..5 {
+        bench.run_for(Duration::from_secs(10));
+        lose(&mut bench);
+    }
+    assert_eq!(bench.fault(), None);
+    lose(&mut bench);
+    assert_eq!(
+        bench.until_fault(),
+        "rotation: 4 TPDO1 are lost or late (limit 3): its positions may be 4 SYNCs old; check bus load, cable, and \
+         what passes frames on"
+    );
+    assert!(bench.until_stopped());
+}
+
+/// A gateway whose queue grows: each answer comes, later and later.
+#[test]
+fn answers_that_come_ever_later_are_a_fault() {
+    let mut bench = Bench::ready();
+    for late_ms in [5, 15, 25, 35, 45] {
+        assert_eq!(bench.fault(), None, "{late_ms} ms");
+        bench.tpdo_delay = Duration::from_millis(late_ms);
+        bench.run_for(Duration::from_millis(500));
+    }
+    let fault = bench.until_fault();
+    assert!(fault.starts_with("insertion: 4 TPDO1 are lost or late (limit 3)"), "{fault}");
 }
 
 #[test]

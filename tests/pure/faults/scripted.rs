@@ -218,6 +218,23 @@ fn a_bus_that_holds_frames() {
     assert!(before.0 + after.0 < 0.03, "{before:?} {after:?}");
 }
 
+/// The drives get the stop by SDO. The set-points for the next SYNC have reached them, and RPDO1 with the stop comes
+/// late. The emergency message is another node's, so the drives stop only as the bench says.
+#[test]
+fn set_points_held_back_as_a_stop_begins() {
+    let test = "set_points_held_back_as_a_stop_begins";
+    let late = r#"kind = "delay", frames = "pdo", toward = "drives", delay_ms = 95"#;
+    let emergency = r#"kind = "foreign", frame = "082#1042090000000000""#;
+    let reason = "stage: rotation: emergency 0x4210 device over-temperature (register 0x09)";
+    for run in hazard(test, &[late, emergency], &[], 0.0, reason) {
+        let (stopping_s, _) = moment(&run.json["emulated"]["stopping"]);
+        for drive in run.json["emulated"]["drives"].as_array().expect("two") {
+            let (left_s, _) = moment(&drive["left_operation"]);
+            assert!(left_s - stopping_s < 0.03, "for good: {}", run.json);
+        }
+    }
+}
+
 /// If the configuration tolerates missing TPDOs for longer.
 #[test]
 fn unconfirmed_frames_stop_the_run() {
