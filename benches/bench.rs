@@ -273,7 +273,7 @@ fn run(c: &mut Criterion) {
 }
 
 fn whole_run(config: &Config) -> usize {
-    let mut session = Session::new(config.session().expect("valid"), Time::ZERO).expect("valid");
+    let mut session = Session::new(config.session().expect("valid"), Time::ZERO);
     let mut stage = VirtualStage::new(config.virtual_stage().expect("valid"), Time::ZERO);
     let (mut now, mut records) = (Time::ZERO, 0);
     while session.outcome().is_none() {

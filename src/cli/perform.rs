@@ -28,6 +28,7 @@ use crate::transport::link::Link;
 use crate::transport::socketcan::{SocketCan, has_device};
 use crate::transport::udp::UdpBus;
 use crate::units::Time;
+use clap::Args;
 use serde_json::{Value, json};
 use std::net::{SocketAddr, TcpListener};
 use std::path::Path;
@@ -35,7 +36,7 @@ use std::time::SystemTime;
 use tokio::runtime::Runtime;
 
 /// The default address of `--live`, where viewers look for a run.
-pub(super) const LIVE_ADDRESS: &str = "127.0.0.1:9876";
+const LIVE_ADDRESS: &str = "127.0.0.1:9876";
 
 /// A session to run, and what its record says about it.
 pub(super) struct Job<'a> {
@@ -47,17 +48,25 @@ pub(super) struct Job<'a> {
 }
 
 /// How a session is run, shown and described.
-#[derive(Clone, Default)]
+#[derive(Debug, Clone, Default, Args)]
 pub(super) struct Options {
-    pub(super) about: About,
+    #[command(flatten)]
     pub(super) realtime: RealTimeArguments,
-    /// Serves the run to viewers at this address.
+    #[command(flatten)]
+    pub(super) about: About,
+    /// Serve the run to rerun viewers as it goes; without an address at 127.0.0.1:9876.
+    #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true,
+          default_missing_value = LIVE_ADDRESS)]
     pub(super) live: Option<SocketAddr>,
-    /// Shows warnings and faults only.
-    pub(super) quiet: bool,
-    /// Shows the run on the whole terminal, and takes its keys.
+    /// Show the run on the whole terminal; its keys hold, resume, step, change the speed and stop. An
+    /// emulated run then takes as long as a real one.
+    #[arg(long, conflicts_with = "quiet")]
     pub(super) console: bool,
+    /// Show warnings and faults only.
+    #[arg(long, short)]
+    pub(super) quiet: bool,
     /// Runs an emulated stage in real time, so that an operator can practise.
+    #[arg(skip)]
     pub(super) paced: bool,
 }
 
@@ -123,7 +132,6 @@ impl Job<'_> {
             OnFailure::GoOn => Some("the run goes on (record.on_failure)"),
             OnFailure::Stop => None,
         };
-        let begin = |now| self.run_config.clone().begin(now).map_err(Failure::configuration);
         let Options { realtime, live, paced, .. } = self.options;
         live.map_or(Ok(()), check_live_address)?;
         let mut session;
@@ -142,7 +150,7 @@ impl Job<'_> {
             };
             let (recorder, _) = self.start_recording(SystemTime::now(), Backpressure::Block)?;
             let sink = Sink::new(recorder, goes_on, operator, interrupt);
-            session = begin(Time::ZERO)?;
+            session = self.run_config.clone().begin(Time::ZERO);
             run_virtual(&mut session, stage, tips, paced.then(Pace::begin), sink)
         } else {
             realtime.check_permission()?;
@@ -153,7 +161,7 @@ impl Job<'_> {
                 self.start_recording(clock.origin_utc(), Backpressure::DropAndCount)?;
             let sink = Sink::new(recorder, goes_on, operator, interrupt);
             // Last: the session's deadlines start to run here.
-            session = begin(clock.now())?;
+            session = self.run_config.clone().begin(clock.now());
             run_live(&mut session, bus.as_mut(), tracker.as_mut(), clock, realtime, sink)
         };
         Ok(Performed { report, done: session.moves().to_vec(), wants_withdrawal: false })
@@ -162,7 +170,7 @@ impl Job<'_> {
     fn needs_tracker(&self) -> bool {
         match &self.run_config {
             RunConfig::Insertion(_) => true,
-            RunConfig::Operation(config) => config.operation.needs_tracker(),
+            RunConfig::Operation(_, operation) => operation.needs_tracker(),
         }
     }
 

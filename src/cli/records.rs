@@ -107,7 +107,8 @@ pub(super) fn describe(config: Config) -> Describe {
 /// What the run of `manifest` was to do, from its configuration and arguments.
 pub(super) fn recorded_run_config(manifest: &Manifest, config: &Config) -> Result<RunConfig> {
     let Some(name) = &manifest.operation else {
-        return Ok(config.session_reading(&mask_reader(None))?.into());
+        let session = config.session_reading(&mask_reader(None))?;
+        return Ok(RunConfig::Insertion(Box::new(session)));
     };
     // The record says `prove-handedness` for `prove --handedness`.
     let command = name.split('-').next().unwrap_or_default();
@@ -118,7 +119,7 @@ pub(super) fn recorded_run_config(manifest: &Manifest, config: &Config) -> Resul
              recorded it"
         ))
     })?;
-    Ok(motion.plan(config)?.into())
+    motion.plan(config)
 }
 
 /// What stage and tracker measured in a recorded run.
@@ -179,10 +180,7 @@ pub(super) fn position_at(stage: &[(Time, SetPoint)], time: Time) -> Option<SetP
     let after = stage.partition_point(|(at, _)| *at <= time);
     let ((t0, a), (t1, b)) = (stage.get(after.checked_sub(1)?)?, stage.get(after)?);
     let part = time.seconds_after(*t0) / t1.seconds_after(*t0);
-    Some(SetPoint {
-        insertion_mm: a.insertion_mm + part * (b.insertion_mm - a.insertion_mm),
-        rotation_rad: a.rotation_rad + part * (b.rotation_rad - a.rotation_rad),
-    })
+    Some(*a + (*b - *a) * part)
 }
 
 /// Recorded insertions, and the configuration to judge them by.

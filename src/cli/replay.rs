@@ -39,7 +39,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<()> {
     let run_config = recorded_run_config(&folder.manifest, &config)?;
     let observer = match &run_config {
         RunConfig::Insertion(session) => Some(session.observer.name()),
-        RunConfig::Operation(_) => None,
+        RunConfig::Operation(..) => None,
     };
     let recorded =
         Recorded { manifest: &folder.manifest, run_config, open: &|name| folder.lines(name) };

@@ -1,16 +1,17 @@
 //! `needle-bench run`: one insertion.
 
-use super::arguments::{About, Configured, RealTimeArguments, parse_seed};
+use super::arguments::{Configured, parse_seed};
 use super::console::Console;
 use super::ending::{
     after_insertion, ending, plan_status, plane_missed_by_mm, possible_withdrawal, status,
 };
 use super::mask::{file_crc32, mask_reader};
 use super::output::{merged, print_result};
-use super::perform::{Job, LIVE_ADDRESS, Options, Performed, end_json};
+use super::perform::{Job, Options, Performed, end_json};
 use super::preflight::{before_rehearsal, before_run};
 use super::{Failure, Result, finish_with, stage};
 use crate::config::Config;
+use crate::operation::RunConfig;
 use crate::preflight::Check;
 use crate::runtime::{RunReport, gates_to_json};
 use crate::session::Outcome;
@@ -18,7 +19,6 @@ use crate::text::screen;
 use clap::Args;
 use minijinja::{Value as Shown, context};
 use serde_json::{Value, json};
-use std::net::SocketAddr;
 use std::path::Path;
 
 #[derive(Debug, Args)]
@@ -40,28 +40,15 @@ pub(super) struct Arguments {
     /// the noise: the trial of a study that has this seed. (The noise alone: --set emulator.seed=SEED.)
     #[arg(long, value_parser = parse_seed, allow_negative_numbers = true)]
     seed: Option<u64>,
-    #[command(flatten)]
-    realtime: RealTimeArguments,
-    #[command(flatten)]
-    about: About,
-    /// Serve the run to rerun viewers as it goes; without an address at 127.0.0.1:9876.
-    #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true,
-          default_missing_value = LIVE_ADDRESS)]
-    live: Option<SocketAddr>,
-    /// Show the run on the whole terminal; its keys hold, resume, step, change the speed and stop. An
-    /// emulated run then takes as long as a real one.
-    #[arg(long, conflicts_with = "quiet")]
-    console: bool,
     /// One JSON object on stdout.
     #[arg(long)]
     json: bool,
-    /// Show warnings and faults only.
-    #[arg(long, short)]
-    quiet: bool,
+    #[command(flatten)]
+    options: Options,
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<()> {
-    if arguments.console {
+    if arguments.options.console {
         // Refused before anything is checked.
         Console::open_keys()?;
     }
@@ -79,22 +66,17 @@ pub(super) fn run(arguments: &Arguments) -> Result<()> {
     }
     // The record names each mask by its absolute path and checksum, for a replay to find and check it.
     config = configured.completed(&config, |mask| file_crc32(mask).ok());
-    let session = config.session_reading(&mask_reader(None))?;
+    let session = Box::new(config.session_reading(&mask_reader(None))?);
     let preflight = if arguments.rehearse {
-        before_rehearsal(&config, &arguments.configured.load(None)?, arguments.quiet)
+        before_rehearsal(&config, &arguments.configured.load(None)?, arguments.options.quiet)
     } else {
         before_run(&config, arguments.yes, arguments.json)?
     };
-    let options = Options {
-        about: arguments.about.clone(),
-        realtime: arguments.realtime,
-        live: arguments.live,
-        quiet: arguments.quiet,
-        console: arguments.console,
-        paced: arguments.console,
-    };
+    let paced = arguments.options.console;
+    let options = Options { paced, ..arguments.options.clone() };
     let withdrawal_options = options.of_withdrawal();
-    let job = Job { config: &config, run_config: session.into(), motion: None, options };
+    let run_config = RunConfig::Insertion(session);
+    let job = Job { config: &config, run_config, motion: None, options };
     let Performed { report, wants_withdrawal, .. } = job.perform()?;
     let object = to_json(&config, &report, &preflight);
     let more = screen_values(&config, configured.whole_path(), &report);

@@ -7,7 +7,7 @@ use super::records::last_run_on_a_bus;
 use super::{ENVIRONMENT_FAILED, Failure, Result, finish_with};
 use crate::canopen::Frame;
 use crate::config::{Source, StopConfig};
-use crate::runtime::{BusTrouble, Clock, talk_despite_errors};
+use crate::runtime::{BusTrouble, Clock, talk_live};
 use crate::stage::{Axis, QuickStop};
 use clap::Args;
 use serde_json::json;
@@ -40,7 +40,7 @@ pub(super) fn stop(configured: &Configured, as_json: bool) -> Result<()> {
     let begun = clock.now();
     let mut quick_stop = QuickStop::new(&settings.stage, begun);
     let deadline = begun + settings.stage.power.stop_timeout;
-    let trouble = talk_despite_errors(&mut quick_stop, bus.as_mut(), clock, deadline);
+    let trouble = talk_live(&mut quick_stop, bus.as_mut(), clock, Some(deadline));
     let status = report(&quick_stop, &trouble, as_json);
     let checked = configured.load(None).and_then(|config| Ok(config.to_stage()?));
     if let Err(failure) = checked {

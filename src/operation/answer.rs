@@ -8,19 +8,18 @@ use super::moving::{Move, Moving};
 use super::{AnswerSettings, Goal};
 use crate::math;
 use crate::session::{
-    Lane, PROVED, Record, SampleRecord, Severity, Shell, State, Task, tracker_news,
+    Lane, MovingMean, PROVED, Record, SampleRecord, Severity, Shell, State, Task, tracker_news,
 };
-use crate::stage::{Feedback, SetPoint, StageConfig, StageEvent};
+use crate::stage::{Feedback, SetPoint, StageEvent};
 use crate::tracker::{Event, GateCounts, Refusal, Sample};
 use crate::units::Time;
-use nalgebra::Vector3;
 use std::time::Duration;
 
 /// Rest before each mean, and the time over which it is taken.
 const SETTLE: Duration = Duration::from_millis(300);
 const SAMPLE: Duration = Duration::from_secs(1);
 /// Fewer positions make no mean.
-const POSITIONS_MIN: u32 = 5;
+const POSITIONS_MIN: usize = 5;
 /// One of so many positions counts as independent: real noise is correlated.
 const CORRELATED: f64 = 4.0;
 /// A chord shorter than this many standard deviations of the means has no direction.
@@ -28,33 +27,6 @@ const CHORD_SDS: f64 = 8.0;
 /// How far the sensor's turn may be from the base's, and its circle from the insertion axis, degrees.
 const TURN_TOLERANCE_DEG: f64 = 15.0;
 const TILT_MAX_DEG: f64 = 20.0;
-
-/// Mean and scatter of the positions at one rest.
-#[derive(Debug, Clone, Copy, Default)]
-struct Mean {
-    count: u32,
-    sum_mm: Vector3<f64>,
-    square_mm2: f64,
-}
-
-impl Mean {
-    fn add(&mut self, position_mm: Vector3<f64>) {
-        self.count += 1;
-        self.sum_mm += position_mm;
-        self.square_mm2 += position_mm.norm_squared();
-    }
-
-    fn position_mm(&self) -> Vector3<f64> {
-        self.sum_mm / f64::from(self.count)
-    }
-
-    /// Variance of each coordinate of the mean, mm².
-    fn variance_mm2(&self) -> f64 {
-        let n = f64::from(self.count);
-        let scatter_mm2 = (self.square_mm2 / n - self.position_mm().norm_squared()).max(0.0) / 3.0;
-        scatter_mm2 * CORRELATED / n
-    }
-}
 
 /// What the base does now.
 #[derive(Debug, Clone)]
@@ -85,13 +57,12 @@ impl AnswerSettings {
 #[derive(Debug)]
 pub(super) struct Answering {
     settings: AnswerSettings,
-    sync_period: Duration,
     counts: GateCounts,
     leg: Leg,
     /// Of the rests that are over.
-    means: Vec<Mean>,
+    means: Vec<MovingMean>,
     /// Of this rest, or the last.
-    mean: Mean,
+    mean: MovingMean,
     /// Why the last position was refused.
     refused: Option<Refusal>,
     /// What the run is stopped for once the base is back.
@@ -99,14 +70,13 @@ pub(super) struct Answering {
 }
 
 impl Answering {
-    pub(super) fn new(config: &StageConfig, settings: AnswerSettings) -> Self {
+    pub(super) fn new(settings: AnswerSettings) -> Self {
         Answering {
-            sync_period: config.bus.sync_period(),
             settings,
             counts: GateCounts::default(),
             leg: Leg::Resting { since: None },
             means: Vec::new(),
-            mean: Mean::default(),
+            mean: MovingMean::new(SETTLE + SAMPLE),
             refused: None,
             failed: None,
         }
@@ -120,7 +90,7 @@ impl Answering {
             matches!(self.leg, Leg::Resting { since: Some(since) } if shell.now >= since + SETTLE);
         match &admitted {
             _ if !is_resting => {}
-            Ok(position_mm) => self.mean.add(*position_mm),
+            Ok(position_mm) => self.mean.take(shell.now, *position_mm),
             Err(refusal) => self.refused = Some(refusal.clone()),
         }
         let refused = admitted.err();
@@ -132,7 +102,8 @@ impl Answering {
         if let Leg::Turning(moving) | Leg::Returning(moving) = &mut self.leg
             && !moving.has_arrived(feedback)?
         {
-            return shell.command(moving.advance(self.sync_period));
+            let sync_period = shell.config().bus.sync_period();
+            return shell.command(moving.advance(sync_period));
         }
         match &mut self.leg {
             Leg::Resting { since } => {
@@ -144,7 +115,7 @@ impl Answering {
             }
             Leg::Turning(_) => {
                 self.leg = Leg::Resting { since: None };
-                self.mean = Mean::default();
+                self.mean = MovingMean::new(SETTLE + SAMPLE);
                 self.refused = None;
                 Ok(())
             }
@@ -161,8 +132,8 @@ impl Answering {
     /// After the third rest, or one without enough positions, the base is turned back.
     fn end_rest(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
         let turn = self.settings.turn;
-        let is_seen = self.mean.count >= POSITIONS_MIN;
-        self.means.push(self.mean);
+        let is_seen = self.mean.count() >= POSITIONS_MIN;
+        self.means.push(self.mean.clone());
         if is_seen && self.means.len() < 3 {
             self.leg = Leg::Turning(Box::new(Moving::new(turn, feedback.commanded)?));
             return Ok(());
@@ -185,7 +156,7 @@ impl Answering {
     }
 
     fn too_few(&self) -> String {
-        let count = self.mean.count;
+        let count = self.mean.count();
         let why = match &self.refused {
             Some(refusal) => refusal.to_string(),
             None => "the stream is silent, or has another tool".to_owned(),
@@ -199,11 +170,15 @@ impl Answering {
     /// What the three means say: the way from the second to the third is that from the first to the
     /// second, turned by what the base was turned.
     fn verdict(&self) -> Result<String, String> {
-        let [a, b, c] = [0, 1, 2].map(|rest| self.means[rest].position_mm());
+        let rests = self.means.iter().filter_map(MovingMean::mean_and_variance);
+        let (means_mm, variances_mm2): (Vec<_>, Vec<_>) = rests.unzip();
+        let [a, b, c] = [means_mm[0], means_mm[1], means_mm[2]];
         let (first, second) = (b - a, c - b);
         let turn_rad = self.settings.turn_rad();
         let radius_mm = 0.5 * (first.norm() + second.norm()) / (2.0 * math::sin(0.5 * turn_rad));
-        let variance_mm2 = self.means.iter().map(Mean::variance_mm2).sum::<f64>() * 2.0 / 3.0;
+        let of_mean = variances_mm2.iter().zip(&self.means);
+        let of_mean = of_mean.map(|(mm2, mean)| mm2 * CORRELATED / mean.count() as f64);
+        let variance_mm2 = of_mean.sum::<f64>() * 2.0 / 3.0;
         let chord_min_mm = CHORD_SDS * variance_mm2.sqrt();
         if first.norm().min(second.norm()) <= chord_min_mm.max(1e-3) {
             return Err(format!(

@@ -1,22 +1,20 @@
 //! Homes the chosen axes, one after the other.
 
 use crate::session::{AxisMove, Record, Shell, State, Task};
-use crate::stage::{Axis, AxisConfig, AxisLimits, PerAxis, StageConfig, StageEvent};
+use crate::stage::{Axis, AxisLimits, PerAxis, StageEvent};
 use std::collections::VecDeque;
 
 /// Homes the chosen axes, the other held.
 #[derive(Debug)]
 pub(super) struct Homing {
-    configs: PerAxis<AxisConfig>,
     /// The axes that are not homed yet, beginning with the one that is being homed.
     remaining: VecDeque<Axis>,
     moves: Vec<AxisMove>,
 }
 
 impl Homing {
-    pub(super) fn new(config: &StageConfig, axes: PerAxis<bool>) -> Self {
+    pub(super) fn new(axes: PerAxis<bool>) -> Self {
         Homing {
-            configs: PerAxis::from_fn(|axis| config.axis(axis).clone()),
             remaining: Axis::BOTH.into_iter().filter(|axis| axes[*axis]).collect(),
             moves: Vec::new(),
         }
@@ -33,8 +31,8 @@ impl Homing {
     }
 
     /// Refuses a home outside the limits, from which the axis could not be moved.
-    fn check_home(&self, axis: Axis, position: f64) -> Result<(), String> {
-        let config = &self.configs[axis];
+    fn check_home(shell: &Shell, axis: Axis, position: f64) -> Result<(), String> {
+        let config = shell.config().axis(axis);
         let scale = config.scale(axis, 0);
         if config.limits.check_counts(axis, position, &scale).is_ok() {
             return Ok(());
@@ -57,7 +55,7 @@ impl Task for Homing {
             }
             StageEvent::Homed { axis, position } => {
                 self.moves.push(AxisMove { axis, from: None, to: position });
-                self.check_home(axis, position)?;
+                Self::check_home(shell, axis, position)?;
                 self.remaining.pop_front();
                 self.home_next(shell)
             }

@@ -49,15 +49,6 @@ pub struct AnswerSettings {
     pub turn: Move,
 }
 
-/// Everything that an operation needs.
-#[derive(Debug, Clone, PartialEq)]
-pub struct OperationConfig {
-    /// The two drives.
-    pub stage: StageConfig,
-    /// The operation.
-    pub operation: Operation,
-}
-
 impl Operation {
     /// Homes the axis `only`, or, for `None`, every axis of `config` that can be homed.
     pub fn home(config: &StageConfig, only: Option<Axis>) -> Self {
@@ -73,61 +64,34 @@ impl Operation {
     }
 }
 
-impl OperationConfig {
-    /// The operation as a session that begins at `now`.
-    ///
-    /// # Errors
-    /// The stage refuses its configuration, or has no homing for an axis that is to be homed.
-    pub fn begin(self, now: Time) -> Result<Session, String> {
-        let OperationConfig { stage: config, operation } = self;
-        let purpose = PerAxis::from_fn(|axis| match &operation {
-            Operation::Home(axes) if axes[axis] => AxisUse::Home,
-            Operation::Move(request) if request.axis == axis => AxisUse::Move,
-            Operation::Home(_) | Operation::Move(_) => AxisUse::Hold,
-            Operation::Prove | Operation::Answer(_) => AxisUse::Steer,
-        });
-        let stage = Stage::for_use(config.clone(), purpose, now);
-        let stage = stage.map_err(|error| format!("stage: {error}"))?;
-        let task: Box<dyn Task> = match operation {
-            Operation::Home(axes) => Box::new(Homing::new(&config, axes)),
-            Operation::Move(request) => Box::new(MoveOneAxis::new(&config, request)),
-            Operation::Prove => Box::new(Prove::new(&config)),
-            Operation::Answer(settings) => Box::new(Answering::new(&config, *settings)),
-        };
-        Ok(Session::begin(stage, config, task, now))
-    }
-}
-
 /// The configuration of a run: an insertion, or an operation of the stage alone.
 #[derive(Debug, Clone)]
 pub enum RunConfig {
     /// Steers a needle.
     Insertion(Box<SessionConfig>),
     /// Uses the stage without steering a needle.
-    Operation(Box<OperationConfig>),
+    Operation(Box<StageConfig>, Operation),
 }
 
 impl RunConfig {
     /// The run as a session that begins at `now`.
-    ///
-    /// # Errors
-    /// The stage refuses its configuration.
-    pub fn begin(self, now: Time) -> Result<Session, String> {
-        match self {
-            RunConfig::Insertion(config) => Session::new(*config, now),
-            RunConfig::Operation(config) => config.begin(now),
-        }
-    }
-}
-
-impl From<SessionConfig> for RunConfig {
-    fn from(config: SessionConfig) -> Self {
-        RunConfig::Insertion(Box::new(config))
-    }
-}
-
-impl From<OperationConfig> for RunConfig {
-    fn from(config: OperationConfig) -> Self {
-        RunConfig::Operation(Box::new(config))
+    pub fn begin(self, now: Time) -> Session {
+        let (config, operation) = match self {
+            RunConfig::Insertion(config) => return Session::new(*config, now),
+            RunConfig::Operation(config, operation) => (config, operation),
+        };
+        let purpose = PerAxis::from_fn(|axis| match &operation {
+            Operation::Home(axes) if axes[axis] => AxisUse::Home,
+            Operation::Move(request) if request.axis == axis => AxisUse::Move,
+            Operation::Home(_) | Operation::Move(_) => AxisUse::Hold,
+            Operation::Prove | Operation::Answer(_) => AxisUse::Steer,
+        });
+        let task: Box<dyn Task> = match operation {
+            Operation::Home(axes) => Box::new(Homing::new(axes)),
+            Operation::Move(request) => Box::new(MoveOneAxis::new(request)),
+            Operation::Prove => Box::new(Prove::default()),
+            Operation::Answer(settings) => Box::new(Answering::new(*settings)),
+        };
+        Session::begin(Stage::for_use(*config, purpose, now), task, now)
     }
 }

@@ -1,7 +1,7 @@
 //! Moves one axis to a goal; the other is held.
 
 use crate::session::{AxisMove, Profile, Record, Shell, State, Task};
-use crate::stage::{Axis, Feedback, SetPoint, StageConfig, StageEvent};
+use crate::stage::{Axis, Feedback, SetPoint, StageEvent};
 use crate::units::Time;
 use std::time::Duration;
 
@@ -133,19 +133,13 @@ impl Moving {
 #[derive(Debug)]
 pub(super) struct MoveOneAxis {
     request: Move,
-    sync_period: Duration,
     moving: Option<Moving>,
     moves: Vec<AxisMove>,
 }
 
 impl MoveOneAxis {
-    pub(super) fn new(config: &StageConfig, request: Move) -> Self {
-        MoveOneAxis {
-            request,
-            sync_period: config.bus.sync_period(),
-            moving: None,
-            moves: Vec::new(),
-        }
+    pub(super) fn new(request: Move) -> Self {
+        MoveOneAxis { request, moving: None, moves: Vec::new() }
     }
 
     /// The move from `at`, if its goal is within the limits.
@@ -171,7 +165,7 @@ impl MoveOneAxis {
             shell.complete();
             return Ok(());
         }
-        let set_point = moving.advance(self.sync_period);
+        let set_point = moving.advance(shell.config().bus.sync_period());
         self.moving = Some(moving);
         shell.command(set_point)
     }

@@ -84,16 +84,9 @@ impl Silence {
 }
 
 /// The task that stops the bench's heartbeat while both axes are held. SYNC and set-points go on.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Prove {
-    config: StageConfig,
     silence: Option<Silence>,
-}
-
-impl Prove {
-    pub(super) fn new(config: &StageConfig) -> Self {
-        Prove { config: config.clone(), silence: None }
-    }
 }
 
 impl Task for Prove {
@@ -102,7 +95,7 @@ impl Task for Prove {
             StageEvent::Ready => {
                 shell.enter(State::Silent);
                 let since = shell.fall_silent();
-                self.silence = Some(Silence::new(&self.config, shell.now, since));
+                self.silence = Some(Silence::new(shell.config(), shell.now, since));
             }
             StageEvent::Emergency(axis, emcy) if emcy.code == EmcyCode::HEARTBEAT => {
                 if let Some(silence) = &mut self.silence {

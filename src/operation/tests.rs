@@ -53,7 +53,7 @@ impl Bench {
     fn new(config: &Config, operation: Operation) -> Self {
         let now = Time::ZERO;
         let stage = config.to_stage().unwrap();
-        let operation = OperationConfig { stage, operation }.begin(now).unwrap();
+        let operation = RunConfig::Operation(Box::new(stage), operation).begin(now);
         let stage = VirtualStage::new(config.virtual_stage().unwrap(), now);
         let start = stage.position_true(now);
         Bench {
@@ -339,7 +339,7 @@ fn homing_finds_the_switch_and_ends_without_power() {
     let needs_homing = self::config(&["stage.insertion.reference=homing"]);
     let jog = Operation::Move(by(Axis::Insertion, 2.0));
     let stage = needs_homing.to_stage().unwrap();
-    let operation = OperationConfig { stage, operation: jog }.begin(bench.now).unwrap();
+    let operation = RunConfig::Operation(Box::new(stage), jog).begin(bench.now);
     let mut bench = Bench { operation, ..bench };
     assert_eq!(bench.run(), Outcome::Completed);
     assert!((bench.travel().0 - 0.2).abs() < 1e-3, "{}", bench.travel().0);
@@ -442,7 +442,7 @@ fn a_home_outside_the_axis_limits_is_an_error() {
     drives.stage.rotation.homing = None;
     let stage = drives.to_stage().unwrap();
     let operation = Operation::home(&stage, None);
-    let operation = OperationConfig { stage, operation }.begin(bench.now).unwrap();
+    let operation = RunConfig::Operation(Box::new(stage), operation).begin(bench.now);
     let mut bench = Bench { operation, ..bench };
     let reason = bench.reason();
     assert!(

@@ -185,9 +185,7 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
 /// Checks that an axis at `position` can travel by `travel` within its limits; mm or rad.
 fn room(axis: Axis, position: f64, travel: f64, drive: &AxisConfig) -> Check {
     let AxisLimits { min, max, .. } = drive.limits;
-    // The run compares whole counts, so this does too.
     let scale = drive.scale(axis, 0);
-    let on_grid = |value| scale.counts(value).map_or(value, |counts| scale.value(counts));
     let goal = position + travel;
     let found = match travel == 0.0 {
         true => format!("at {}", axis.shown(position)),
@@ -196,7 +194,8 @@ fn room(axis: Axis, position: f64, travel: f64, drive: &AxisConfig) -> Check {
     let limit = format!("{} to {}", axis.shown(min), axis.shown(max));
     let next = "withdraw, lower insertion.depth_mm, or set the limits of this axis";
     let check = Check::new(format!("{axis} room"), found, limit);
-    let is_inside = on_grid(position) >= on_grid(min) && on_grid(goal) <= on_grid(max);
+    let is_allowed = |at| drive.limits.check_counts(axis, at, &scale).is_ok();
+    let is_inside = is_allowed(position) && is_allowed(goal);
     check.unless(is_inside, Fail, next)
 }
 

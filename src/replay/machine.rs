@@ -115,15 +115,15 @@ pub fn replay_to(
     let mut run_config = recorded.run_config.clone();
     match (&mut run_config, what_if) {
         (RunConfig::Insertion(config), what_if) => config.shadows.extend(what_if),
-        (RunConfig::Operation(_), Some(_)) => {
+        (RunConfig::Operation(..), Some(_)) => {
             return Err("an operation of the stage has no observer to ask about".to_owned());
         }
-        (RunConfig::Operation(_), None) => {}
+        (RunConfig::Operation(..), None) => {}
     }
     let mut inputs = RecordedInputs::open(recorded)?;
     let mut end = inputs.begun();
     let mut replay = Replay {
-        session: run_config.begin(end).map_err(|error| format!("{}: {error}", file::CONFIG))?,
+        session: run_config.begin(end),
         comparison: Comparison::open(recorded)?,
         take,
         has_what_if: what_if.is_some(),

@@ -13,35 +13,6 @@ use crate::units::Time;
 /// Interval between two attempts to send a frame that the bus refused.
 const RETRY_PERIOD: Duration = Duration::from_millis(100);
 
-/// Runs `dialogue` on `bus` to its end.
-///
-/// # Errors
-/// The interface is down or gone, or refuses a frame.
-pub fn talk_live(
-    dialogue: &mut dyn Dialogue,
-    bus: &mut dyn CanBus,
-    clock: Clock,
-) -> Result<(), CanError> {
-    loop {
-        while let Some(frame) = dialogue.poll_transmit() {
-            bus.send(&frame)?;
-        }
-        if dialogue.is_over() {
-            return Ok(());
-        }
-        let (now, deadline) = (clock.now(), dialogue.deadline());
-        if now >= deadline {
-            dialogue.handle_timeout(now);
-            continue;
-        }
-        match bus.receive(deadline.since(now))? {
-            Some(BusEvent::Frame(frame)) => dialogue.handle_frame(clock.now(), &frame),
-            Some(BusEvent::Error(error)) => tracing::warn!("{error}"),
-            None => {}
-        }
-    }
-}
-
 /// The bus errors of a dialogue that continued in spite of them.
 #[derive(Debug, Default)]
 pub struct BusTrouble {
@@ -68,11 +39,11 @@ impl BusTrouble {
 
 /// Runs `dialogue` on `bus` to its end, whatever errors the bus reports. A frame that the bus
 /// refuses is sent again, ten times a second, until the dialogue is over and `give_up` has passed.
-pub fn talk_despite_errors(
+pub fn talk_live(
     dialogue: &mut dyn Dialogue,
     bus: &mut dyn CanBus,
     clock: Clock,
-    give_up: Time,
+    give_up: Option<Time>,
 ) -> BusTrouble {
     let mut trouble = BusTrouble::default();
     let mut retry = Time::NEVER;
@@ -89,8 +60,13 @@ pub fn talk_despite_errors(
             trouble.send(bus);
             retry = if trouble.unsent.is_empty() { Time::NEVER } else { now + RETRY_PERIOD };
         }
+        if give_up.is_none() && trouble.first.is_some() {
+            return trouble;
+        }
         let due = match dialogue.is_over() {
-            true if trouble.unsent.is_empty() || now >= give_up => return trouble,
+            true if trouble.unsent.is_empty() || give_up.is_none_or(|at| now >= at) => {
+                return trouble;
+            }
             true => retry,
             false if now >= dialogue.deadline() => {
                 dialogue.handle_timeout(now);
@@ -214,12 +190,8 @@ mod tests {
         let mut bus = RefusingBus { stage, clock, refuses, sent: Vec::new(), receive_errors };
         let begun = clock.now();
         let mut quick_stop = QuickStop::new(&config, begun);
-        let trouble = talk_despite_errors(
-            &mut quick_stop,
-            &mut bus,
-            clock,
-            begun + config.power.stop_timeout,
-        );
+        let trouble =
+            talk_live(&mut quick_stop, &mut bus, clock, Some(begun + config.power.stop_timeout));
         (bus, quick_stop, trouble, clock.now().since(begun))
     }
 

@@ -270,12 +270,9 @@ pub fn run_live(
     let mut run = Live::new(session, bus, tracker, clock, sink);
     run.spin = if realtime.is_some() { SPIN } else { Duration::ZERO };
     let outcome = drive(&mut run);
-    run.witness.progress(run.session.progress());
     let figures = run.timing.report(run.session.stage_counters());
     let timing = TimingReport { frames_dropped: run.bus.dropped().ok(), realtime, ..figures };
-    let (gates, stage_at_end) = (run.session.gate_counts(), run.session.stage_at_end());
-    let report = run.witness.finish(outcome, clock.now(), gates, Some(timing));
-    RunReport { stage_at_end, ..report }
+    run.witness.finish(run.session, outcome, clock.now(), Some(timing))
 }
 
 #[cfg(test)]

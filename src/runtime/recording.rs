@@ -281,7 +281,8 @@ mod tests {
 
     fn describe() -> Describe {
         Box::new(|_| {
-            let run_config = RunConfig::from(Config::from_sources(&[], &[])?.session()?);
+            let run_config =
+                RunConfig::Insertion(Box::new(Config::from_sources(&[], &[])?.session()?));
             Ok(RecordedRun { run_config, scene: scene(), config_toml: CONFIG_TOML.to_owned() })
         })
     }

@@ -8,7 +8,7 @@ use crate::archive::{DriveIdentity, Manifest};
 use crate::canopen::NodeId;
 use crate::emulator::Truth;
 use crate::session::{
-    Lane, OperatorCommand, Outcome, Progress, Record, Severity, StageAtEnd, State,
+    Lane, Machine, OperatorCommand, Outcome, Progress, Record, Severity, StageAtEnd, State,
 };
 use crate::stage::{Axis, Identity};
 use crate::study::RunFigures;
@@ -150,11 +150,13 @@ impl<'a> Sink<'a> {
     /// Closes the record.
     pub(crate) fn finish(
         self,
+        session: &dyn Machine,
         outcome: Outcome,
         end: Time,
-        gates: GateCounts,
         timing: Option<TimingReport>,
     ) -> RunReport {
+        self.operator.progress(session.progress());
+        let gates = session.gate_counts();
         let timing = timing.map(|timing| timing.with_record_times(&self.record_times));
         let run_dir = self.recorder.as_ref().ok().map(|recorder| recorder.run_dir.clone());
         let sum_up = |manifest: &mut Manifest| {
@@ -165,19 +167,17 @@ impl<'a> Sink<'a> {
             manifest.timing = json_keys(&timing);
         };
         let record = self.recorder.and_then(|recorder| recorder.finish(sum_up));
-        let (figures, holds) = (self.figures, self.holds);
-        let (stage_at_end, emulated) = (StageAtEnd::default(), None);
         RunReport {
             outcome,
-            figures,
-            stage_at_end,
-            holds,
+            figures: self.figures,
+            stage_at_end: session.stage_at_end(),
+            holds: self.holds,
             gates,
             end,
             timing,
             run_dir,
             record,
-            emulated,
+            emulated: None,
         }
     }
 }

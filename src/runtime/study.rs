@@ -4,7 +4,7 @@ use super::virtual_time::{TipSource, run_unwatched};
 use crate::emulator::{TrackerModel, Truth, VirtualStage, VirtualStageConfig, WhiteNoise};
 use crate::geometry::Pose;
 use crate::session::{Goal, Outcome, Record, Session, SessionConfig};
-use crate::study::{Prior, Timetable, TimetableBuilder, TrialResult, TrialScorer, insert};
+use crate::study::{Prior, Timetable, TrialResult, TrialScorer, insert};
 use crate::units::Time;
 use nalgebra::Vector3;
 use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
@@ -59,7 +59,7 @@ impl Study<'_> {
     ) -> Result<Vec<TrialResult>, String> {
         self.run_trials(seeds, done, |session, stage, score| {
             let take = |step: &_, truth: &_| score.take(step, truth);
-            Ok(insert(&session, &stage, timetable, take))
+            insert(&session, &stage, timetable, take)
         })
     }
 
@@ -87,8 +87,7 @@ impl Study<'_> {
         &self,
         seeds: &[u64],
         done: TrialDone<'_>,
-        insert: impl Fn(SessionConfig, VirtualStageConfig, &mut TrialScorer) -> Result<Outcome, String>
-        + Sync,
+        insert: impl Fn(SessionConfig, VirtualStageConfig, &mut TrialScorer) -> Outcome + Sync,
     ) -> Result<Vec<TrialResult>, String> {
         let is_over = AtomicBool::new(false);
         let trial = |&seed: &u64| {
@@ -103,7 +102,7 @@ impl Study<'_> {
                     let mut score =
                         TrialScorer::new(seed, stage.clone(), &self.prior, goal.as_ref());
                     let session = SessionConfig { goal, ..self.session.clone() };
-                    let outcome = insert(session, stage, &mut score)?;
+                    let outcome = insert(session, stage, &mut score);
                     score.finish(outcome)
                 }
             };
@@ -137,11 +136,10 @@ impl Study<'_> {
             tracker,
             ..stage
         };
-        let mut builder = TimetableBuilder::new(&self.session.insertion, tracker);
-        let take = |record, _| builder.take(&record);
-        let outcome = self.whole_session(self.session.clone(), stage, take)?;
-        match outcome {
-            Outcome::Completed => Ok(builder.finish()),
+        let mut timetable = Timetable::new(&self.session.insertion, tracker);
+        let take = |record, _| timetable.take(&record);
+        match self.whole_session(self.session.clone(), stage, take) {
+            Outcome::Completed => Ok(timetable),
             Outcome::Stopped(reason) => {
                 Err(format!("an insertion from the plane, without noise, was stopped: {reason}"))
             }
@@ -153,13 +151,13 @@ impl Study<'_> {
         session: SessionConfig,
         stage: VirtualStageConfig,
         take: impl FnMut(Record, Option<Truth>),
-    ) -> Result<Outcome, String> {
+    ) -> Outcome {
         let stage = VirtualStage::new(stage, Time::ZERO);
         let target = session.goal.as_ref().and_then(|goal| goal.tool.as_ref());
         let target = target.map(|tool| tool.gate.tool.clone());
-        let mut session = Session::new(session, Time::ZERO).map_err(|error| error.to_string())?;
+        let mut session = Session::new(session, Time::ZERO);
         let tips = TipSource::Emulated { tool: self.tool.to_owned(), target };
-        Ok(run_unwatched(&mut session, stage, tips, take))
+        run_unwatched(&mut session, stage, tips, take)
     }
 }
 
@@ -200,7 +198,7 @@ mod tests {
                 whole.push((*step, truth));
             }
         };
-        let outcome = study.whole_session(session.clone(), stage(seed).unwrap(), take).unwrap();
+        let outcome = study.whole_session(session.clone(), stage(seed).unwrap(), take);
         assert_eq!(outcome, Outcome::Completed);
         let timetable = study.timetable(seed).unwrap();
         let take = |step: &StepRecord, truth: &Truth| short.push((step.clone(), *truth));

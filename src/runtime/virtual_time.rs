@@ -42,11 +42,9 @@ pub fn run_virtual(
 ) -> RunReport {
     let mut run = VirtualRun { pace, ..VirtualRun::new(session, stage, tips, sink) };
     let outcome = drive(&mut run);
-    run.witness.progress(run.session.progress());
     run.emulated.update(&run.stage, run.now);
-    let (gates, stage_at_end) = (run.session.gate_counts(), run.session.stage_at_end());
-    let report = run.witness.finish(outcome, run.now, gates, None);
-    RunReport { emulated: Some(run.emulated), stage_at_end, ..report }
+    let report = run.witness.finish(run.session, outcome, run.now, None);
+    RunReport { emulated: Some(run.emulated), ..report }
 }
 
 /// Runs `session` against `stage` until it ends, and passes each record to `take`, with the true pose

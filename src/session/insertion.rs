@@ -86,12 +86,12 @@ impl Insertion {
 
     /// The stage's measured position, counted from where the insertion began.
     pub(crate) fn measured(&self, at: SetPoint) -> SetPoint {
-        from_origin(self.origin_meas, at)
+        at - self.origin_meas
     }
 
     /// The stage's target, counted from where the insertion began.
     pub(crate) fn commanded(&self, at: SetPoint) -> SetPoint {
-        from_origin(self.origin_cmd, at)
+        at - self.origin_cmd
     }
 
     /// The deepest measured position of the stage that is believed while its target is `commanded`, mm.
@@ -335,24 +335,13 @@ impl Insertion {
     /// The set-point for the next SYNC, in the stage's own coordinates.
     pub(crate) fn advance(&mut self, sync_period: Duration) -> SetPoint {
         self.profile.advance(sync_period);
-        let SetPoint { insertion_mm, rotation_rad } = self.set_point();
-        SetPoint {
-            insertion_mm: self.origin_cmd.insertion_mm + insertion_mm,
-            rotation_rad: self.origin_cmd.rotation_rad + rotation_rad,
-        }
+        self.origin_cmd + self.set_point()
     }
 }
 
 /// The number of the last step, which may be shorter than the others.
 fn last_step(config: &InsertionConfig) -> u32 {
     (config.depth_mm / config.step_mm - 1e-9).ceil() as u32
-}
-
-fn from_origin(origin: SetPoint, at: SetPoint) -> SetPoint {
-    SetPoint {
-        insertion_mm: at.insertion_mm - origin.insertion_mm,
-        rotation_rad: at.rotation_rad - origin.rotation_rad,
-    }
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ use super::shell::{Power, Shell};
 use super::state::State;
 use super::task::Task;
 use crate::canopen::Frame;
-use crate::stage::{Axis, Counters, Stage, StageConfig, StageEvent};
+use crate::stage::{Axis, Counters, Stage, StageEvent};
 use crate::tracker::{Event, GateCounts};
 use crate::units::Time;
 use derive_more::Display;
@@ -173,21 +173,15 @@ pub struct Session {
 
 impl Session {
     /// An insertion that begins at `now`.
-    ///
-    /// # Errors
-    /// If the stage refuses its configuration.
-    pub fn new(config: SessionConfig, now: Time) -> Result<Self, String> {
-        let stage_config = config.stage.clone();
-        let task = InsertTask::new(config, now);
-        let stage = Stage::new(stage_config.clone(), now);
-        let stage = stage.map_err(|error| format!("stage: {error}"))?;
-        Ok(Session::begin(stage, stage_config, Box::new(task), now))
+    pub fn new(config: SessionConfig, now: Time) -> Self {
+        let stage = Stage::new(config.stage.clone(), now);
+        Session::begin(stage, Box::new(InsertTask::new(config, now)), now)
     }
 
     /// `task` on `stage`, begun at `now`.
-    pub(crate) fn begin(stage: Stage, config: StageConfig, task: Box<dyn Task>, now: Time) -> Self {
-        let mut session =
-            Session { shell: Shell::new(stage, config, now), task, bus_warnings: BTreeMap::new() };
+    pub(crate) fn begin(stage: Stage, task: Box<dyn Task>, now: Time) -> Self {
+        let shell = Shell::new(stage, now);
+        let mut session = Session { shell, task, bus_warnings: BTreeMap::new() };
         session.shell.record(Record::Begun { time: now });
         session.shell.enter(State::Preparing);
         session.task.begin(&mut session.shell);

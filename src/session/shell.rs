@@ -47,7 +47,6 @@ pub(crate) struct Shell {
     pub(super) stage: Stage,
     /// The time of the present input.
     pub(crate) now: Time,
-    config: StageConfig,
     phase: Phase,
     power: Power,
     /// The bench has stopped sending its heartbeat on purpose.
@@ -64,11 +63,10 @@ pub(crate) struct Shell {
 }
 
 impl Shell {
-    pub(super) fn new(stage: Stage, config: StageConfig, now: Time) -> Self {
+    pub(super) fn new(stage: Stage, now: Time) -> Self {
         Shell {
             stage,
             now,
-            config,
             phase: Phase::Running,
             power: Power::Off,
             is_silent: false,
@@ -78,6 +76,11 @@ impl Shell {
             stopped_with_power: false,
             outputs: VecDeque::new(),
         }
+    }
+
+    /// The configuration of the stage.
+    pub(crate) fn config(&self) -> &StageConfig {
+        &self.stage.config
     }
 
     pub(crate) fn record(&mut self, record: Record) {
@@ -170,7 +173,7 @@ impl Shell {
     /// while they are being stopped, and while the bench is silent on purpose.
     pub(super) fn stall_max(&self) -> Option<Duration> {
         let is_noticed = matches!(self.power, Power::On(_)) && self.is_running() && !self.is_silent;
-        is_noticed.then_some(self.config.bus.heartbeat_timeout())
+        is_noticed.then_some(self.config().bus.heartbeat_timeout())
     }
 
     /// Records an event of the stage.
@@ -197,7 +200,7 @@ impl Shell {
             }
             StageEvent::Identity(axis, identity) => {
                 let (axis, identity) = (*axis, *identity);
-                let node = self.config.axis(axis).node;
+                let node = self.config().axis(axis).node;
                 self.record(Record::Drive { time: self.now, axis, node, identity });
             }
             StageEvent::Fault(fault) => self.stop(format!("stage: {fault}")),
@@ -206,7 +209,7 @@ impl Shell {
     }
 
     fn is_sdo_answer(&self, frame: &Frame) -> bool {
-        let answers = Axis::BOTH.map(|axis| cob::sdo_tx(self.config.axis(axis).node));
+        let answers = Axis::BOTH.map(|axis| cob::sdo_tx(self.config().axis(axis).node));
         frame.cob_id().is_some_and(|cob_id| answers.contains(&cob_id))
     }
 
@@ -255,7 +258,7 @@ impl Shell {
 
     /// The longest that a stop may take: the stage's own timeouts, plus a margin.
     fn stop_timeout(&self) -> Duration {
-        self.config.power.stop_timeout * 2 + STOP_MARGIN
+        self.config().power.stop_timeout * 2 + STOP_MARGIN
     }
 
     /// When the shell or its stage next has something to do.

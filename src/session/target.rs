@@ -50,6 +50,18 @@ impl MovingMean {
         while self.newest.pop_front_if(|(time, _)| *time < oldest).is_some() {}
     }
 
+    /// Number of positions.
+    pub fn count(&self) -> usize {
+        self.newest.len()
+    }
+
+    /// The mean, mm, and the variance of each coordinate of one position, mm²; `None` before the first position.
+    pub fn mean_and_variance(&self) -> Option<(Vector3<f64>, f64)> {
+        let mean_mm = self.mean_mm()?;
+        let squares_mm2 = self.newest.iter().map(|(_, mm)| (mm - mean_mm).norm_squared());
+        Some((mean_mm, squares_mm2.sum::<f64>() / (3.0 * self.count() as f64)))
+    }
+
     /// The mean, mm; `None` before the first position.
     pub fn mean_mm(&self) -> Option<Vector3<f64>> {
         let sum: Vector3<f64> = self.newest.iter().map(|(_, position_mm)| position_mm).sum();
@@ -161,7 +173,7 @@ impl TargetTracking {
     /// Where the target is expected to be seen next: at the mean of its last positions.
     fn prediction(&self) -> Option<Prediction> {
         let position_mm = self.mean.mean_mm()?;
-        let variance_mm2 = self.noise_sd_mm.powi(2) / self.mean.newest.len() as f64;
+        let variance_mm2 = self.noise_sd_mm.powi(2) / self.mean.count() as f64;
         Some(Prediction {
             position_mm,
             heading: Vector3::zeros(),

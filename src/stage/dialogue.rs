@@ -209,7 +209,8 @@ impl Sdo {
 
 /// Runs a script that talks with a drive, and keeps its outcome.
 pub(super) struct ScriptRunner<T> {
-    sdo: Sdo,
+    /// The script's access to its drive.
+    pub(super) sdo: Sdo,
     script: Pin<Box<dyn Future<Output = T>>>,
     outcome: Option<T>,
 }
@@ -278,11 +279,6 @@ impl<T> ScriptRunner<T> {
     pub(super) fn outcome(&self) -> Option<&T> {
         self.outcome.as_ref()
     }
-
-    /// The script's access to its drive.
-    pub(super) fn sdo(&self) -> &Sdo {
-        &self.sdo
-    }
 }
 
 impl<T> fmt::Debug for ScriptRunner<T> {
@@ -296,7 +292,7 @@ impl<T> fmt::Debug for ScriptRunner<T> {
 pub struct WithBothDrives<T> {
     /// Frames to send before those of the scripts.
     first: VecDeque<Frame>,
-    axes: PerAxis<ScriptRunner<Result<T, String>>>,
+    pub(super) axes: PerAxis<ScriptRunner<Result<T, String>>>,
 }
 
 impl<T> WithBothDrives<T> {
@@ -305,10 +301,6 @@ impl<T> WithBothDrives<T> {
         axis: impl FnMut(Axis) -> ScriptRunner<Result<T, String>>,
     ) -> Self {
         WithBothDrives { first: first.into(), axes: PerAxis::from_fn(axis) }
-    }
-
-    pub(super) fn axis(&self, axis: Axis) -> &ScriptRunner<Result<T, String>> {
-        &self.axes[axis]
     }
 }
 

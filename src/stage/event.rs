@@ -8,7 +8,7 @@ use crate::units::Time;
 use std::time::Duration;
 
 /// Where both axes are to be at the next SYNC.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, derive_more::Add, derive_more::Sub, derive_more::Mul)]
 pub struct SetPoint {
     /// Depth.
     pub insertion_mm: f64,

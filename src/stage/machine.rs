@@ -4,7 +4,6 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use super::bring_up::BringUp;
-use super::config::no_homing;
 use super::drive::Drive;
 use super::event::DriveReport;
 use super::flood::FloodWatch;
@@ -60,7 +59,7 @@ pub(super) enum Phase {
 /// The master of the two axes; the [module](super) states its contract.
 #[derive(Debug)]
 pub struct Stage {
-    pub(super) config: StageConfig,
+    pub(crate) config: StageConfig,
     pub(super) phase: Phase,
     pub(super) bring_ups: PerAxis<Option<BringUp>>,
     pub(super) drives: PerAxis<Drive>,
@@ -88,30 +87,15 @@ pub struct Stage {
 }
 
 impl Stage {
-    /// A stage that begins at `now`: it listens, then brings up its drives.
-    ///
-    /// # Errors
-    /// When the configuration cannot work; nothing has been sent then.
-    pub fn new(config: StageConfig, now: Time) -> Result<Self, String> {
+    /// A stage that begins at `now`: it listens, then brings up its drives. The configuration must be
+    /// [valid](StageConfig::validate).
+    pub fn new(config: StageConfig, now: Time) -> Self {
         Self::for_use(config, PerAxis::from_fn(|_| AxisUse::Steer), now)
     }
 
     /// A stage that begins at `now` and uses each axis for its `purpose`. An axis in homing mode takes no
     /// set-points; [`Stage::home`] homes it.
-    ///
-    /// # Errors
-    /// When the configuration cannot work, or has no homing for an axis that is to be homed.
-    pub fn for_use(
-        config: StageConfig,
-        purpose: PerAxis<AxisUse>,
-        now: Time,
-    ) -> Result<Self, String> {
-        for axis in Axis::BOTH {
-            if purpose[axis] == AxisUse::Home && config.axis(axis).homing.is_none() {
-                return Err(no_homing(axis));
-            }
-        }
-        config.validate()?;
+    pub fn for_use(config: StageConfig, purpose: PerAxis<AxisUse>, now: Time) -> Self {
         let timeout = config.bus.heartbeat_timeout();
         let until = now + config.listen_first;
         let mut stage = Stage {
@@ -143,7 +127,7 @@ impl Stage {
         };
         stage.emit(StageEvent::Progress(Progress::Listening));
         stage.handle_timeout(now);
-        Ok(stage)
+        stage
     }
 
     /// Takes a frame received at `now`.

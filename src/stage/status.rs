@@ -66,7 +66,7 @@ impl StatusReader {
     /// If the drive does not answer, has no statusword, or was not read to the end.
     pub fn status(&self, axis: Axis) -> Result<AxisStatus, String> {
         let interrupted = || Err(format!("{axis}: reading the status was interrupted"));
-        let sdo = self.axis(axis).sdo();
+        let sdo = &self.axes[axis].sdo;
         let (nmt_state, extra_answers) = (sdo.nmt_state(), sdo.extra_answers());
         let status = self.outcome(axis).unwrap_or_else(interrupted);
         match (status, nmt_state) {

@@ -136,7 +136,7 @@ impl Nees {
 
 /// 95 % of Student's t with `freedom` degrees of freedom lie within this; from 10 on by its expansion for
 /// many (Abramowitz and Stegun 26.7.5), right to 0.2 %.
-fn student_95(freedom: usize) -> f64 {
+pub fn student_95(freedom: usize) -> f64 {
     let few = freedom.checked_sub(1).and_then(|at| STUDENT_T_95.get(at));
     let part = 1.0 / freedom as f64;
     few.copied().unwrap_or(WITHIN_95 + 2.37 * part + 2.82 * part * part)

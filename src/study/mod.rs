@@ -15,7 +15,7 @@ mod timetable;
 mod trial;
 
 pub use bound::{InformationBound, Prior};
-pub use consistency::{Consistency, Nees, TrialNees, Verdict};
+pub use consistency::{Consistency, Nees, TrialNees, Verdict, student_95};
 pub use evaluation::{Evaluation, Quantiles, RecordingScore, Scoring, evaluate};
 pub use figures::{FigureReport, OFF_PLANE_LIMIT_MM, PlanStatus, RunFigures, TipError};
 pub use mount::mount;
@@ -23,5 +23,5 @@ pub use recording::{RecordedRoll, RecordedRow, Recording};
 pub use score::{TargetScore, TrialResult, TrialScorer};
 pub use statistics::{quantile, rms};
 pub use summary::{StudySummary, trial_seed};
-pub use timetable::{Timetable, TimetableBuilder};
+pub use timetable::Timetable;
 pub use trial::insert;

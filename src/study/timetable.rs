@@ -38,14 +38,8 @@ pub(super) struct StepDue {
 
 /// The steps of an insertion, from the records of one whole session on the emulated stage. Commands turn
 /// the needle but do not change the insertion, so one session gives the depths of all trials.
-#[derive(Debug, Clone, Default)]
-pub struct Timetable {
-    pub(super) steps: Vec<StepDue>,
-}
-
-/// Builds a [`Timetable`] from a session's records.
 #[derive(Debug)]
-pub struct TimetableBuilder {
+pub struct Timetable {
     tracker: TrackerModel,
     /// Positions averaged at a step.
     averaged: u32,
@@ -57,17 +51,17 @@ pub struct TimetableBuilder {
     /// Time and measured depth of every SYNC.
     stage: Vec<(Time, f64)>,
     command_mm: f64,
-    steps: Vec<StepDue>,
+    pub(super) steps: Vec<StepDue>,
 }
 
-impl TimetableBuilder {
-    /// A builder for insertions with this configuration, on a stage with this tracker.
+impl Timetable {
+    /// An empty timetable for insertions with this configuration, on a stage with this tracker.
     pub fn new(insertion: &InsertionConfig, tracker: TrackerModel) -> Self {
         let (averaged, takes_all) = match insertion.mode {
             InsertionMode::Continuous => (1, insertion.corrected_by == Samples::All),
             InsertionMode::Stepwise => (insertion.samples, false),
         };
-        TimetableBuilder {
+        Timetable {
             tracker,
             averaged,
             takes_all,
@@ -106,11 +100,6 @@ impl TimetableBuilder {
             }
             _ => {}
         }
-    }
-
-    /// The finished timetable.
-    pub fn finish(self) -> Timetable {
-        Timetable { steps: self.steps }
     }
 
     /// Every position accepted since the step before.
@@ -194,10 +183,10 @@ mod tests {
     fn the_depth_is_interpolated_between_syncs_and_stays_after_the_last() {
         let config = Config::from_sources(&[], &[]).unwrap();
         let (session, stage) = (config.session().unwrap(), config.virtual_stage().unwrap());
-        let mut builder = TimetableBuilder::new(&session.insertion, stage.tracker);
+        let mut timetable = Timetable::new(&session.insertion, stage.tracker);
         let at = |ms: i64| Time::from_nanos(ms * 1_000_000);
-        builder.stage = vec![(at(10), 0.0), (at(20), 0.5)];
-        let depths = [0, 10, 15, 20, 25].map(|ms| builder.insertion_at(at(ms)));
+        timetable.stage = vec![(at(10), 0.0), (at(20), 0.5)];
+        let depths = [0, 10, 15, 20, 25].map(|ms| timetable.insertion_at(at(ms)));
         assert_eq!(depths, [0.0, 0.0, 0.25, 0.5, 0.5]);
     }
 }

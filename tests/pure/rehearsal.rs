@@ -372,3 +372,22 @@ fn every_command_of_the_protocol_is_accepted() {
     }
     assert_eq!((rehearsed.len(), understood.len()), (15, 13), "{rehearsed:#?} {understood:#?}");
 }
+
+/// Nothing is recorded of an operation that never begins.
+#[test]
+fn an_axis_without_homing_is_refused_before_a_record_is_made() {
+    let scratch = Scratch::new();
+    let rig = fs::read_to_string(repository("bench-config/rig-epos4.toml")).unwrap();
+    let homing = rig.find("\n[stage.rotation.homing]").expect("the rig's");
+    let after = homing + rig[homing..].find("[[stage.rotation.sdo]]").expect("the next");
+    let absolute = [&rig[..homing], &rig[after..]].concat();
+    let file = scratch.write("absolute.toml", &absolute);
+    let file = file.to_str().expect("UTF-8");
+    let sets = ["--set", "stage.rotation.reference=absolute", "--set", "record.dir=runs"];
+    let stage = ["stage", "--rehearse", "--config", file];
+    let said =
+        needle_bench(&scratch, &[&stage[..], &sets, &["home", "--axis", "rotation"]].concat());
+    assert_eq!(said.status, 2, "{}", said.screen());
+    assert!(said.stderr.ends_with("no homing is configured\n"), "{}", said.stderr);
+    assert!(!scratch.path().join("runs").exists(), "{}", said.screen());
+}

@@ -198,7 +198,7 @@ impl Run {
             };
             Ok(Lines::new(Cursor::new(text.clone())))
         };
-        let run_config = RunConfig::from(self.session.clone());
+        let run_config = RunConfig::Insertion(Box::new(self.session.clone()));
         replay(&Recorded { manifest: &self.manifest, run_config, open: &open })
     }
 

@@ -51,7 +51,7 @@ impl Bench {
         let stage = config.to_stage().unwrap();
         let mut bench = Bench {
             now,
-            master: Stage::new(stage.clone(), now).unwrap(),
+            master: Stage::new(stage.clone(), now),
             config: stage,
             stage: VirtualStage::new(config.virtual_stage().unwrap(), now),
             step: 0,

@@ -76,7 +76,7 @@ impl Bench {
         };
         Bench {
             now,
-            stage: Stage::new(config(), now).expect("valid"),
+            stage: Stage::new(config(), now),
             drives: [drive(1, 12_345), drive(2, -70_000)],
             events: Vec::new(),
             sent: Vec::new(),
@@ -233,7 +233,7 @@ fn a_run_that_finds_another_type_takes_power_off_its_own_drive_alone() {
     config.rotation.product_code = Some(PRODUCT + 1);
     // If the stage listened first, the drives would miss the heartbeat of the killed run.
     config.listen_first = Duration::ZERO;
-    bench.stage = Stage::new(config, bench.now).expect("valid");
+    bench.stage = Stage::new(config, bench.now);
     bench.sent.clear();
     let fault = bench.fault();
     assert!(fault.starts_with("node 2 (rotation): 0x1018:02: expected 0x00000002"), "{fault}");
@@ -275,12 +275,12 @@ fn both_axes_are_homed_by_their_drives_and_a_run_may_begin() {
         });
         axis.zero = Some(0);
     }
-    bench.stage = Stage::new(config.clone(), bench.now).expect("valid");
+    bench.stage = Stage::new(config.clone(), bench.now);
     let fault = bench.fault();
     assert!(fault.contains("not homed"), "{fault}");
 
     let both = PerAxis::from_fn(|_| AxisUse::Home);
-    bench.stage = Stage::for_use(config.clone(), both, bench.now).expect("valid");
+    bench.stage = Stage::for_use(config.clone(), both, bench.now);
     bench.run_until(|event| matches!(event, StageEvent::Ready).then_some(()));
     for axis in Axis::BOTH {
         bench.stage.home(bench.now, axis).expect("ready");
@@ -298,7 +298,7 @@ fn both_axes_are_homed_by_their_drives_and_a_run_may_begin() {
     bench.stage.disable(bench.now);
     assert!(bench.stopped());
 
-    bench.stage = Stage::new(config, bench.now).expect("valid");
+    bench.stage = Stage::new(config, bench.now);
     let feedback = bench.feedback();
     assert_eq!((feedback.measured.insertion_mm, feedback.measured.rotation_rad), (0.0, 0.0));
 }

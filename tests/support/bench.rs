@@ -97,7 +97,7 @@ pub(crate) fn is_frame(input: &Input, cob_ids: &[u16]) -> bool {
 impl Bench {
     pub(crate) fn new((session, stage): (SessionConfig, VirtualStageConfig)) -> Self {
         let now = Time::ZERO;
-        let mut begun = Session::new(session.clone(), now).expect("valid");
+        let mut begun = Session::new(session.clone(), now);
         let peer = "127.0.0.1:18944".to_owned();
         begun.handle(now, Input::Tracker(Event::Connected { peer }));
         Bench {

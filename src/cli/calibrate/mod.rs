@@ -18,7 +18,7 @@ use crate::calibration::{FiducialPair, NeedleFit, PosedRow, RegistrationFit, Tip
 use crate::config::RegistrationConfig;
 use crate::geometry::FixedAngles;
 use crate::needle::TorsionConfig;
-use crate::study::RecordedRoll;
+use crate::study::{RecordedRoll, student_95};
 use crate::telemetry::utc_text;
 use crate::text::screen;
 use clap::{Args, Subcommand};
@@ -27,18 +27,6 @@ use nalgebra::Rotation3;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::time::SystemTime;
-
-/// Student's t for a two-sided 95% interval from so many insertions, at least 3: standard errors from a few are
-/// themselves uncertain.
-fn student_t_95(insertions: usize) -> f64 {
-    const FROM_3: [f64; 8] = [4.3, 3.2, 2.8, 2.6, 2.4, 2.4, 2.3, 2.3];
-    match insertions {
-        ..=10 => FROM_3[insertions.saturating_sub(3)],
-        11..=14 => 2.2,
-        15..=28 => 2.1,
-        29.. => 2.0,
-    }
-}
 
 /// Default limit of the RMS distance from the circle, mm.
 const RMS_MAX_MM: f64 = 0.5;
@@ -225,7 +213,7 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<()> {
             "bend_axis": <[f64; 3]>::from(fit.bend.bend_axis),
         },
     });
-    let student_t = student_t_95(fit.insertions);
+    let student_t = student_95(fit.insertions - 1);
     let more = context! { student_t, overlay => to_toml(&overlay)? };
     let toml = Some(include_str!("needle.toml"));
     output.write(&overlay, more, include_str!("needle.txt"), toml)

@@ -12,10 +12,9 @@ use crate::cli::stage::{load_stage, perform, sensor_off_axis};
 use crate::cli::tracker::{Listener, listen};
 use crate::cli::{Failure, Result, finish_with};
 use crate::geometry::Pose;
+use crate::session::MovingMean;
 use crate::tracker::{Event, Registration};
-use crate::units::Time;
 use nalgebra::Vector3;
-use std::collections::VecDeque;
 use std::fs::OpenOptions;
 use std::io::{Write as _, stdin};
 use std::path::Path;
@@ -136,7 +135,7 @@ fn position_at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
     let limit_mm = STILL_SDS * listener.config.tracker.to_track().noise_sd_mm;
     let tip = Registration::new(Pose::identity()).with_tip(listener.config.tracker.x_sb());
     let gate = listener.config.tracker.to_unregistered_gate();
-    let mut last_second = LastSecond { begun, window: VecDeque::new() };
+    let mut last_second = MovingMean::new(REST);
     let mut moved_mm = None;
     while let Some(event) = listener.next(begun + WAIT_MAX) {
         let Event::Sample(sample) = event else { continue };
@@ -144,9 +143,14 @@ fn position_at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
             continue;
         }
         let tip_mm = tip.tip_mm(&sample).map_err(|refusal| refusal.to_string())?;
-        let Some((mean_mm, sd_mm)) = last_second.take(sample.receive_time, tip_mm) else {
+        last_second.take(sample.receive_time, tip_mm);
+        let is_enough = last_second.count() >= POSITIONS_MIN;
+        let rested = last_second.mean_and_variance().filter(|_| is_enough);
+        let Some((mean_mm, mm2)) = rested.filter(|_| sample.receive_time.since(begun) >= REST)
+        else {
             continue;
         };
+        let sd_mm = mm2.sqrt();
         if sd_mm <= limit_mm {
             return Ok(mean_mm);
         }
@@ -163,32 +167,6 @@ fn position_at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
         ),
         None => listener.explain_missing(),
     })
-}
-
-/// The positions of the last second.
-struct LastSecond {
-    begun: Time,
-    window: VecDeque<(Time, Vector3<f64>)>,
-}
-
-impl LastSecond {
-    /// Takes a position, mm. Returns the mean of the last second and the standard deviation of a coordinate,
-    /// both mm, once there is a whole second with enough positions.
-    fn take(&mut self, now: Time, position_mm: Vector3<f64>) -> Option<(Vector3<f64>, f64)> {
-        self.window.push_back((now, position_mm));
-        while self.window.front().is_some_and(|(time, _)| now.since(*time) > REST) {
-            self.window.pop_front();
-        }
-        if now.since(self.begun) < REST || self.window.len() < POSITIONS_MIN {
-            return None;
-        }
-        let count = self.window.len() as f64;
-        let positions = || self.window.iter().map(|(_, position_mm)| position_mm);
-        let mean_mm = positions().sum::<Vector3<f64>>() / count;
-        let square_mm2 =
-            positions().map(|position| (position - mean_mm).norm_squared()).sum::<f64>();
-        Some((mean_mm, (square_mm2 / (3.0 * count)).sqrt()))
-    }
 }
 
 /// How well the points in `text` fit, if there are enough.
@@ -278,6 +256,7 @@ fn rows_of(turn: RunMeasurements) -> Vec<Vec<f64>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::units::Time;
 
     #[test]
     fn a_position_is_three_numbers() {
@@ -289,15 +268,16 @@ mod tests {
 
     #[test]
     fn a_point_is_the_mean_of_the_first_second_at_rest() {
-        let mut last_second = LastSecond { begun: Time::ZERO, window: VecDeque::new() };
+        let mut last_second = MovingMean::new(REST);
         // The tip comes to rest after half a second. Positions are 0.05 mm to either side.
         let mut first_still = None;
         for k in 1..=80 {
             let now = Time::from_secs_f64(f64::from(k) * 0.025);
             let way_mm = f64::from((20 - k).max(0)) + if k % 2 == 0 { 0.05 } else { -0.05 };
-            match last_second.take(now, Vector3::new(7.0, way_mm, 0.0)) {
+            last_second.take(now, Vector3::new(7.0, way_mm, 0.0));
+            match last_second.mean_and_variance().filter(|_| k >= 40) {
                 None => assert!(k < 40, "no mean after a whole second, at {k}"),
-                Some((mean_mm, sd_mm)) if sd_mm < 0.06 => {
+                Some((mean_mm, mm2)) if mm2.sqrt() < 0.06 => {
                     first_still.get_or_insert((k, mean_mm));
                 }
                 Some(_) => {}

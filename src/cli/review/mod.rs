@@ -2,9 +2,9 @@
 
 mod read;
 
-use super::output::{print_result, print_stderr};
+use super::output::{print_result, print_result_despite, print_stderr};
 use super::records::{RUNS, describe, newest_first, open};
-use super::{Failure, Result, finish_with};
+use super::{Failure, Result};
 use crate::archive::{Verdict, VerdictKind, file};
 use crate::review::{
     Campaign, Comparison, Condition, Folder, GENERATOR, Run, html, to_json, to_text,
@@ -14,8 +14,7 @@ use crate::telemetry::{RunFolder, is_being_written, lock, repair, utc_text, writ
 use crate::text::{escaped, shell_word};
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
-use minijinja::Error as TemplateError;
-use serde_json::{Value, json};
+use serde_json::json;
 use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
@@ -90,8 +89,9 @@ pub(super) fn review(arguments: &Arguments) -> Result<()> {
         [a, b] => {
             let (a, b) = (read::run(a)?, read::run(b)?);
             let comparison = Comparison::of(&a, &b);
-            let edited = edited(&a).or_else(|| edited(&b));
-            print_with(edited, arguments.json, comparison.to_json(), || comparison.to_text())
+            let edited = check_unedited(&a).and_then(|()| check_unedited(&b));
+            let text = || comparison.to_text();
+            print_result_despite(edited, arguments.json, &comparison.to_json(), text)
         }
         paths => {
             let lines = paths.iter().map(|path| read::campaign_lines(path));
@@ -116,29 +116,15 @@ fn review_one(path: &Path, arguments: &Arguments) -> Result<()> {
         let hint = "--html FILE writes it to a new file, --no-html leaves it out";
         written.map(|()| path.to_string()).map_err(|error| format!("{path}: {error}; {hint}"))
     });
-    let (report, failure) = match page_written.transpose() {
-        Err(error) => (None, Some(Failure::environment(error))),
-        Ok(report) if arguments.open => (report, open_viewer(path).err()),
-        Ok(report) => (report, None),
+    let (report, shown) = match page_written.transpose() {
+        Err(error) => (None, Err(Failure::environment(error))),
+        Ok(report) if arguments.open => (report, open_viewer(path)),
+        Ok(report) => (report, Ok(())),
     };
     let mut object = to_json(&run);
     object["report"] = json!(report);
-    let failure = failure.or_else(|| edited(&run));
-    print_with(failure, arguments.json, object, || to_text(&run, report.as_deref()))
-}
-
-/// Prints the result of a review; a `failure` is in its object, follows its text, and gives the exit status.
-fn print_with(
-    failure: Option<Failure>,
-    json: bool,
-    mut object: Value,
-    text: impl FnOnce() -> Result<String, TemplateError>,
-) -> Result<()> {
-    let Some(failure) = failure else { return print_result(json, &object, text) };
-    object["error"] = json!(failure.to_string());
-    print_result(json, &object, text)?;
-    print_stderr(format_args!("error: {failure}"));
-    finish_with(failure.status)
+    let checked = shown.and_then(|()| check_unedited(&run));
+    print_result_despite(checked, arguments.json, &object, || to_text(&run, report.as_deref()))
 }
 
 /// Starts the viewer with the recording of the run in `path`, without waiting for it to end.
@@ -184,9 +170,9 @@ fn write_report(path: &Path, page: &str) -> io::Result<()> {
 }
 
 /// The failure of the review of an edited record: it is bad input, since it is not what the run recorded.
-fn edited(Run { folder, .. }: &Run) -> Option<Failure> {
-    let Condition::Changed(what) = &folder.condition else { return None };
-    Some(Failure::bad_input(folder.dir.as_ref(), what))
+fn check_unedited(Run { folder, .. }: &Run) -> Result<()> {
+    let Condition::Changed(what) = &folder.condition else { return Ok(()) };
+    Err(Failure::bad_input(folder.dir.as_ref(), what))
 }
 
 /// A parser of a verdict's name, for clap.

@@ -14,7 +14,7 @@ use super::records::last_run_on_a_bus;
 use super::stop::stop;
 use super::{Failure, Result};
 use crate::config::{CanInterface, Config};
-use crate::operation::{AnswerSettings, Goal, Move, Operation, OperationConfig};
+use crate::operation::{AnswerSettings, Goal, Move, Operation, RunConfig};
 use crate::session::AxisMove;
 use crate::stage::{Axis, StageConfig};
 use crate::tracker::{Gate, Registration};
@@ -227,9 +227,14 @@ impl Motion {
     }
 
     /// The operation that this motion asks of the stage of `config`.
-    pub(super) fn plan(&self, config: &Config) -> Result<OperationConfig> {
+    pub(super) fn plan(&self, config: &Config) -> Result<RunConfig> {
         let stage = config.to_stage()?;
         let operation = match self {
+            Motion::Home { axis: Some(axis), .. } if stage.axis(*axis).homing.is_none() => {
+                return Err(Failure::configuration(format_args!(
+                    "stage: {axis}: its position is to come from homing, and no homing is configured"
+                )));
+            }
             Motion::Home { axis, .. } => match Operation::home(&stage, *axis) {
                 Operation::Home(axes) if axes.all(|chosen| !chosen) => {
                     return Err(Failure::configuration(
@@ -260,7 +265,7 @@ impl Motion {
                 }))
             }
         };
-        Ok(OperationConfig { stage, operation })
+        Ok(RunConfig::Operation(Box::new(stage), operation))
     }
 }
 

@@ -8,7 +8,7 @@ use crate::cli::perform::{Job, Options, Performed, end_json};
 use crate::cli::{Failure, Result, finish_with};
 use crate::config::Config;
 use crate::emulator::drive::HOMING_METHODS;
-use crate::operation::Operation;
+use crate::operation::{Operation, RunConfig};
 use crate::runtime::RunReport;
 use crate::session::AxisMove;
 use crate::stage::{Axis, HomingConfig};
@@ -55,15 +55,15 @@ fn job<'a>(config: &'a Config, motion: &'a Motion, options: Options) -> Result<J
             homing.method
         ));
     }
-    let planned = motion.plan(config)?;
-    if let Operation::Home(axes) = &planned.operation
+    let run_config = motion.plan(config)?;
+    if let RunConfig::Operation(_, Operation::Home(axes)) = &run_config
         && config.is_emulated()
     {
         for axis in Axis::BOTH.into_iter().filter(|axis| axes[*axis]) {
             check_emulated_homing(axis, config.stage.axis(axis).homing)?;
         }
     }
-    Ok(Job { config, run_config: planned.into(), motion: Some(motion), options })
+    Ok(Job { config, run_config, motion: Some(motion), options })
 }
 
 /// Refuses a homing method of `axis` that no emulated drive has.

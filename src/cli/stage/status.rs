@@ -28,7 +28,8 @@ fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<()> {
         return Ok(());
     }
     let mut bus = open_bus(config.bus())?;
-    talk_live(dialogue, bus.as_mut(), Clock::start()).map_err(Failure::environment)
+    let trouble = talk_live(dialogue, bus.as_mut(), Clock::start(), None);
+    trouble.first.map_or(Ok(()), |error| Err(error.into()))
 }
 
 /// Resets the faults of both drives, then prints their status.

@@ -406,8 +406,7 @@ fn run_ticking(
             None => run.session.handle(run.session.deadline(), Input::Tick),
         }
     };
-    let gates = run.session.gate_counts();
-    run.witness.finish(outcome, clock.now(), gates, None)
+    run.witness.finish(run.session, outcome, clock.now(), None)
 }
 
 /// Frames queued behind the refused one are stale and never sent; the frames of the stop are. The record holds
@@ -423,7 +422,7 @@ fn behind_a_refused_frame_only_the_stop_is_sent() {
         Recorder::create(&scratch.0, manifest, CONFIG_TOML.to_owned(), Backpressure::Block)
             .unwrap();
     let sink = Sink::new(Ok(recorder), None, &mut operator, &Interrupt::default());
-    let mut session = Session::new(config.session().unwrap(), clock.now()).unwrap();
+    let mut session = Session::new(config.session().unwrap(), clock.now());
     let mut bus = Refusing::default();
     let report = run_ticking(&mut session, &mut bus, clock, sink);
     let stale = |frame: &&String| frame.starts_with("601#40") || frame.starts_with("602#40");

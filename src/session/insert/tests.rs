@@ -37,7 +37,7 @@ impl Bench {
         let now = Time::ZERO;
         Bench {
             now,
-            session: Session::new(config.session().unwrap(), now).unwrap(),
+            session: Session::new(config.session().unwrap(), now),
             stage: VirtualStage::new(config.virtual_stage().unwrap(), now),
             tool: config.tracker.tool,
             tip_mm: Vector3::zeros(),

@@ -157,7 +157,7 @@ fn an_axis_that_stands_outside_its_limits_can_be_moved_back() {
     let nodes = config.nodes();
     let begun = Time::from_secs_f64(1.0);
     let purpose = PerAxis::from_fn(|_| AxisUse::Move);
-    let mut bench = Bench::with(Stage::for_use(config, purpose, begun).expect("valid"), nodes);
+    let mut bench = Bench::with(Stage::for_use(config, purpose, begun), nodes);
     let feedback = bench.until_feedback();
     assert_eq!(feedback.measured.insertion_mm, -2.0);
     let at = |insertion_mm| SetPoint { insertion_mm, ..feedback.commanded };

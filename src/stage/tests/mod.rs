@@ -132,7 +132,7 @@ impl Bench {
     fn new(config: StageConfig) -> Self {
         let now = Time::from_secs_f64(1.0);
         let nodes = config.nodes();
-        Self::with(Stage::new(config, now).expect("valid"), nodes)
+        Self::with(Stage::new(config, now), nodes)
     }
 
     fn with(stage: Stage, nodes: PerAxis<NodeId>) -> Self {

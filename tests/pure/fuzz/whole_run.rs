@@ -45,8 +45,8 @@ impl Run {
         let now = Time::ZERO;
         Run {
             now,
-            session: Session::new(config.session().expect("valid"), now).expect("valid"),
-            stage: VirtualStage::new(config.virtual_stage().expect("valid"), now),
+            session: Session::new(config.session().expect("valid"), now),
+            stage: VirtualStage::new(config.virtual_stage().unwrap(), now),
             tool: config.tracker.tool,
             bus: Vec::new(),
         }
