@@ -16,7 +16,7 @@ use serde_json::json;
 pub(super) struct Arguments {
     #[command(flatten)]
     insertions: Insertions,
-    /// The observer to score first, as with `--set observer.kind=…`; the others of the configuration follow.
+    /// The observer to score first, as with `--set observer.kind=…`; the shadows of the configuration follow.
     #[arg(long, value_name = "KIND")]
     observer: Option<String>,
     /// One JSON object on stdout.

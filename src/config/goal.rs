@@ -29,7 +29,8 @@ section! {
         tool: Option<String> [not_blank("the name of a tool")];
         /// How far from `position_mm` that tool may be, mm.
         tool_range_mm: f64 [over(0.0, 1000.0)] = 10.0;
-        /// The target is the mean of that tool's positions over this long.
+        /// The target is the mean of that tool's positions over this long. One that moves is seen half of it
+        /// too late, and `target_error_est_mm` does not contain that.
         tool_average as "tool_average_s": Duration [within(0.01, 60.0)] = 1.0;
         /// How far from the target a path may end, mm.
         tolerance_mm: f64 [over(0.0, 100.0)] = 1.0;

@@ -39,6 +39,7 @@ impl BusTrouble {
 
 /// Runs `dialogue` on `bus` to its end, whatever errors the bus reports. A frame that the bus
 /// refuses is sent again, ten times a second, until the dialogue is over and `give_up` has passed.
+/// Without `give_up` the first error ends it.
 pub fn talk_live(
     dialogue: &mut dyn Dialogue,
     bus: &mut dyn CanBus,

@@ -25,6 +25,10 @@ pub(crate) fn stage_news(event: &StageEvent) -> Option<(Severity, String)> {
             "{axis}: the drive warns (statusword {statusword}, bit 7), {count} so far; see its manual \
              and its display for why"
         ),
+        StageEvent::CutOff(axis, statusword) => format!(
+            "{axis}: the drive does not stop, or was enabled again (statusword {statusword}); its node is \
+             sent to pre-operational and commanded again; does something delay frames on the bus?"
+        ),
         StageEvent::Flood(frames) => {
             format!("a flood on the bus: {frames} frames outside the SYNC cycle within 100 ms")
         }

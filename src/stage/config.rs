@@ -261,7 +261,8 @@ impl StageConfig {
         PerAxis { insertion: self.insertion.node, rotation: self.rotation.node }
     }
 
-    /// Checks what the ranges of the keys cannot express.
+    /// Checks what the ranges of the keys, and one key against another, cannot express: the order of the limits,
+    /// and what must fit in counts. Node numbers, periods and homing are checked with the configuration.
     ///
     /// # Errors
     /// The first setting that the stage cannot work with.

@@ -5,7 +5,7 @@ use super::machine::Phase;
 use super::supervision::refused_to_switch_on;
 use super::{Axis, Feedback, PerAxis, Progress, SetPoint, Stage, StageEvent};
 use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};
-use crate::canopen::nmt::{NmtCommand, NmtState};
+use crate::canopen::nmt::NmtState;
 use crate::canopen::sdo::codec::ServerFrame;
 use crate::canopen::sdo::{SdoReply, SdoRequest};
 use crate::canopen::sync::sync_frame;
@@ -134,12 +134,10 @@ impl Stage {
         if !is_located {
             return;
         }
-        if !self.drives.all(|drive| drive.answers.fresh) {
-            self.counters.feedback_missed += 1;
-        }
         let all_answered = self.drives.all(|drive| drive.answers.missed_in_a_row == 0);
         let missed = self.missed_in_a_row.saturating_add(1);
         self.missed_in_a_row = if all_answered { 0 } else { missed };
+        self.counters.feedback_missed += u64::from(!all_answered);
         if self.missed_in_a_row > missed_max {
             let syncs = self.missed_in_a_row;
             // Name the drive that has missed more: the other may have missed only this SYNC.
@@ -181,7 +179,7 @@ impl Stage {
                 for axis in Axis::BOTH {
                     self.drives[axis].answers.fresh = false;
                 }
-                return self.sync_count == 0 || now >= self.sync_time + DRAIN;
+                return self.sync_count == 0 || now >= self.sync_time + self.drain_time();
             }
             self.phase = Phase::Standby { give_up, located: true };
             self.emit(StageEvent::Located(self.positions(Drive::commanded)));
@@ -193,6 +191,14 @@ impl Stage {
             self.lead_to_enabled();
         }
         true
+    }
+
+    /// Answers that are late by more than this leave so many SYNCs after the next one without an answer that it is a
+    /// fault.
+    fn drain_time(&self) -> Duration {
+        let syncs = u32::from(self.config.bus.missed_feedback_max) + 2;
+        let time = DRAIN.max(self.config.bus.sync_period() * syncs);
+        time.min(self.config.power.enable_timeout / 2)
     }
 
     /// Enabling has timed out: names a drive that is not in NMT Operational, else one that was not heard, else one
@@ -219,7 +225,7 @@ impl Stage {
         } else if matches!(self.phase, Phase::Standby { located: false, .. }) {
             format!(
                 "in {timeout_ms} ms the drives did not both answer one SYNC before the next was due ({} ms): \
-                 their positions would be too old; what delays frames on the bus?",
+                 their positions would be too old; what delays frames on the bus, or this bench?",
                 self.config.bus.sync_ms
             )
         } else if let Some(axis) = Axis::BOTH
@@ -391,9 +397,11 @@ impl Stage {
     /// In a quick stop: stops by SDO alone a drive that is enabled, since set-points that are late on the bus may
     /// enable it again and again. In Pre-operational it takes no RPDO1.
     pub(super) fn cut_off(&mut self, axis: Axis) {
-        self.drives[axis].is_cut_off = true;
-        self.send_nmt(NmtCommand::EnterPreOperational, axis);
-        self.send_controlword(axis, self.drives[axis].controlword);
+        let drive = &mut self.drives[axis];
+        drive.is_cut_off = true;
+        let (controlword, statusword) = (drive.controlword, drive.statusword.unwrap_or_default());
+        self.emit(StageEvent::CutOff(axis, statusword));
+        self.send_controlword(axis, controlword);
     }
 
     /// True if the drive may be in another NMT state than Operational, and send no TPDO1.

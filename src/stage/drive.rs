@@ -17,6 +17,8 @@ use crate::units::Time;
 const RESET_TIMEOUT: Duration = Duration::from_millis(500);
 /// The first SYNC of a stop carries its controlword, and the TPDO1 after that may have been sampled before.
 const STOP_SYNCS: u64 = 2;
+/// A drive takes a command to stop within this time.
+const OBEYS_WITHIN: Duration = Duration::from_millis(20);
 /// The bits that a drive on its way to Operation Enabled keeps once it has shown them.
 const BEFORE_POWER: u16 = Statusword::REMOTE | Statusword::VOLTAGE_ENABLED;
 
@@ -475,7 +477,8 @@ impl Drive {
 
     /// True if the drive is in Operation Enabled although it has had time to take the command to stop.
     pub(super) fn disobeys_stop(&self) -> bool {
-        self.is_enabled() && self.statusword_sync >= self.stop_sync + STOP_SYNCS
+        let syncs = OBEYS_WITHIN.div_duration_f64(self.sync_period) as u64;
+        self.is_enabled() && self.statusword_sync >= self.stop_sync + syncs.max(STOP_SYNCS)
     }
 
     /// True if the motor has no power, or is losing it.

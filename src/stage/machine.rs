@@ -33,7 +33,7 @@ pub(super) enum Phase {
     /// SYNC runs from here to the end of `Disabling`. The drives are supervised, and get no power before
     /// it is permitted.
     Standby {
-        /// When both drives must have answered a SYNC.
+        /// When both drives must have answered a SYNC in time.
         give_up: Time,
         /// [`StageEvent::Located`] was emitted.
         located: bool,
@@ -342,7 +342,8 @@ impl Stage {
     /// Writes a controlword, without waiting for the reply.
     pub(super) fn send_controlword(&mut self, axis: Axis, word: Controlword) {
         // In Stopped a node takes neither PDO nor SDO (CiA 301, 7.3.2.2).
-        if self.monitors[axis].state() == Some(NmtState::Stopped) {
+        let is_stopped = self.monitors[axis].state() == Some(NmtState::Stopped);
+        if is_stopped || self.drives[axis].is_cut_off {
             self.send_nmt(NmtCommand::EnterPreOperational, axis);
         }
         self.send_sdo(axis, SdoRequest::Download(object::CONTROLWORD, word.0.into()));

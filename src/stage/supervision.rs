@@ -116,7 +116,8 @@ impl Stage {
         }
         // Errors from before bring-up took power off stop nothing: bring-up reads the statusword instead.
         let is_watched = self.bring_ups[axis].as_ref().is_none_or(|drive| drive.state().disarmed)
-            && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped);
+            && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped)
+            && !self.drives[axis].is_cut_off;
         let is_of_found_fault = self.drives[axis].is_of_found_fault(emcy.code);
         let is_expected = emcy.code == EmcyCode::NO_ERROR
             || emcy.code == EmcyCode::HEARTBEAT && self.note_silence_noticed(axis);
@@ -144,7 +145,8 @@ impl Stage {
         let previous = self.drives[axis].state();
         self.drives[axis].take_tpdo(payload, self.sync_count);
         self.check_statusword(now, axis, previous);
-        if self.is_quick_stopping() && self.drives[axis].disobeys_stop() {
+        let drive = &self.drives[axis];
+        if self.is_quick_stopping() && drive.disobeys_stop() && !drive.is_cut_off {
             self.cut_off(axis);
         }
         if self.drives.all(|drive| drive.answers.fresh) {

@@ -1,6 +1,6 @@
 //! `needle-bench calibrate needle`: recorded insertions become a configuration.
 
-use crate::support::program::{Scratch, needle_bench, refusals};
+use crate::support::program::{Scratch, needle_bench, refusals, repository};
 use crate::support::recording::{heading_only, recording, to_and_fro};
 use needle_bench::needle::{Needle, Torsion, TorsionConfig};
 
@@ -109,4 +109,19 @@ fn headings_after_small_turns_are_refused_as_such() {
     assert_eq!(said.status, 2, "{}", said.stdout);
     let why = "a.csv: the base turned by only 34 deg, so the orientations do not show whether they turn with it";
     assert!(said.stderr.replace("\n       ", " ").contains(why), "{}", said.stderr);
+}
+
+#[test]
+fn a_rig_without_noise_of_the_path_is_warned_about() {
+    let scratch = Scratch::new();
+    recorded(&scratch);
+    let rig = repository("bench-config/rig-epos4.toml");
+    let files = ["calibrate", "needle", "a.csv", "b.csv", "c.csv", &rig];
+    let is_warned = |sets: &[&str]| {
+        let said = needle_bench(&scratch, &[&files, sets].concat());
+        assert_eq!(said.status, 0, "{}", said.screen());
+        said.stderr.contains("warning: observer.invariant.noise has axial_mm = 0")
+    };
+    assert!(is_warned(&[]));
+    assert!(!is_warned(&["--set", "observer.invariant.noise.axial_mm=0.9"]));
 }

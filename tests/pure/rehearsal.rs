@@ -388,6 +388,10 @@ fn an_axis_without_homing_is_refused_before_a_record_is_made() {
     let said =
         needle_bench(&scratch, &[&stage[..], &sets, &["home", "--axis", "rotation"]].concat());
     assert_eq!(said.status, 2, "{}", said.screen());
-    assert!(said.stderr.ends_with("no homing is configured\n"), "{}", said.stderr);
+    assert!(
+        said.stderr.ends_with("rotation: no homing is configured (stage.rotation.homing)\n"),
+        "{}",
+        said.stderr
+    );
     assert!(!scratch.path().join("runs").exists(), "{}", said.screen());
 }

@@ -184,8 +184,15 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<()> {
     }
     let posed_rows = insertions.iter().map(posed_rows).collect::<Result<Vec<_>, _>>()?;
     check_roll(&insertions)?;
+    let noise = config.path_noise();
+    if !config.is_emulated() && noise.axial_noise_mm == 0.0 && noise.heading_noise_rad == 0.0 {
+        print_stderr(
+            "warning: observer.invariant.noise has axial_mm = 0 and heading_deg = 0: real tissue disturbs the \
+             path, so results and standard errors are off; bench-config/recordings.toml has an example",
+        );
+    }
     let name = |index: usize| insertions[index].path.display().to_string();
-    let fit = NeedleFit::of(&posed_rows, name, &config.path_noise());
+    let fit = NeedleFit::of(&posed_rows, name, &noise);
     let fit = fit.map_err(Failure::configuration)?;
     let mut file = insertions[0].path.display().to_string();
     if insertions.len() > 1 {

@@ -232,7 +232,7 @@ impl Motion {
         let operation = match self {
             Motion::Home { axis: Some(axis), .. } if stage.axis(*axis).homing.is_none() => {
                 return Err(Failure::configuration(format_args!(
-                    "stage: {axis}: its position is to come from homing, and no homing is configured"
+                    "stage: {axis}: no homing is configured (stage.{axis}.homing)"
                 )));
             }
             Motion::Home { axis, .. } => match Operation::home(&stage, *axis) {

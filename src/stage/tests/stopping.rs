@@ -67,6 +67,8 @@ fn a_drive_that_late_set_points_enable_again_is_stopped_by_sdo_alone() {
     assert!(enabled_ms.iter().all(|ms| *ms < 20), "{enabled_ms:?}");
     assert!(!enabled_ms.is_empty());
     assert_eq!(bench.fault(), None, "it was stopped without a fault");
+    let cut_off = |event: &&StageEvent| matches!(event, StageEvent::CutOff(Axis::Insertion, _));
+    assert_eq!(bench.events.iter().filter(cut_off).count(), 1, "told once");
     assert!(bench.events.contains(&StageEvent::Stopped { standing: true, off: true }));
 }
 
