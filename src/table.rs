@@ -84,8 +84,10 @@ impl Table {
             }
             (None, _) => {
                 let columns = self.header.iter().collect::<Vec<_>>().join(", ");
+                let has_semicolons = self.header.len() == 1 && columns.contains(';');
+                let hint = if has_semicolons { "; separate columns by commas" } else { "" };
                 let columns = clipped(&columns, SHOWN_MAX);
-                Err(TableError(format!("line 1: no column \"{name}\"; there are {columns}")))
+                Err(TableError(format!("line 1: no column \"{name}\"; there are {columns}{hint}")))
             }
         }
     }
@@ -210,6 +212,8 @@ mod tests {
         let message = |csv: &str| Table::parse(csv).numbers(["a", "b"]).unwrap_err().to_string();
         assert_eq!(message(""), "the file is empty; column \"a\" is needed");
         assert_eq!(message("x,a\n"), "line 1: no column \"b\"; there are x, a");
+        let semicolons = "line 1: no column \"a\"; there are a;b; separate columns by commas";
+        assert_eq!(message("a;b\n1;2\n"), semicolons);
         for end in ["\n", "\r\n"] {
             let csv = ["a,b", "", "1,2", "", "", "3,inf"].join(end);
             assert_eq!(message(&csv), "line 6: b is \"inf\", expected a finite number");

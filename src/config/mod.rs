@@ -211,10 +211,16 @@ impl Config {
         key.split('.').try_fold(&self.toml, |table, name| table.get(name))
     }
 
-    /// True if the dotted `key` has another value than its default. A printed configuration has all defaults.
+    /// True if the dotted `key`, or a key of that section, has another value than its default. A printed
+    /// configuration has all defaults.
     fn is_changed(&self, key: &str) -> bool {
         let default = keys::find(Self::KEYS, key).and_then(|key| key.default_value());
-        self.value_at(key) != default.as_ref()
+        match self.value_at(key) {
+            Some(Value::Table(section)) if default.is_none() => {
+                section.keys().any(|name| self.is_changed(&format!("{key}.{name}")))
+            }
+            value => value != default.as_ref(),
+        }
     }
 
     /// The number at the dotted `key`, in the key's own unit; NaN if it is not given.
@@ -235,12 +241,21 @@ impl Config {
         keys::json_schema(Config::KEYS, "needle-bench configuration")
     }
 
-    /// The whole configuration as TOML, which reads back to the same.
+    /// The whole configuration as TOML, which reads back to the same. For hardware, defaults of `[emulator]` that
+    /// a rehearsal derives are left out, so that it can still derive them.
     ///
     /// # Errors
     /// Not for a configuration that was read.
     pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
-        toml::to_string(&self.toml)
+        let mut toml = self.toml.clone();
+        if !self.is_emulated()
+            && let Some(emulator) = toml.get_mut("emulator").and_then(Value::as_table_mut)
+        {
+            emulator.retain(|key, _| {
+                !rehearsal::derives(key, self) || self.is_changed(&format!("emulator.{key}"))
+            });
+        }
+        toml::to_string(&toml)
     }
 }
 

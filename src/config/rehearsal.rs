@@ -18,6 +18,18 @@ const START_PART: f64 = 1.0 / 16.0;
 /// The start is at most this far off the plane, mm.
 const START_MAX_MM: f64 = 5.0;
 
+/// True if a rehearsal derives this key of `[emulator]`, or the one in place of which it may be given.
+pub(super) fn derives(key: &str, config: &Config) -> bool {
+    match key {
+        "drives" | "homed" | "radius_mm" | "curvature_per_mm" | "tip_ahead_mm" | "torsion"
+        | "start" | "sensor" => true,
+        "noise" | "tracker_latency_ms" | "tracker_repeats" => {
+            config.emulator.tracker == TrackerPreset::Plain
+        }
+        _ => false,
+    }
+}
+
 /// The keys of `[emulator]` that a rehearsal derives from the rest of `config`, as TOML.
 ///
 /// # Errors

@@ -158,3 +158,14 @@ proptest! {
         prop_assert_eq!(&loaded(&config.to_toml().expect("TOML"), &[]), &config);
     }
 }
+
+/// Printed defaults would override what a rehearsal derives.
+#[test]
+fn a_printed_rig_is_rehearsed_like_its_file() {
+    let rehearse = ["emulator.rehearse=true"];
+    let sets = ["needle.radius_mm=95.0", "needle.torsion.half_width_deg=4.0"];
+    let printed = loaded(RIG, &sets).to_toml().expect("TOML");
+    let of_file = loaded(RIG, &[&sets[..], &rehearse].concat());
+    assert!(of_file.emulator.homed);
+    assert_eq!(loaded(&printed, &rehearse).emulator, of_file.emulator);
+}
