@@ -18,7 +18,7 @@ const START_PART: f64 = 1.0 / 16.0;
 /// The start is at most this far off the plane, mm.
 const START_MAX_MM: f64 = 5.0;
 
-/// True if a rehearsal derives this key of `[emulator]`, or the one in place of which it may be given.
+/// True if a rehearsal derives this key of `[emulator]`, or its alternative.
 pub(super) fn derives(key: &str, config: &Config) -> bool {
     match key {
         "drives" | "homed" | "radius_mm" | "curvature_per_mm" | "tip_ahead_mm" | "torsion"

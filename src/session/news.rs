@@ -25,7 +25,7 @@ pub(crate) fn stage_news(event: &StageEvent) -> Option<(Severity, String)> {
             "{axis}: the drive warns (statusword {statusword}, bit 7), {count} so far; see its manual \
              and its display for why"
         ),
-        StageEvent::CutOff(axis, statusword) => format!(
+        StageEvent::StopNotObeyed(axis, statusword) => format!(
             "{axis}: the drive does not stop, or was enabled again (statusword {statusword}); its node is \
              sent to pre-operational and commanded again; does something delay frames on the bus?"
         ),

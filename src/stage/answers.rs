@@ -2,12 +2,12 @@
 
 use crate::canopen::Frame;
 
-/// A drive may owe so many answers more than it may leave out in a row …
-const OWED_MAX: u32 = 2;
-/// … and one of them is forgotten every so many SYNCs: a frame that is lost now and then is no fault.
-const FORGOTTEN_SYNCS: u64 = 1000;
+/// So many SYNCs more may stay unanswered than may be missed in a row.
+const UNANSWERED_MAX: u32 = 2;
+/// One unanswered SYNC no longer counts after so many: a frame that is lost now and then is no fault.
+const LEAK_SYNCS: u64 = 1000;
 
-/// What has come of one drive's answers.
+/// The answers of one drive so far.
 #[derive(Debug, Default)]
 pub(super) struct Answers {
     /// The answer to the last SYNC has come.
@@ -17,7 +17,7 @@ pub(super) struct Answers {
     /// The length, bytes, of a TPDO1 that came since the last one that was taken.
     pub(super) wrong_length: Option<usize>,
     /// SYNCs that were sent, less the TPDO1 that came: answers that were lost, or that are late by so many SYNCs.
-    owed: u32,
+    unanswered: u32,
     payload: [u8; 6],
     /// A second TPDO1 after the last SYNC, with another payload.
     second: Option<Frame>,
@@ -29,13 +29,13 @@ impl Answers {
     /// The SYNC of this number is sent.
     pub(super) fn begin(&mut self, sync: u64) {
         self.fresh = false;
-        self.owed += 1;
-        self.owed -= u32::from(sync.is_multiple_of(FORGOTTEN_SYNCS));
+        self.unanswered += 1;
+        self.unanswered -= u32::from(sync.is_multiple_of(LEAK_SYNCS));
     }
 
     /// Takes a TPDO1 with this payload. False if the last SYNC has had its answer: the payload must not be used then.
     pub(super) fn take(&mut self, frame: &Frame, payload: [u8; 6]) -> bool {
-        self.owed = self.owed.saturating_sub(1);
+        self.unanswered = self.unanswered.saturating_sub(1);
         if self.fresh {
             self.second = (payload != self.payload).then_some(*frame).or(self.second);
             return false;
@@ -49,7 +49,7 @@ impl Answers {
     pub(super) fn judge(&mut self, missed_max: u32, may_be_silent: bool) -> Option<String> {
         let missed = self.missed_in_a_row.saturating_add(1);
         self.missed_in_a_row = if self.fresh || may_be_silent { 0 } else { missed };
-        self.owed = if may_be_silent { 0 } else { self.owed };
+        self.unanswered = if may_be_silent { 0 } else { self.unanswered };
         let second = self.second.take();
         self.conflicts = if second.is_some() { self.conflicts.saturating_add(1) } else { 0 };
         let syncs = self.conflicts;
@@ -62,11 +62,11 @@ impl Answers {
     }
 
     /// The fault of a drive whose positions may be too old.
-    pub(super) fn fault_of_owed(&self, missed_max: u32) -> Option<String> {
-        let (owed, owed_max) = (self.owed, missed_max + OWED_MAX);
-        (owed > owed_max).then(|| {
+    pub(super) fn fault_of_unanswered(&self, missed_max: u32) -> Option<String> {
+        let (unanswered, unanswered_max) = (self.unanswered, missed_max + UNANSWERED_MAX);
+        (unanswered > unanswered_max).then(|| {
             format!(
-                "{owed} TPDO1 are lost or late (limit {owed_max}): its positions may be {owed} SYNCs old; check bus \
+                "{unanswered} TPDO1 are lost or late (limit {unanswered_max}): its positions may be {unanswered} SYNCs old; check bus \
                  load, cable, and what passes frames on"
             )
         })

@@ -156,7 +156,7 @@ impl Stage {
             return self.fail_drive(now, axis, &fault);
         }
         for axis in Axis::BOTH {
-            if let Some(fault) = self.drives[axis].answers.fault_of_owed(missed_max) {
+            if let Some(fault) = self.drives[axis].answers.fault_of_unanswered(missed_max) {
                 self.fail_drive(now, axis, &fault);
             }
         }
@@ -396,17 +396,17 @@ impl Stage {
 
     /// In a quick stop: stops by SDO alone a drive that is enabled, since set-points that are late on the bus may
     /// enable it again and again. In Pre-operational it takes no RPDO1.
-    pub(super) fn cut_off(&mut self, axis: Axis) {
+    pub(super) fn stop_by_sdo_alone(&mut self, axis: Axis) {
         let drive = &mut self.drives[axis];
-        drive.is_cut_off = true;
+        drive.sent_to_pre_operational = true;
         let (controlword, statusword) = (drive.controlword, drive.statusword.unwrap_or_default());
-        self.emit(StageEvent::CutOff(axis, statusword));
+        self.emit(StageEvent::StopNotObeyed(axis, statusword));
         self.send_controlword(axis, controlword);
     }
 
     /// True if the drive may be in another NMT state than Operational, and send no TPDO1.
     pub(super) fn may_leave_operational(&self, axis: Axis) -> bool {
-        self.has_noticed_silence(axis) || self.drives[axis].is_cut_off
+        self.has_noticed_silence(axis) || self.drives[axis].sent_to_pre_operational
     }
 
     /// While the stage stops, reads the statusword and the position of a drive that sends no TPDO, such as

@@ -58,7 +58,7 @@ pub(super) struct Drive {
     stop_sync: u64,
     pub(super) answers: Answers,
     /// In this stop the bench has sent its node to Pre-operational, in which it takes no RPDO1.
-    pub(super) is_cut_off: bool,
+    pub(super) sent_to_pre_operational: bool,
     sequence: EnableSequence,
     reset: FaultReset,
     /// SYNCs that the drive has stayed in a state that it is commanded to leave.
@@ -107,7 +107,7 @@ impl Drive {
             off_sync: 0,
             stop_sync: 0,
             answers: Answers::default(),
-            is_cut_off: false,
+            sent_to_pre_operational: false,
             sequence: EnableSequence::default(),
             reset: FaultReset::None,
             transition_syncs: 0,

@@ -191,7 +191,7 @@ pub enum StageEvent {
         count: u64,
     },
     /// A drive was enabled although it was commanded to stop: its node is sent to Pre-operational.
-    CutOff(Axis, Statusword),
+    StopNotObeyed(Axis, Statusword),
     /// A flood begins: this many frames that are no part of the SYNC cycle or of the bring-up came within 100 ms.
     Flood(u64),
     /// A frame had no effect. Reported for the 1st, 2nd, 4th, 8th … of a kind.

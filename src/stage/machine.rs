@@ -343,7 +343,7 @@ impl Stage {
     pub(super) fn send_controlword(&mut self, axis: Axis, word: Controlword) {
         // In Stopped a node takes neither PDO nor SDO (CiA 301, 7.3.2.2).
         let is_stopped = self.monitors[axis].state() == Some(NmtState::Stopped);
-        if is_stopped || self.drives[axis].is_cut_off {
+        if is_stopped || self.drives[axis].sent_to_pre_operational {
             self.send_nmt(NmtCommand::EnterPreOperational, axis);
         }
         self.send_sdo(axis, SdoRequest::Download(object::CONTROLWORD, word.0.into()));

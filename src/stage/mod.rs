@@ -22,7 +22,8 @@
 //!
 //! A [`StageEvent::Fault`] is reported once and quick-stops both axes. SYNC continues until both are seen to
 //! stand, or until a timeout. Then power is taken off, the nodes are sent to Pre-operational and
-//! [`StageEvent::Stopped`] is reported. A drive that does not obey is commanded again by SDO every 100 ms.
+//! [`StageEvent::Stopped`] is reported. A drive that does not obey is sent to Pre-operational and commanded again
+//! by SDO, at once and every 100 ms.
 //! If an orderly end ([`Stage::disable`]) times out, that is such a fault, too. The stage never moves again: a
 //! new run needs a new stage.
 //!
@@ -32,8 +33,9 @@
 //! Frames of the wrong length, from other nodes, or without a SYNC are counted and have no other effect. A
 //! TPDO carries no timestamp, so one that comes after the next SYNC is taken for the answer to that SYNC. The
 //! real answer, which follows, is then ignored and counted. If the two differ after several SYNCs in a row,
-//! there is a second sender, which is a fault. A drive whose every answer is late by a whole period cannot be
-//! distinguished from one that is on time.
+//! there is a second sender, which is a fault. Before power both answers to a SYNC must come before the next SYNC
+//! is due. Later a late answer cannot be distinguished from a lost one, so unanswered SYNCs are counted: too many
+//! are a fault.
 
 mod answers;
 mod axis;

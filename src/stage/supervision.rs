@@ -117,7 +117,7 @@ impl Stage {
         // Errors from before bring-up took power off stop nothing: bring-up reads the statusword instead.
         let is_watched = self.bring_ups[axis].as_ref().is_none_or(|drive| drive.state().disarmed)
             && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped)
-            && !self.drives[axis].is_cut_off;
+            && !self.drives[axis].sent_to_pre_operational;
         let is_of_found_fault = self.drives[axis].is_of_found_fault(emcy.code);
         let is_expected = emcy.code == EmcyCode::NO_ERROR
             || emcy.code == EmcyCode::HEARTBEAT && self.note_silence_noticed(axis);
@@ -146,8 +146,8 @@ impl Stage {
         self.drives[axis].take_tpdo(payload, self.sync_count);
         self.check_statusword(now, axis, previous);
         let drive = &self.drives[axis];
-        if self.is_quick_stopping() && drive.disobeys_stop() && !drive.is_cut_off {
-            self.cut_off(axis);
+        if self.is_quick_stopping() && drive.disobeys_stop() && !drive.sent_to_pre_operational {
+            self.stop_by_sdo_alone(axis);
         }
         if self.drives.all(|drive| drive.answers.fresh) {
             self.handle_feedback(now);

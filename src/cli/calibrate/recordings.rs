@@ -144,13 +144,8 @@ fn position_at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
         }
         let tip_mm = tip.tip_mm(&sample).map_err(|refusal| refusal.to_string())?;
         last_second.take(sample.receive_time, tip_mm);
-        let is_enough = last_second.count() >= POSITIONS_MIN;
-        let rested = last_second.mean_and_variance().filter(|_| is_enough);
-        let Some((mean_mm, mm2)) = rested.filter(|_| sample.receive_time.since(begun) >= REST)
-        else {
-            continue;
-        };
-        let sd_mm = mm2.sqrt();
+        let waited = sample.receive_time.since(begun);
+        let Some((mean_mm, sd_mm)) = mean_and_sd_mm(&last_second, waited) else { continue };
         if sd_mm <= limit_mm {
             return Ok(mean_mm);
         }
@@ -167,6 +162,14 @@ fn position_at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
         ),
         None => listener.explain_missing(),
     })
+}
+
+/// Mean of the last second and standard deviation of a coordinate, mm, once there is a whole second with enough
+/// positions.
+fn mean_and_sd_mm(last_second: &MovingMean, waited: Duration) -> Option<(Vector3<f64>, f64)> {
+    let is_enough = waited >= REST && last_second.count() >= POSITIONS_MIN;
+    let (mean_mm, variance_mm2) = last_second.mean_and_variance().filter(|_| is_enough)?;
+    Some((mean_mm, variance_mm2.sqrt()))
 }
 
 /// How well the points in `text` fit, if there are enough.
@@ -275,9 +278,10 @@ mod tests {
             let now = Time::from_secs_f64(f64::from(k) * 0.025);
             let way_mm = f64::from((20 - k).max(0)) + if k % 2 == 0 { 0.05 } else { -0.05 };
             last_second.take(now, Vector3::new(7.0, way_mm, 0.0));
-            match last_second.mean_and_variance().filter(|_| k >= 40) {
+            match mean_and_sd_mm(&last_second, now.since(Time::ZERO)) {
                 None => assert!(k < 40, "no mean after a whole second, at {k}"),
-                Some((mean_mm, mm2)) if mm2.sqrt() < 0.06 => {
+                Some(_) if k < 40 => panic!("a mean before a whole second, at {k}"),
+                Some((mean_mm, sd_mm)) if sd_mm < 0.06 => {
                     first_still.get_or_insert((k, mean_mm));
                 }
                 Some(_) => {}

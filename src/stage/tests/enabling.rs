@@ -255,8 +255,11 @@ fn an_axis_that_moves_while_its_drive_takes_long_to_enable_is_a_fault() {
 /// Something on the bus delays them from the start. They would be taken for answers to later SYNCs.
 #[test]
 fn answers_that_come_after_the_next_sync_is_due_get_no_power() {
-    for late_ms in [15, 95, 195] {
-        let mut bench = Bench::new(config());
+    // More than 250 ms pass for an answer in time if the bench does not wait for longer than may be missed.
+    for (late_ms, missed_max) in [(15, 1), (95, 1), (195, 1), (255, 30)] {
+        let mut config = config();
+        config.bus.missed_feedback_max = missed_max;
+        let mut bench = Bench::new(config);
         bench.tpdo_delay = Duration::from_millis(late_ms);
         let fault = bench.until_fault();
         let expected =

@@ -60,6 +60,10 @@ fn a_drive_that_late_set_points_enable_again_is_stopped_by_sdo_alone() {
     let (begun, mut enabled_ms) = (bench.now, Vec::new());
     while !bench.events.iter().any(|event| matches!(event, StageEvent::Stopped { .. })) {
         bench.step();
+        if bench.insertion.nmt == NmtState::PreOperational {
+            // Some drives report that they have left Operational.
+            bench.receive(bench.insertion.emergency(0x8100));
+        }
         if bench.insertion.state == DriveState::OperationEnabled {
             enabled_ms.push(bench.now.since(begun).as_millis());
         }
@@ -67,9 +71,32 @@ fn a_drive_that_late_set_points_enable_again_is_stopped_by_sdo_alone() {
     assert!(enabled_ms.iter().all(|ms| *ms < 20), "{enabled_ms:?}");
     assert!(!enabled_ms.is_empty());
     assert_eq!(bench.fault(), None, "it was stopped without a fault");
-    let cut_off = |event: &&StageEvent| matches!(event, StageEvent::CutOff(Axis::Insertion, _));
-    assert_eq!(bench.events.iter().filter(cut_off).count(), 1, "told once");
+    assert_eq!(bench.stage.counters().feedback_missed, 0);
+    let told = |event: &&StageEvent| matches!(event, StageEvent::StopNotObeyed(Axis::Insertion, _));
+    assert_eq!(bench.events.iter().filter(told).count(), 1, "told once");
     assert!(bench.events.contains(&StageEvent::Stopped { standing: true, off: true }));
+}
+
+/// At 2 ms two SYNCs are less than a drive may take.
+#[test]
+fn a_drive_has_20_ms_to_obey() {
+    let mut config = config();
+    config.bus.sync_ms = 2;
+    let mut bench = Bench::new(config);
+    bench.until_feedback();
+    for drive in [&mut bench.insertion, &mut bench.rotation] {
+        (drive.ignores_rpdo, drive.ignores_sdo) = (true, true);
+    }
+    bench.stage.quick_stop(bench.now);
+    bench.run_for(Duration::from_millis(16));
+    (bench.insertion.ignores_rpdo, bench.insertion.ignores_sdo) = (false, false);
+    bench.until_stopped();
+    let told = |axis| {
+        let is_told =
+            |event: &StageEvent| matches!(event, StageEvent::StopNotObeyed(of, _) if *of == axis);
+        bench.events.iter().any(is_told)
+    };
+    assert_eq!(Axis::BOTH.map(told), [false, true]);
 }
 
 /// The positions of both axes freeze while they move, and the stage is stopped at once.
