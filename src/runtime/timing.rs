@@ -4,26 +4,32 @@ use super::realtime::RealTime;
 use crate::stage::Counters;
 use crate::units::Time;
 use hdrhistogram::Histogram;
+use nix::time::{ClockId, clock_gettime};
 use serde::Serialize;
 use std::fmt;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, SystemTime};
 
-/// A monotonic clock whose origin is known in UTC.
+/// A monotonic clock whose origin is known in UTC. It also counts the time for which the machine is suspended: an
+/// [`Instant`](std::time::Instant) does not, and a run would go on as if nothing had been.
 #[derive(Debug, Clone, Copy)]
 pub struct Clock {
-    origin: Instant,
+    origin_since_boot: Duration,
     origin_utc: SystemTime,
+}
+
+fn since_boot() -> Duration {
+    clock_gettime(ClockId::CLOCK_BOOTTIME).expect("Linux has this clock").into()
 }
 
 impl Clock {
     /// A clock that starts at [`Time::ZERO`] now.
     pub fn start() -> Self {
-        Clock { origin: Instant::now(), origin_utc: SystemTime::now() }
+        Clock { origin_since_boot: since_boot(), origin_utc: SystemTime::now() }
     }
 
     /// The present time.
     pub fn now(&self) -> Time {
-        Time::ZERO + self.origin.elapsed()
+        Time::ZERO + (since_boot() - self.origin_since_boot)
     }
 
     /// The origin, UTC.
