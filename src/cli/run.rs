@@ -6,7 +6,7 @@ use super::ending::{
     after_insertion, ending, plan_status, plane_missed_by_mm, possible_withdrawal, status,
 };
 use super::mask::{file_crc32, mask_reader};
-use super::output::{merged, print_result};
+use super::output::{merged, print_result, print_stderr};
 use super::perform::{Job, Options, Performed, end_json};
 use super::preflight::{before_rehearsal, before_run};
 use super::{Failure, Result, finish_with, stage};
@@ -14,7 +14,7 @@ use crate::config::Config;
 use crate::operation::RunConfig;
 use crate::preflight::Check;
 use crate::runtime::{RunReport, gates_to_json};
-use crate::session::Outcome;
+use crate::session::{Outcome, Resume};
 use crate::text::screen;
 use clap::Args;
 use minijinja::{Value as Shown, context};
@@ -63,6 +63,11 @@ pub(super) fn run(arguments: &Arguments) -> Result<()> {
             )));
         }
         config = config.drawn(seed)?;
+    }
+    if config.tracker.hold.resume == Resume::Operator && !arguments.options.console {
+        print_stderr(format_args!(
+            "warning: tracker.resume is \"operator\", but only the keys of --console resume: a hold will end the run"
+        ));
     }
     // The record names each mask by its absolute path and checksum, for a replay to find and check it.
     config = configured.completed(&config, |mask| file_crc32(mask).ok());

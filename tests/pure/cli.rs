@@ -302,6 +302,21 @@ fn a_record_folder_that_is_a_file_is_refused() {
     insta::assert_snapshot!(said.screen());
 }
 
+#[test]
+fn a_run_that_nobody_can_resume_is_warned_about() {
+    let scratch = Scratch::new();
+    let run =
+        ["run", "--quiet", "--set", "insertion={ depth_mm = 1, plane_out_of_reach = \"insert\" }"];
+    for (resume, is_warned) in [("operator", true), ("automatic", false)] {
+        let set = format!("tracker.resume={resume}");
+        let said = needle_bench(&scratch, &[&run[..], &["--set", &set]].concat());
+        assert_eq!(said.status, 0, "{}", said.stderr);
+        let warning =
+            "warning: tracker.resume is \"operator\", but only the keys of --console resume";
+        assert_eq!(said.stderr.contains(warning), is_warned, "{}", said.stderr);
+    }
+}
+
 /// A limit of a law that does not steer has no effect.
 #[test]
 fn a_section_without_effect_is_warned_about() {

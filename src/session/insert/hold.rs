@@ -50,6 +50,8 @@ enum HeldBy {
         lost: &'static str,
         /// The hold interrupted a single step, which never goes on by itself.
         in_step: bool,
+        /// The operator was told that the insertion may go on.
+        is_told: bool,
     },
     Operator,
     Step,
@@ -76,7 +78,7 @@ impl InsertTask {
                 let text = clipped(&text, MESSAGE_MAX).into_owned();
                 insertion.profile.hold(self.config.tracker.hold.braking_mm_per_s2);
                 let in_step = insertion.profile.is_stepping();
-                let by = HeldBy::Tracker { trouble, lost, in_step };
+                let by = HeldBy::Tracker { trouble, lost, in_step, is_told: false };
                 let before = self.ended_hold.map_or(Duration::ZERO, |ended| {
                     ended.lasted.saturating_sub(now.since(ended.at))
                 });
@@ -88,14 +90,21 @@ impl InsertTask {
             }
             return Ok(());
         };
-        let HeldBy::Tracker { trouble: first, lost, in_step } = &hold.by else { return Ok(()) };
+        let HeldBy::Tracker { trouble: first, lost, in_step, is_told } = &hold.by else {
+            return Ok(());
+        };
         let tracker = &self.config.tracker;
         let is_standing = insertion.is_standing(insertion_meas_mm);
-        if tracker.hold.resume == Resume::Automatic
-            && is_standing
-            && found.is_none()
-            && self.is_seen(now)
-        {
+        let may_go_on = is_standing && found.is_none() && self.is_seen(now);
+        if may_go_on && tracker.hold.resume == Resume::Operator && !is_told {
+            let text = format!("the {lost} is seen again; held until the operator resumes");
+            shell.report_at(now, Lane::Tracker, Severity::Info, text);
+            if let Some(Hold { by: HeldBy::Tracker { is_told, .. }, .. }) = &mut self.hold {
+                *is_told = true;
+            }
+            return Ok(());
+        }
+        if may_go_on && tracker.hold.resume == Resume::Automatic {
             if *in_step {
                 self.hold_after_step(shell, now, insertion);
                 return Ok(());
