@@ -26,6 +26,9 @@ const FAILED_MAX: usize = 20;
 pub(super) struct Arguments {
     #[command(flatten)]
     configured: Configured,
+    /// Study the configuration of a rig on emulated drives and an emulated tracker, as `run --rehearse` runs it.
+    #[arg(long)]
+    rehearse: bool,
     /// Number of insertions.
     #[arg(long, default_value_t = 1000, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
     trials: u32,
@@ -48,11 +51,11 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn study(arguments: &Arguments) -> Result<()> {
-    let config = arguments.configured.load(None)?;
+    let config = arguments.configured.clone().rehearsed(arguments.rehearse).load(None)?;
     refuse_unwritable(arguments.out.as_deref())?;
     if !config.is_emulated() {
         return Err(Failure::configuration(format!(
-            "can.interface is \"{}\": a study needs the emulated needle, can.interface = \"memory\"",
+            "can.interface is \"{}\", but a study emulates the needle: study this rig with --rehearse",
             config.can.interface
         )));
     }
@@ -107,7 +110,7 @@ pub(super) fn study(arguments: &Arguments) -> Result<()> {
         control => config.control.kind.to_string(),
         rms => summary.estimate_rms.map(|rms| rms.to_string()),
         failed_max => FAILED_MAX,
-        repeat => repeat_command(&arguments.configured, config.insertion.plane_out_of_reach),
+        repeat => repeat_command(arguments, config.insertion.plane_out_of_reach),
     };
     let text = || screen(include_str!("study.txt"), &report, more);
     print_result_despite(ended, arguments.json, &report, text)
@@ -120,12 +123,14 @@ fn interrupted(trials: &[TrialResult], seeds: &[u64]) -> Failure {
 }
 
 /// The command that repeats a trial, without its seed. A run refuses a plane out of reach, which a study counts.
-fn repeat_command(configured: &Configured, plane_out_of_reach: PlaneOutOfReach) -> String {
+fn repeat_command(arguments: &Arguments, plane_out_of_reach: PlaneOutOfReach) -> String {
+    let Arguments { configured, rehearse, .. } = arguments;
     let path = configured.path().map(|path| path.display().to_string());
+    let flag = rehearse.then(|| "--rehearse".to_owned());
     let is_refused = plane_out_of_reach != PlaneOutOfReach::Insert;
     let inserts_anyway = is_refused.then(|| "insertion.plane_out_of_reach=insert".to_owned());
     let sets = configured.set.iter().cloned().chain(inserts_anyway);
-    let words = path.into_iter().chain(sets.flat_map(|set| ["--set".to_owned(), set]));
+    let words = path.into_iter().chain(flag).chain(sets.flat_map(|set| ["--set".to_owned(), set]));
     words.fold("needle-bench run".to_owned(), |line, word| line + " " + &shell_word(word))
 }
 

@@ -1,6 +1,6 @@
 //! The command `needle-bench study`.
 
-use crate::support::program::{Scratch, needle_bench, refusals};
+use crate::support::program::{Scratch, needle_bench, refusals, repository};
 use serde_json::Value;
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -216,6 +216,24 @@ fn bad_ranges_counts_and_stages_of_a_study_are_refused() {
         &[&["run", "--seed", "7"], &on_vcan[..]].concat(),
     ];
     insta::assert_snapshot!(refusals(&scratch, commands));
+}
+
+/// A trial of a rig's study is repeated by the command that the study prints.
+#[test]
+fn the_configuration_of_a_rig_is_studied_on_the_emulated_stage() {
+    let scratch = Scratch::new();
+    let rig = repository("bench-config/rig-epos4.toml");
+    let rig = rig.as_str();
+    let refused = needle_bench(&scratch, &["study", rig]);
+    assert_eq!(refused.status, 2, "{}", refused.stderr);
+    assert!(refused.stderr.contains("study this rig with --rehearse"), "{}", refused.stderr);
+    let study = ["study", rig, "--rehearse", "--trials", "3", "--set", "insertion.depth_mm=30"];
+    let said = needle_bench(&scratch, &study);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    let (_, repeat) = said.stdout.split_once("needle-bench ").expect("a command");
+    let run = needle_bench(&scratch, &repeat.split_whitespace().collect::<Vec<_>>());
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    assert!(run.stdout.contains("can0 was not opened"), "{}", run.stdout);
 }
 
 /// The whole session that a study runs first must start at the configured roll too.
