@@ -11,6 +11,7 @@ mod change;
 use super::refusal::{Effect, Refusal};
 use crate::units::IN_METRES;
 use change::{FASTER, SLOWER, ScaleChange, Tenths};
+use derive_more::{AddAssign, Mul};
 use nalgebra::Vector3;
 use std::collections::VecDeque;
 
@@ -21,6 +22,9 @@ const STRETCHES: [usize; 10] = [12, 16, 24, 32, 48, 64, 96, 128, 192, BINS_MAX];
 const BINS_MAX: usize = 256;
 /// A stretch with fewer positions is not checked.
 const POSITIONS_MIN: f64 = 6.0;
+/// A bin with more positions than this many times the usual number, because the needle was held there, counts as one
+/// with so many. Otherwise it would outweigh the others, and a stretch with it would not be checked.
+const CROWDED: f64 = 4.0;
 /// At most this many positions per mm count as independent: real noise is correlated.
 const INDEPENDENT_PER_MM: f64 = 10.0;
 /// Standard deviations of the slope's length that are allowed for noise, besides the tolerance.
@@ -70,7 +74,7 @@ pub struct TravelCheck {
 
 /// Sums over the positions of a bin or a stretch: `Σ 1, Σ ℓ, Σ ℓ², Σ p, Σ ℓ p, Σ pᵀp`, and how many independent
 /// positions they are worth. Depth and position are counted from a common origin.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy, Default, AddAssign, Mul)]
 struct Sums {
     count: f64,
     depth_mm: f64,
@@ -93,16 +97,6 @@ impl Sums {
             square_mm2: position_mm.norm_squared(),
             independent,
         }
-    }
-
-    fn add(&mut self, other: &Sums) {
-        self.count += other.count;
-        self.depth_mm += other.depth_mm;
-        self.depth_mm2 += other.depth_mm2;
-        self.position_mm += other.position_mm;
-        self.product_mm2 += other.product_mm2;
-        self.square_mm2 += other.square_mm2;
-        self.independent += other.independent;
     }
 
     fn depth_spread_mm2(&self) -> f64 {
@@ -157,7 +151,7 @@ impl TravelCheck {
         }
         // After an encoder's step back the position still counts to the newest bin.
         if let Some(newest) = self.bins.back_mut() {
-            newest.add(&Sums::of(insertion_mm, position_mm, independent));
+            *newest += Sums::of(insertion_mm, position_mm, independent);
         }
     }
 
@@ -169,11 +163,20 @@ impl TravelCheck {
         self.error.clone().map_or(Ok(()), Err)
     }
 
+    /// The median number of positions in the bins that have any; 0 if there are none.
+    fn usual_count(&self) -> f64 {
+        let counts = self.bins.iter().map(|bin| bin.count).filter(|count| *count > 0.0);
+        let mut counts: Vec<f64> = counts.collect();
+        counts.sort_by(f64::total_cmp);
+        counts.get(counts.len() / 2).copied().unwrap_or_default()
+    }
+
     /// Checks every stretch that ends with the newest bin, the shortest first.
     fn check_stretches(&mut self) {
+        let count_max = CROWDED * self.usual_count();
         let mut sums = Sums::default();
         for (bins, bin) in (1..).zip(self.bins.iter().rev()) {
-            sums.add(bin);
+            sums += if bin.count > count_max { *bin * (count_max / bin.count) } else { *bin };
             if STRETCHES.contains(&bins) {
                 let error = self.contradiction(&sums, bins);
                 self.error = self.error.take().or(error);
@@ -186,7 +189,7 @@ impl TravelCheck {
     pub fn explain(&self, mut refusal: Refusal) -> Refusal {
         if refusal.effect == Effect::Loses {
             let mut sums = Sums::default();
-            self.bins.iter().rev().take(EXPLAINED_BINS).for_each(|bin| sums.add(bin));
+            self.bins.iter().rev().take(EXPLAINED_BINS).for_each(|bin| sums += *bin);
             refusal.why += &match self.change_over(EXPLAINED_BINS, SLOWER) {
                 _ if sums.is_in_metres() => format!(": {IN_METRES}"),
                 Some(change) => format!(": {change}"),
@@ -259,7 +262,7 @@ pub fn check_recorded(rows: &[(f64, Vector3<f64>)]) -> Result<(), String> {
         let to_mm = from_mm + stretch_mm;
         let mut sums = Sums::default();
         for (mm, position_mm) in rows.iter().filter(|(mm, _)| (from_mm..=to_mm).contains(mm)) {
-            sums.add(&Sums::of(mm - first_mm, &(position_mm - origin_mm), 1.0));
+            sums += Sums::of(mm - first_mm, &(position_mm - origin_mm), 1.0);
         }
         let filled_mm = (12.0 * sums.depth_spread_mm2() / sums.count).sqrt();
         if sums.count < POSITIONS_MIN || filled_mm < 0.5 * RECORDED_STRETCH_MM {
@@ -291,11 +294,23 @@ mod tests {
     /// The depth, mm, at which the check contradicts a stream. The stream has a position each 0.05 mm of depth:
     /// `position(depth)`, with noise of ±`noise_mm`.
     fn contradicted_mm(noise_mm: f64, position: impl Fn(f64) -> Vector3<f64>) -> Option<f64> {
+        contradicted_with_hold_mm(None, noise_mm, position)
+    }
+
+    /// The same if the needle is also held at that depth, over 2400 positions: a minute at 40 Hz.
+    fn contradicted_with_hold_mm(
+        held_mm: Option<f64>,
+        noise_mm: f64,
+        position: impl Fn(f64) -> Vector3<f64>,
+    ) -> Option<f64> {
         let mut check = TravelCheck::new(0.6, 1.0 / 122.0);
         // A Weyl sequence for each coordinate gives uniform noise.
         let noise = |k: u32, step: f64| 2.0 * (f64::from(k) * step).fract() - 1.0;
-        for k in 0..4000 {
-            let depth_mm = 0.05 * f64::from(k);
+        let held = held_mm.map_or(0, |_| 2400);
+        for k in 0..4000u32 + held {
+            let held_from = held_mm.map_or(u32::MAX, |mm| (mm / 0.05) as u32);
+            let moved = k - k.saturating_sub(held_from).min(held);
+            let depth_mm = 0.05 * f64::from(moved);
             let steps = [0.618_034, 0.414_214, 0.732_051];
             let off_mm = Vector3::from(steps.map(|step| noise_mm * noise(k * 7919 % 65_537, step)));
             check.take(depth_mm, &(position(depth_mm) + off_mm), 1.0);
@@ -317,6 +332,21 @@ mod tests {
         let drift =
             |depth_mm: f64| z * depth_mm + Vector3::x() * (0.5 * (depth_mm - 40.0).max(0.0));
         assert!(matches!(contradicted_mm(1.0, drift), Some(40.0..=60.0)));
+    }
+
+    #[test]
+    fn a_long_hold_delays_no_contradiction() {
+        let z = Vector3::<f64>::z();
+        for held_mm in [0.0, 40.0, 46.0, 52.0] {
+            for (scale, at_mm) in [(1.1, 60.0), (1.5, 45.0), (0.9, 85.0)] {
+                let scaled =
+                    |depth_mm: f64| z * (depth_mm + (scale - 1.0) * (depth_mm - 40.0).max(0.0));
+                let found_mm = contradicted_with_hold_mm(Some(held_mm), 1.0, scaled);
+                assert!(found_mm.is_some_and(|mm| mm < at_mm), "{held_mm} {scale} {found_mm:?}");
+            }
+            let straight = contradicted_with_hold_mm(Some(held_mm), 1.0, |depth_mm| z * depth_mm);
+            assert_eq!(straight, None);
+        }
     }
 
     #[test]

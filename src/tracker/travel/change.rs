@@ -46,7 +46,7 @@ impl ScaleChange {
         let mut after = vec![Sums::default()];
         for bin in bins {
             let mut sums = after[after.len() - 1];
-            sums.add(bin);
+            sums += *bin;
             after.push(sums);
         }
         let all = *after.last()?;
@@ -112,7 +112,7 @@ mod tests {
             let mut sum = Sums::default();
             for n in 0..5 {
                 let depth_mm = 100.0 + BIN_MM * (f64::from(bin) + f64::from(n) / 5.0);
-                sum.add(&Sums::of(depth_mm, &(heading * travel(depth_mm - 100.0)), 1.0));
+                sum += Sums::of(depth_mm, &(heading * travel(depth_mm - 100.0)), 1.0);
             }
             sum
         });
