@@ -61,6 +61,10 @@ pub(super) fn ending(config: &Config, report: &RunReport) -> String {
             fixed(report.figures.report().target_error_est_mm, 3),
             config.goal.tolerance_mm
         ),
+        (None, None) if report.figures.is_unsteered() => {
+            "completed, not steered: the observer had no estimate at any step; see observer.kind and its section"
+                .to_owned()
+        }
         (None, None) => "completed".to_owned(),
         (None, Some(off_mm)) => format!(
             "completed, not in the plane: {off_mm:.1} mm RMS off it over the last third by the estimate \

@@ -267,6 +267,11 @@ impl RunFigures {
         missed_by_mm.filter(|rms_mm| *rms_mm > OFF_PLANE_LIMIT_MM)
     }
 
+    /// True if the insertion made steps, but had an estimate at none of them, so that nothing steered it.
+    pub fn is_unsteered(&self) -> bool {
+        !self.steps.is_empty() && self.estimated.is_empty()
+    }
+
     /// Depth after which the distance from the plane stays within 1 mm; `None` if it does not stay.
     fn settling_mm(&self) -> Option<f64> {
         let is_outside = |x_mm: Option<f64>| x_mm.is_none_or(|x| x.abs() > OFF_PLANE_LIMIT_MM);

@@ -2,6 +2,7 @@
 //!
 //! `cargo test --test pure steering:: -- --nocapture` prints it.
 
+use crate::support::program::{Scratch, needle_bench};
 use nalgebra::Vector3;
 use needle_bench::control::{Controller, FeedbackLinearization, FeedbackLinearizationConfig};
 use needle_bench::geometry::{FixedAngles, Pose};
@@ -96,4 +97,22 @@ fn every_noisy_insertion_settles_and_the_default_rate_is_accurate() {
             assert!(median < 0.17 && p95 < 0.30 && roll_deg < 2.5, "{median} {p95} {roll_deg}");
         }
     }
+}
+
+/// A baseline that is longer than the insertion leaves nothing to compare.
+#[test]
+fn an_insertion_without_an_estimate_is_not_just_completed() {
+    let scratch = Scratch::new();
+    let sets = [
+        "insertion.depth_mm=8",
+        "insertion.plane_out_of_reach=insert",
+        "observer.kind=finite-difference",
+        "observer.finite_difference.baseline_mm=20",
+    ];
+    let sets = sets.iter().flat_map(|set| ["--set", set]);
+    let run: Vec<&str> = ["run"].into_iter().chain(sets).collect();
+    let said = needle_bench(&scratch, &run);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    let last = said.stdout.lines().last().unwrap_or_default();
+    assert!(last.starts_with("completed, not steered: the observer had no estimate"), "{last}");
 }
