@@ -1,6 +1,7 @@
 //! Where calibrated values in a configuration came from, and how good they are. The preflight judges their
-//! age and the registration's RMS; nothing else uses them.
+//! age and the registration's RMS. The fiducials say how well the tip is known; nothing else is used.
 
+use super::FiducialPair;
 use crate::keys::{Rule, section, within};
 use crate::needle::TorsionConfig;
 
@@ -18,6 +19,8 @@ section! {
         rms_mm: f64 [LENGTH];
         /// RMS extent of the fiducials along their principal axes, mm.
         spread_mm: [f64; 3] [LENGTH];
+        /// The fiducials. From them follows how well the tip is known at the depth of a run.
+        fiducials: Vec<FiducialPair> [Rule::Fields("tracker_mm, bench_mm")] = [], everywhere;
     }
 }
 

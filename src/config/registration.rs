@@ -48,6 +48,13 @@ impl Field for RegistrationConfig {
     }
 }
 
+impl GivenRegistration {
+    /// The registration of the fiducials that its file keeps; `None` without them.
+    pub fn of_fiducials(&self) -> Option<RegistrationFit> {
+        RegistrationFit::of(&self.fit.as_ref()?.fiducials, f64::INFINITY).ok()
+    }
+}
+
 impl RegistrationConfig {
     /// The default of `rms_max_mm`, for `needle-bench calibrate registration`.
     pub fn rms_max_mm() -> f64 {
@@ -69,15 +76,19 @@ impl Fiducials {
 
 impl Config {
     /// Standard deviation in the worst direction, mm, of a tip on the planned path, due to the error of the
-    /// registration: as configured, or computed from the fiducials at both ends of the path, whichever is
-    /// larger; in between it is never larger. Zero if it is unknown.
+    /// registration: as configured, or computed from the fiducials at either end of the path, whichever is
+    /// larger; in between it is never larger. Zero if it is unknown. The configured one alone would not do: it is
+    /// of the depth and the plane for which it was calibrated.
     ///
     /// # Errors
     /// Fiducials that determine no registration.
     pub fn registration_sd_mm(&self) -> Result<f64, ConfigError> {
         match &self.tracker.registration {
             None => Ok(0.0),
-            Some(RegistrationConfig::Given(given)) => Ok(given.sd_mm),
+            Some(RegistrationConfig::Given(given)) => {
+                let computed_mm = given.of_fiducials().map(|fit| self.registration_sd_of_mm(&fit));
+                Ok(given.sd_mm.max(computed_mm.unwrap_or_default()))
+            }
             Some(RegistrationConfig::Fiducials(fiducials)) => {
                 Ok(self.registration_sd_of_mm(&fiducials.fit()?))
             }
@@ -113,6 +124,43 @@ mod tests {
 
     fn calibration(set: &str) -> String {
         Config::from_sources(&[], &[set.to_owned()]).unwrap().calibration_toml().unwrap()
+    }
+
+    /// As uncertain as with the same fiducials in the configuration, unless more is given.
+    #[test]
+    fn a_registration_is_as_uncertain_as_the_run_is_deep() {
+        let off = |n: usize| if n.is_multiple_of(2) { 0.3 } else { -0.3 };
+        let points =
+            [[-60, -60, 0], [60, -60, 0], [60, 60, 0], [-60, 60, 0], [0, 0, 120], [30, 0, 9]];
+        let pairs = points.iter().enumerate().map(|(n, [x, y, z])| {
+            let (x_mm, z_mm) = (f64::from(*x) + off(n), f64::from(*z) + off(n / 2));
+            format!(
+                "{{ tracker_mm = [{x_mm:.1}, {y}.0, {z_mm:.1}], bench_mm = [{x}.0, {y}.0, {z}.0] }}"
+            )
+        });
+        let fiducials = format!("fiducials = [{}]", pairs.collect::<Vec<_>>().join(", "));
+        let given = |sd_mm: f64| {
+            format!(
+                "x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0, \
+                 sd_mm = {sd_mm:.2}, fit = {{ file = \"p.csv\", sha256 = \"0\", version = \"0\", date_utc = \"0\", \
+                 points = 6, rms_mm = 0.4, spread_mm = [9.0, 9.0, 9.0], {fiducials} }}"
+            )
+        };
+        let sd_mm = |registration: &str, depth_mm: u32, z_mm: u32| {
+            let sets = [
+                format!("tracker.registration={{ {registration} }}"),
+                format!("insertion.depth_mm={depth_mm}"),
+                format!("plane.z_mm={z_mm}"),
+            ];
+            Config::from_sources(&[], &sets).unwrap().registration_sd_mm().unwrap()
+        };
+        for (depth_mm, z_mm) in [(10, 0), (250, 0), (10, 400)] {
+            let computed_mm = sd_mm(&fiducials, depth_mm, z_mm);
+            assert_eq!(sd_mm(&given(0.01), depth_mm, z_mm), computed_mm);
+            assert_eq!(sd_mm(&given(9.0), depth_mm, z_mm), 9.0);
+        }
+        assert!(sd_mm(&fiducials, 250, 0) > 2.0 * sd_mm(&fiducials, 10, 0));
+        assert!(sd_mm(&fiducials, 10, 400) > 2.0 * sd_mm(&fiducials, 10, 0));
     }
 
     #[test]

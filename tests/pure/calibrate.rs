@@ -83,6 +83,7 @@ fn a_registration_is_computed_used_from_its_file_and_recorded() {
     let fit = &config["tracker"]["registration"]["fit"];
     assert_eq!(fit["file"].as_str(), Some("points.csv"));
     assert_eq!(fit["sha256"].as_str().map(str::len), Some(64));
+    assert_eq!(fit["fiducials"].as_array().map(Vec::len), Some(6));
     assert!(fit["date_utc"].as_str().is_some_and(|date| date.ends_with('Z')));
 
     let run = [

@@ -276,6 +276,12 @@ fn torsion_json(torsion: &TorsionConfig) -> Value {
     })
 }
 
+/// A fiducial in the keys of the configuration.
+fn fiducial_json(pair: &FiducialPair) -> Value {
+    let [tracker_mm, bench_mm] = [pair.tracker_mm, pair.bench_mm].map(<[f64; 3]>::from);
+    json!({ "tracker_mm": tracker_mm, "bench_mm": bench_mm })
+}
+
 /// The tracker's pose on the bench from fiducials.
 fn registration(arguments: &RegistrationArguments) -> Result<()> {
     let path = &arguments.file;
@@ -288,7 +294,13 @@ fn registration(arguments: &RegistrationArguments) -> Result<()> {
     let pairs = FiducialPair::parse(&text).map_err(|error| Failure::bad_input(path, error))?;
     let fit = RegistrationFit::of(&pairs, arguments.rms_max_mm)
         .map_err(|error| Failure::bad_input(path, error))?;
-    let found = json!({ "points": fit.points, "rms_mm": fit.rms_mm, "spread_mm": fit.spread_mm });
+    let fiducials: Vec<Value> = pairs.iter().map(fiducial_json).collect();
+    let found = json!({
+        "points": fit.points,
+        "rms_mm": fit.rms_mm,
+        "spread_mm": fit.spread_mm,
+        "fiducials": fiducials,
+    });
     let [x_mm, y_mm, z_mm]: [f64; 3] = fit.x_wt.translation.into();
     let registration = json!({
         "x_mm": x_mm,
