@@ -63,13 +63,19 @@ impl Preflight {
                         .with(Verdict::Fail, failure.to_string()),
                 ),
             }
-            let is_completed_proof = |run: &Manifest| {
-                let is_completed = run.outcome == Some(RunOutcome::Completed);
-                is_completed && run.operation.as_deref() == Some("prove")
-            };
-            let concerns_proof = |key: &str| key.starts_with("stage.") || key.starts_with("can.");
-            let last_proof = earlier_run(rig, is_completed_proof, concerns_proof);
-            checks.push(proof(rig, last_proof.as_ref(), now_unix_us));
+            let tracked = ["tracker.registration", "tracker.tip_"];
+            for (operation, concerns) in [("prove", &[][..]), ("prove-handedness", &tracked)] {
+                let is_completed_proof = |run: &Manifest| {
+                    let is_completed = run.outcome == Some(RunOutcome::Completed);
+                    is_completed && run.operation.as_deref() == Some(operation)
+                };
+                let concerns_proof = |key: &str| {
+                    ["stage.", "can."].iter().chain(concerns).any(|start| key.starts_with(start))
+                };
+                let last_proof = earlier_run(rig, is_completed_proof, concerns_proof);
+                let is_of_handedness = operation != "prove";
+                checks.push(proof(rig, is_of_handedness, last_proof.as_ref(), now_unix_us));
+            }
         }
         let listened = listen_to_tracker(config, listen);
         checks.extend(match &listened {

@@ -11,6 +11,9 @@ const DAY_US: f64 = 86_400e6;
 /// A date may be ahead of this machine's clock by an hour; a later one is wrong.
 const AHEAD_MAX_DAYS: f64 = 1.0 / 24.0;
 
+/// The pose that the fiducials give may be off by this, mm and rad: the rounding of its numbers.
+const SAME_POSE: f64 = 1e-6;
+
 /// A run before this one.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Earlier {
@@ -61,23 +64,39 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
     let collect = format!("{register} --collect");
     let rms_max_mm = RegistrationConfig::rms_max_mm();
     let limit = format!("up to {rms_max_mm} mm RMS and {days_max:.0} days");
+    let close = |check: Check, rms_mm: f64| {
+        check.unless(rms_mm <= rms_max_mm, Fail, format!("over {rms_max_mm} mm RMS: {register}"))
+    };
     let registration = match &tracker.registration {
         None => {
             let next = format!("{register}, then name its file in tracker.registration_file");
             Check::new("registration", "missing", limit).with(Fail, next)
         }
         Some(RegistrationConfig::Given(given)) => {
-            let fit = given.fit.as_ref();
+            let of_fiducials = given.of_fiducials();
+            let off = of_fiducials.map(|fit| (fit.x_wt.inverse() * given.x_wt).log().to_vector());
+            // A pose that was changed by hand has no origin.
+            let fit = given.fit.as_ref().filter(|_| off.is_none_or(|off| off.amax() < SAME_POSE));
             let found = fit.map(|fit| format!("{:.2} mm RMS", fit.rms_mm)).unwrap_or_default();
             let provenance = fit.map(|fit| &fit.provenance);
-            let is_close = fit.is_none_or(|fit| fit.rms_mm <= rms_max_mm);
-            let next = format!("over {rms_max_mm} mm RMS: {register}");
-            dated("registration", found, &limit, provenance, &collect).unless(is_close, Fail, next)
+            let rms_mm = fit.map_or(0.0, |fit| fit.rms_mm);
+            let old =
+                "its file has no fiducials, so its sd_mm is of the depth and plane of that time";
+            close(dated("registration", found, &limit, provenance, &collect), rms_mm).unless(
+                fit.is_none() || of_fiducials.is_some(),
+                Warn,
+                format!("{old}: {register}"),
+            )
         }
         Some(RegistrationConfig::Fiducials(fiducials)) => match fiducials.fit() {
             Ok(fit) => {
                 let found = format!("{} points, {:.2} mm RMS", fit.points, fit.rms_mm);
-                dated("registration", found, &limit, None, &collect)
+                let remarks = fit.remarks().join("; ");
+                close(dated("registration", found, &limit, None, &collect), fit.rms_mm).unless(
+                    remarks.is_empty(),
+                    Warn,
+                    remarks,
+                )
             }
             Err(error) => {
                 let check = Check::new("registration", error.to_string(), limit);
@@ -118,20 +137,32 @@ pub fn start_roll(config: &Config) -> Option<Check> {
     config.stage.hardware.then(|| check.unless(is_known, Warn, next))
 }
 
-/// Judges the `last` completed `stage prove` on this bus: its age, and the keys of stage and bus that changed
-/// since.
-pub fn proof(config: &Config, last: Option<&Earlier>, now_unix_us: i64) -> Check {
-    let next = "needle-bench stage prove CONFIG, without a needle";
+/// Judges the `last` completed `stage prove` on this bus, or the last one of `--handedness`: its age, and the keys that
+/// it concerns and that changed since.
+pub fn proof(
+    config: &Config,
+    is_of_handedness: bool,
+    last: Option<&Earlier>,
+    now_unix_us: i64,
+) -> Check {
+    let (name, next) = match is_of_handedness {
+        false => ("stage prove", "needle-bench stage prove CONFIG, without a needle"),
+        true => (
+            "handedness",
+            "a base or a tracker of the wrong sign steers away from the plane: needle-bench stage prove CONFIG \
+             --handedness, without a needle",
+        ),
+    };
     let days_max = config.calibration.max_age_days;
     let limit = format!("this configuration, up to {days_max:.0} days");
     let Some(Earlier { started_utc, changed, proof }) = last else {
-        return Check::new("stage prove", "never", limit).with(Warn, next);
+        return Check::new(name, "never", limit).with(Warn, next);
     };
     let days = age_days(started_utc, now_unix_us);
     let proof = proof.as_ref().map(|proof| format!("{proof}, ")).unwrap_or_default();
     let found = format!("{proof}{}{}", ago(days), listed(changed, ", changed since: "));
     let is_valid = changed.is_empty() && is_recent(days, days_max);
-    Check::new("stage prove", found, limit).unless(is_valid, Warn, next)
+    Check::new(name, found, limit).unless(is_valid, Warn, next)
 }
 
 /// Judges what changed since the `last` run on this bus.

@@ -19,6 +19,10 @@ const LOAD_MAX: f64 = 0.5;
 const ERRORS_WARN: u16 = 96;
 /// Largest ratio of the noise that is measured in a short rest to the configured noise.
 const NOISE_MAX: f64 = 1.5;
+/// Smallest such ratio: wider gates find a jump late.
+const NOISE_MIN: f64 = 0.1;
+/// Largest depth that should be inserted without a tip position, mm.
+const BLIND_MAX_MM: f64 = 5.0;
 /// Largest difference between the clocks of two machines, s.
 const SKEW_MAX_S: f64 = 1.0;
 /// Fewest positions while the needle advances by `tracker.hold_after_mm`.
@@ -220,18 +224,32 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     let faster = "lower insertion.speed_mm_per_s, or raise the tracker's rate";
     let rate = rate.unless(*rate_hz >= rate_min_hz, Warn, faster);
 
+    let blind_mm = hold.after_mm.min(hold.after.as_secs_f64() * config.insertion.speed_mm_per_s);
+    let blind = Check::new(
+        "without a tip",
+        format!("up to {blind_mm:.1} mm inserted"),
+        format!("up to {BLIND_MAX_MM:.1} mm"),
+    );
+    let sooner = "lower tracker.hold_after_mm or tracker.hold_after_s";
+    let blind = blind.unless(blind_mm <= BLIND_MAX_MM, Warn, sooner);
+
     let is_within = |value: Option<f64>, limit: f64| value.is_none_or(|value| value.abs() <= limit);
     let noise_mm = report.noise_sd_mm;
-    let noise_max_mm = NOISE_MAX * config.tracker.to_track().noise_sd_mm;
+    let gate_mm = config.tracker.to_track().noise_sd_mm;
+    let [noise_min_mm, noise_max_mm] = [NOISE_MIN, NOISE_MAX].map(|ratio| ratio * gate_mm);
     let found = noise_mm.map_or_else(|| "not measured".to_owned(), |mm| format!("{mm:.3} mm"));
-    let limit = format!("up to {noise_max_mm:.3}, {NOISE_MAX} times tracker.gates.noise_sd_mm");
+    let limit = format!(
+        "{noise_min_mm:.3} to {noise_max_mm:.3}, {NOISE_MIN} to {NOISE_MAX} times tracker.gates.noise_sd_mm"
+    );
     let longer = format!(
         "listen for at least {POSITIONS_MIN} positions: check CONFIG --connect --listen 10"
     );
     let measure = "measure it: needle-bench tracker rest CONFIG";
+    let wide = format!("gates so wide find a jump late; {measure}");
     let noise = Check::new("tracker noise at rest", found, limit)
         .unless(noise_mm.is_some(), Warn, longer)
-        .unless(is_within(noise_mm, noise_max_mm), Warn, measure);
+        .unless(is_within(noise_mm, noise_max_mm), Warn, measure)
+        .unless(noise_mm.is_none_or(|mm| mm >= noise_min_mm), Warn, wide);
 
     let is_stamped = config.tracker.stamp != StampPolicy::Receive;
     let skew_s = report.stamp_skew_s;
@@ -245,7 +263,7 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     let stamps = Check::new("tracker stamps", found, format!("within {SKEW_MAX_S} s"))
         .unless(skew_s.is_some() || !is_stamped, Warn, send)
         .unless(is_within(skew_s, SKEW_MAX_S), Warn, set);
-    vec![stream, rate, noise, stamps, workspace(config, report)]
+    vec![stream, rate, blind, noise, stamps, workspace(config, report)]
 }
 
 /// Checks that the measured tip is in the workspace. Without a registration the tip's position on the bench is

@@ -159,17 +159,17 @@ fn a_tracker_is_judged_by_its_positions_noise_and_stamps() {
     assert_eq!((quiet.accepted, quiet.rate_hz, quiet.trouble.as_deref()), (80, 40.0, None));
     assert!((quiet.stamp_skew_s.unwrap() - 0.02).abs() < 1e-9, "{quiet:?}");
     // The rig has no workspace yet.
-    assert_eq!(verdicts(&tracker(&config, &quiet)), "PPPPW");
+    assert_eq!(verdicts(&tracker(&config, &quiet)), "PPPPPW");
     // A value that was not measured is no PASS.
     let unmeasured = TrackerReport { noise_sd_mm: None, stamp_skew_s: None, ..quiet.clone() };
-    assert_eq!(verdicts(&tracker(&config, &unmeasured)), "PPWWW");
+    assert_eq!(verdicts(&tracker(&config, &unmeasured)), "PPPWWW");
     let unstamped = rig(&[REGISTRATION, "tracker.stamp=\"receive\""]);
-    assert_eq!(verdicts(&tracker(&unstamped, &unmeasured)), "PPWPW", "no stamp is used");
+    assert_eq!(verdicts(&tracker(&unstamped, &unmeasured)), "PPPWPW", "no stamp is used");
     let noisy = listened(&config, -2.0, jitter(3.0));
-    assert_eq!(verdicts(&tracker(&config, &noisy)), "PPWWW");
+    assert_eq!(verdicts(&tracker(&config, &noisy)), "PPPWWW");
     // A tool that is moved is not noisy.
     let moved = listened(&config, 0.0, |k| Vector3::new(0.5 * f64::from(k) + 0.1, 0.0, 0.0));
-    assert_eq!(verdicts(&tracker(&config, &moved)), "PPPPW");
+    assert_eq!(verdicts(&tracker(&config, &moved)), "PPPPPW");
     let two = listened(&config, 0.0, |k| Vector3::new(1.0, 2.0, f64::from(k % 2) * 80.0 + 0.1));
     assert!(two.has_two_tools);
     assert_eq!(verdicts(&tracker(&config, &two))[..1], *"F");
@@ -213,7 +213,7 @@ fn a_tip_outside_the_workspace_fails() {
     );
     let outside = listened(&config, 0.0, |k| Vector3::new(99.0, f64::from(k), 0.5));
     assert_eq!((outside.accepted, outside.refused), (0, 80), "counted as in a run");
-    assert_eq!(verdicts(&tracker(&config, &outside)), "FWPPF");
+    assert_eq!(verdicts(&tracker(&config, &outside)), "FWPPPF");
     // Without a registration the position in the bench frame is unknown.
     let unregistered = at(&rig(&[BOX]), 99.0);
     assert_eq!(unregistered.verdict, Verdict::Warn, "{unregistered:?}");
@@ -239,7 +239,12 @@ fn the_plane_is_checked_from_the_last_position() {
 
 const FIT: &str = "tracker.registration={ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, \
     pitch_deg = 0.0, roll_deg = 0.0, fit = { file = \"p.csv\", sha256 = \"0\", version = \"0\", \
-    date_utc = \"2026-08-01T12:00:00.000000Z\", points = 9, rms_mm = 0.4, spread_mm = [9.0, 9.0, 9.0] } }";
+    date_utc = \"2026-08-01T12:00:00.000000Z\", points = 4, rms_mm = 0.4, spread_mm = [9.0, 9.0, 9.0], \
+    fiducials = [\
+        { tracker_mm = [0.0, 0.0, 0.0], bench_mm = [0.0, 0.0, 0.0] }, \
+        { tracker_mm = [50.0, 0.0, 0.0], bench_mm = [50.0, 0.0, 0.0] }, \
+        { tracker_mm = [0.0, 0.0, 50.0], bench_mm = [0.0, 0.0, 50.0] }, \
+        { tracker_mm = [0.0, 50.0, 0.0], bench_mm = [0.0, 50.0, 0.0] }] } }";
 
 #[test]
 fn missing_poor_or_old_calibrations_do_not_pass() {
@@ -275,6 +280,60 @@ fn missing_poor_or_old_calibrations_do_not_pass() {
     }
 }
 
+/// The verdict on the registration alone, and the next step.
+#[test]
+fn a_registration_is_judged_by_its_fiducials() {
+    let of = |set: &str| {
+        let sets = [set, "calibration.max_age_days=120"];
+        let check = calibrations(&rig(&sets), NOW_UNIX_US).swap_remove(0);
+        (check.verdict, check.found, check.next_step.unwrap_or_default())
+    };
+    let (verdict, found, _) = of(FIT);
+    assert_eq!((verdict, found.as_str()), (Verdict::Pass, "0.40 mm RMS, 113 days ago"));
+    // A pose that is not theirs was changed by hand.
+    let (verdict, found, _) = of(&FIT.replacen("x_mm = 0.0", "x_mm = 0.01", 1));
+    assert_eq!((verdict, found.as_str()), (Verdict::Warn, "typed in, no date"));
+    let (start, fiducials) = FIT.split_once(", fiducials").unwrap();
+    let (verdict, _, next) = of(&format!("{start} }} }}"));
+    assert_eq!(verdict, Verdict::Warn);
+    assert!(next.starts_with("its file has no fiducials"), "{next}");
+    // The same ones in the configuration itself, near their places and off them.
+    let inline = |x_mm: f64, z_mm: f64| {
+        let fiducials = fiducials
+            .replace("bench_mm = [50.0, 0.0, 0.0]", &format!("bench_mm = [{x_mm:.1}, 0.0, 0.0]"));
+        let fiducials = fiducials.replace("0.0, 50.0]", &format!("0.0, {z_mm:.1}]"));
+        let fiducials = fiducials.trim_end_matches(" }");
+        of(&format!("tracker.registration={{ rms_max_mm = 99.0, fiducials{fiducials} }}"))
+    };
+    let (verdict, _, next) = inline(50.0, 50.0);
+    assert_eq!((verdict, next.starts_with("nothing shows when")), (Verdict::Warn, true), "{next}");
+    let (verdict, found, next) = inline(60.0, 50.0);
+    assert_eq!(verdict, Verdict::Fail, "{found}");
+    assert!(next.starts_with("over 1 mm RMS"), "{next}");
+    let (verdict, _, next) = inline(50.0, 0.1);
+    assert_eq!(
+        (verdict, next.starts_with("the points lie in a plane")),
+        (Verdict::Warn, true),
+        "{next}"
+    );
+}
+
+#[test]
+fn wide_gates_are_warned_about() {
+    let jitter =
+        |k: u32| Vector3::new(1.0 + if (k / 2).is_multiple_of(2) { 0.05 } else { -0.05 }, 2.0, 3.0);
+    let of = |sets: &[&str]| {
+        let config = rig(&[&[REGISTRATION], sets].concat());
+        verdicts(&tracker(&config, &listened(&config, 0.02, jitter)))
+    };
+    let fine = "tracker.gates.noise_sd_mm=0.1";
+    assert_eq!(of(&[fine]), "PPPPPW");
+    assert_eq!(of(&["tracker.gates.noise_sd_mm=100.0"]), "PPPWPW");
+    // Half a second at 1 mm/s is less than 100 mm.
+    assert_eq!(of(&[fine, "tracker.hold_after_mm=100.0"]), "PPPPPW");
+    assert_eq!(of(&[fine, "tracker.hold_after_mm=100.0", "tracker.hold_after_s=60.0"]), "PPWPPW");
+}
+
 /// A run notices a registration that is turned about the needle only if the roll at the start is known.
 #[test]
 fn an_unknown_roll_at_the_start_is_a_warning() {
@@ -298,7 +357,7 @@ fn a_proof_counts_while_it_is_young_and_its_keys_unchanged() {
         proof: None,
         changed: changed.iter().map(|key| (*key).to_owned()).collect(),
     };
-    let of = |last: Option<&Earlier>| proof(&config, last, NOW_UNIX_US);
+    let of = |last: Option<&Earlier>| proof(&config, false, last, NOW_UNIX_US);
     assert_eq!(of(None).verdict, Verdict::Warn);
     let young = earlier("2026-11-22T09:00:00.000000Z", &[]);
     assert_eq!(
@@ -322,6 +381,13 @@ fn a_proof_counts_while_it_is_young_and_its_keys_unchanged() {
     let one = changes(Some(&earlier("2026-11-22T09:00:00.000000Z", &["a"])), NOW_UNIX_US);
     assert_eq!(one.found, "1 key changed: a");
     assert_eq!(changes(None, NOW_UNIX_US).verdict, Verdict::Pass);
+}
+
+#[test]
+fn a_proof_of_handedness_is_asked_for() {
+    let never = proof(&rig(&[]), true, None, NOW_UNIX_US);
+    assert_eq!((never.name.as_str(), never.verdict), ("handedness", Verdict::Warn));
+    assert!(never.next_step.unwrap().contains("stage prove CONFIG --handedness"));
 }
 
 #[test]
