@@ -148,7 +148,7 @@ impl Job<'_> {
                     },
                 }),
             };
-            let (recorder, _) = self.start_recording(SystemTime::now(), Backpressure::Block)?;
+            let (recorder, _) = self.start_recording(SystemTime::now())?;
             let sink = Sink::new(recorder, goes_on, operator, interrupt);
             session = self.run_config.clone().begin(Time::ZERO);
             run_virtual(&mut session, stage, tips, paced.then(Pace::begin), sink)
@@ -157,8 +157,7 @@ impl Job<'_> {
             let mut bus = open_stage_bus(config)?;
             let clock = Clock::start();
             let mut tracker = self.open_tracker(runtime, clock)?;
-            let (recorder, realtime) =
-                self.start_recording(clock.origin_utc(), Backpressure::DropAndCount)?;
+            let (recorder, realtime) = self.start_recording(clock.origin_utc())?;
             let sink = Sink::new(recorder, goes_on, operator, interrupt);
             // Last: the session's deadlines start to run here.
             session = self.run_config.clone().begin(clock.now());
@@ -208,13 +207,12 @@ impl Job<'_> {
     fn start_recording(
         &self,
         started_utc: SystemTime,
-        backpressure: Backpressure,
     ) -> Result<(Result<Recorder, TelemetryError>, Option<RealTime>)> {
         let mut recorder = if self.is_withdrawal() {
-            self.record_if_possible(started_utc, backpressure)
+            self.record_if_possible(started_utc)
         } else {
             self.check_record_dir()?;
-            Ok(self.create_recorder(started_utc, backpressure)?)
+            Ok(self.create_recorder(started_utc)?)
         };
         let served = recorder.as_mut().map_or(Ok(()), |recorder| self.serve(recorder));
         match served.and_then(|()| self.options.realtime.enter()) {
@@ -228,15 +226,10 @@ impl Job<'_> {
         }
     }
 
-    /// As for any run, but warns where that is refused.
-    fn record_if_possible(
-        &self,
-        started_utc: SystemTime,
-        backpressure: Backpressure,
-    ) -> Result<Recorder, TelemetryError> {
+    /// Checks the folder and creates the recorder as for any run, but only warns where that is refused.
+    fn record_if_possible(&self, started_utc: SystemTime) -> Result<Recorder, TelemetryError> {
         let checked = self.check_record_dir();
-        let created = self.create_recorder(started_utc, backpressure);
-        match created {
+        match self.create_recorder(started_utc) {
             Ok(recorder) => {
                 if let Err(failure) = checked {
                     print_stderr(format_args!("warning: {failure}; the withdrawal goes on"));
@@ -263,14 +256,15 @@ impl Job<'_> {
         check_room(dir, self.config.record.free_mb_min).map_err(Failure::environment)
     }
 
-    fn create_recorder(
-        &self,
-        started_utc: SystemTime,
-        backpressure: Backpressure,
-    ) -> Result<Recorder> {
+    fn create_recorder(&self, started_utc: SystemTime) -> Result<Recorder> {
         let manifest = self.manifest(started_utc)?;
         let config_toml = self.config.to_toml().map_err(Failure::environment)?;
         let dir = Path::new(&self.config.record.dir);
+        // Waiting is harmless in virtual time.
+        let backpressure = match self.config.is_emulated() {
+            true => Backpressure::Block,
+            false => Backpressure::DropAndCount,
+        };
         Recorder::create(dir, manifest, config_toml, backpressure).map_err(Failure::environment)
     }
 

@@ -303,22 +303,18 @@ impl VirtualStage {
 
     /// Adds to the lines of drive `n` what `fault` does to its frames until `end`.
     fn add_frame_faults(&mut self, n: usize, end: Time, fault: &Fault) {
-        let (from_drive, to_drive) = match fault.kind {
-            FaultKind::Silent => (true, true),
-            // A restart without a duration takes no time.
-            FaultKind::Restart => (fault.duration.is_some(), fault.duration.is_some()),
-            kind => (
-                kind.has("frames") && fault.toward == Toward::Bench,
-                kind.has("frames") && fault.toward == Toward::Drives,
-            ),
-        };
         let id = fault.frame_id(self.drives[n].id());
-        for (line, is_faulty) in
-            [(&mut self.from_drive[n], from_drive), (&mut self.to_drive[n], to_drive)]
-        {
-            if is_faulty {
-                line.add(fault.clone(), id, end);
-            }
+        let changes_frames = |toward: Toward| match fault.kind {
+            FaultKind::Silent => true,
+            // A restart without a duration takes no time.
+            FaultKind::Restart => fault.duration.is_some(),
+            kind => kind.has("frames") && fault.toward == toward,
+        };
+        if changes_frames(Toward::Bench) {
+            self.from_drive[n].add(fault.clone(), id, end);
+        }
+        if changes_frames(Toward::Drives) {
+            self.to_drive[n].add(fault.clone(), id, end);
         }
     }
 

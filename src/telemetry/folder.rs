@@ -1,7 +1,7 @@
 //! Run folders, named `<UTC>-<name>`: creating a new one, its lock, its manifest, and the space on its disk.
 
 use super::TelemetryError;
-use crate::archive::{Manifest, compact, file};
+use crate::archive::{Manifest, compact, file, unix_us_of};
 use nix::errno::Errno;
 use nix::fcntl::{FcntlArg, fcntl};
 use nix::libc::{F_UNLCK, F_WRLCK, SEEK_SET, flock};
@@ -14,20 +14,17 @@ use std::path::{Path, PathBuf};
 /// Runs of one name in one second are distinguished by a number, up to this.
 const COLLISIONS_MAX: u32 = 1000;
 
-/// Creates a new folder for the run `name` in `parent`, and `parent` itself if it does not exist. `name` must
-/// be valid as a key of the configuration.
+/// Creates a new folder for the run of `manifest` in `parent`, and `parent` itself if it does not exist. The run's
+/// name must be valid as a key of the configuration.
 ///
 /// `create_dir` fails on an existing folder, so two processes never get the same one.
 ///
 /// # Errors
 /// The folder cannot be created.
-pub(super) fn create(
-    parent: &Path,
-    started_unix_us: i64,
-    name: &str,
-) -> Result<PathBuf, TelemetryError> {
+pub(super) fn create(parent: &Path, manifest: &Manifest) -> Result<PathBuf, TelemetryError> {
     fs::create_dir_all(parent).map_err(TelemetryError::folder(parent))?;
-    let base = format!("{}-{name}", compact(started_unix_us));
+    let started_unix_us = unix_us_of(&manifest.started_utc).unwrap_or_default();
+    let base = format!("{}-{}", compact(started_unix_us), manifest.name);
     let mut path = parent.join(&base);
     for n in 2..=COLLISIONS_MAX {
         match fs::create_dir(&path) {
@@ -185,7 +182,10 @@ mod tests {
         let scratch = Scratch::new("folder");
         let parent = scratch.0.join("runs");
         let made: Vec<String> = (0..3)
-            .map(|_| create(&parent, 1_700_000_000_000_000, "virtual").unwrap())
+            .map(|_| {
+                create(&parent, &Manifest::new("virtual", "2023-11-14T22:13:20.000000Z".to_owned()))
+                    .unwrap()
+            })
             .map(|p| p.file_name().unwrap().to_str().unwrap().to_owned())
             .collect();
         let base = "20231114T221320Z-virtual";
@@ -247,7 +247,7 @@ mod tests {
         let scratch = Scratch::new("parent-is-file");
         let file = scratch.0.join("runs");
         fs::write(&file, "").unwrap();
-        let error = create(&file, 0, "x").unwrap_err().to_string();
+        let error = create(&file, &Manifest::default()).unwrap_err().to_string();
         assert!(error.contains(file.to_str().unwrap()), "{error}");
     }
 

@@ -31,9 +31,7 @@ type OpenPath = (PathBuf, File);
 ///
 /// # Errors
 /// The folder or a file cannot be opened, or no thread can be started.
-pub(super) fn keep(
-    dir: &Path,
-) -> Result<(Worker<Box<Manifest>>, Consumer<String>), TelemetryError> {
+pub(super) fn keep(dir: &Path) -> Result<(Worker<Manifest>, Consumer<String>), TelemetryError> {
     let (reports, problems) = RingBuffer::new(QUEUE_PROBLEMS);
     let folder = Folder::open(dir, reports)?;
     let worker = Worker::start(KEEPER, QUEUE_MANIFESTS, Backpressure::DropAndCount, folder)?;
@@ -67,7 +65,7 @@ impl Folder {
     /// Syncs one of the text files in turn, and checks the folder, its files and the free space. Returns the
     /// problems.
     fn sync_and_check(&mut self) -> Vec<TelemetryError> {
-        let turn = self.files.iter().cycle().nth(self.checks % file::TEXT_FILES.len());
+        let turn = self.files.get(self.checks % file::TEXT_FILES.len());
         self.checks += 1;
         let synced = turn.map(|(path, file)| file.sync_data().map_err(TelemetryError::file(path)));
         let checked = match check_in_place(&self.dir) {
@@ -121,12 +119,12 @@ fn check_in_place((path, file): &OpenPath) -> Result<(), TelemetryError> {
 }
 
 impl Sink for Folder {
-    type Item = Box<Manifest>;
+    type Item = Manifest;
     const ITEMS: &'static str = "manifests";
     /// Each check syncs one of the five text files, so a loss of power costs 1.25 s.
     const TICK: Duration = Duration::from_millis(250);
 
-    fn take(&mut self, manifest: Box<Manifest>) -> Result<(), String> {
+    fn take(&mut self, manifest: Manifest) -> Result<(), String> {
         let problem = self.write_manifest(&manifest).err();
         self.report(problem);
         Ok(())
@@ -217,7 +215,7 @@ mod tests {
         create_files(&scratch.0);
         let (mut keeper, _) = keep(&scratch.0).unwrap();
         while keeper.dropped == 0 {
-            keeper.give(Box::default());
+            keeper.give(Manifest::default());
         }
         let news = std::iter::from_fn(|| keeper.news(Instant::now()));
         let said: Vec<String> = news.map(|news| format!("{news:?}")).collect();

@@ -6,7 +6,7 @@ use super::text::{TextFiles, WRITER};
 use super::vitals::RecordNews;
 use super::worker::{Backpressure, Worker};
 use super::{Entry, Scene, TelemetryError, folder, utc_text};
-use crate::archive::{DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex, unix_us_of};
+use crate::archive::{DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex};
 use rtrb::Consumer;
 use std::fs::{self, File};
 use std::iter;
@@ -30,7 +30,7 @@ pub struct Recorder {
     manifest: Manifest,
     text: Worker<Entry>,
     live: Option<Worker<Entry>>,
-    keeper: Worker<Box<Manifest>>,
+    keeper: Worker<Manifest>,
     /// Problems that the keeper found.
     problems: Consumer<String>,
     /// Shows other processes that the folder is being written.
@@ -49,8 +49,7 @@ impl Recorder {
         config_toml: String,
         backpressure: Backpressure,
     ) -> Result<Recorder, TelemetryError> {
-        let started_unix_us = unix_us_of(&manifest.started_utc).unwrap_or_default();
-        let run_dir = folder::create(parent, started_unix_us, &manifest.name)?;
+        let run_dir = folder::create(parent, &manifest)?;
         let config_sha256 = sha256_hex(config_toml.as_bytes());
         let manifest = Manifest { config_sha256, ..manifest };
         let fill = |run_dir: PathBuf| {
@@ -110,7 +109,7 @@ impl Recorder {
     /// Puts a drive found on the bus into the manifest, without waiting for it to be written.
     pub fn identify_drive(&mut self, drive: DriveIdentity) {
         self.manifest.drives.push(drive);
-        self.keeper.give(Box::new(self.manifest.clone()));
+        self.keeper.give(self.manifest.clone());
     }
 
     /// Completes the text files, seals them and writes the final manifest, to which `sum_up` adds the

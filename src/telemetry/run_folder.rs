@@ -74,22 +74,18 @@ impl RunFolder {
     /// # Errors
     /// [`TelemetryError::File`].
     pub fn change(&self, name: &str) -> Result<Option<String>, TelemetryError> {
-        let seal = self.manifest.files.get(name);
-        let config_sha256 = Some(&self.manifest.config_sha256).filter(|_| name == file::CONFIG);
-        let Some(sha256) = seal.map(|seal| &seal.sha256).or(config_sha256) else {
-            let exists = self.dir.join(name).exists();
-            let what = if exists { "has no seal in the manifest" } else { "is missing" };
-            return Ok(Some(format!("{name} {what}")));
-        };
         let Some(now) = seal_of(&self.dir, name)? else {
             return Ok(Some(format!("{name} is missing")));
         };
-        Ok(match seal {
-            Some(seal) if seal.bytes != now.bytes => Some(format!(
+        let seal = self.manifest.files.get(name);
+        let config_sha256 = Some(&self.manifest.config_sha256).filter(|_| name == file::CONFIG);
+        Ok(match (seal, seal.map(|seal| &seal.sha256).or(config_sha256)) {
+            (_, None) => Some(format!("{name} has no seal in the manifest")),
+            (Some(seal), _) if seal.bytes != now.bytes => Some(format!(
                 "{name} had {} bytes when the record was closed and has {} now",
                 seal.bytes, now.bytes
             )),
-            _ if *sha256 != now.sha256 => {
+            (_, Some(sha256)) if *sha256 != now.sha256 => {
                 Some(format!("{name} was edited: its SHA-256 is not the one in manifest.json"))
             }
             _ => None,

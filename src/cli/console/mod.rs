@@ -190,15 +190,12 @@ impl Operator for Console {
     }
 
     fn record(&mut self, record: &Record) {
-        let is_shown = matches!(
-            record,
-            Record::Can { .. }
-                | Record::Sample(_)
-                | Record::Stage(_)
-                | Record::Step(_)
-                | Record::State { .. }
-                | Record::Input { input: Input::Operator(_), .. }
-        );
+        let is_shown = match record {
+            // Events come by `event`.
+            Record::Event { .. } => false,
+            Record::Input { input, .. } => matches!(input, Input::Operator(_)),
+            _ => true,
+        };
         if is_shown {
             self.send(Message::Record(record.clone()));
         }

@@ -248,7 +248,7 @@ impl Motion {
                 .and_then(|goal| with_speed(jog_move(config, *axis, goal), *speed, &stage))
                 .map(Operation::Move)
                 .map_err(Failure::configuration)?,
-            Motion::Withdraw { by, speed, .. } => withdrawal_move(config, &stage, *by)
+            Motion::Withdraw { by, speed, .. } => withdrawal_move(config, *by)
                 .and_then(|withdrawal| with_speed(withdrawal, *speed, &stage))
                 .map(Operation::Move)
                 .map_err(Failure::configuration)?,
@@ -417,13 +417,9 @@ fn jog_move(config: &Config, axis: Axis, goal: Goal) -> Move {
 }
 
 /// The move that withdraws the needle: by a distance, or to depth 0, which only an axis with a configured zero has.
-fn withdrawal_move(
-    config: &Config,
-    stage: &StageConfig,
-    by: Option<Distance>,
-) -> Result<Move, String> {
+fn withdrawal_move(config: &Config, by: Option<Distance>) -> Result<Move, String> {
     let insertion = &config.stage.insertion;
-    let along = |by: Distance| by.nonzero_along(Axis::Insertion, stage.insertion.ratio);
+    let along = |by: Distance| by.nonzero_along(Axis::Insertion, insertion.ratio);
     let goal = match by.map(along).transpose()? {
         Some(mm) if mm > 0.0 => Goal::By(-mm),
         Some(mm) => {

@@ -25,21 +25,14 @@ impl Motion {
         Motion::Linear { start: now, end: now + period, from, to }
     }
 
-    /// The elapsed part of the piece, 0 to 1.
-    fn progress(now: Time, start: Time, end: Time) -> f64 {
-        if now >= end {
-            return 1.0;
-        }
-        (now.seconds_after(start) / end.seconds_after(start)).clamp(0.0, 1.0)
-    }
-
     /// Position in counts; exactly the end point from the end on.
     pub(super) fn position_at(&self, now: Time) -> f64 {
         match *self {
             Motion::Hold { at } => at,
             Motion::Linear { end, to, .. } if now >= end => to,
             Motion::Linear { start, end, from, to } => {
-                from + (to - from) * Self::progress(now, start, end)
+                let part = now.seconds_after(start).max(0.0) / end.seconds_after(start);
+                from + (to - from) * part
             }
             Motion::Brake(profile) | Motion::Ramped(profile) => profile.position_at(now),
         }
@@ -119,9 +112,8 @@ impl Motion {
     /// a SYNC that comes a little early.
     pub(super) fn align_to_sync(&mut self, now: Time) {
         if let Motion::Linear { start, end, .. } = self
-            && *start < now
             && now < *end
-            && Self::progress(now, *start, *end) > 0.5
+            && now.since(*start) > end.since(now)
         {
             // Not shortened: the speed at which a stop would begin does not change.
             *start = now - end.since(*start);
