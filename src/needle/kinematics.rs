@@ -1,34 +1,26 @@
-//! The tip's motion under insertion and rotation (paper Eq. 1), in exact steps.
+//! The tip's motion under insertion and rotation (paper Eq. 1), in exact steps. An error names the argument that was
+//! refused, its value and the limit.
 
 use crate::geometry::{Pose, Twist};
 use nalgebra::Vector3;
-use thiserror::Error;
 
 /// The largest magnitude of any argument, in mm, rad or per mm. It is far beyond any needle, and so
 /// small that products of a few arguments do not overflow.
 pub(crate) const MAGNITUDE_MAX: f64 = 1e6;
 
-/// Why an argument was refused, with its value and the limit.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("{0}")]
-pub struct NeedleError(pub(super) String);
-
-impl NeedleError {
-    /// `quantity` is far beyond any needle.
-    pub fn too_large(quantity: &str, value: f64) -> Self {
-        let max = MAGNITUDE_MAX;
-        NeedleError(format!("{quantity} is {value:e}, allowed is up to {max:e} in magnitude"))
-    }
+/// The error of a `quantity` far beyond any needle.
+pub fn too_large(quantity: &str, value: f64) -> String {
+    format!("{quantity} is {value:e}, allowed is up to {MAGNITUDE_MAX:e} in magnitude")
 }
 
 /// Refuses a value that is not finite or over [`MAGNITUDE_MAX`] in magnitude.
-pub(super) fn bounded(quantity: &str, value: f64) -> Result<(), NeedleError> {
+pub(super) fn bounded(quantity: &str, value: f64) -> Result<(), String> {
     if !value.is_finite() {
-        return Err(NeedleError(format!("{quantity} is {value}: not a finite number")));
+        return Err(format!("{quantity} is {value}: not a finite number"));
     }
     match value.abs() <= MAGNITUDE_MAX {
         true => Ok(()),
-        false => Err(NeedleError::too_large(quantity, value)),
+        false => Err(too_large(quantity, value)),
     }
 }
 
@@ -45,14 +37,14 @@ impl Increment {
     /// # Errors
     /// A value that is not finite or over 1e6, and an insertion below zero: the model holds only while
     /// the needle cuts tissue.
-    pub fn new(insertion_mm: f64, rotation_rad: f64) -> Result<Self, NeedleError> {
+    pub fn new(insertion_mm: f64, rotation_rad: f64) -> Result<Self, String> {
         bounded("insertion increment in mm", insertion_mm)?;
         bounded("rotation increment in rad", rotation_rad)?;
         if insertion_mm < 0.0 {
-            return Err(NeedleError(format!(
+            return Err(format!(
                 "insertion increment is {insertion_mm} mm, the least is 0; withdrawal retraces the \
                  inserted path"
-            )));
+            ));
         }
         Ok(Increment { insertion_mm, rotation_rad })
     }
@@ -97,13 +89,13 @@ impl Needle {
     ///
     /// # Errors
     /// A curvature that is not finite, over 1e6 or negative.
-    pub fn new(curvature_per_mm: f64) -> Result<Self, NeedleError> {
+    pub fn new(curvature_per_mm: f64) -> Result<Self, String> {
         bounded("needle curvature per mm", curvature_per_mm)?;
         if curvature_per_mm < 0.0 {
-            return Err(NeedleError(format!(
+            return Err(format!(
                 "needle curvature is {curvature_per_mm}/mm, the least is 0; turn the bevel zero by \
                  180 deg for a needle that bends the other way"
-            )));
+            ));
         }
         Ok(Needle { curvature_per_mm, tip_ahead_mm: 0.0 })
     }
@@ -112,7 +104,7 @@ impl Needle {
     ///
     /// # Errors
     /// A distance that is not finite or over 1e6.
-    pub fn with_tip_ahead(self, tip_ahead_mm: f64) -> Result<Self, NeedleError> {
+    pub fn with_tip_ahead(self, tip_ahead_mm: f64) -> Result<Self, String> {
         bounded("needle tip_ahead in mm", tip_ahead_mm)?;
         Ok(Needle { tip_ahead_mm, ..self })
     }
@@ -256,21 +248,20 @@ mod tests {
 
     #[test]
     fn arguments_out_of_range_are_refused_with_the_limit() {
-        let text = |error: NeedleError| error.to_string();
         let needle = Needle::new(0.01).unwrap();
         for error in [
             needle.with_tip_ahead(f64::NAN).unwrap_err(),
             Needle::new(f64::NAN).unwrap_err(),
             Increment::new(0.0, f64::INFINITY).unwrap_err(),
         ] {
-            assert!(text(error).contains("not a finite number"));
+            assert!(error.contains("not a finite number"));
         }
-        assert!(text(Needle::new(-0.01).unwrap_err()).starts_with("needle curvature is -0.01/mm"));
-        assert!(text(Needle::new(1.1e6).unwrap_err()).contains("up to 1e6"));
-        assert!(text(Increment::new(1e308, 0.0).unwrap_err()).contains("up to 1e6"));
-        assert!(text(Increment::new(-1e-9, 0.0).unwrap_err()).contains("the least is 0"));
+        assert!(Needle::new(-0.01).unwrap_err().starts_with("needle curvature is -0.01/mm"));
+        assert!(Needle::new(1.1e6).unwrap_err().contains("up to 1e6"));
+        assert!(Increment::new(1e308, 0.0).unwrap_err().contains("up to 1e6"));
+        assert!(Increment::new(-1e-9, 0.0).unwrap_err().contains("the least is 0"));
         assert_eq!(
-            text(Increment::new(0.0, -1e308).unwrap_err()),
+            Increment::new(0.0, -1e308).unwrap_err(),
             "rotation increment in rad is -1e308, allowed is up to 1e6 in magnitude"
         );
     }

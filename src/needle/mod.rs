@@ -11,7 +11,7 @@ mod reduction;
 mod torsion;
 mod two_arc;
 
-pub use kinematics::{Increment, Needle, NeedleError};
+pub use kinematics::{Increment, Needle, too_large};
 pub use measurement::TipPosition;
 pub use path::{Cut, InsertedPath};
 pub use reduction::{Fibre, Reduced};

@@ -1,7 +1,7 @@
 //! The shaft's torsion: between the base's rotation and the tip's roll there is play (hysteresis).
 
 use super::Increment;
-use super::kinematics::{NeedleError, bounded};
+use super::kinematics::bounded;
 use crate::keys::{Rule, section, within};
 use crate::math;
 
@@ -52,7 +52,7 @@ impl Torsion {
     /// A value that is not finite, over 1e6 or negative; a creep length that grows from zero, for which
     /// the creep at the start is not defined; without creep a start outside the band, as the lag starts
     /// at 0.
-    pub fn new(config: TorsionConfig) -> Result<Self, NeedleError> {
+    pub fn new(config: TorsionConfig) -> Result<Self, String> {
         let TorsionConfig { half_width_rad, offset_rad, creep_mm, creep_mm_per_mm, .. } = config;
         bounded("torsion offset in rad", offset_rad)?;
         for (quantity, value) in [
@@ -63,21 +63,21 @@ impl Torsion {
         ] {
             bounded(quantity, value)?;
             if value < 0.0 {
-                return Err(NeedleError(format!("{quantity} is {value}, the least is 0")));
+                return Err(format!("{quantity} is {value}, the least is 0"));
             }
         }
         if creep_mm == 0.0 && creep_mm_per_mm > 0.0 {
-            return Err(NeedleError(format!(
+            return Err(format!(
                 "torsion creep grows by {creep_mm_per_mm} mm per mm from 0 mm: give its length at the \
                  start"
-            )));
+            ));
         }
         if creep_mm == 0.0 && offset_rad.abs() > half_width_rad {
             let (offset_deg, limit_deg) = (offset_rad.to_degrees(), half_width_rad.to_degrees());
-            return Err(NeedleError(format!(
+            return Err(format!(
                 "torsion offset is {offset_deg:.3} deg, allowed is up to the half-width at the start, \
                  {limit_deg:.3} deg, in magnitude: the tip would start outside its own band"
-            )));
+            ));
         }
         Ok(Torsion { config })
     }
@@ -395,7 +395,7 @@ mod tests {
                 creep_mm: creep,
                 creep_mm_per_mm: growth,
             };
-            Torsion::new(config).unwrap_err().to_string()
+            Torsion::new(config).unwrap_err()
         };
         assert_eq!(
             refused(-0.1, 0.0, 0.0, 0.0, 0.0),

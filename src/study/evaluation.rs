@@ -4,7 +4,7 @@ use super::recording::{RecordedRoll, RecordedRow, Recording};
 use super::statistics::{quantile, rms};
 use crate::geometry::{Pose, so3};
 use crate::math;
-use crate::needle::{Increment, NeedleError, TipPosition};
+use crate::needle::{Increment, TipPosition, too_large};
 use crate::observer::{Observer, Whiteness};
 use crate::session::Samples;
 use nalgebra::{Rotation3, UnitQuaternion};
@@ -130,7 +130,7 @@ fn steps(recording: &Recording, r_sb: &Rotation3<f64>) -> Result<Vec<Step>, Stri
     let r_ps = r_sb.inverse() * first.sensor_orientation.unwrap_or_default().inverse();
     let (mut depth_mm, mut rotation_rad) = (0.0, first.rotation_meas_rad);
     let step = |row: &RecordedRow| {
-        let refused = |error: NeedleError| format!("line {}: {error}", row.line);
+        let refused = |error: String| format!("line {}: {error}", row.line);
         // Insertion never decreases: if the encoder steps back, no tissue is cut.
         let deeper_mm = (row.insertion_meas_mm - first.insertion_meas_mm - depth_mm).max(0.0);
         let turn_rad = row.rotation_meas_rad - rotation_rad;
@@ -139,7 +139,7 @@ fn steps(recording: &Recording, r_sb: &Rotation3<f64>) -> Result<Vec<Step>, Stri
         let position_mm = r_ps * (row.position_meas_mm - first.position_meas_mm);
         let tip_meas = TipPosition::new(position_mm).ok_or_else(|| {
             let way = "way from the first position in mm";
-            refused(NeedleError::too_large(way, position_mm.amax()))
+            refused(too_large(way, position_mm.amax()))
         })?;
         let rotation_true = row.sensor_orientation.filter(|_| has_roll);
         let rotation_true = rotation_true.map(|rotation| r_ps * rotation * r_sb);
