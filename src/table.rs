@@ -1,19 +1,14 @@
-//! CSV tables with a header line, read by the names of their columns.
+//! CSV tables with a header line, read by the names of their columns. An error names the line, what it holds and what
+//! was expected.
 
 use crate::text::clipped;
 use csv::{ReaderBuilder, StringRecord, Trim};
 use nalgebra::{Quaternion, Rotation3, UnitQuaternion};
-use thiserror::Error;
 
 /// The columns of an orientation: a table has all four or none.
 const QUATERNION: [&str; 4] = ["qw", "qx", "qy", "qz"];
 /// An error shows at most this many characters of the file.
 const SHOWN_MAX: usize = 80;
-
-/// Why a table was refused: the line, what it holds and what was expected.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("{0}")]
-pub struct TableError(pub String);
 
 /// A table as text. Spaces around a field, a byte order mark and blank lines are ignored.
 #[derive(Debug, Clone)]
@@ -74,20 +69,20 @@ impl Table {
     ///
     /// # Errors
     /// The header does not have it, or has it twice.
-    pub fn column(&self, name: &str) -> Result<Column, TableError> {
+    pub fn column(&self, name: &str) -> Result<Column, String> {
         let mut columns = self.columns().filter(|column| column.name == name);
         match (columns.next(), columns.next()) {
             (Some(column), None) => Ok(column),
-            (Some(_), Some(_)) => Err(TableError(format!("line 1: column \"{name}\" twice"))),
+            (Some(_), Some(_)) => Err(format!("line 1: column \"{name}\" twice")),
             (None, _) if self.header.is_empty() => {
-                Err(TableError(format!("the file is empty; column \"{name}\" is needed")))
+                Err(format!("the file is empty; column \"{name}\" is needed"))
             }
             (None, _) => {
                 let columns = self.header.iter().collect::<Vec<_>>().join(", ");
                 let has_semicolons = self.header.len() == 1 && columns.contains(';');
                 let hint = if has_semicolons { "; separate columns by commas" } else { "" };
                 let columns = clipped(&columns, SHOWN_MAX);
-                Err(TableError(format!("line 1: no column \"{name}\"; there are {columns}{hint}")))
+                Err(format!("line 1: no column \"{name}\"; there are {columns}{hint}"))
             }
         }
     }
@@ -101,14 +96,13 @@ impl Table {
     ///
     /// # Errors
     /// The first row that is not.
-    pub fn check_row_lengths(&self) -> Result<(), TableError> {
+    pub fn check_row_lengths(&self) -> Result<(), String> {
         let columns = self.header.len();
         match self.rows.iter().find(|row| row.fields.len() != columns) {
             None => Ok(()),
-            Some(Row { line, fields }) => Err(TableError(format!(
-                "line {line}: {} fields where the header has {columns}",
-                fields.len()
-            ))),
+            Some(Row { line, fields }) => {
+                Err(format!("line {line}: {} fields where the header has {columns}", fields.len()))
+            }
         }
     }
 
@@ -116,13 +110,13 @@ impl Table {
     ///
     /// # Errors
     /// A column that is missing, a row that is not as long as the header, or a field that is not a finite number.
-    pub fn numbers<const N: usize>(&self, names: [&str; N]) -> Result<Vec<[f64; N]>, TableError> {
+    pub fn numbers<const N: usize>(&self, names: [&str; N]) -> Result<Vec<[f64; N]>, String> {
         self.check_row_lengths()?;
         let columns = self.columns_of(names)?;
         self.rows.iter().map(|row| row.finite_numbers(&columns)).collect()
     }
 
-    fn columns_of<const N: usize>(&self, names: [&str; N]) -> Result<Vec<Column>, TableError> {
+    fn columns_of<const N: usize>(&self, names: [&str; N]) -> Result<Vec<Column>, String> {
         names.iter().map(|name| self.column(name)).collect()
     }
 
@@ -132,7 +126,7 @@ impl Table {
     /// # Errors
     /// Some of the columns or rows without the others, a field that is not a finite number, or a quaternion that
     /// cannot be normalised.
-    pub fn rotations(&self) -> Result<Vec<Option<Rotation3<f64>>>, TableError> {
+    pub fn rotations(&self) -> Result<Vec<Option<Rotation3<f64>>>, String> {
         if !self.header.iter().any(|name| QUATERNION.contains(&name)) {
             return Ok(vec![None; self.rows.len()]);
         }
@@ -143,19 +137,19 @@ impl Table {
         }
         let rotation = |row: &Row| {
             if is_empty(row) {
-                return Err(TableError(format!(
+                return Err(format!(
                     "line {}: no orientation (qw,qx,qy,qz), but other rows have one",
                     row.line
-                )));
+                ));
             }
             let [w, x, y, z] = row.finite_numbers(&columns)?;
             let quaternion = Quaternion::new(w, x, y, z);
             let norm = quaternion.norm();
             if !(norm.is_finite() && norm > 1e-6) {
-                return Err(TableError(format!(
+                return Err(format!(
                     "line {}: qw,qx,qy,qz have the norm {norm}: no orientation",
                     row.line
-                )));
+                ));
             }
             Ok(Some(UnitQuaternion::new_normalize(quaternion).to_rotation_matrix()))
         };
@@ -174,11 +168,11 @@ impl Row {
     ///
     /// # Errors
     /// The field is not a number.
-    pub fn number(&self, column: &Column) -> Result<f64, TableError> {
+    pub fn number(&self, column: &Column) -> Result<f64, String> {
         self.text(column).parse().map_err(|_| self.error(column, "number"))
     }
 
-    fn finite_numbers<const N: usize>(&self, columns: &[Column]) -> Result<[f64; N], TableError> {
+    fn finite_numbers<const N: usize>(&self, columns: &[Column]) -> Result<[f64; N], String> {
         let mut numbers = [0.0; N];
         for (number, column) in numbers.iter_mut().zip(columns) {
             let finite = self.number(column).ok().filter(|number| number.is_finite());
@@ -188,10 +182,10 @@ impl Row {
     }
 
     /// The error for a field in `column` that does not hold what was `expected`.
-    pub fn error(&self, column: &Column, expected: &str) -> TableError {
+    pub fn error(&self, column: &Column, expected: &str) -> String {
         let (line, name) = (self.line, &column.name);
         let field = clipped(self.text(column), SHOWN_MAX);
-        TableError(format!("line {line}: {name} is {field:?}, expected a {expected}"))
+        format!("line {line}: {name} is {field:?}, expected a {expected}")
     }
 }
 
@@ -209,7 +203,7 @@ mod tests {
 
     #[test]
     fn errors_name_the_line_and_the_column() {
-        let message = |csv: &str| Table::parse(csv).numbers(["a", "b"]).unwrap_err().to_string();
+        let message = |csv: &str| Table::parse(csv).numbers(["a", "b"]).unwrap_err();
         assert_eq!(message(""), "the file is empty; column \"a\" is needed");
         assert_eq!(message("x,a\n"), "line 1: no column \"b\"; there are x, a");
         let semicolons = "line 1: no column \"a\"; there are a;b; separate columns by commas";
@@ -229,14 +223,14 @@ mod tests {
     fn messages_about_long_cells_stay_short() {
         let long = "x".repeat(10_000);
         for csv in [format!("{long}\n"), format!("a\n{long}\n"), format!("a\n\"{long}\n1\n")] {
-            let message = Table::parse(&csv).numbers(["a"]).unwrap_err().to_string();
+            let message = Table::parse(&csv).numbers(["a"]).unwrap_err();
             assert!(message.chars().count() <= 200, "{message}");
         }
     }
 
     #[test]
     fn an_orientation_needs_four_columns_and_a_norm() {
-        let rotations = |csv: &str| Table::parse(csv).rotations().map_err(|e| e.to_string());
+        let rotations = |csv: &str| Table::parse(csv).rotations();
         assert_eq!(rotations("a\n1\n"), Ok(vec![None]));
         assert_eq!(rotations("qw,qx,qy,qz\n2,0,0,0\n"), Ok(vec![Some(Rotation3::identity())]));
         assert_eq!(rotations("qw,qx,qy,qz\n,,,\n"), Ok(vec![None]));

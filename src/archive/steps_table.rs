@@ -1,7 +1,7 @@
 //! `steps.csv` as numbers, by the names of its columns.
 
 use super::lines::without_partial_line;
-use crate::table::{Table, TableError};
+use crate::table::Table;
 use std::collections::BTreeMap;
 
 /// A `steps.csv`, or another table of numbers with a header.
@@ -16,7 +16,7 @@ impl StepsTable {
     ///
     /// # Errors
     /// A row that is not as long as the header, or a field that is not a number.
-    pub fn parse(text: &str) -> Result<Self, TableError> {
+    pub fn parse(text: &str) -> Result<Self, String> {
         let table = Table::parse(without_partial_line(text));
         table.check_row_lengths()?;
         let columns = table.columns().map(|column| {
@@ -26,7 +26,10 @@ impl StepsTable {
             });
             Ok((column.name.clone(), numbers.collect::<Result<_, _>>()?))
         });
-        Ok(StepsTable { rows: table.rows().len(), columns: columns.collect::<Result<_, _>>()? })
+        Ok(StepsTable {
+            rows: table.rows().len(),
+            columns: columns.collect::<Result<_, String>>()?,
+        })
     }
 
     /// The column `name` from the first row to the last; unknown in every row if there is no such column.
@@ -62,9 +65,9 @@ mod tests {
     #[test]
     fn a_value_that_is_not_a_number_is_refused_with_its_line() {
         let error = StepsTable::parse("step,x_mm\n0,1\n1,gone\n").unwrap_err();
-        assert_eq!(error.to_string(), "line 3: x_mm is \"gone\", expected a number");
+        assert_eq!(error, "line 3: x_mm is \"gone\", expected a number");
         let error = StepsTable::parse("step,x_mm\n0,1\n1\n2,3\n").unwrap_err();
-        assert_eq!(error.to_string(), "line 3: 1 fields where the header has 2");
+        assert_eq!(error, "line 3: 1 fields where the header has 2");
     }
 
     #[test]

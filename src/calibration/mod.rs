@@ -1,7 +1,8 @@
 //! Calibrations of the rig: from recordings to numbers in the configuration.
 //!
 //! Each calibration is a least-squares fit. It refuses a recording that does not determine the
-//! result. Everything here is pure; `needle-bench calibrate` reads the files.
+//! result. The error says what is wrong with the recording, with numbers and limits, and what to do.
+//! Everything here is pure; `needle-bench calibrate` reads the files.
 
 pub mod needle;
 mod record;
@@ -16,31 +17,20 @@ pub use tip::{SensorMount, TipFit, TurnSample};
 pub use tracker::{AxisNoise, DatedBy, Measured, NoiseFit, RestSample, TrackerFit};
 
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
-use thiserror::Error;
 
 /// The farthest from its frame's origin that a position may be, mm.
 const DISTANCE_MAX_MM: f64 = 5000.0;
 
-/// A recording that does not determine the result: what is wrong, with its numbers and limits, and
-/// what to do.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("{0}")]
-pub struct CalibrationError(String);
-
 /// Refuses a position that is not finite, or farther away than any bench reaches. `what` names the
 /// calibration and a position in it.
-fn check_distances(
-    what: &str,
-    frame: &str,
-    positions_mm: &[Vector3<f64>],
-) -> Result<(), CalibrationError> {
+fn check_distances(what: &str, frame: &str, positions_mm: &[Vector3<f64>]) -> Result<(), String> {
     let mut distances_mm = positions_mm.iter().map(|position| position.norm()).zip(1..);
     match distances_mm.find(|(mm, _)| mm.is_nan() || *mm > DISTANCE_MAX_MM) {
         None => Ok(()),
-        Some((mm, number)) => Err(CalibrationError(format!(
+        Some((mm, number)) => Err(format!(
             "{what} {number} is {mm:?} mm from the {frame}'s origin (limit {DISTANCE_MAX_MM:.0}); give \
              positions in mm"
-        ))),
+        )),
     }
 }
 

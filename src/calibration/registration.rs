@@ -1,9 +1,9 @@
 //! The tracker's pose on the bench from fiducials: points measured in both frames.
 
-use super::{CalibrationError, check_distances, cross_covariance, mean, principal_axes};
+use super::{check_distances, cross_covariance, mean, principal_axes};
 use crate::geometry::Pose;
 use crate::keys::{Rule, section, within};
-use crate::table::{Table, TableError};
+use crate::table::Table;
 use crate::units::IN_METRES;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use std::cmp::Ordering;
@@ -43,7 +43,7 @@ impl FiducialPair {
     ///
     /// # Errors
     /// A missing column, or a field that is not a finite number, with its line.
-    pub fn parse(csv: &str) -> Result<Vec<Self>, TableError> {
+    pub fn parse(csv: &str) -> Result<Vec<Self>, String> {
         let rows = Table::parse(csv).numbers(FIDUCIAL_COLUMNS)?;
         Ok(rows
             .into_iter()
@@ -96,7 +96,7 @@ impl RegistrationFit {
     /// # Errors
     /// Fewer than three points, positions beyond 5 m, the same position twice, sets whose sizes differ by more
     /// than a factor of 2, points on a line, or more than `rms_max_mm` RMS.
-    pub fn of(pairs: &[FiducialPair], rms_max_mm: f64) -> Result<Self, CalibrationError> {
+    pub fn of(pairs: &[FiducialPair], rms_max_mm: f64) -> Result<Self, String> {
         let points = pairs.len();
         if points < 3 {
             return refused(format!(
@@ -248,12 +248,12 @@ fn wrong_scale(tracker_mm: &[Vector3<f64>], bench_mm: &[Vector3<f64>]) -> Option
     ((scale - 1.0).abs() > (SCALE_SDS * sd).max(SCALE_ERROR_MIN)).then_some(scale.recip())
 }
 
-fn refused<T>(reason: String) -> Result<T, CalibrationError> {
-    Err(CalibrationError(format!("registration: {reason}")))
+fn refused<T>(reason: String) -> Result<T, String> {
+    Err(format!("registration: {reason}"))
 }
 
 /// Refuses positions farther away than any bench reaches, and two that are the same.
-fn check_positions(frame: &str, positions_mm: &[Vector3<f64>]) -> Result<(), CalibrationError> {
+fn check_positions(frame: &str, positions_mm: &[Vector3<f64>]) -> Result<(), String> {
     check_distances("registration: point", frame, positions_mm)?;
     let mut numbered: Vec<([f64; 3], usize)> =
         positions_mm.iter().map(|position| (*position).into()).zip(1..).collect();

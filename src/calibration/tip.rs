@@ -1,10 +1,10 @@
 //! The tip's pose on the sensor, from a recording in which only the base turns. The sensor then
 //! moves on a circle about the needle's axis.
 
-use super::{CalibrationError, check_distances, mean, principal_axes};
+use super::{check_distances, mean, principal_axes};
 use crate::geometry::{FixedAngles, Pose};
 use crate::math;
-use crate::table::{Table, TableError};
+use crate::table::Table;
 use crate::units::IN_METRES;
 use nalgebra::{Matrix2, Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
 use std::f64::consts::{PI, TAU};
@@ -45,7 +45,7 @@ impl TurnSample {
     /// # Errors
     /// A missing column, a field that is not a finite number, or a quaternion that cannot be normalised,
     /// with its line.
-    pub fn parse(csv: &str) -> Result<Vec<Self>, TableError> {
+    pub fn parse(csv: &str) -> Result<Vec<Self>, String> {
         let table = Table::parse(csv);
         let samples = table.numbers(TURN_COLUMNS)?.into_iter().zip(table.rotations()?);
         Ok(samples
@@ -99,7 +99,7 @@ impl TipFit {
     /// # Errors
     /// Fewer than eight positions, more than `rms_max_mm` RMS off a circle, under half a turn, a
     /// radius within the noise or under 0.02 mm, or a sensor that does not follow the base.
-    pub fn of(samples: &[TurnSample], rms_max_mm: f64) -> Result<Self, CalibrationError> {
+    pub fn of(samples: &[TurnSample], rms_max_mm: f64) -> Result<Self, String> {
         let points = samples.len();
         if points < POINTS_MIN {
             return refused(format!(
@@ -234,8 +234,8 @@ fn tilt(samples: &[TurnSample], circle: &Circle) -> Option<f64> {
     Some(math::acos((sum / samples.len() as f64).clamp(-1.0, 1.0)))
 }
 
-fn refused<T>(reason: String) -> Result<T, CalibrationError> {
-    Err(CalibrationError(format!("tip: {reason}")))
+fn refused<T>(reason: String) -> Result<T, String> {
+    Err(format!("tip: {reason}"))
 }
 
 impl SensorMount {

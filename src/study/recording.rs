@@ -1,7 +1,7 @@
 //! A recorded insertion: what stage and tracker measured, and where the tip was.
 
 use crate::geometry::so3;
-use crate::table::{Table, TableError};
+use crate::table::Table;
 use crate::units::wrap_angle;
 use derive_more::Display;
 use nalgebra::{Rotation3, Vector3};
@@ -77,8 +77,8 @@ impl Recording {
     /// and, all four or none, `qw,qx,qy,qz`, in any order.
     ///
     /// # Errors
-    /// [`TableError`], with the line.
-    pub fn parse(csv: &str) -> Result<Self, TableError> {
+    /// Those of [`Table`], with the line, and a file without rows.
+    pub fn parse(csv: &str) -> Result<Self, String> {
         let table = Table::parse(csv);
         let numbers = table.numbers(REQUIRED)?;
         let rows = table.rows().iter().zip(numbers).zip(table.rotations()?);
@@ -92,7 +92,7 @@ impl Recording {
             })
             .collect();
         match rows.is_empty() {
-            true => Err(TableError("no rows below the header".to_owned())),
+            true => Err("no rows below the header".to_owned()),
             false => Ok(Recording { rows }),
         }
     }
@@ -252,7 +252,7 @@ mod tests {
 
     #[test]
     fn refuses_by_line_and_column() {
-        let message = |csv: &str| Recording::parse(csv).unwrap_err().to_string();
+        let message = |csv: &str| Recording::parse(csv).unwrap_err();
         assert!(message("insertion_mm,x_mm\n").contains("no column \"rotation_rad\""));
         assert!(message(&format!("{HEADER},qw\n")).contains("no column \"qx\""));
         assert_eq!(
@@ -263,8 +263,7 @@ mod tests {
             message(&format!("{HEADER}\n0,0,0,0\n")),
             "line 2: 4 fields where the header has 5"
         );
-        let empty = TableError("no rows below the header".to_owned());
-        assert_eq!(Recording::parse(HEADER), Err(empty));
+        assert_eq!(message(HEADER), "no rows below the header");
         assert_eq!(
             message(&format!("{HEADER},qw,qx,qy,qz\n0,0,0,0,0,0,0,0,0\n")),
             "line 2: qw,qx,qy,qz have the norm 0: no orientation"

@@ -9,7 +9,7 @@ use super::event::Event;
 use super::orientation::Orientation;
 use super::sample::{Sample, Validity};
 use crate::keys::{Rule, not_blank, over, section, within};
-use crate::table::{Column, Row, Table, TableError};
+use crate::table::{Column, Row, Table};
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::time::Duration;
@@ -68,12 +68,11 @@ pub fn recording(
     tool: &str,
 ) -> Result<Vec<(Time, Event)>, String> {
     let table = Table::parse(text);
-    let columns = Columns::find(&table, mapping).map_err(|error| error.to_string())?;
-    table.check_row_lengths().map_err(|error| error.to_string())?;
+    let columns = Columns::find(&table, mapping)?;
+    table.check_row_lengths()?;
     let (mut events, mut first, mut newest) = (Vec::new(), None, None);
     for row in table.rows() {
-        let sample = columns.sample(row, mapping, tool).map_err(|error| error.to_string())?;
-        let Some(sample) = sample else { continue };
+        let Some(sample) = columns.sample(row, mapping, tool)? else { continue };
         let time = sample.receive_time;
         let back_ns =
             newest.map_or(0, |newest: Time| newest.as_nanos().saturating_sub(time.as_nanos()));
@@ -107,11 +106,11 @@ struct Columns {
 }
 
 impl Columns {
-    fn find(table: &Table, mapping: &CsvMapping) -> Result<Self, TableError> {
-        let columns = |names: &[String]| -> Result<Vec<Column>, TableError> {
+    fn find(table: &Table, mapping: &CsvMapping) -> Result<Self, String> {
+        let columns = |names: &[String]| -> Result<Vec<Column>, String> {
             names.iter().map(|name| table.column(name)).collect()
         };
-        let times = |columns: &TimeColumns| -> Result<Vec<(Column, i64)>, TableError> {
+        let times = |columns: &TimeColumns| -> Result<Vec<(Column, i64)>, String> {
             columns.named().map(|(name, unit_ns)| Ok((table.column(name)?, unit_ns))).collect()
         };
         Ok(Columns {
@@ -130,13 +129,13 @@ impl Columns {
         row: &Row,
         mapping: &CsvMapping,
         tool: &str,
-    ) -> Result<Option<Sample>, TableError> {
+    ) -> Result<Option<Sample>, String> {
         let is_blank =
             |columns: &[Column]| columns.iter().all(|column| row.text(column).is_empty());
         if is_blank(&self.position) {
             return Ok(None);
         }
-        let numbers = |columns: &[Column]| -> Result<Vec<f64>, TableError> {
+        let numbers = |columns: &[Column]| -> Result<Vec<f64>, String> {
             columns.iter().map(|column| row.number(column)).collect()
         };
         let position_mm = Vector3::from_vec(numbers(&self.position)?) * mapping.position_unit_mm;
@@ -162,7 +161,7 @@ impl Columns {
 }
 
 /// The sum of `columns`, each in its unit, ns; 0 of none. Whole numbers stay exact.
-fn sum_ns(row: &Row, columns: &[(Column, i64)]) -> Result<i64, TableError> {
+fn sum_ns(row: &Row, columns: &[(Column, i64)]) -> Result<i64, String> {
     columns.iter().try_fold(0i64, |sum, (column, unit_ns)| {
         nanoseconds(row.text(column), *unit_ns)
             .and_then(|ns| sum.checked_add(ns))

@@ -7,7 +7,7 @@
 //! all insertions is summed, and the nearest bicycle model is fitted to it: `S = a (K_y, −K_x)`.
 
 use super::insertion::RecordedInsertion;
-use super::{CalibrationError, Part, jackknife_covariance, needle_error};
+use super::{Part, jackknife_covariance, needle_error};
 use crate::geometry::{Pose, Twist};
 use crate::math;
 use nalgebra::{Matrix3, Matrix4, Rotation3, SMatrix, SVector, Vector2, Vector3, Vector4, Vector6};
@@ -64,7 +64,7 @@ struct Information {
     vector: Vector4<f64>,
 }
 
-fn no_bend() -> CalibrationError {
+fn no_bend() -> String {
     needle_error(
         "the positions show no clear bend of the path; hold the base still over some mm from time \
          to time, or insert deeper",
@@ -152,7 +152,7 @@ impl BendFit {
         insertions: &[RecordedInsertion],
         r_sa: &Rotation3<f64>,
         noise: &PathNoise,
-    ) -> Result<Self, CalibrationError> {
+    ) -> Result<Self, String> {
         let (mut bend, mut information) = (Vector4::zeros(), Vec::new());
         let (mut matrix, mut vector) = (Matrix4::zeros(), Vector4::zeros());
         for _ in 0..PASSES {

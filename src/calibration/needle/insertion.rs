@@ -1,6 +1,6 @@
 //! A recorded insertion as the fits need it: depth, rotations of base and tip, positions.
 
-use super::{CalibrationError, needle_error};
+use super::needle_error;
 use crate::geometry::so3;
 use crate::needle::Increment;
 use nalgebra::{Matrix2, Matrix3, Rotation3, Vector2, Vector3};
@@ -33,7 +33,7 @@ pub struct PosedRow {
 ///
 /// While the base turns by `w_z` a mm the sensor turns by `w = k + w_z (a_x, a_y, 1)`: k is the
 /// bend, `(a_x, a_y, 1)` the axis. Least squares over all insertions.
-pub(super) fn shaft_axis(insertions: &[Vec<PosedRow>]) -> Result<Vector3<f64>, CalibrationError> {
+pub(super) fn shaft_axis(insertions: &[Vec<PosedRow>]) -> Result<Vector3<f64>, String> {
     let (mut normal, mut sum_x, mut sum_y) = (Matrix2::zeros(), Vector2::zeros(), Vector2::zeros());
     for rows in insertions {
         let Some(first) = rows.first() else { continue };
@@ -90,11 +90,7 @@ pub(super) struct RecordedInsertion {
 
 impl RecordedInsertion {
     /// The insertion `name` with these rows; `r_sa` is the shaft frame A in the sensor frame.
-    pub(super) fn of(
-        name: &str,
-        rows: &[PosedRow],
-        r_sa: &Rotation3<f64>,
-    ) -> Result<Self, CalibrationError> {
+    pub(super) fn of(name: &str, rows: &[PosedRow], r_sa: &Rotation3<f64>) -> Result<Self, String> {
         let too_short = |depth_mm: f64| {
             needle_error(format!(
                 "{name} is {depth_mm:.1} mm deep, at least {DEPTH_MIN_MM:.0} needed; \

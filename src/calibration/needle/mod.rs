@@ -8,7 +8,6 @@ pub use bend::{BendFit, PathNoise};
 pub use insertion::PosedRow;
 pub use torsion::TorsionFit;
 
-use super::CalibrationError;
 use insertion::RecordedInsertion;
 use nalgebra::{SMatrix, SVector, Vector3};
 use std::fmt::Display;
@@ -32,8 +31,8 @@ pub struct NeedleFit {
     pub torsion: TorsionFit,
 }
 
-fn needle_error(reason: impl Display) -> CalibrationError {
-    CalibrationError(format!("needle: {reason}"))
+fn needle_error(reason: impl Display) -> String {
+    format!("needle: {reason}")
 }
 
 impl NeedleFit {
@@ -46,7 +45,7 @@ impl NeedleFit {
         insertions: &[Vec<PosedRow>],
         name: impl Fn(usize) -> String,
         noise: &PathNoise,
-    ) -> Result<Self, CalibrationError> {
+    ) -> Result<Self, String> {
         if insertions.len() < INSERTIONS_MIN {
             return Err(needle_error(format!(
                 "{} insertions, at least {INSERTIONS_MIN} needed: their scatter gives the \

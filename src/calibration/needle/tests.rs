@@ -106,8 +106,7 @@ fn the_band_of_a_known_needle_is_found() {
 #[test]
 fn insertions_that_determine_no_needle_are_refused() {
     let mut rows = recorded(CREEPING, 0.0);
-    let message =
-        |rows: &[Vec<PosedRow>]| NeedleFit::of(rows, name, &NOISE).unwrap_err().to_string();
+    let message = |rows: &[Vec<PosedRow>]| NeedleFit::of(rows, name, &NOISE).unwrap_err();
     assert_eq!(
         message(&rows[..2]),
         "needle: 2 insertions, at least 3 needed: their scatter gives the standard errors"

@@ -1,7 +1,7 @@
 //! Fits the torsion from the recorded rotations of base and tip.
 
 use super::insertion::{ENTRY_MM, RecordedInsertion};
-use super::{CalibrationError, Part, jackknife_covariance, needle_error};
+use super::{Part, jackknife_covariance, needle_error};
 use crate::keys::Range;
 use crate::needle::{Play, Torsion, TorsionConfig};
 use nalgebra::{SMatrix, SVector};
@@ -37,7 +37,7 @@ pub struct TorsionFit {
     pub roll_rms_rad: f64,
 }
 
-fn undetermined() -> CalibrationError {
+fn undetermined() -> String {
     needle_error(
         "the insertions do not determine the torsion: is rotation_rad in rad, its sign right, are the rows in order, \
          and does the base turn both ways, by more than the tip lags, at several depths?",
@@ -55,7 +55,7 @@ fn config(p: &Parameters) -> TorsionConfig {
 }
 
 /// Roll predicted by the torsion `p` minus the recorded roll, at each row of `insertion`.
-fn residuals(insertion: &RecordedInsertion, p: &Parameters) -> Result<Vec<f64>, CalibrationError> {
+fn residuals(insertion: &RecordedInsertion, p: &Parameters) -> Result<Vec<f64>, String> {
     // A fit that runs away finds no needle.
     let torsion = Torsion::new(config(p)).map_err(|_| undetermined())?;
     let (mut play, mut base_rad, mut tip_rad) = (Play::default(), 0.0, 0.0);
@@ -79,7 +79,7 @@ struct Linearised {
 }
 
 impl Linearised {
-    fn at(p: &Parameters, insertion: &RecordedInsertion) -> Result<Self, CalibrationError> {
+    fn at(p: &Parameters, insertion: &RecordedInsertion) -> Result<Self, String> {
         let residuals_at_p = residuals(insertion, p)?;
         let mut columns = Vec::with_capacity(PARAMETERS);
         for (k, &step) in DERIVATIVE_STEP.iter().enumerate() {
@@ -108,7 +108,7 @@ fn exclude(hessian: &mut Hessian, k: usize) {
 
 impl TorsionFit {
     /// Least squares of the tip's roll; without a band if none is clear.
-    pub(super) fn of(insertions: &[RecordedInsertion]) -> Result<Self, CalibrationError> {
+    pub(super) fn of(insertions: &[RecordedInsertion]) -> Result<Self, String> {
         let fit = Self::fit(insertions, true)?;
         let is_clear = |width: f64, sd: f64| width > CLEAR_SD * sd;
         let TorsionConfig { half_width_rad, half_width_rad_per_mm, .. } = fit.torsion;
@@ -156,7 +156,7 @@ impl TorsionFit {
     }
 
     /// Levenberg-Marquardt iteration within the bounds of the parameters, with or without a band.
-    fn fit(insertions: &[RecordedInsertion], has_band: bool) -> Result<Self, CalibrationError> {
+    fn fit(insertions: &[RecordedInsertion], has_band: bool) -> Result<Self, String> {
         let linearise = |p: &Parameters| {
             let parts = insertions.iter().map(|insertion| Linearised::at(p, insertion));
             parts.collect::<Result<Vec<_>, _>>()

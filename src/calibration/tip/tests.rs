@@ -72,7 +72,7 @@ fn the_standard_errors_match_the_scatter_of_noisy_fits() {
 
 #[track_caller]
 fn refusal(samples: &[TurnSample]) -> String {
-    TipFit::of(samples, 0.5).expect_err("refused").to_string()
+    TipFit::of(samples, 0.5).expect_err("refused")
 }
 
 fn vector(max: f64) -> impl Strategy<Value = Vector3<f64>> {
@@ -265,7 +265,7 @@ fn a_recording_is_read_by_its_header() {
     let posed = TurnSample::parse(&format!("{header}\n0,1,2,3,1,0,0,0\n")).expect("read");
     assert_eq!(posed[0].orientation_meas, Some(Rotation3::identity()));
     let error = TurnSample::parse(&format!("{header}\n0,1,2,3,0,0,0,0\n")).expect_err("zero");
-    assert!(error.to_string().starts_with("line 2: "), "{error}");
+    assert!(error.starts_with("line 2: "), "{error}");
 }
 
 /// A base that counts in the other direction looks like a sensor mounted backwards, which would put

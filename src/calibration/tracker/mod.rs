@@ -7,7 +7,7 @@ mod tests;
 pub use likelihood::{Measured, NoiseFit};
 
 use self::likelihood::Residuals;
-use super::{CalibrationError, check_distances};
+use super::check_distances;
 use crate::units::Time;
 use nalgebra::Vector3;
 
@@ -113,7 +113,7 @@ impl TrackerFit {
     ///
     /// # Errors
     /// A recording that is too short, that moves, or that has positions no bench reaches.
-    pub fn of(samples: &[RestSample]) -> Result<Self, CalibrationError> {
+    pub fn of(samples: &[RestSample]) -> Result<Self, String> {
         let mut valid: Vec<(&RestSample, Vector3<f64>)> =
             samples.iter().filter_map(|sample| Some((sample, sample.position_mm?))).collect();
         let positions_mm: Vec<Vector3<f64>> = valid.iter().map(|(_, position)| *position).collect();
@@ -139,11 +139,11 @@ impl TrackerFit {
             };
             let is_mostly_new = points.len() >= repeats + invalid;
             let next = if is_mostly_new { "record longer" } else { "is the tool in view?" };
-            return Err(CalibrationError(format!(
+            return Err(format!(
                 "{} new positions in {duration_s:.1} s{left_out}, at least {POSITIONS_MIN} in \
                  {DURATION_MIN_S:.0} s are needed; {next}",
                 points.len()
-            )));
+            ));
         }
         let mut gaps_s: Vec<f64> = points.windows(2).map(|pair| pair[1].0 - pair[0].0).collect();
         let rate_hz = rate(&gaps_s);
@@ -190,17 +190,17 @@ impl TrackerFit {
         let drifted_mm = drift_mm_per_min.value * minutes;
         let limit_mm = DRIFT_MAX_MM.max(DRIFT_ERRORS * drift_mm_per_min.error * minutes);
         if drifted_mm > limit_mm {
-            return Err(CalibrationError(format!(
+            return Err(format!(
                 "the sensor moves by {drifted_mm:.2} mm in {duration_s:.0} s (limit {limit_mm:.2} mm); hold \
                  it still and record again"
-            )));
+            ));
         }
         let refused_s = TIME_SHARE_REFUSED * duration_s;
         if together.correlation_time_s.value > refused_s && wander_mm > WANDER_MAX_MM {
-            return Err(CalibrationError(format!(
+            return Err(format!(
                 "the positions wander by {wander_mm:.3} mm (limit {WANDER_MAX_MM}) over more than \
                  {refused_s:.1} s of {duration_s:.0} s; the sensor moved, or record longer"
-            )));
+            ));
         }
         let by_stamp = valid.iter().filter(|_| dated_by == DatedBy::Stamp);
         let (latency_jitter_ms, latency_p99_ms) =
@@ -304,9 +304,7 @@ fn rate(gaps_s: &[f64]) -> Measured {
 ///
 /// # Errors
 /// There are too many of them: the sensor was moved.
-fn without_outliers(
-    points: Vec<(f64, Vector3<f64>)>,
-) -> Result<Vec<(f64, Vector3<f64>)>, CalibrationError> {
+fn without_outliers(points: Vec<(f64, Vector3<f64>)>) -> Result<Vec<(f64, Vector3<f64>)>, String> {
     let limits: [(f64, f64); 3] = std::array::from_fn(|axis| {
         let mut values: Vec<f64> = points.iter().map(|(_, position)| position[axis]).collect();
         let middle = median(&mut values);
@@ -325,11 +323,11 @@ fn without_outliers(
     let kept: Vec<_> = points.into_iter().filter(is_near).collect();
     let outliers = total - kept.len();
     if outliers as f64 > OUTLIER_SHARE_MAX * total as f64 {
-        return Err(CalibrationError(format!(
+        return Err(format!(
             "{outliers} of {total} positions are over {OUTLIER_SDS:.0} standard deviations from the median \
              (limit {:.0}%); the sensor moved, or another tool is in the recording",
             100.0 * OUTLIER_SHARE_MAX
-        )));
+        ));
     }
     Ok(kept)
 }
@@ -371,7 +369,7 @@ impl Detrended {
 
     /// Refuses positions that swing, as under a breathing hand: after half a period they are on the other
     /// side.
-    fn check_swing(&self, spacing_s: f64) -> Result<(), CalibrationError> {
+    fn check_swing(&self, spacing_s: f64) -> Result<(), String> {
         let count = self.gaps_s.len();
         let autocovariance_mm2 = |lag: usize| -> f64 {
             let products = |series: &Vec<f64>| -> f64 {
@@ -390,12 +388,12 @@ impl Detrended {
             return Ok(());
         };
         if correlation < SWING_CORRELATION {
-            return Err(CalibrationError(format!(
+            return Err(format!(
                 "the sensor swings by {:.2} mm with a period of {:.1} s (correlation {correlation:.2} after \
                  half of it, limit {SWING_CORRELATION}); hold it still and record again",
                 square_mm2.sqrt(),
                 2.0 * lag as f64 * spacing_s
-            )));
+            ));
         }
         Ok(())
     }

@@ -39,7 +39,7 @@ fn still(_: f64) -> Vector3<f64> {
 }
 
 fn refusal(samples: &[RestSample]) -> String {
-    let text = TrackerFit::of(samples).expect_err("refused").to_string();
+    let text = TrackerFit::of(samples).expect_err("refused");
     assert!(text.chars().count() <= 200, "{text}");
     text
 }

@@ -174,9 +174,8 @@ fn mean_and_sd_mm(last_second: &MovingMean, waited: Duration) -> Option<(Vector3
 
 /// How well the points in `text` fit, if there are enough.
 fn residuals(text: &str) -> String {
-    let pairs = FiducialPair::parse(text).map_err(|error| error.to_string());
-    match pairs.and_then(|pairs| RegistrationFit::of(&pairs, ANY_RMS_MM).map_err(|e| e.to_string()))
-    {
+    let fit = FiducialPair::parse(text).and_then(|pairs| RegistrationFit::of(&pairs, ANY_RMS_MM));
+    match fit {
         Ok(fit) => format!(
             "{} points fit by {:.2} mm RMS, the worst is point {} by {:.2} mm",
             fit.points, fit.rms_mm, fit.worst_point, fit.worst_mm
