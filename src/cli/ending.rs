@@ -116,7 +116,7 @@ pub(super) fn after_insertion(
 }
 
 /// Where the insertion axis stands after an insertion, mm. `None` if the drives have not reported it, or if it is less
-/// than the run has inserted from the lower limit on, as of a drive that has restarted and counts anew.
+/// than the lower limit plus what the run inserted: then a drive has restarted and counts anew.
 fn depth_mm(config: &Config, report: &RunReport) -> Option<f64> {
     let depth_mm = report.stage_at_end.position_of(Axis::Insertion)?;
     let least_mm = config.stage.insertion.limits.min + report.figures.report().insertion_mm;

@@ -2,6 +2,7 @@
 
 use crate::geometry::Pose;
 use crate::plan::{Mask, Obstacle};
+use crate::telemetry::open_regular;
 use flate2::CrcReader;
 use flate2::read::MultiGzDecoder;
 use nalgebra::Vector3;
@@ -33,8 +34,7 @@ pub(super) fn mask_reader(
 
 /// The image in `path`, as an obstacle.
 fn read_mask(path: &Path, crc32: Option<u32>, pose: &Pose) -> Result<Obstacle, String> {
-    check_regular(path).map_err(|error| error.to_string())?;
-    check_name(path)?;
+    check_name(path, open_regular(path).map_err(|error| error.to_string())?)?;
     let header = NiftiHeader::from_file(path).map_err(|error| reason(&error))?;
     // A record has one checksum for a mask, so the mask must be one file.
     if &header.magic != b"n+1\0" {
@@ -109,9 +109,9 @@ const HEADER_BYTES: usize = 352;
 const VOXEL_OFFSET_MAX: f64 = 1e6;
 
 /// Refuses a compressed image whose name does not say so: `nifti` goes by the name.
-fn check_name(path: &Path) -> Result<(), String> {
+fn check_name(path: &Path, mut file: File) -> Result<(), String> {
     let mut start = [0; 2];
-    let is_read = File::open(path).and_then(|mut file| file.read_exact(&mut start)).is_ok();
+    let is_read = file.read_exact(&mut start).is_ok();
     match is_read && start == [0x1f, 0x8b] && !is_compressed(path) {
         true => Err("it is compressed by gzip; give it a name that ends in .nii.gz".to_owned()),
         false => Ok(()),
@@ -149,19 +149,9 @@ fn check_length(path: &Path, header: &NiftiHeader, voxels: usize) -> Result<(), 
     }
 }
 
-/// Refuses a pipe or a device, because reading it may never end.
-fn check_regular(path: &Path) -> io::Result<()> {
-    match std::fs::metadata(path) {
-        Ok(found) if !found.is_file() => Err(io::Error::other("not a regular file")),
-        // A missing or unreadable file fails when it is opened, with the reason.
-        _ => Ok(()),
-    }
-}
-
 /// The CRC-32 of the file in `path`, read in pieces: a file that is not a mask may be of any size.
 pub(super) fn file_crc32(path: &Path) -> io::Result<u32> {
-    check_regular(path)?;
-    let mut file = CrcReader::new(File::open(path)?);
+    let mut file = CrcReader::new(open_regular(path)?);
     io::copy(&mut file, &mut io::sink())?;
     Ok(file.crc().sum())
 }
@@ -169,7 +159,6 @@ pub(super) fn file_crc32(path: &Path) -> io::Result<u32> {
 /// Why an image cannot be read.
 fn reason(error: &NiftiError) -> String {
     match error {
-        NiftiError::Io(error) if error.kind() == io::ErrorKind::NotFound => error.to_string(),
         NiftiError::Io(error) if error.kind() == io::ErrorKind::UnexpectedEof => {
             "no NIfTI image, or the file is cut off; copy it again".to_owned()
         }

@@ -151,7 +151,7 @@ impl From<io::Error> for Failure {
 /// A folder without a run, or with an incomplete run, is bad input; a failing disk is not.
 impl From<TelemetryError> for Failure {
     fn from(error: TelemetryError) -> Self {
-        use TelemetryError::{File, NotARun, Record};
+        use TelemetryError::{File, NotARun, Unusable};
         match &error {
             NotARun { .. } => Failure::configuration(format_args!(
                 "{error}; name a run's own folder (in record.dir: <UTC>-<name>)"
@@ -159,7 +159,7 @@ impl From<TelemetryError> for Failure {
             File { source, .. } if source.kind() == ErrorKind::NotFound => {
                 Failure::configuration(error)
             }
-            Record { .. } => Failure::configuration(error),
+            Unusable { .. } => Failure::configuration(error),
             _ => Failure::environment(error),
         }
     }

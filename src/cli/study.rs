@@ -168,7 +168,6 @@ fn trial_row(
     target_mm: Option<Vector3<f64>>,
 ) -> Vec<(String, String)> {
     let TrialResult { stage, figures, .. } = trial;
-    let torsion = stage.torsion.config();
     let mut row = Vec::new();
     let mut add = |name: &str, cell: String| row.push((name.to_owned(), cell));
     let shown = |value: Option<f64>| {
@@ -187,13 +186,11 @@ fn trial_row(
             add(&format!("{group}_{name}"), shown(pose.map(|pose| pose.coordinates()[i])));
         }
     }
+    add("curvature_per_mm", shown(Some(stage.needle.curvature_per_mm())));
+    for (name, value) in stage.torsion.config().in_keys() {
+        add(&format!("torsion_{name}"), shown(Some(value)));
+    }
     for (name, value) in [
-        ("curvature_per_mm", Some(stage.needle.curvature_per_mm())),
-        ("torsion_half_width_deg", Some(torsion.half_width_rad.to_degrees())),
-        ("torsion_half_width_deg_per_mm", Some(torsion.half_width_rad_per_mm.to_degrees())),
-        ("torsion_offset_deg", Some(torsion.offset_rad.to_degrees())),
-        ("torsion_creep_mm", Some(torsion.creep_mm)),
-        ("torsion_creep_mm_per_mm", Some(torsion.creep_mm_per_mm)),
         ("insertion_mm", Some(figures.insertion_mm)),
         ("off_plane_rms_mm", figures.off_plane_rms_mm),
         ("settling_mm", figures.settling_mm),

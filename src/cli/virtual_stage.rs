@@ -94,7 +94,7 @@ fn frame_log(
     let mut file = file.transpose()?;
     let origin = clock.origin_utc().duration_since(UNIX_EPOCH).unwrap_or_default();
     let started_unix_us = i64::try_from(origin.as_micros()).unwrap_or(0);
-    let interface = interface_name(interface).to_owned();
+    let interface = interface_name(interface);
     Ok(move |direction, frame: &Frame| {
         let Some((out, path)) = &mut file else { return };
         let (unix_us, interface) = (unix_us(started_unix_us, clock.now()), &interface);

@@ -25,7 +25,7 @@ section! {
     pub struct EmulatorConfig {
         /// The arc that the needle really cuts.
         arc: Arc, flat;
-        /// The real value of what `[needle]` assumes under this name, mm.
+        /// How far the tip really is ahead, mm; `[needle]` has what the bench believes under the same name.
         tip_ahead_mm: f64 [TIP_AHEAD] = 0.0;
         /// Seed of all random numbers.
         seed: u64 [within(0.0, SEED_MAX as f64)] = 1;

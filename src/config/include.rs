@@ -16,8 +16,8 @@ struct CalibrationFile {
     made_by: &'static str,
     /// The keys in such a file; it has all of them and no others.
     holds: &'static [&'static str],
-    /// Keys that replace the file if a source of higher precedence gives them. One source may not give `key`
-    /// together with one of these or with a key that the file holds.
+    /// If a source of higher precedence gives one of these keys, the file does not count. One source may not give
+    /// `key` together with one of these, or with a key that the file holds.
     instead_of: &'static [&'static str],
     /// The key in `holds` that says when and from what the values were computed, for the preflight.
     fit: &'static str,

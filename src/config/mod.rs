@@ -17,8 +17,8 @@
 //! calibration (`fit`) is left out.
 //!
 //! Three things are not overridden key by key:
-//! - of two alternatives (`needle.radius_mm` and `needle.curvature_per_mm`, `emulator.noise`'s two) the one
-//!   in a higher layer removes the one in a lower layer;
+//! - of two alternatives (a radius and a curvature, `uniform_mm` and `sd_mm` of `emulator.noise`, `at_mm` and
+//!   `at_s` of a fault) the one in a higher layer removes the one in a lower layer;
 //! - `emulator.noise`, the counts per mm or turn and `tracker.registration` are replaced as a whole:
 //!   `noise = {}` means none;
 //! - a real rig does not get the defaults of the virtual one. With `stage.hardware = true` the drives'

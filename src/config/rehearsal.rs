@@ -9,7 +9,7 @@ use crate::emulator::drive::Switches;
 use crate::geometry::coordinates;
 use crate::stage::AxisConfig;
 use crate::tracker::TrackerKind;
-use serde_json::json;
+use serde_json::{Value, json};
 
 /// maxon motor; a drive of this vendor is emulated as an EPOS4.
 const MAXON_VENDOR_ID: u32 = 0xFB;
@@ -20,14 +20,8 @@ const START_MAX_MM: f64 = 5.0;
 
 /// True if a rehearsal derives this key of `[emulator]`, or its alternative.
 pub(super) fn derives(key: &str, config: &Config) -> bool {
-    match key {
-        "drives" | "homed" | "radius_mm" | "curvature_per_mm" | "tip_ahead_mm" | "torsion"
-        | "start" | "sensor" => true,
-        "noise" | "tracker_latency_ms" | "tracker_repeats" => {
-            config.emulator.tracker == TrackerPreset::Plain
-        }
-        _ => false,
-    }
+    let key = if key == "radius_mm" { "curvature_per_mm" } else { key };
+    derived(config).get(key).is_some()
 }
 
 /// The keys of `[emulator]` that a rehearsal derives from the rest of `config`, as TOML.
@@ -35,6 +29,10 @@ pub(super) fn derives(key: &str, config: &Config) -> bool {
 /// # Errors
 /// Never for a configuration that was read.
 pub(super) fn layer(config: &Config) -> Result<String, toml::ser::Error> {
+    toml::to_string(&json!({ "emulator": derived(config) }))
+}
+
+fn derived(config: &Config) -> Value {
     let (needle, tracker) = (&config.needle, &config.tracker);
     let curvature = needle.arc.curvature_per_mm();
     let depth_mm = config.insertion.depth_mm;
@@ -61,7 +59,7 @@ pub(super) fn layer(config: &Config) -> Result<String, toml::ser::Error> {
         emulator["tracker_latency_ms"] = json!(tracker.latency.as_secs_f64() * 1e3);
         emulator["tracker_repeats"] = json!(u32::from(tracker.kind == TrackerKind::Imaging));
     }
-    toml::to_string(&json!({ "emulator": emulator }))
+    emulator
 }
 
 /// The switches of an axis with `counts_per_unit` counts per mm or rad: those `given`, and the switch that its

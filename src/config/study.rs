@@ -75,7 +75,7 @@ const ASIDE_MM: f64 = 30.0;
 const ROOM_MM: f64 = 1.0;
 
 /// A point as a value of the configuration.
-fn array(point: &Vector3<f64>) -> Value {
+fn toml_point(point: &Vector3<f64>) -> Value {
     Value::from(point.iter().copied().collect::<Vec<_>>())
 }
 
@@ -135,7 +135,7 @@ impl Config {
                 let across = (1.0 - along * along).sqrt();
                 let direction = Vector3::new(along, across * sin, across * cos);
                 let drift_mm_per_mm = direction * (move_mm / target_mm.norm());
-                toml["emulator"]["target_drift_mm_per_mm"] = array(&drift_mm_per_mm);
+                toml["emulator"]["target_drift_mm_per_mm"] = toml_point(&drift_mm_per_mm);
             }
         }
         Ok(Config::of(toml))
@@ -195,7 +195,7 @@ impl Config {
             };
             let reach_mm = arc_mm.min(room_mm(0)).min(room_mm(1));
             target_mm = aside * (share * reach_mm) + Vector3::z() * depth_mm;
-            goal["position_mm"] = array(&target_mm);
+            goal["position_mm"] = toml_point(&target_mm);
         }
         let [low, high] = study.obstacle_radius_mm.unwrap_or_default();
         let obstacles = study.obstacles.unwrap_or_default();
@@ -228,7 +228,7 @@ impl Config {
                 )
             })?;
             let shape = ("shape".to_owned(), Value::from("sphere"));
-            let centre = ("centre_mm".to_owned(), array(&centre_mm));
+            let centre = ("centre_mm".to_owned(), toml_point(&centre_mm));
             let radius = ("radius_mm".to_owned(), Value::from(radius_mm));
             drawn.push(Value::Table(Table::from_iter([shape, centre, radius])));
         }

@@ -55,7 +55,7 @@ pub enum StageOutput {
     Tip {
         /// The position that the tracker reports.
         tip: TrackedTip,
-        /// The true tip pose when it was acquired.
+        /// The true tip pose when it was acquired; without a target.
         truth: Truth,
     },
     /// The tracked target.

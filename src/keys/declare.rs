@@ -6,9 +6,9 @@
 /// field, and its value is converted from the unit of the key to mm, rad or s. Fields under `beside`
 /// have no key: they start with the value given there, and the caller sets them.
 ///
-/// The table of an axis is declared as `struct NAME of AXIS`: its keys may depend on the axis, 0 or 1. The key
-/// that holds such a table says which keys are allowed: `table(NAME::keys_of::<1>())`. A field is read from
-/// whichever axis's key is given.
+/// The table of an axis is declared as `struct NAME of AXIS`: the names and rules of its keys may depend on AXIS, 0
+/// or 1. The key that holds such a table says whose keys are allowed: `table(NAME::keys_of::<1>())`. The struct is the
+/// same for both axes: a field is read from the key of either.
 macro_rules! section {
     (
         $(#[$attribute:meta])*

@@ -44,10 +44,10 @@ pub(crate) struct Key {
     pub(crate) narrowed: &'static [(&'static str, Rule)],
 }
 
-/// When a default holds. A key of a drive whose default is `Undecided` does not compile.
+/// When a default holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum DefaultHolds {
-    /// Always; whether hardware must give the key is not decided.
+    /// Always. Nobody has decided whether hardware must give the key; for a key of a drive this does not compile.
     Undecided,
     /// With an emulated tracker only.
     ForEmulatedTracker,
@@ -85,7 +85,7 @@ pub(crate) enum Rule {
     Integers(&'static [i64]),
     /// Text that the function accepts, described in words.
     Text(&'static str, fn(&str) -> bool),
-    /// This word, which stands for no value, or a value, described in words.
+    /// Either this word, which stands for no value, or a value, which the second text describes.
     Or(&'static str, &'static str),
     /// Tables with the keys that this text lists.
     Fields(&'static str),

@@ -34,6 +34,19 @@ section! {
     }
 }
 
+impl TorsionConfig {
+    /// The name of each key, and its value in the key's unit.
+    pub fn in_keys(&self) -> [(&'static str, f64); 5] {
+        [
+            ("half_width_deg", self.half_width_rad.to_degrees()),
+            ("half_width_deg_per_mm", self.half_width_rad_per_mm.to_degrees()),
+            ("offset_deg", self.offset_rad.to_degrees()),
+            ("creep_mm", self.creep_mm),
+            ("creep_mm_per_mm", self.creep_mm_per_mm),
+        ]
+    }
+}
+
 /// The play between base and tip. The lag λ is tip roll minus base rotation, both counted from the
 /// start. The play keeps it within the band `c ± w(ℓ)` with `w(ℓ) = w₀ + w₁ ℓ`.
 ///

@@ -79,7 +79,7 @@ impl Listening {
                 let outside = self.workspace.and_then(|workspace| workspace.outside(&position_mm));
                 self.is_in_metres = outside.is_some()
                     && self.workspace.is_some_and(|workspace| {
-                        workspace.is_for_metres(&self.gate.registration, sample)
+                        workspace.fits_in_metres(&self.gate.registration, sample)
                     });
                 let outside = outside
                     .map(|outside| Refusal::new(GateName::Workspace, format!("tip at {outside}")));

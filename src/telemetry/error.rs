@@ -30,7 +30,7 @@ pub enum TelemetryError {
     },
     /// The record cannot be used for this: it was edited, is closed already, or is still being written.
     #[error("{path}: {reason}", path = path.display())]
-    Record {
+    Unusable {
         /// The run folder, or its manifest.
         path: PathBuf,
         /// The reason.
@@ -55,8 +55,8 @@ impl TelemetryError {
     }
 
     /// The record at `path` cannot be used, for this `reason`.
-    pub(super) fn record(path: &Path, reason: impl Display) -> Self {
-        TelemetryError::Record { path: path.to_path_buf(), reason: reason.to_string() }
+    pub(super) fn unusable(path: &Path, reason: impl Display) -> Self {
+        TelemetryError::Unusable { path: path.to_path_buf(), reason: reason.to_string() }
     }
 
     /// `writer` failed during the run: later records are not on disk.

@@ -2,7 +2,7 @@
 //!
 //! A [`Recorder`] takes [`Entry`]s from the session's thread through a bounded queue. One thread appends to
 //! the text files (`steps.csv`, `can.log`, `tracker.ndjson`, `inputs.log`, `events.log`). A second thread
-//! keeps the folder: it syncs the text files, which can take longer than the 200 ms that a kill may cost,
+//! keeps the folder: it syncs the text files, which can take longer than the lines that a kill may cost (200 ms),
 //! writes the manifest, and checks that the folder is still there. Entries that do not fit into a full queue
 //! are dropped, counted and reported. A thread that fails or stalls is reported to the runtime
 //! ([`Recorder::news`]). The live view is a lossy tap with a queue of its own.
@@ -33,7 +33,7 @@ pub use folder::{check_room, free_mb, is_being_written, lock, try_to_write, writ
 pub use recorder::Recorder;
 pub use recording::Recording;
 pub use repair::{Repaired, note_recording, repair};
-pub use run_folder::RunFolder;
+pub use run_folder::{RunFolder, open_regular};
 pub use vitals::RecordNews;
 pub use worker::Backpressure;
 

@@ -58,17 +58,18 @@ fn cut_text(name: &str, bytes: u64) -> String {
 /// # Errors
 /// [`TelemetryError`]; the record then stays open.
 pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
+    // Without a run folder there is nothing to lock, and the error must say so.
     RunFolder::open(dir)?;
     let Some(_lock) = folder::lock(dir)? else {
         let reason = "a bench is still writing this record, or another repair has it; wait for it, or end it with Ctrl-C";
-        return Err(TelemetryError::record(dir, reason));
+        return Err(TelemetryError::unusable(dir, reason));
     };
     // The bench may have closed the record before the lock was taken.
     let run = RunFolder::open(dir)?;
     run.verify()?;
     if run.is_closed() {
         let reason = "the record is closed: there is nothing to repair";
-        return Err(TelemetryError::record(dir, reason));
+        return Err(TelemetryError::unusable(dir, reason));
     }
     let (mut lines, mut cuts, mut missing) = (BTreeMap::new(), Vec::new(), Vec::new());
     for name in file::TEXT_FILES {

@@ -20,7 +20,7 @@ impl RunFolder {
     /// Opens `dir` and reads only its manifest.
     ///
     /// # Errors
-    /// [`TelemetryError::NotARun`], and [`TelemetryError::Record`] if its manifest cannot be used.
+    /// [`TelemetryError::NotARun`], and [`TelemetryError::Unusable`] if its manifest cannot be used.
     pub fn open(dir: &Path) -> Result<Self, TelemetryError> {
         let not_a_run =
             |reason: String| TelemetryError::NotARun { path: dir.to_path_buf(), reason };
@@ -32,7 +32,7 @@ impl RunFolder {
         let text = read_text(&path).map_err(|e| not_a_run(format!("{}: {e}", file::MANIFEST)))?;
         match Manifest::from_text(&text) {
             Ok(manifest) => Ok(RunFolder { dir: dir.to_path_buf(), manifest }),
-            Err(error) => Err(TelemetryError::record(&path, error)),
+            Err(error) => Err(TelemetryError::unusable(&path, error)),
         }
     }
 
@@ -46,7 +46,7 @@ impl RunFolder {
     /// (see [`Self::change`]): it follows from the other files, and nothing is read from it.
     ///
     /// # Errors
-    /// [`TelemetryError::Record`] with every file that differs, and [`TelemetryError::File`].
+    /// [`TelemetryError::Unusable`] with every file that differs, and [`TelemetryError::File`].
     pub fn verify(&self) -> Result<(), TelemetryError> {
         let files = &self.manifest.files;
         let sealed = files.keys().map(String::as_str).filter(|name| *name != file::RECORDING);
@@ -65,7 +65,7 @@ impl RunFolder {
         let reason = format!(
             "{changes}, so this is not the record of that run any more (restore it from a copy)"
         );
-        Err(TelemetryError::record(&self.dir, reason))
+        Err(TelemetryError::unusable(&self.dir, reason))
     }
 
     /// How the file `name` differs from its seal in the manifest; `None` if it is unchanged. Of the configuration
@@ -110,8 +110,11 @@ impl RunFolder {
     }
 }
 
-/// Opens the file `path`. A pipe or a device is refused, because reading it may never end.
-fn open_regular(path: &Path) -> io::Result<File> {
+/// Opens the file `path`.
+///
+/// # Errors
+/// It cannot be opened, or it is a pipe or a device: reading it may never end.
+pub fn open_regular(path: &Path) -> io::Result<File> {
     if !fs::metadata(path)?.is_file() {
         return Err(io::Error::other("not a regular file"));
     }

@@ -16,14 +16,14 @@ const DROP_WARNING_INTERVAL: Duration = Duration::from_secs(1);
 /// Whether a recording thread works, shared without a lock.
 #[derive(Debug, Default)]
 pub(super) struct Vitals {
-    /// The number of rounds of its loop so far.
+    /// Signs of life so far.
     pub(super) beats: AtomicU64,
     /// The first reason why it has failed.
     pub(super) fault: OnceLock<String>,
 }
 
 impl Vitals {
-    /// Called by the thread after each round of its loop.
+    /// A sign of life: at every tick, and now and then while the files are completed.
     pub(super) fn beat(&self) {
         self.beats.fetch_add(1, Ordering::Relaxed);
     }

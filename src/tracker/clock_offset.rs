@@ -30,11 +30,11 @@ const DATED_BEHIND_MAX_NS: i64 = 40_000_000;
 /// learnt over a longer time.
 const ANOTHER_CLOCK_NS: i64 = 500_000_000;
 const ANOTHER_CLOCK_TIME: Duration = Duration::from_secs(1);
-/// The operator is told when all stamps trail by more than the first limit for 1 s, or by more than the
-/// second for 5 s …
+/// The operator is told when all stamps trail by more than the first limit for 1 s, or by more than the second for
+/// 5 s.
 const LATE_LIMITS: [(i64, Duration); 2] =
     [(DATED_BEHIND_MAX_NS, Duration::from_secs(1)), (BEHIND_MIN_NS, Duration::from_secs(5))];
-/// … and there are at least this many of them.
+/// A run of fewer late stamps than this is not reported.
 const LATE_SAMPLES: u32 = 10;
 
 /// Tracks the minimum of `receive − source` over the last 30 to 60 s. The quickest delivery shows the offset

@@ -95,7 +95,7 @@ impl Gate {
         }
         let Some(workspace) = &self.workspace else { return Ok(p_wb_mm) };
         let Some(outside) = workspace.outside(&p_wb_mm) else { return Ok(p_wb_mm) };
-        let hint = match workspace.is_for_metres(&self.registration, sample) {
+        let hint = match workspace.fits_in_metres(&self.registration, sample) {
             true => IN_METRES,
             false => "check the registration",
         };
@@ -105,7 +105,7 @@ impl Gate {
 
 impl Workspace {
     /// Whether the tip would be in the box if the position of the `sample` were in metres.
-    pub fn is_for_metres(&self, registration: &Registration, sample: &Sample) -> bool {
+    pub fn fits_in_metres(&self, registration: &Registration, sample: &Sample) -> bool {
         let in_mm = Sample { position_mm: 1e3 * sample.position_mm, ..sample.clone() };
         registration.tip_mm(&in_mm).is_ok_and(|tip_mm| self.outside(&tip_mm).is_none())
     }

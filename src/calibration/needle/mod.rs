@@ -70,6 +70,7 @@ impl NeedleFit {
 }
 
 /// What one insertion adds to a least-squares fit, linearised at its result: `JᵀJ` and `Jᵀr`.
+#[derive(Clone, Copy)]
 struct Part<const N: usize> {
     hessian: SMatrix<f64, N, N>,
     gradient: SVector<f64, N>,

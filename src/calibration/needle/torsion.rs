@@ -71,39 +71,40 @@ fn residuals(insertion: &RecordedInsertion, p: &Parameters) -> Result<Vec<f64>, 
     Ok(residuals)
 }
 
-/// The least-squares problem of one insertion, linearised: `JᵀJ`, `Jᵀr` and `rᵀr`.
-struct Linearised {
-    hessian: Hessian,
-    gradient: Parameters,
-    cost: f64,
-}
-
-impl Linearised {
-    fn at(p: &Parameters, insertion: &RecordedInsertion) -> Result<Self, String> {
-        let residuals_at_p = residuals(insertion, p)?;
-        let mut columns = Vec::with_capacity(PARAMETERS);
-        for (k, &step) in DERIVATIVE_STEP.iter().enumerate() {
-            let mut moved = *p;
-            moved[k] += step;
-            let moved = residuals(insertion, &moved)?;
-            let column: Vec<f64> =
-                moved.iter().zip(&residuals_at_p).map(|(m, r)| (m - r) / step).collect();
-            columns.push(column);
-        }
-        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-        Ok(Linearised {
-            hessian: Hessian::from_fn(|i, j| dot(&columns[i], &columns[j])),
-            gradient: Parameters::from_fn(|i, _| dot(&columns[i], &residuals_at_p)),
-            cost: dot(&residuals_at_p, &residuals_at_p),
-        })
+/// The least-squares problem of one insertion, linearised at `p`, and its cost `rᵀr`. Without a band its
+/// parameters are kept out.
+fn linearised(
+    p: &Parameters,
+    insertion: &RecordedInsertion,
+    has_band: bool,
+) -> Result<(Part<PARAMETERS>, f64), String> {
+    let residuals_at_p = residuals(insertion, p)?;
+    let mut columns = Vec::with_capacity(PARAMETERS);
+    for (k, &step) in DERIVATIVE_STEP.iter().enumerate() {
+        let mut moved = *p;
+        moved[k] += step;
+        let moved = residuals(insertion, &moved)?;
+        let column: Vec<f64> =
+            moved.iter().zip(&residuals_at_p).map(|(m, r)| (m - r) / step).collect();
+        columns.push(column);
     }
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let mut part = Part {
+        hessian: Hessian::from_fn(|i, j| dot(&columns[i], &columns[j])),
+        gradient: Parameters::from_fn(|i, _| dot(&columns[i], &residuals_at_p)),
+    };
+    if !has_band {
+        (0..OFFSET).for_each(|k| exclude(&mut part, k));
+    }
+    Ok((part, dot(&residuals_at_p, &residuals_at_p)))
 }
 
 /// Keeps parameter number `k` out of a fit.
-fn exclude(hessian: &mut Hessian, k: usize) {
-    hessian.row_mut(k).fill(0.0);
-    hessian.column_mut(k).fill(0.0);
-    hessian[(k, k)] = 1.0;
+fn exclude(part: &mut Part<PARAMETERS>, k: usize) {
+    part.hessian.row_mut(k).fill(0.0);
+    part.hessian.column_mut(k).fill(0.0);
+    part.hessian[(k, k)] = 1.0;
+    part.gradient[k] = 0.0;
 }
 
 impl TorsionFit {
@@ -125,31 +126,19 @@ impl TorsionFit {
 
     /// Why this is no torsion of a needle, in words.
     pub(super) fn fault(&self) -> Option<String> {
-        let TorsionConfig { half_width_rad, half_width_rad_per_mm, offset_rad, .. } = self.torsion;
-        let [half_width_deg, half_width_deg_per_mm, offset_deg, roll_rms_deg] =
-            [half_width_rad, half_width_rad_per_mm, offset_rad, self.roll_rms_rad]
-                .map(f64::to_degrees);
-        let TorsionConfig { creep_mm, creep_mm_per_mm, .. } = self.torsion;
-        let values = [half_width_deg, half_width_deg_per_mm, offset_deg, creep_mm, creep_mm_per_mm];
-        let outside = TorsionConfig::KEYS.iter().zip(values).find_map(|(key, value)| {
+        let values = self.torsion.in_keys();
+        let outside = TorsionConfig::KEYS.iter().zip(values).find_map(|(key, (name, value))| {
             let Range { low, high, .. } =
                 key.kind.range(&key.rule).filter(|range| !range.contains(value))?;
-            Some(format!(
-                "the torsion fits with {} = {value:.1} (limits {low} to {high})",
-                key.name
-            ))
+            Some(format!("the torsion fits with {name} = {value:.1} (limits {low} to {high})"))
         });
+        let roll_rms_deg = self.roll_rms_rad.to_degrees();
         let roll_is_off = roll_rms_deg > ROLL_RMS_MAX_DEG || roll_rms_deg.is_nan();
         let off = roll_is_off.then(|| {
             format!("the tip's roll is {roll_rms_deg:.0} deg RMS off the fit (limit {ROLL_RMS_MAX_DEG:.0})")
         });
-        let sds = [self.sd.half_width_rad, self.sd.half_width_rad_per_mm, self.sd.offset_rad];
-        let sds = sds.iter().chain([
-            &self.sd.creep_mm,
-            &self.sd.creep_mm_per_mm,
-            &self.offset_spread_rad,
-        ]);
-        let is_unknown = !sds.sum::<f64>().is_finite();
+        let sds = self.sd.in_keys().map(|(_, sd)| sd);
+        let is_unknown = !(sds.iter().sum::<f64>() + self.offset_spread_rad).is_finite();
         let unknown =
             is_unknown.then(|| "the torsion fits with no finite standard errors".to_owned());
         outside.or(off).or(unknown)
@@ -158,10 +147,10 @@ impl TorsionFit {
     /// Levenberg-Marquardt iteration within the bounds of the parameters, with or without a band.
     fn fit(insertions: &[RecordedInsertion], has_band: bool) -> Result<Self, String> {
         let linearise = |p: &Parameters| {
-            let parts = insertions.iter().map(|insertion| Linearised::at(p, insertion));
+            let parts = insertions.iter().map(|insertion| linearised(p, insertion, has_band));
             parts.collect::<Result<Vec<_>, _>>()
         };
-        let cost = |parts: &[Linearised]| parts.iter().map(|part| part.cost).sum();
+        let cost = |parts: &[(Part<PARAMETERS>, f64)]| parts.iter().map(|(_, cost)| cost).sum();
         let mut p = Parameters::from(START);
         if !has_band {
             p.fixed_rows_mut::<OFFSET>(0).fill(0.0);
@@ -169,21 +158,20 @@ impl TorsionFit {
         let mut parts = linearise(&p)?;
         let (mut damping, mut settled) = (1e-3, false);
         for _ in 0..ITERATIONS_MAX {
-            let (mut hessian, mut gradient) = (Hessian::zeros(), Parameters::zeros());
-            for part in &parts {
-                (hessian, gradient) = (hessian + part.hessian, gradient + part.gradient);
+            let mut whole = Part { hessian: Hessian::zeros(), gradient: Parameters::zeros() };
+            for (part, _) in &parts {
+                whole.hessian += part.hessian;
+                whole.gradient += part.gradient;
             }
-            hessian += Hessian::from_diagonal(&hessian.diagonal()) * damping;
+            whole.hessian += Hessian::from_diagonal(&whole.hessian.diagonal()) * damping;
             for k in 0..PARAMETERS {
-                let would_pass_bound = p[k] <= MIN[k] && gradient[k] > 0.0;
-                let is_of_no_band = !has_band && k < OFFSET;
-                if would_pass_bound || is_of_no_band {
-                    exclude(&mut hessian, k);
-                    gradient[k] = 0.0;
+                // A parameter at its bound that would pass it.
+                if p[k] <= MIN[k] && whole.gradient[k] > 0.0 {
+                    exclude(&mut whole, k);
                 }
             }
-            let inverse = hessian.try_inverse().ok_or_else(undetermined)?;
-            let mut next = p - inverse * gradient;
+            let inverse = whole.hessian.try_inverse().ok_or_else(undetermined)?;
+            let mut next = p - inverse * whole.gradient;
             next.iter_mut().zip(MIN).for_each(|(value, min)| *value = value.max(min));
             let tried = linearise(&next)?;
             let (before, after): (f64, f64) = (cost(&parts), cost(&tried));
@@ -201,26 +189,18 @@ impl TorsionFit {
         if !settled {
             return Err(undetermined());
         }
-        let fitted = parts.iter().map(|part| {
-            let Linearised { mut hessian, mut gradient, .. } = *part;
-            if !has_band {
-                (0..OFFSET).for_each(|k| exclude(&mut hessian, k));
-                gradient.fixed_rows_mut::<OFFSET>(0).fill(0.0);
-            }
-            Part { hessian, gradient }
-        });
-        let covariance =
-            jackknife_covariance(&fitted.collect::<Vec<_>>()).ok_or_else(undetermined)?;
+        let fitted: Vec<_> = parts.iter().map(|(part, _)| *part).collect();
+        let covariance = jackknife_covariance(&fitted).ok_or_else(undetermined)?;
         // Each insertion's own offset, by one Newton step with the other parameters kept.
         let offsets =
-            parts.iter().map(|part| part.gradient[OFFSET] / part.hessian[(OFFSET, OFFSET)]);
+            fitted.iter().map(|part| part.gradient[OFFSET] / part.hessian[(OFFSET, OFFSET)]);
         let n = insertions.len() as f64;
         let spread = (offsets.map(|off| off * off).sum::<f64>() / (n - 1.0)).sqrt();
         let mut count = 0;
         for insertion in insertions {
             count += residuals(insertion, &p)?.len();
         }
-        let squares: f64 = parts.iter().map(|part| part.cost).sum();
+        let squares: f64 = cost(&parts);
         Ok(TorsionFit {
             torsion: config(&p),
             sd: config(&covariance.diagonal().map(|variance| variance.max(0.0).sqrt())),

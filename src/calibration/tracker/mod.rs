@@ -22,8 +22,9 @@ const DRIFT_ERRORS: f64 = 6.0;
 const BURST_SHARE: f64 = 0.1;
 /// The longest correlation time, as a share of the recording: with a longer one, noise looks like motion.
 const TIME_SHARE_MAX: f64 = 0.05;
-/// A correlation time over this share is refused if the positions wander by more than this, mm RMS.
+/// A correlation time over this share of the recording …
 const TIME_SHARE_REFUSED: f64 = 0.035;
+/// … is refused if the positions also wander by more than this, mm RMS.
 const WANDER_MAX_MM: f64 = 0.2;
 /// An outlier is more than this many robust standard deviations from the median.
 const OUTLIER_SDS: f64 = 6.0;

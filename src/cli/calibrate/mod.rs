@@ -17,7 +17,6 @@ use crate::archive::sha256_hex;
 use crate::calibration::{FiducialPair, NeedleFit, PosedRow, RegistrationFit, TipFit, TurnSample};
 use crate::config::RegistrationConfig;
 use crate::geometry::FixedAngles;
-use crate::needle::TorsionConfig;
 use crate::study::{RecordedRoll, student_95};
 use crate::telemetry::utc_text;
 use crate::text::screen;
@@ -206,13 +205,13 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<()> {
         "tip_ahead_sd_mm": fit.bend.tip_ahead_sd_mm,
         "bend_axis_sd_deg": fit.bend.bend_axis_sd_rad.to_degrees(),
         "offset_spread_deg": fit.torsion.offset_spread_rad.to_degrees(),
-        "torsion_sd": torsion_json(&fit.torsion.sd),
+        "torsion_sd": Value::from_iter(fit.torsion.sd.in_keys()),
     });
     let overlay = json!({
         "needle": {
             "curvature_per_mm": fit.bend.curvature_per_mm,
             "tip_ahead_mm": fit.bend.tip_ahead_mm,
-            "torsion": torsion_json(&fit.torsion.torsion),
+            "torsion": Value::from_iter(fit.torsion.torsion.in_keys()),
             "fit": fit_table(&file, Some(&text), &found),
         },
         "evaluation": {
@@ -263,17 +262,6 @@ fn check_roll(insertions: &[Insertion]) -> Result<()> {
         return Err(Failure::bad_input(path, format_args!("{roll}; {next}")));
     }
     Ok(())
-}
-
-/// A torsion in the keys of the configuration.
-fn torsion_json(torsion: &TorsionConfig) -> Value {
-    json!({
-        "half_width_deg": torsion.half_width_rad.to_degrees(),
-        "half_width_deg_per_mm": torsion.half_width_rad_per_mm.to_degrees(),
-        "offset_deg": torsion.offset_rad.to_degrees(),
-        "creep_mm": torsion.creep_mm,
-        "creep_mm_per_mm": torsion.creep_mm_per_mm,
-    })
 }
 
 /// A fiducial in the keys of the configuration.

@@ -129,7 +129,7 @@ impl Screen {
             Record::Step(step) => self.take_step(step),
             Record::Stage(stage) => {
                 self.time = stage.time;
-                for (drive, axis) in self.drives.iter_mut().zip([Axis::Insertion, Axis::Rotation]) {
+                for (drive, axis) in self.drives.iter_mut().zip(Axis::BOTH) {
                     drive.position = stage.measured.along(axis);
                     drive.following_error = stage.commanded.along(axis) - drive.position;
                 }
@@ -210,8 +210,8 @@ impl Screen {
             self.faults += 1;
             self.alarm();
         }
-        // The first fault explains the end, and the first warning of the tracker or the answer to the operator
-        // a hold: nothing that is said meanwhile does.
+        // The first fault explains the end. A hold is explained by the first warning of the tracker, or by the answer
+        // to the operator. Nothing else that is said meanwhile explains anything.
         let is_answer = lane == Lane::Session && mem::take(&mut self.is_answer_due);
         let is_of_tracker = lane == Lane::Tracker && severity == Severity::Warning;
         let is_reason = self.reason_due == Some(lane) && (is_answer || is_of_tracker);

@@ -90,7 +90,7 @@ pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), TelemetryError> {
         Ok(()) if record.is_closed() => Condition::Whole,
         Ok(()) if is_being_written(path) => Condition::BeingWritten,
         Ok(()) => Condition::Open,
-        Err(TelemetryError::Record { reason, .. }) => Condition::Changed(reason),
+        Err(TelemetryError::Unusable { reason, .. }) => Condition::Changed(reason),
         Err(error) => return Err(error),
     };
     let figures_of_steps = match record.manifest.figures.is_empty() {

@@ -31,12 +31,12 @@ pub(super) fn operate(
     let performed = job(config, motion, options)?.perform()?;
     let proof = proof_of(&performed.report);
     let object = to_json(motion.name(), &performed, &proof);
-    let of_no_rig = proof.as_ref().filter(|_| config.is_emulated()).map(|_| {
-        "emulated drives take their signs from the configuration: this proves nothing about a rig"
-            .to_owned()
-    });
+    if matches!(motion, Motion::Prove { handedness: true, .. }) && config.is_emulated() {
+        print_stderr(
+            "emulated    the drives take their signs from the configuration: this proves nothing about a rig",
+        );
+    }
     let text = [summary(config, path, motion, &performed)].into_iter().chain(proof);
-    let text = text.chain(of_no_rig);
     print_result(arguments.json, &object, || Ok(text.collect::<Vec<_>>().join("\n")))?;
     finish_with(status(config, &performed.report))
 }

@@ -127,9 +127,11 @@ pub(super) struct Listener {
     census: Census,
     /// Why there is no connection; `None` while there is one.
     trouble: Option<String>,
-    /// Connections that ended, also since the last [`Self::connection_trouble`], and why the last one did.
+    /// Connections that ended.
     ended: u64,
+    /// Those of them since the last [`Self::connection_trouble`].
     ended_lately: u64,
+    /// Why the last one ended.
     last_end: String,
     unreadable: Unreadable,
     has_ended: bool,

@@ -41,13 +41,13 @@ fn recording_path(text: &str) -> Result<PathBuf, String> {
 }
 
 /// A recording in progress.
-struct Recording {
+struct SampleFile {
     out: BufWriter<File>,
     is_csv: bool,
     flushed: Time,
 }
 
-impl Recording {
+impl SampleFile {
     /// A new file, begun at `now`.
     fn create(path: &Path, is_csv: bool, now: Time) -> io::Result<Self> {
         let mut out = BufWriter::new(File::create_new(path)?);
@@ -55,7 +55,7 @@ impl Recording {
             let names = [&[RECEIVED, STAMP], &POSITION[..], &QUATERNION].concat();
             writeln!(out, "{}", names.join(","))?;
         }
-        Ok(Recording { out, is_csv, flushed: now })
+        Ok(SampleFile { out, is_csv, flushed: now })
     }
 
     fn take(&mut self, sample: &Sample) -> io::Result<()> {
@@ -103,8 +103,8 @@ pub(super) fn record(arguments: &RecordArguments) -> Result<()> {
             return Ok(());
         }
         let taken = match &mut recording {
-            Some(recording) => Recording::take(recording, sample),
-            None => Recording::create(path, is_csv, sample.receive_time)
+            Some(recording) => SampleFile::take(recording, sample),
+            None => SampleFile::create(path, is_csv, sample.receive_time)
                 .and_then(|new| recording.insert(new).take(sample)),
         };
         taken.map_err(|error| failed(error, written))?;
@@ -144,7 +144,7 @@ mod tests {
         let path = std::env::temp_dir().join(format!("needle-record-{}.csv", std::process::id()));
         let turned = sample("");
         let without = Sample { orientation: None, ..turned.clone() };
-        let mut recording = Recording::create(&path, true, turned.receive_time).unwrap();
+        let mut recording = SampleFile::create(&path, true, turned.receive_time).unwrap();
         recording.take(&without).unwrap();
         recording.take(&turned).unwrap();
         recording.out.flush().unwrap();

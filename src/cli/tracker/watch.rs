@@ -36,7 +36,7 @@ struct Watch {
     repeats: u32,
     /// Why the newest sample or message was refused, since the last line.
     refusal: Option<String>,
-    /// Why the last sample that was refused was refused.
+    /// The newest refusal, for the end.
     last_refusal: Option<Refusal>,
     /// Messages that could not be read.
     malformed: u64,

@@ -48,7 +48,7 @@ pub(super) struct Axis {
     pub(super) has_voltage: bool,
     /// Something blocks the axis.
     pub(super) is_stalled: bool,
-    /// A supervised node is lost: a fault reset is refused.
+    /// A supervised node is lost: a fault reset and Operation Enabled are refused.
     partner_lost: bool,
     /// Position at the last update, in whole counts.
     counts: i64,

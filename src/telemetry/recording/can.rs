@@ -37,7 +37,7 @@ impl Selection {
     /// Chooses among the frames of this stage.
     pub(super) fn new(stage: &StageConfig) -> Self {
         Selection {
-            nodes: PerAxis::from_fn(|axis| stage.axis(axis).node),
+            nodes: stage.nodes(),
             states: PerAxis::from_fn(|_| None),
             shown: HashMap::new(),
         }

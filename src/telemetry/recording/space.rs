@@ -44,7 +44,7 @@ impl Sheet {
     const MARGIN_MM: f64 = 10.0;
     /// Least and greatest extent of the plane to one side, without the margin, mm.
     const SIDE_MM: [f64; 2] = [20.0, 1000.0];
-    /// A needle further away than this is not shown, mm.
+    /// The sheet does not follow a needle that is further away than this, mm.
     const PLACE_MM_MAX: f64 = 10_000.0;
     /// At most about this many depths have a label.
     const LABELS_MAX: f64 = 6.0;

@@ -29,6 +29,7 @@ use crate::units::Time;
 use nalgebra::Vector3;
 use serde::Deserialize;
 use serde::de::IgnoredAny;
+use serde_json::Value;
 use std::fmt::Display;
 
 /// The longest line, bytes. A sample takes about 300.
@@ -87,13 +88,13 @@ impl Line {
     /// The sample, received at `receive_time`.
     pub(super) fn into_sample(self, receive_time: Time) -> Sample {
         let orientation = self.orientation_tracker_wxyz.map_or(Orientation::Absent, |wxyz| {
-            Orientation::of_quaternion(wxyz.map(Number::value))
+            Orientation::of_quaternion(wxyz.map(|Number(value)| value))
         });
         Sample {
             tool: self.tool,
             receive_time,
             source_unix_ns: self.source_unix_ns.filter(|&unix_ns| unix_ns != 0),
-            position_mm: Vector3::from(self.position_tracker_mm.map(Number::value)),
+            position_mm: Vector3::from(self.position_tracker_mm.map(|Number(mm)| mm)),
             orientation: None,
             validity: self.status.map_or(Validity::Valid, |status| Validity::from_status(&status)),
         }
@@ -162,29 +163,15 @@ fn timed_sample(line: u64, text: &str, newest: Option<Time>) -> Result<Sample, S
 
 /// A JSON number, or the word for one that JSON lacks.
 #[derive(Debug, Clone, Copy, Deserialize)]
-#[serde(untagged, expecting = "expected a number, \"NaN\", \"inf\" or \"-inf\"")]
-enum Number {
-    Number(f64),
-    Word(NumberWord),
-}
+#[serde(try_from = "Value")]
+struct Number(f64);
 
-#[derive(Debug, Clone, Copy, Deserialize)]
-enum NumberWord {
-    NaN,
-    #[serde(rename = "inf")]
-    Infinity,
-    #[serde(rename = "-inf")]
-    MinusInfinity,
-}
-
-impl Number {
-    fn value(self) -> f64 {
-        match self {
-            Number::Number(value) => value,
-            Number::Word(NumberWord::NaN) => f64::NAN,
-            Number::Word(NumberWord::Infinity) => f64::INFINITY,
-            Number::Word(NumberWord::MinusInfinity) => f64::NEG_INFINITY,
-        }
+impl TryFrom<Value> for Number {
+    type Error = &'static str;
+    fn try_from(value: Value) -> Result<Self, Self::Error> {
+        let word = value.as_str().filter(|word| ["NaN", "inf", "-inf"].contains(word));
+        let number = value.as_f64().or_else(|| word?.parse().ok());
+        number.map(Number).ok_or("expected a number, \"NaN\", \"inf\" or \"-inf\"")
     }
 }
 
