@@ -120,10 +120,7 @@ const STATUS_NAME_LEN: usize = 20;
 
 /// True for the types whose content is decoded.
 pub(super) fn is_read(message_type: &[u8]) -> bool {
-    matches!(
-        message_type,
-        b"TRANSFORM" | b"POSITION" | b"QTRANS" | b"STATUS" | b"TDATA" | b"QTDATA"
-    )
+    !matches!(Body::decode(message_type, &[]), Ok(Body::Other(_)))
 }
 
 impl Body {
