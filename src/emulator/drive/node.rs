@@ -188,7 +188,7 @@ impl Drive {
             return;
         }
         self.device.nmt_state = state;
-        self.rpdos.iter_mut().for_each(Rpdo::discard_latched);
+        self.rpdos.iter_mut().for_each(|rpdo| drop(rpdo.take_latched()));
         if state == NmtState::Operational {
             self.tpdos.iter_mut().for_each(|tpdo| tpdo.start(now));
         }

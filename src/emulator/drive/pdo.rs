@@ -57,10 +57,6 @@ impl Rpdo {
         Rpdo { settings: Settings::load(objects, PdoDirection::Receive, offset), latched: None }
     }
 
-    pub(super) fn discard_latched(&mut self) {
-        self.latched = None;
-    }
-
     pub(super) fn is_for(&self, frame: &Frame) -> bool {
         self.settings.cob_id.is_some_and(|cob_id| frame.cob_id() == Some(cob_id))
     }
