@@ -50,8 +50,6 @@ pub(super) struct Axis {
     pub(super) is_stalled: bool,
     /// A supervised node is lost: a fault reset and Operation Enabled are refused.
     partner_lost: bool,
-    /// Position at the last update, in whole counts.
-    counts: i64,
     updated: Time,
     pub(super) homing: Homing,
     /// The last homing since power-on succeeded.
@@ -74,7 +72,6 @@ impl Axis {
             has_voltage: true,
             is_stalled: false,
             partner_lost: false,
-            counts: config.start_counts,
             updated: Time::ZERO,
             homing: Homing::default(),
             referenced: config.homed,
@@ -232,11 +229,11 @@ impl Axis {
         Mode(objects.integer(object::MODES_OF_OPERATION) as i8)
     }
 
-    /// Stops an axis that moves onto a closed limit switch: an EPOS4 faults, others make a quick stop.
+    /// Stops an axis that moves onto a limit switch that is closed at `counts`: an EPOS4 faults, others make a quick stop.
     /// Homing may move onto the switch that it seeks.
-    fn check_switches(&mut self, now: Time, device: &mut Device) {
+    fn check_switches(&mut self, now: Time, counts: i64, device: &mut Device) {
         let Some(end) = self.heading(now) else { return };
-        if self.state != DriveState::OperationEnabled || !self.inputs.is_closed(end, self.counts) {
+        if self.state != DriveState::OperationEnabled || !self.inputs.is_closed(end, counts) {
             return;
         }
         if let Homing::InProgress { onto, .. } = self.homing {
@@ -276,8 +273,8 @@ impl Axis {
         }
     }
 
-    /// Object 0x6041.
-    fn statusword(&self, now: Time, device: &Device) -> u16 {
+    /// Object 0x6041 at the position `counts`.
+    fn statusword(&self, now: Time, counts: i64, device: &Device) -> u16 {
         let follows = self.follows_targets(device);
         let powered =
             matches!(self.state, DriveState::OperationEnabled | DriveState::QuickStopActive);
@@ -285,7 +282,7 @@ impl Axis {
         let limited = self.target_limited || self.lag != 0;
         let on_switch = [End::Negative, End::Positive]
             .into_iter()
-            .any(|end| self.inputs.is_closed(end, self.counts));
+            .any(|end| self.inputs.is_closed(end, counts));
         // The meaning of bits 10, 12 and 13 depends on the mode. In CSP bit 10 is reserved; this drive
         // sets it when a halt or quick stop has ended.
         let following_error = device.is_active(EmcyCode::FOLLOWING_ERROR);
@@ -337,21 +334,21 @@ impl Axis {
         {
             self.state = next;
         }
-        self.counts = whole(self.motion.position_at(now));
-        self.check_switches(now, device);
-        let reported = self.counts.wrapping_sub(self.zero);
+        let counts = whole(self.motion.position_at(now));
+        self.check_switches(now, counts, device);
+        let reported = counts.wrapping_sub(self.zero);
         let demand = match self.motion {
             Motion::Ramped(_) => reported,
             _ => reported.wrapping_add(self.lag),
         };
         let values = [
-            (object::STATUSWORD, self.statusword(now, device).into()),
+            (object::STATUSWORD, self.statusword(now, counts, device).into()),
             (object::MODES_OF_OPERATION_DISPLAY, self.mode(&device.objects).0.into()),
             (object::POSITION_ACTUAL, reported),
             (object::POSITION_DEMAND, demand),
             (object::FOLLOWING_ERROR_ACTUAL, self.lag),
             (object::VELOCITY_ACTUAL, whole(self.motion.velocity_at(now))),
-            (object::DIGITAL_INPUTS, self.inputs.bits(self.counts)),
+            (object::DIGITAL_INPUTS, self.inputs.bits(counts)),
         ];
         values.into_iter().for_each(|(address, value)| device.objects.set(address, value));
     }
