@@ -9,7 +9,8 @@ use crate::units::IN_METRES;
 use nalgebra::{Matrix2, Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
 use std::f64::consts::{PI, TAU};
 
-const TURN_COLUMNS: [&str; 4] = ["rotation_rad", "x_mm", "y_mm", "z_mm"];
+/// Columns of a recorded turn, without those of the orientation.
+pub const TURN_COLUMNS: [&str; 4] = ["rotation_rad", "x_mm", "y_mm", "z_mm"];
 
 /// A circle in space has six unknowns; two more points show whether it fits.
 const POINTS_MIN: usize = 8;

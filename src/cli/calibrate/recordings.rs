@@ -2,8 +2,11 @@
 //! fiducial and types its bench coordinates. For the tip the stage turns the base once in air and back, by two
 //! jogs; their records hold the sensor's circle.
 
+use crate::calibration::registration::FIDUCIAL_COLUMNS;
+use crate::calibration::tip::TURN_COLUMNS;
 use crate::calibration::{FiducialPair, RegistrationFit};
 use crate::cli::arguments::Configured;
+use crate::cli::calibrate::tracker::QUATERNION;
 use crate::cli::ending::status;
 use crate::cli::output::{print_stderr, refuse_unwritable, write_new};
 use crate::cli::perform::Options;
@@ -22,7 +25,6 @@ use std::sync::mpsc::{Receiver, TryRecvError, channel};
 use std::thread;
 use std::time::Duration;
 
-const HEADER: &str = "x_tracker_mm,y_tracker_mm,z_tracker_mm,x_bench_mm,y_bench_mm,z_bench_mm\n";
 /// A point is the mean of the positions of this time at rest.
 const REST: Duration = Duration::from_secs(1);
 /// Fewest positions that give a point.
@@ -43,11 +45,12 @@ pub(super) fn collect_fiducials(path: &Path, configured: &Configured) -> Result<
         let why = "--collect reads the operator's lines from standard input, not the tracker's";
         return Err(Failure::configuration(why));
     }
-    write_new(path, HEADER)?;
+    let header = FIDUCIAL_COLUMNS.join(",") + "\n";
+    write_new(path, &header)?;
     let failed = |error| Failure::io(path, error);
     let mut file = OpenOptions::new().append(true).open(path).map_err(failed)?;
     let lines = read_lines();
-    let mut text = HEADER.to_owned();
+    let mut text = header.clone();
     loop {
         let number = text.lines().count();
         print_stderr(format_args!(
@@ -83,7 +86,7 @@ pub(super) fn collect_fiducials(path: &Path, configured: &Configured) -> Result<
             }
         }
     }
-    if text != HEADER {
+    if text != header {
         return Ok(());
     }
     std::fs::remove_file(path).map_err(failed)?;
@@ -184,9 +187,6 @@ fn residuals(text: &str) -> String {
     }
 }
 
-const COLUMNS: [&str; 8] = ["rotation_rad", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"];
-/// Cells of a row without an orientation.
-const CELLS_MIN: usize = 4;
 /// A whole turn, and back: no cable stays wound up, and a lag in one direction is a lead in the other.
 const TURNS: [&str; 2] = ["360deg", "-360deg"];
 /// Smallest rotation between two rows of a turn: a base at rest gives one row.
@@ -217,9 +217,10 @@ pub(super) fn record_turn(
             rows.extend(rows_of(read_run(run_dir)?));
         }
     }
-    let has_orientation = rows.iter().all(|row| row.len() == COLUMNS.len());
-    let cells = if has_orientation { COLUMNS.len() } else { CELLS_MIN };
-    let mut text = COLUMNS[..cells].join(",") + "\n";
+    let columns = [&TURN_COLUMNS[..], &QUATERNION].concat();
+    let has_orientation = rows.iter().all(|row| row.len() == columns.len());
+    let cells = if has_orientation { columns.len() } else { TURN_COLUMNS.len() };
+    let mut text = columns[..cells].join(",") + "\n";
     for row in rows {
         let row: Vec<String> = row.iter().take(cells).map(f64::to_string).collect();
         text += &(row.join(",") + "\n");
