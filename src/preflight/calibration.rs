@@ -14,6 +14,9 @@ const AHEAD_MAX_DAYS: f64 = 1.0 / 24.0;
 /// The pose that the fiducials give may be off by this, mm and rad: the rounding of its numbers.
 const SAME_POSE: f64 = 1e-6;
 
+/// The largest standard error of a calibrated curvature, as a part of it.
+const CURVATURE_PART_MAX: f64 = 0.2;
+
 /// A run before this one.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Earlier {
@@ -122,6 +125,10 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
     let found = fit.map(|fit| format!("{} insertions", fit.insertions)).unwrap_or_default();
     let next = "needle-bench calibrate needle";
     let needle = dated("needle", found, &days_limit, fit.map(|fit| &fit.provenance), next);
+    let part = fit.map(|fit| fit.curvature_sd_per_mm / config.needle.arc.curvature_per_mm());
+    let vague =
+        "its curvature is known to no better than a fifth: calibrate it from more insertions";
+    let needle = needle.unless(part.is_none_or(|part| part <= CURVATURE_PART_MAX), Warn, vague);
     vec![registration, tip, needle]
 }
 

@@ -319,6 +319,32 @@ fn a_registration_is_judged_by_its_fiducials() {
 }
 
 #[test]
+fn a_curvature_that_is_poorly_known_is_warned_about() {
+    const TORSION: &str = "half_width_deg = 0.0, half_width_deg_per_mm = 0.0, offset_deg = 0.0, creep_mm = 0.0, \
+                           creep_mm_per_mm = 0.0";
+    let of = |sd_per_mm: f64| {
+        let fit = format!(
+            "needle.fit={{ file = \"a.csv\", sha256 = \"0\", version = \"0\", date_utc = \"2026-11-01T12:00:00.000000Z\", \
+             insertions = 3, roll_rms_deg = 5.0, curvature_sd_per_mm = {sd_per_mm}, tip_ahead_sd_mm = 0.1, \
+             bend_axis_sd_deg = 1.0, offset_spread_deg = 1.0, torsion_sd = {{ {TORSION} }} }}"
+        );
+        let needle = calibrations(
+            &rig(&["needle.radius_mm=100.0", "calibration.max_age_days=120", &fit]),
+            NOW_UNIX_US,
+        )
+        .remove(2);
+        (needle.verdict, needle.next_step.unwrap_or_default())
+    };
+    assert_eq!(of(0.0015), (Verdict::Pass, String::new()));
+    let (verdict, next) = of(0.0025);
+    assert_eq!(
+        (verdict, next.starts_with("its curvature is known to no better")),
+        (Verdict::Warn, true),
+        "{next}"
+    );
+}
+
+#[test]
 fn wide_gates_are_warned_about() {
     let jitter =
         |k: u32| Vector3::new(1.0 + if (k / 2).is_multiple_of(2) { 0.05 } else { -0.05 }, 2.0, 3.0);

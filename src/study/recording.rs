@@ -22,6 +22,11 @@ const FOLLOWED_MAX: f64 = 1.8;
 /// roll of 5 deg.
 const FOLLOWED_MIN_RAD: f64 = 0.12;
 
+/// Largest change of the depth, mm, and of the base's rotation, rad, from one row to the next: less than a turn, so
+/// that an angle that starts again is noticed.
+const STEP_MAX_MM: f64 = 5.0;
+const TURN_MAX_RAD: f64 = 6.0;
+
 /// One row of a recording, in the recording's own frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RecordedRow {
@@ -95,6 +100,42 @@ impl Recording {
             true => Err("no rows below the header".to_owned()),
             false => Ok(Recording { rows }),
         }
+    }
+
+    /// Refuses a row whose depth or rotation is far from that of the row before: one such value would change the
+    /// rows after it as well.
+    ///
+    /// # Errors
+    /// The first such row, by its line.
+    pub fn check_steps(&self) -> Result<(), String> {
+        for (last, row) in self.rows.iter().zip(&self.rows[1..]) {
+            for (name, step, max, hint) in [
+                (
+                    "insertion_mm",
+                    row.insertion_meas_mm - last.insertion_meas_mm,
+                    STEP_MAX_MM,
+                    "is a digit wrong, or are rows missing?",
+                ),
+                (
+                    "rotation_rad",
+                    row.rotation_meas_rad - last.rotation_meas_rad,
+                    TURN_MAX_RAD,
+                    "does it start again after a turn? It must count on",
+                ),
+            ] {
+                if step.abs() > max {
+                    let by = match step.abs() < 1e6 {
+                        true => format!("{step:.2}"),
+                        false => format!("{step:e}"),
+                    };
+                    return Err(format!(
+                        "line {}: {name} changes by {by} from the row before (limit {max}): {hint}",
+                        row.line
+                    ));
+                }
+            }
+        }
+        Ok(())
     }
 
     /// Whether the orientations contain the roll; `None` if a row has no orientation, or there is only one. A sensor
@@ -218,6 +259,25 @@ mod tests {
         }
         // The sensor lacks half a radian of the turn.
         assert_eq!(roll(10, 0.85), RecordedRoll::Turns);
+    }
+
+    #[test]
+    fn a_row_far_from_the_one_before_is_refused() {
+        let rows = |depth_mm: f64, rotation_rad: f64| {
+            let text = format!(
+                "insertion_mm,rotation_rad,x_mm,y_mm,z_mm\n0,0,0,0,0\n1,0.5,0,0,1\n{depth_mm},{rotation_rad},0,0,2\n"
+            );
+            Recording::parse(&text).unwrap().check_steps()
+        };
+        assert_eq!(rows(2.0, 1.0), Ok(()));
+        assert_eq!(rows(6.0, -5.4), Ok(()));
+        let spike = "line 4: insertion_mm changes by 19.00 from the row before (limit 5): is a digit wrong, or are rows \
+                     missing?";
+        assert_eq!(rows(20.0, 1.0), Err(spike.to_owned()));
+        let turned = "line 4: rotation_rad changes by 6.28 from the row before (limit 6): does it start again after a \
+                      turn? It must count on";
+        assert_eq!(rows(2.0, 6.783), Err(turned.to_owned()));
+        assert_eq!(rows(2.0, -5.783), Err(turned.replace("6.28", "-6.28")));
     }
 
     /// The base turns by 48 degrees and back, in 60 mm.

@@ -80,6 +80,8 @@ fn too_few_or_unusable_recordings_are_refused_with_the_reason() {
     scratch.write("plain.csv", "insertion_mm,rotation_rad,x_mm,y_mm,z_mm\n0,0,0,0,0\n");
     let text = std::fs::read_to_string(scratch.path().join("a.csv")).unwrap();
     scratch.write("again.csv", &text.replacen('\n', "\n\n", 1));
+    // A depth has lost its point.
+    scratch.write("spike.csv", &text.replacen("\n20.5,", "\n205,", 1));
     let screens = refusals(
         &scratch,
         &[
@@ -89,6 +91,7 @@ fn too_few_or_unusable_recordings_are_refused_with_the_reason() {
             &["calibrate", "needle", "a.csv", "b.csv", "again.csv"],
             &["calibrate", "needle", "a.csv", "plain.csv"],
             &["calibrate", "needle", "a.csv", "absent.csv"],
+            &["evaluate", "spike.csv"],
         ],
     );
     insta::assert_snapshot!(screens);
@@ -124,4 +127,32 @@ fn a_rig_without_noise_of_the_path_is_warned_about() {
     };
     assert!(is_warned(&[]));
     assert!(!is_warned(&["--set", "observer.invariant.noise.axial_mm=0.9"]));
+}
+
+/// As with a wrong counts_per_turn. The fit makes it a creep.
+#[test]
+fn a_rotation_of_another_scale_is_warned_about() {
+    let scratch = Scratch::new();
+    recorded(&scratch);
+    for name in ["a.csv", "b.csv", "c.csv"] {
+        let text = std::fs::read_to_string(scratch.path().join(name)).unwrap();
+        let scaled =
+            text.lines().enumerate().map(|(n, line)| match line.split(',').collect::<Vec<_>>() {
+                cells if n > 0 => {
+                    let rotation_rad = 1.4 * cells[1].parse::<f64>().unwrap();
+                    format!("{},{rotation_rad},{}\n", cells[0], cells[2..].join(","))
+                }
+                _ => format!("{line}\n"),
+            });
+        scratch.write(&format!("scaled-{name}"), &scaled.collect::<String>());
+    }
+    let is_warned = |prefix: &str| {
+        let files = ["a.csv", "b.csv", "c.csv"].map(|name| format!("{prefix}{name}"));
+        let said =
+            needle_bench(&scratch, &["calibrate", "needle", &files[0], &files[1], &files[2]]);
+        assert_eq!(said.status, 0, "{}", said.screen());
+        said.stderr.contains("is stage.rotation.counts_per_turn right")
+    };
+    assert!(!is_warned(""));
+    assert!(is_warned("scaled-"));
 }

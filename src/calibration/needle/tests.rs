@@ -141,6 +141,21 @@ fn insertions_that_determine_no_needle_are_refused() {
 }
 
 /// Each insertion has one residual from the mean.
+/// As from a source that names its axes otherwise for positions than for orientations.
+#[test]
+fn positions_with_exchanged_or_mirrored_axes_are_refused() {
+    let exchanged = |p: Vector3<f64>| Vector3::new(p.y, p.x, p.z);
+    let mirrored = |p: Vector3<f64>| Vector3::new(-p.x, p.y, p.z);
+    for change in [exchanged, mirrored] as [fn(Vector3<f64>) -> Vector3<f64>; 2] {
+        let mut insertions = recorded(CREEPING, 0.01);
+        for row in insertions.iter_mut().flatten() {
+            row.position_mm = change(row.position_mm);
+        }
+        let error = NeedleFit::of(&insertions, name, &NOISE).unwrap_err();
+        assert!(error.contains("is no axis mirrored or exchanged"), "{error}");
+    }
+}
+
 #[test]
 fn the_jackknife_covariance_of_a_mean_is_its_standard_error() {
     let values = [1.0, 2.0, 4.0, 9.0];

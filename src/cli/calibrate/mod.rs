@@ -173,6 +173,10 @@ fn angles_json(rotation: &Rotation3<f64>) -> Value {
     })
 }
 
+/// The tip's roll is usually no farther than this off the fitted torsion, RMS, deg: 7 with recorded insertions of a real
+/// needle.
+const ROLL_RMS_USUAL_DEG: f64 = 12.0;
+
 /// Curvature, bevel zero, sensor tilt and torsion from insertions.
 fn needle(insertions: &Insertions, output: &Output) -> Result<()> {
     output.refuse_unwritable()?;
@@ -193,6 +197,13 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<()> {
     let name = |index: usize| insertions[index].path.display().to_string();
     let fit = NeedleFit::of(&posed_rows, name, &noise);
     let fit = fit.map_err(Failure::configuration)?;
+    let roll_rms_deg = fit.torsion.roll_rms_rad.to_degrees();
+    if roll_rms_deg > ROLL_RMS_USUAL_DEG {
+        print_stderr(format_args!(
+            "warning: the tip's roll is {roll_rms_deg:.0} deg RMS off the fit (usual: up to {ROLL_RMS_USUAL_DEG:.0}): \
+             is stage.rotation.counts_per_turn right, and does the shaft slip in its clamp?"
+        ));
+    }
     let mut file = insertions[0].path.display().to_string();
     if insertions.len() > 1 {
         file += &format!(" and {} more", insertions.len() - 1);
@@ -200,7 +211,7 @@ fn needle(insertions: &Insertions, output: &Output) -> Result<()> {
     let text: String = insertions.iter().map(|insertion| insertion.text.as_str()).collect();
     let found = json!({
         "insertions": fit.insertions,
-        "roll_rms_deg": fit.torsion.roll_rms_rad.to_degrees(),
+        "roll_rms_deg": roll_rms_deg,
         "curvature_sd_per_mm": fit.bend.curvature_sd_per_mm,
         "tip_ahead_sd_mm": fit.bend.tip_ahead_sd_mm,
         "bend_axis_sd_deg": fit.bend.bend_axis_sd_rad.to_degrees(),

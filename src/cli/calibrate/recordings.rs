@@ -13,7 +13,7 @@ use crate::cli::perform::Options;
 use crate::cli::records::{RunMeasurements, position_at, read_run};
 use crate::cli::stage::{load_stage, perform, sensor_off_axis};
 use crate::cli::tracker::{Listener, listen};
-use crate::cli::{Failure, Result, finish_with};
+use crate::cli::{Failure, Result, STOPPED, finish_with};
 use crate::geometry::Pose;
 use crate::session::MovingMean;
 use crate::tracker::{Event, Registration};
@@ -85,6 +85,13 @@ pub(super) fn collect_fiducials(path: &Path, configured: &Configured) -> Result<
                 ));
             }
         }
+    }
+    if text != header && listener.is_interrupted() {
+        let (points, file) = (text.lines().count() - 1, path.display());
+        let message = format!(
+            "interrupted; {points} points are in {file}: needle-bench calibrate registration {file} uses them"
+        );
+        return Err(Failure { message: Some(message), status: STOPPED });
     }
     if text != header {
         return Ok(());
