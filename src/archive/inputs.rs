@@ -57,6 +57,7 @@ fn word_and_values(input: &Input) -> (&'static str, Vec<Value>) {
             Event::Sample(_) => ("sample", vec![]),
             Event::Connected { peer } => ("connected", vec![json!(peer)]),
             Event::Unreachable { reason } => ("unreachable", vec![json!(reason)]),
+            Event::TurnedAway { reason } => ("turned-away", vec![json!(reason)]),
             Event::Disconnected { reason } => ("disconnected", vec![json!(reason)]),
             Event::Malformed(error) => ("malformed", vec![json!(error)]),
             Event::PassedOver { messages, dropped } => {
@@ -182,6 +183,7 @@ fn parse_input(word: &str, values: &[Value]) -> Option<RecordedInput> {
         (_, values) => Input::Tracker(match (word, values) {
             ("connected", [peer]) => Event::Connected { peer: text(peer)? },
             ("unreachable", [reason]) => Event::Unreachable { reason: text(reason)? },
+            ("turned-away", [reason]) => Event::TurnedAway { reason: text(reason)? },
             ("disconnected", [reason]) => Event::Disconnected { reason: text(reason)? },
             ("malformed", [error]) => Event::Malformed(text(error)?),
             ("saw-tool", [tool, message_type]) => {
@@ -251,6 +253,10 @@ mod tests {
             (
                 tracker(Event::Unreachable { reason: reason() }),
                 r#"-5 unreachable "gone,\nsaid \"x\"""#,
+            ),
+            (
+                tracker(Event::TurnedAway { reason: reason() }),
+                r#"-5 turned-away "gone,\nsaid \"x\"""#,
             ),
             (
                 tracker(Event::Disconnected { reason: reason() }),

@@ -12,11 +12,11 @@ use std::os::fd::AsFd;
 use std::path::Path;
 
 /// Writes `text`, made [`plain`], and a line end to stdout. A closed pipe (`run --json | true`) is no
-/// failure: the reader has read all that it wanted.
+/// failure: the reader has read all that it wanted. Nor is a closed terminal: nobody is there to read.
 pub(super) fn print_stdout(text: impl Display) -> Result<()> {
     let mut stdout = io::stdout().lock();
     match writeln!(stdout, "{}", plain(text, "\n\t")).and_then(|()| stdout.flush()) {
-        Err(error) if error.kind() != ErrorKind::BrokenPipe => {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe && !has_no_reader(&stdout) => {
             Err(Failure::environment(format_args!("stdout: {error}")))
         }
         _ => Ok(()),
@@ -128,12 +128,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_pipe_without_a_reader_is_recognised() {
+    fn a_pipe_or_a_terminal_without_a_reader_is_recognised() {
         let (reader, writer) = nix::unistd::pipe().unwrap();
         assert!(!has_no_reader(&writer));
         drop(reader);
         assert!(has_no_reader(&writer));
         assert!(!has_no_reader(&File::open("/dev/null").unwrap()));
+        let terminal = nix::pty::openpty(None, None).unwrap();
+        assert!(!has_no_reader(&terminal.slave));
+        drop(terminal.master);
+        assert!(has_no_reader(&terminal.slave));
     }
 
     #[test]

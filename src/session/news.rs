@@ -53,9 +53,9 @@ pub(crate) fn stage_news(event: &StageEvent) -> Option<(Severity, String)> {
 pub(crate) fn tracker_news(event: &Event) -> Option<(Severity, String)> {
     Some(match event {
         Event::Connected { peer } => (Severity::Info, format!("connected to {peer}")),
-        Event::Unreachable { reason } | Event::Disconnected { reason } => {
-            (Severity::Warning, reason.clone())
-        }
+        Event::Unreachable { reason }
+        | Event::TurnedAway { reason }
+        | Event::Disconnected { reason } => (Severity::Warning, reason.clone()),
         Event::Status { device, status } => {
             let (code, name, message) = (status.code, &status.error_name, &status.message);
             (Severity::Info, format!("{device}: status {code} {name} {message}"))

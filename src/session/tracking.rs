@@ -123,7 +123,7 @@ impl Tracking {
             Event::Status { status, .. } => self.status_is_ok = status.code == Status::OK,
             Event::Malformed(error) => self.malformed = Some(error.clone()),
             Event::PassedOver { dropped, .. } => self.count_dropped(now, *dropped),
-            Event::Sample(_) | Event::SawTool { .. } => {}
+            Event::Sample(_) | Event::SawTool { .. } | Event::TurnedAway { .. } => {}
         }
     }
 

@@ -20,6 +20,11 @@ pub enum Event {
         /// What happened and what to check.
         reason: String,
     },
+    /// Another client wanted to connect; the bench reads one at a time.
+    TurnedAway {
+        /// Which one, and why.
+        reason: String,
+    },
     /// A tool's position.
     Sample(Sample),
     /// The peer reports a status.
@@ -106,7 +111,10 @@ impl Census {
                     known.clone_from(message_type);
                 }
             }
-            Event::SawTool { .. } | Event::Unreachable { .. } | Event::Disconnected { .. } => {}
+            Event::SawTool { .. }
+            | Event::Unreachable { .. }
+            | Event::TurnedAway { .. }
+            | Event::Disconnected { .. } => {}
         }
     }
 

@@ -2,13 +2,13 @@
 
 use crate::support::peers::serving_peer;
 use crate::support::program::{Said, Scratch, needle_bench};
-use crate::support::programs::{Program, beside_others, free_address};
+use crate::support::programs::{Program, beside_others, free_address, send_signal};
 use needle_bench::emulator::WhiteNoise;
 use needle_bench::tracker::openigtlink::{Body, IgtlStamp, Message};
 use needle_bench::transport::tcp::TransformServer;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpListener;
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
@@ -152,12 +152,9 @@ fn recordings_and_rest_measure_the_same_noise() {
     }
 }
 
-/// The tool touches one point after the other, and the operator types the position of each.
-#[test]
-fn a_registration_is_collected_point_by_point() {
-    let _machine = beside_others();
-    let (server, scratch) = (Server::start(), Scratch::new());
-    let mut collecting = Command::new(env!("CARGO_BIN_EXE_needle-bench"))
+/// `calibrate registration --collect` with this server as its tracker.
+fn collecting(server: &Server, scratch: &Scratch) -> Child {
+    Command::new(env!("CARGO_BIN_EXE_needle-bench"))
         .current_dir(scratch.path())
         .args(["calibrate", "registration", "points.csv", "--collect", "--json"])
         .args(["--set", &format!("tracker.address=\"127.0.0.1:{}\"", server.port)])
@@ -169,7 +166,44 @@ fn a_registration_is_collected_point_by_point() {
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
-        .expect("the program starts");
+        .expect("the program starts")
+}
+
+/// A connection that drops must not leave a registration of half of the points.
+#[test]
+fn an_interrupted_collection_keeps_its_points_and_writes_no_registration() {
+    let _machine = beside_others();
+    let (server, scratch) = (Server::start(), Scratch::new());
+    let mut collecting = collecting(&server, &scratch);
+    let mut operator = collecting.stdin.take().expect("a pipe");
+    let mut screen = BufReader::new(collecting.stderr.take().expect("a pipe")).lines();
+    let mut until = |part: &str| {
+        let mut lines = screen.by_ref().map_while(Result::ok);
+        lines.find(|line| line.contains(part)).unwrap_or_else(|| panic!("no {part:?}"))
+    };
+    for (n, [x, y]) in (1..).zip([[0.0f32, 0.0], [50.0, 0.0], [0.0, 40.0]]) {
+        until(&format!("point {n}: touch it"));
+        *server.at.lock().unwrap() = [x, y, 0.0];
+        std::thread::sleep(Duration::from_millis(300));
+        writeln!(operator, "{x} {y} 0").unwrap();
+        until("taken: ");
+    }
+    until("point 4: touch it");
+    send_signal(collecting.id(), "HUP");
+    until(
+        "interrupted; 3 points are in points.csv: needle-bench calibrate registration points.csv",
+    );
+    assert_eq!(collecting.wait().unwrap().code(), Some(1));
+    let points = std::fs::read_to_string(scratch.path().join("points.csv")).unwrap();
+    assert_eq!(points.lines().count(), 4, "{points}");
+}
+
+/// The tool touches one point after the other, and the operator types the position of each.
+#[test]
+fn a_registration_is_collected_point_by_point() {
+    let _machine = beside_others();
+    let (server, scratch) = (Server::start(), Scratch::new());
+    let mut collecting = collecting(&server, &scratch);
     let mut operator = collecting.stdin.take().expect("a pipe");
     let mut screen = BufReader::new(collecting.stderr.take().expect("a pipe")).lines();
     let mut said = Vec::new();

@@ -14,6 +14,7 @@ use super::output::print_stderr;
 use super::{Failure, Result, io_runtime};
 use crate::config::{Config, TrackerMode, TrackerSection, TrackerSource};
 use crate::runtime::{Clock, Interrupt};
+use crate::session::Resume;
 use crate::text::clipped;
 use crate::tracker::{Census, Event, Sample, Sieve, StreamReplay, csv, ndjson};
 use crate::transport::link::{Link, LinkSettings};
@@ -45,6 +46,17 @@ pub(super) fn tracker(command: &TrackerCommand) -> Result<()> {
     }
 }
 
+fn link_settings(tracker: &TrackerSection, tools: Vec<String>) -> LinkSettings {
+    let default = LinkSettings::default();
+    // A hold that may end leaves time to connect again.
+    let silence_limit = match tracker.hold.resume {
+        Resume::Stop => default.silence_limit,
+        Resume::Automatic | Resume::Operator => default.silence_limit.min(tracker.hold.timeout / 2),
+    };
+    let (protocol, request) = (tracker.to_protocol(), tracker.to_request());
+    LinkSettings { protocol, tools, request, silence_limit, ..default }
+}
+
 /// Opens the stream of `tools`, or of every tool if none is named, in real time.
 pub(super) fn open_tracker(
     config: &Config,
@@ -55,12 +67,7 @@ pub(super) fn open_tracker(
     let tracker = &config.tracker;
     let address = &tracker.address;
     let now = move || clock.now();
-    let settings = LinkSettings {
-        protocol: tracker.to_protocol(),
-        tools,
-        request: tracker.to_request(),
-        ..LinkSettings::default()
-    };
+    let settings = link_settings(tracker, tools);
     let _in_runtime = runtime.enter();
     if let Some(replay) = load_replay(tracker, clock.now())? {
         return Ok(Link::replay(replay, &settings, now));
@@ -213,7 +220,12 @@ impl Listener {
 
     /// True after Ctrl-C or the end of the stream.
     pub(super) fn is_over(&self) -> bool {
-        self.has_ended || self.interrupt.is_raised()
+        self.has_ended || self.is_interrupted()
+    }
+
+    /// True after Ctrl-C or another signal that ends a program.
+    pub(super) fn is_interrupted(&self) -> bool {
+        self.interrupt.is_raised()
     }
 
     pub(super) fn now(&self) -> Time {
@@ -329,5 +341,23 @@ impl Unreadable {
                 clipped(last, ERROR_MAX)
             ));
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_silent_peer_is_given_up_while_a_hold_may_still_end() {
+        let limit_s = |resume: &str, timeout_s: u32| {
+            let sets =
+                [format!("tracker.resume={resume}"), format!("tracker.hold_timeout_s={timeout_s}")];
+            let config = Config::from_sources(&[], &sets).unwrap();
+            link_settings(&config.tracker, Vec::new()).silence_limit.as_secs_f64()
+        };
+        assert_eq!(limit_s("stop", 5), 10.0);
+        assert_eq!([limit_s("automatic", 5), limit_s("operator", 5)], [2.5, 2.5]);
+        assert_eq!(limit_s("automatic", 60), 10.0);
     }
 }

@@ -31,7 +31,7 @@ impl Motion {
             Motion::Hold { at } => at,
             Motion::Linear { end, to, .. } if now >= end => to,
             Motion::Linear { start, end, from, to } => {
-                let part = now.seconds_after(start).max(0.0) / end.seconds_after(start);
+                let part = (now.seconds_after(start) / end.seconds_after(start)).max(0.0);
                 from + (to - from) * part
             }
             Motion::Brake(profile) | Motion::Ramped(profile) => profile.position_at(now),

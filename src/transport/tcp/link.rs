@@ -141,6 +141,7 @@ impl<C: Fn() -> Time> LinkTask<C> {
         }
         let retry = self.settings.retry_first;
         let mut next_client = pin!(accept(listener, retry));
+        let mut is_told = false;
         loop {
             tokio::select! {
                 read = peer.read() => {
@@ -155,11 +156,14 @@ impl<C: Fn() -> Time> LinkTask<C> {
                         *next = Some((stream, newcomer));
                         return reason;
                     }
-                    tracing::warn!(
-                        "tracker: {newcomer} turned away: {} is connected, and one tracker at a \
-                         time is read",
-                        peer.name
-                    );
+                    // Told once: a client may try again many times a second.
+                    if !std::mem::replace(&mut is_told, true) {
+                        let reason = format!(
+                            "tracker: {newcomer} turned away: {} is connected, and one tracker at a time is read",
+                            peer.name
+                        );
+                        self.report(Event::TurnedAway { reason });
+                    }
                     next_client.set(accept(listener, retry));
                 }
             }

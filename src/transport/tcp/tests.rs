@@ -305,6 +305,12 @@ async fn a_client_that_pushes_is_read_and_a_second_is_refused() {
     let mut second = TcpStream::connect(&address).await.expect("listening");
     let closed = timeout(HANGING, second.read(&mut [0; 1])).await.expect("refused");
     assert!(matches!(closed, Ok(0) | Err(_)));
+    let turned_away = |event: &Event| match event {
+        Event::TurnedAway { reason } => Some(reason.clone()),
+        _ => None,
+    };
+    let reason = until(&mut link, turned_away).await;
+    assert!(reason.contains("turned away: 127.0.0.1:"), "{reason}");
     drop(first);
     until(&mut link, disconnected).await;
     let _third = push(&address, &position("Third", 1.0)).await;
