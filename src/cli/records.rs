@@ -223,8 +223,7 @@ impl Insertions {
             let rows = insertion.recording.rows.iter();
             let rows: Vec<_> =
                 rows.map(|row| (row.insertion_meas_mm, row.position_meas_mm)).collect();
-            let checked = insertion.recording.check_steps().and_then(|()| check_recorded(&rows));
-            checked.map_err(|error| Failure::bad_input(path, error))?;
+            check_recorded(&rows).map_err(|error| Failure::bad_input(path, error))?;
             let is_same = |other: &&Insertion| other.recording.is_same(&insertion.recording);
             if let Some(first) = insertions.iter().find(is_same) {
                 let first = first.path.display();

@@ -77,6 +77,42 @@ pub struct Recording {
     pub rows: Vec<RecordedRow>,
 }
 
+/// Refuses a row whose depth or rotation is far from that of the row before: one such value would change the
+/// rows after it as well.
+///
+/// # Errors
+/// The first such row, by its line.
+fn check_steps(rows: &[RecordedRow]) -> Result<(), String> {
+    for (last, row) in rows.iter().zip(&rows[1..]) {
+        for (name, step, max, hint) in [
+            (
+                "insertion_mm",
+                row.insertion_meas_mm - last.insertion_meas_mm,
+                STEP_MAX_MM,
+                "is a digit wrong, or are rows missing?",
+            ),
+            (
+                "rotation_rad",
+                row.rotation_meas_rad - last.rotation_meas_rad,
+                TURN_MAX_RAD,
+                "does it start again after a turn? It must count on",
+            ),
+        ] {
+            if step.abs() > max {
+                let by = match step.abs() < 1e6 {
+                    true => format!("{step:.2}"),
+                    false => format!("{step:e}"),
+                };
+                return Err(format!(
+                    "line {}: {name} changes by {by} from the row before (limit {max}): {hint}",
+                    row.line
+                ));
+            }
+        }
+    }
+    Ok(())
+}
+
 impl Recording {
     /// Reads a recording from CSV text with the columns `insertion_mm,rotation_rad,x_mm,y_mm,z_mm`
     /// and, all four or none, `qw,qx,qy,qz`, in any order.
@@ -98,44 +134,8 @@ impl Recording {
             .collect();
         match rows.is_empty() {
             true => Err("no rows below the header".to_owned()),
-            false => Ok(Recording { rows }),
+            false => check_steps(&rows).map(|()| Recording { rows }),
         }
-    }
-
-    /// Refuses a row whose depth or rotation is far from that of the row before: one such value would change the
-    /// rows after it as well.
-    ///
-    /// # Errors
-    /// The first such row, by its line.
-    pub fn check_steps(&self) -> Result<(), String> {
-        for (last, row) in self.rows.iter().zip(&self.rows[1..]) {
-            for (name, step, max, hint) in [
-                (
-                    "insertion_mm",
-                    row.insertion_meas_mm - last.insertion_meas_mm,
-                    STEP_MAX_MM,
-                    "is a digit wrong, or are rows missing?",
-                ),
-                (
-                    "rotation_rad",
-                    row.rotation_meas_rad - last.rotation_meas_rad,
-                    TURN_MAX_RAD,
-                    "does it start again after a turn? It must count on",
-                ),
-            ] {
-                if step.abs() > max {
-                    let by = match step.abs() < 1e6 {
-                        true => format!("{step:.2}"),
-                        false => format!("{step:e}"),
-                    };
-                    return Err(format!(
-                        "line {}: {name} changes by {by} from the row before (limit {max}): {hint}",
-                        row.line
-                    ));
-                }
-            }
-        }
-        Ok(())
     }
 
     /// Whether the orientations contain the roll; `None` if a row has no orientation, or there is only one. A sensor
@@ -267,7 +267,7 @@ mod tests {
             let text = format!(
                 "insertion_mm,rotation_rad,x_mm,y_mm,z_mm\n0,0,0,0,0\n1,0.5,0,0,1\n{depth_mm},{rotation_rad},0,0,2\n"
             );
-            Recording::parse(&text).unwrap().check_steps()
+            Recording::parse(&text).map(drop)
         };
         assert_eq!(rows(2.0, 1.0), Ok(()));
         assert_eq!(rows(6.0, -5.4), Ok(()));
