@@ -118,7 +118,7 @@ impl Recording {
     /// and, all four or none, `qw,qx,qy,qz`, in any order.
     ///
     /// # Errors
-    /// Those of [`Table`], with the line, and a file without rows.
+    /// Those of [`Table`], a row far from the one before, both with the line, and a file without rows.
     pub fn parse(csv: &str) -> Result<Self, String> {
         let table = Table::parse(csv);
         let numbers = table.numbers(REQUIRED)?;
