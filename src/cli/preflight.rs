@@ -31,6 +31,17 @@ const LISTEN: Duration = Duration::from_secs(2);
 /// Interval at which the question of `run` checks for a signal.
 const SIGNAL_POLL_MS: u8 = 50;
 
+/// The names of the two proofs in their records.
+const PROVE: &str = "prove";
+const PROVE_HANDEDNESS: &str = "prove-handedness";
+
+/// True if this operation proves something that `key` of the configuration changes.
+fn concerns(operation: &str, key: &str) -> bool {
+    let is_one_of = |starts: [&str; 2]| starts.iter().any(|start| key.starts_with(start));
+    is_one_of(["stage.", "can."])
+        || operation == PROVE_HANDEDNESS && is_one_of(["tracker.registration", "tracker.tip_"])
+}
+
 /// The checks, and what was found for them.
 pub(super) struct Preflight {
     pub(super) checks: Vec<Check>,
@@ -63,17 +74,14 @@ impl Preflight {
                         .with(Verdict::Fail, failure.to_string()),
                 ),
             }
-            let tracked = ["tracker.registration", "tracker.tip_"];
-            for (operation, concerns) in [("prove", &[][..]), ("prove-handedness", &tracked)] {
+            for operation in [PROVE, PROVE_HANDEDNESS] {
                 let is_completed_proof = |run: &Manifest| {
                     let is_completed = run.outcome == Some(RunOutcome::Completed);
                     is_completed && run.operation.as_deref() == Some(operation)
                 };
-                let concerns_proof = |key: &str| {
-                    ["stage.", "can."].iter().chain(concerns).any(|start| key.starts_with(start))
-                };
-                let last_proof = earlier_run(rig, is_completed_proof, concerns_proof);
-                let is_of_handedness = operation != "prove";
+                let last_proof =
+                    earlier_run(rig, is_completed_proof, |key| concerns(operation, key));
+                let is_of_handedness = operation == PROVE_HANDEDNESS;
                 checks.push(proof(rig, is_of_handedness, last_proof.as_ref(), now_unix_us));
             }
         }
@@ -258,6 +266,19 @@ fn listen_to_tracker(config: &Config, listen: Duration) -> Result<Option<Tracker
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::stage::Motion;
+
+    #[test]
+    fn a_proof_concerns_the_keys_that_could_make_it_wrong() {
+        for (words, name) in [("prove", PROVE), ("prove --handedness", PROVE_HANDEDNESS)] {
+            assert_eq!(Motion::of(words).unwrap().name(), name);
+            assert!(concerns(name, "stage.rotation.sign") && concerns(name, "can.sync_ms"));
+            assert!(!concerns(name, "insertion.depth_mm") && !concerns(name, "tracker.address"));
+        }
+        for key in ["tracker.registration.x_mm", "tracker.tip_offset_mm"] {
+            assert!(concerns(PROVE_HANDEDNESS, key) && !concerns(PROVE, key), "{key}");
+        }
+    }
 
     /// Ctrl-C during the checks may be the reason why some of them failed.
     #[test]

@@ -83,8 +83,7 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
             let found = fit.map(|fit| format!("{:.2} mm RMS", fit.rms_mm)).unwrap_or_default();
             let provenance = fit.map(|fit| &fit.provenance);
             let rms_mm = fit.map_or(0.0, |fit| fit.rms_mm);
-            let old =
-                "its file has no fiducials, so its sd_mm is of the depth and plane of that time";
+            let old = "its file has no fiducials to compute its error from: sd_mm is of the depth and plane of that time";
             close(dated("registration", found, &limit, provenance, &collect), rms_mm).unless(
                 fit.is_none() || of_fiducials.is_some(),
                 Warn,

@@ -226,7 +226,7 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
 
     let blind_mm = hold.after_mm.min(hold.after.as_secs_f64() * config.insertion.speed_mm_per_s);
     let blind = Check::new(
-        "without a tip",
+        "depth without a tip",
         format!("up to {blind_mm:.1} mm inserted"),
         format!("up to {BLIND_MAX_MM:.1} mm"),
     );
@@ -237,9 +237,11 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     let noise_mm = report.noise_sd_mm;
     let gate_mm = config.tracker.to_track().noise_sd_mm;
     let [noise_min_mm, noise_max_mm] = [NOISE_MIN, NOISE_MAX].map(|ratio| ratio * gate_mm);
+    // A short rest shows little of a correlated noise.
+    let noise_min_mm = if config.tracker.noise.is_some() { 0.0 } else { noise_min_mm };
     let found = noise_mm.map_or_else(|| "not measured".to_owned(), |mm| format!("{mm:.3} mm"));
     let limit = format!(
-        "{noise_min_mm:.3} to {noise_max_mm:.3}, {NOISE_MIN} to {NOISE_MAX} times tracker.gates.noise_sd_mm"
+        "{noise_min_mm:.3} to {noise_max_mm:.3}, at most {NOISE_MAX} times tracker.gates.noise_sd_mm"
     );
     let longer = format!(
         "listen for at least {POSITIONS_MIN} positions: check CONFIG --connect --listen 10"

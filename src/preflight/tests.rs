@@ -355,6 +355,9 @@ fn wide_gates_are_warned_about() {
     let fine = "tracker.gates.noise_sd_mm=0.1";
     assert_eq!(of(&[fine]), "PPPPPW");
     assert_eq!(of(&["tracker.gates.noise_sd_mm=100.0"]), "PPPWPW");
+    let noise =
+        "tracker.noise={ white_sd_mm = 0.05, correlated_sd_mm = 5.0, correlation_time_s = 5.0 }";
+    assert_eq!(of(&[noise]), "PPPPPW");
     // Half a second at 1 mm/s is less than 100 mm.
     assert_eq!(of(&[fine, "tracker.hold_after_mm=100.0"]), "PPPPPW");
     assert_eq!(of(&[fine, "tracker.hold_after_mm=100.0", "tracker.hold_after_s=60.0"]), "PPWPPW");

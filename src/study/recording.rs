@@ -22,9 +22,9 @@ const FOLLOWED_MAX: f64 = 1.8;
 /// roll of 5 deg.
 const FOLLOWED_MIN_RAD: f64 = 0.12;
 
-/// Largest change of the depth, mm, and of the base's rotation, rad, from one row to the next: less than a turn, so
-/// that an angle that starts again is noticed.
-const STEP_MAX_MM: f64 = 5.0;
+/// Largest change of the depth, mm, and of the base's rotation, rad, from one row to the next: over the largest
+/// `insertion.step_mm`, and less than a turn, so that an angle that starts again is noticed.
+const STEP_MAX_MM: f64 = 12.0;
 const TURN_MAX_RAD: f64 = 6.0;
 
 /// One row of a recording, in the recording's own frame.
@@ -271,7 +271,7 @@ mod tests {
         };
         assert_eq!(rows(2.0, 1.0), Ok(()));
         assert_eq!(rows(6.0, -5.4), Ok(()));
-        let spike = "line 4: insertion_mm changes by 19.00 from the row before (limit 5): is a digit wrong, or are rows \
+        let spike = "line 4: insertion_mm changes by 19.00 from the row before (limit 12): is a digit wrong, or are rows \
                      missing?";
         assert_eq!(rows(20.0, 1.0), Err(spike.to_owned()));
         let turned = "line 4: rotation_rad changes by 6.28 from the row before (limit 6): does it start again after a \

@@ -173,15 +173,19 @@ impl TravelCheck {
 
     /// Checks every stretch that ends with the newest bin, the shortest first.
     fn check_stretches(&mut self) {
-        let count_max = CROWDED * self.usual_count();
         let mut sums = Sums::default();
-        for (bins, bin) in (1..).zip(self.bins.iter().rev()) {
-            sums += if bin.count > count_max { *bin * (count_max / bin.count) } else { *bin };
-            if STRETCHES.contains(&bins) {
-                let error = self.contradiction(&sums, bins);
-                self.error = self.error.take().or(error);
-            }
-        }
+        let error = (1..).zip(self.weighed_bins()).find_map(|(bins, bin)| {
+            sums += bin;
+            STRETCHES.contains(&bins).then(|| self.contradiction(&sums, bins))?
+        });
+        self.error = self.error.take().or(error);
+    }
+
+    /// The bins, the newest first, none with more weight than [`CROWDED`] allows.
+    fn weighed_bins(&self) -> impl Iterator<Item = Sums> {
+        let count_max = CROWDED * self.usual_count();
+        let limited = move |bin: &Sums| *bin * (count_max / bin.count).min(1.0);
+        self.bins.iter().rev().map(move |bin| if bin.count > 0.0 { limited(bin) } else { *bin })
     }
 
     /// Adds the likely cause to a refusal that loses the track: a frozen stream or too small a scale if the
@@ -189,7 +193,7 @@ impl TravelCheck {
     pub fn explain(&self, mut refusal: Refusal) -> Refusal {
         if refusal.effect == Effect::Loses {
             let mut sums = Sums::default();
-            self.bins.iter().rev().take(EXPLAINED_BINS).for_each(|bin| sums += *bin);
+            self.weighed_bins().take(EXPLAINED_BINS).for_each(|bin| sums += bin);
             refusal.why += &match self.change_over(EXPLAINED_BINS, SLOWER) {
                 _ if sums.is_in_metres() => format!(": {IN_METRES}"),
                 Some(change) => format!(": {change}"),
@@ -201,8 +205,7 @@ impl TravelCheck {
 
     /// The change to a scale in this range that fits the last `bins` bins, if any does.
     fn change_over(&self, bins: usize, tenths: Tenths) -> Option<ScaleChange> {
-        let bins = self.bins.iter().rev().take(bins);
-        ScaleChange::fitted(bins, tenths, self.noise_sd_mm.powi(2))
+        ScaleChange::fitted(self.weighed_bins().take(bins), tenths, self.noise_sd_mm.powi(2))
     }
 
     /// How the positions over the last `bins` bins, with these sums, contradict the insertion, if they do.

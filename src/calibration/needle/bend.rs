@@ -18,8 +18,8 @@ const HEADING_SD_RAD: f64 = 0.1;
 const ROLL_SD_RAD: f64 = 1e-3;
 const BEND_SD_RAD_PER_MM: f64 = 0.02;
 const SLIP_SD: f64 = 0.2;
-/// Largest standard error of the bend's axis about the shaft's, deg. Three insertions of a real needle have up to 3, but
-/// positions with two axes exchanged or one mirrored over 15.
+/// Largest standard error of the bend's axis about the shaft's, deg. Three insertions of a real needle have up to 3,
+/// positions with two axes exchanged or one mirrored have over 15.
 const AXIS_SD_MAX_DEG: f64 = 10.0;
 /// Passes over all insertions, each linearised about the result of the last one.
 const PASSES: usize = 3;
@@ -201,7 +201,8 @@ impl BendFit {
             false => Err(no_bend()),
             true if axis_sd_deg > AXIS_SD_MAX_DEG => Err(needle_error(format!(
                 "the bend's axis has a standard error of {axis_sd_deg:.0} deg (limit {AXIS_SD_MAX_DEG:.0}): are \
-                 positions and orientations in one frame, and is no axis mirrored or exchanged with another?"
+                 positions and orientations in one frame, and is no axis mirrored or exchanged with another? \
+                 Else record more or deeper insertions"
             ))),
             true => Ok(fit),
         }

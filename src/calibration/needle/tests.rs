@@ -140,7 +140,6 @@ fn insertions_that_determine_no_needle_are_refused() {
     assert!(message(&rows).contains("turn the base both ways"), "{}", message(&rows));
 }
 
-/// Each insertion has one residual from the mean.
 /// As from a source that names its axes otherwise for positions than for orientations.
 #[test]
 fn positions_with_exchanged_or_mirrored_axes_are_refused() {
@@ -156,6 +155,7 @@ fn positions_with_exchanged_or_mirrored_axes_are_refused() {
     }
 }
 
+/// Each insertion has one residual from the mean.
 #[test]
 fn the_jackknife_covariance_of_a_mean_is_its_standard_error() {
     let values = [1.0, 2.0, 4.0, 9.0];

@@ -173,8 +173,8 @@ fn angles_json(rotation: &Rotation3<f64>) -> Value {
     })
 }
 
-/// The tip's roll is usually no farther than this off the fitted torsion, RMS, deg: 7 with recorded insertions of a real
-/// needle.
+/// The tip's roll is usually no farther than this off the fitted torsion, RMS, deg: up to 7 in recorded insertions of
+/// a real needle.
 const ROLL_RMS_USUAL_DEG: f64 = 12.0;
 
 /// Curvature, bevel zero, sensor tilt and torsion from insertions.

@@ -86,10 +86,11 @@ pub(super) fn collect_fiducials(path: &Path, configured: &Configured) -> Result<
             }
         }
     }
-    if text != header && listener.is_interrupted() {
+    if text != header && listener.is_over() {
         let (points, file) = (text.lines().count() - 1, path.display());
         let message = format!(
-            "interrupted; {points} points are in {file}: needle-bench calibrate registration {file} uses them"
+            "interrupted, or the tracker's stream has ended; {points} points are in {file}: needle-bench calibrate \
+             registration {file} uses them"
         );
         return Err(Failure { message: Some(message), status: STOPPED });
     }

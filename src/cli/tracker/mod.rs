@@ -14,7 +14,7 @@ use super::output::print_stderr;
 use super::{Failure, Result, io_runtime};
 use crate::config::{Config, TrackerMode, TrackerSection, TrackerSource};
 use crate::runtime::{Clock, Interrupt};
-use crate::session::Resume;
+use crate::session::{HoldConfig, Resume};
 use crate::text::clipped;
 use crate::tracker::{Census, Event, Sample, Sieve, StreamReplay, csv, ndjson};
 use crate::transport::link::{Link, LinkSettings};
@@ -46,12 +46,17 @@ pub(super) fn tracker(command: &TrackerCommand) -> Result<()> {
     }
 }
 
+/// A peer that is silent for less long is not given up: a slow tracker may pause.
+const SILENCE_MIN: Duration = Duration::from_secs(1);
+
 fn link_settings(tracker: &TrackerSection, tools: Vec<String>) -> LinkSettings {
     let default = LinkSettings::default();
-    // A hold that may end leaves time to connect again.
-    let silence_limit = match tracker.hold.resume {
+    let HoldConfig { after, timeout, resume, .. } = tracker.hold;
+    // In a hold that may end, half of the time is left to connect again.
+    let in_a_hold = (after + timeout / 2).max(SILENCE_MIN);
+    let silence_limit = match resume {
         Resume::Stop => default.silence_limit,
-        Resume::Automatic | Resume::Operator => default.silence_limit.min(tracker.hold.timeout / 2),
+        Resume::Automatic | Resume::Operator => default.silence_limit.min(in_a_hold),
     };
     let (protocol, request) = (tracker.to_protocol(), tracker.to_request());
     LinkSettings { protocol, tools, request, silence_limit, ..default }
@@ -220,12 +225,7 @@ impl Listener {
 
     /// True after Ctrl-C or the end of the stream.
     pub(super) fn is_over(&self) -> bool {
-        self.has_ended || self.is_interrupted()
-    }
-
-    /// True after Ctrl-C or another signal that ends a program.
-    pub(super) fn is_interrupted(&self) -> bool {
-        self.interrupt.is_raised()
+        self.has_ended || self.interrupt.is_raised()
     }
 
     pub(super) fn now(&self) -> Time {
@@ -350,14 +350,14 @@ mod tests {
 
     #[test]
     fn a_silent_peer_is_given_up_while_a_hold_may_still_end() {
-        let limit_s = |resume: &str, timeout_s: u32| {
+        let limit_s = |resume: &str, timeout_s: f64| {
             let sets =
                 [format!("tracker.resume={resume}"), format!("tracker.hold_timeout_s={timeout_s}")];
             let config = Config::from_sources(&[], &sets).unwrap();
             link_settings(&config.tracker, Vec::new()).silence_limit.as_secs_f64()
         };
-        assert_eq!(limit_s("stop", 5), 10.0);
-        assert_eq!([limit_s("automatic", 5), limit_s("operator", 5)], [2.5, 2.5]);
-        assert_eq!(limit_s("automatic", 60), 10.0);
+        assert_eq!(limit_s("stop", 5.0), 10.0);
+        assert_eq!([limit_s("automatic", 5.0), limit_s("operator", 5.0)], [3.0, 3.0]);
+        assert_eq!([limit_s("automatic", 60.0), limit_s("automatic", 0.3)], [10.0, 1.0]);
     }
 }

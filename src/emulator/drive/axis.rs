@@ -229,8 +229,8 @@ impl Axis {
         Mode(objects.integer(object::MODES_OF_OPERATION) as i8)
     }
 
-    /// Stops an axis that moves onto a limit switch that is closed at `counts`: an EPOS4 faults, others make a quick stop.
-    /// Homing may move onto the switch that it seeks.
+    /// Stops an axis that moves onto a limit switch that is closed at `counts`: an EPOS4 faults, others make a quick
+    /// stop. Homing may move onto the switch that it seeks.
     fn check_switches(&mut self, now: Time, counts: i64, device: &mut Device) {
         let Some(end) = self.heading(now) else { return };
         if self.state != DriveState::OperationEnabled || !self.inputs.is_closed(end, counts) {

@@ -136,6 +136,8 @@ mod tests {
         assert_eq!(motion.position_at(at_ms(10)), 1e9 + 1.0);
         assert_eq!(motion.position_at(at_ms(99)), 1e9 + 1.0);
         assert_eq!(motion.velocity_at(at_ms(11)), 0.0);
+        let at_once = Motion::linear(at_ms(5), 1.0, 2.0, Duration::ZERO);
+        assert_eq!([at_once.position_at(at_ms(4)), at_once.position_at(at_ms(5))], [1.0, 2.0]);
     }
 
     #[test]

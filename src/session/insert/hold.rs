@@ -97,7 +97,10 @@ impl InsertTask {
         let is_standing = insertion.is_standing(insertion_meas_mm);
         let may_go_on = is_standing && found.is_none() && self.is_seen(now);
         if may_go_on && tracker.hold.resume == Resume::Operator && !is_told {
-            let text = format!("the {lost} is seen again; held until the operator resumes");
+            let held = now.since(hold.since) + hold.before;
+            let left_s = tracker.hold.timeout.saturating_sub(held).as_secs_f64();
+            let text =
+                format!("the {lost} is seen again; resume within {left_s:.1} s, or the run ends");
             shell.report_at(now, Lane::Tracker, Severity::Info, text);
             if let Some(Hold { by: HeldBy::Tracker { is_told, .. }, .. }) = &mut self.hold {
                 *is_told = true;

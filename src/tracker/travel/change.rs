@@ -37,8 +37,8 @@ impl fmt::Display for ScaleChange {
 impl ScaleChange {
     /// The change to a scale of `tenths` that fits the positions of these bins best, newest bin first, with
     /// noise of this variance in each coordinate, mm²; `None` if a stream without a change fits as well.
-    pub(super) fn fitted<'a>(
-        bins: impl Iterator<Item = &'a Sums>,
+    pub(super) fn fitted(
+        bins: impl Iterator<Item = Sums>,
         tenths: Tenths,
         variance_mm2: f64,
     ) -> Option<Self> {
@@ -46,7 +46,7 @@ impl ScaleChange {
         let mut after = vec![Sums::default()];
         for bin in bins {
             let mut sums = after[after.len() - 1];
-            sums += *bin;
+            sums += bin;
             after.push(sums);
         }
         let all = *after.last()?;
@@ -116,7 +116,7 @@ mod tests {
             }
             sum
         });
-        ScaleChange::fitted(bins.collect::<Vec<_>>().iter(), tenths, 0.01)
+        ScaleChange::fitted(bins, tenths, 0.01)
     }
 
     #[test]
@@ -133,8 +133,8 @@ mod tests {
 
     #[test]
     fn without_positions_no_change_is_found() {
-        assert_eq!(ScaleChange::fitted([].iter(), SLOWER, 0.36), None);
-        assert_eq!(ScaleChange::fitted([Sums::default()].iter(), SLOWER, 0.36), None);
+        assert_eq!(ScaleChange::fitted([].into_iter(), SLOWER, 0.36), None);
+        assert_eq!(ScaleChange::fitted([Sums::default()].into_iter(), SLOWER, 0.36), None);
     }
 
     #[test]
