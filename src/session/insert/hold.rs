@@ -50,7 +50,7 @@ enum HeldBy {
         lost: &'static str,
         /// The hold interrupted a single step, which never goes on by itself.
         in_step: bool,
-        /// The operator was told that the insertion may go on.
+        /// What the operator was told last: that the insertion may go on, or not.
         is_told: bool,
     },
     Operator,
@@ -96,14 +96,18 @@ impl InsertTask {
         let tracker = &self.config.tracker;
         let is_standing = insertion.is_standing(insertion_meas_mm);
         let may_go_on = is_standing && found.is_none() && self.is_seen(now);
-        if may_go_on && tracker.hold.resume == Resume::Operator && !is_told {
+        if tracker.hold.resume == Resume::Operator && may_go_on != *is_told {
             let held = now.since(hold.since) + hold.before;
             let left_s = tracker.hold.timeout.saturating_sub(held).as_secs_f64();
-            let text =
-                format!("the {lost} is seen again; resume within {left_s:.1} s, or the run ends");
+            let text = match may_go_on {
+                true => format!(
+                    "the {lost} is seen again; resume within {left_s:.1} s, or the run ends"
+                ),
+                false => format!("the {lost} is lost again; {left_s:.1} s are left"),
+            };
             shell.report_at(now, Lane::Tracker, Severity::Info, text);
             if let Some(Hold { by: HeldBy::Tracker { is_told, .. }, .. }) = &mut self.hold {
-                *is_told = true;
+                *is_told = may_go_on;
             }
             return Ok(());
         }

@@ -151,9 +151,16 @@ fn a_hold_by_the_tracker_is_ended_by_the_operator_or_by_its_timeout() {
         if asks {
             assert!(ask(&mut bench, Resume).starts_with("operator: resume at "));
         }
+        if !asks {
+            bench.lose(is_tracker);
+            bench.run_for(SECOND);
+            bench.spoil(Fate::Arrives);
+            bench.run_for(SECOND / 2);
+        }
         bench.run_to_end();
-        let told = bench.events().filter(|text| text.starts_with(SEEN_AGAIN)).count();
-        assert_eq!(told, 1);
+        let told = |start: &str| bench.events().filter(|text| text.starts_with(start)).count();
+        let again = usize::from(!asks);
+        assert_eq!([told(SEEN_AGAIN), told("the tip is lost again; ")], [1 + again, again]);
         assert_eq!(bench.completed(), asks, "{}", bench.reason());
         let nobody = "tracker: the tip is seen again, but the operator did not resume \
                       (tracker.hold_timeout_s); held for 5.0 s and stopped";
