@@ -263,6 +263,25 @@ fn a_closed_terminal_stops_the_run() {
     stage.assert_it_stands();
 }
 
+/// Without the console, too, and although the last lines have nowhere to go.
+#[test]
+fn a_run_whose_terminal_is_closed_ends_as_stopped() {
+    let _machine = beside_others();
+    let scratch = Scratch::new("terminal-gone");
+    let stage = Stage::start(&[]);
+    let terminal = nix::pty::openpty(None, None).unwrap();
+    let end = || terminal.slave.try_clone().unwrap();
+    let mut bench = scratch.command(&[], &stage.settings(&["insertion.depth_mm=100", FAR]));
+    let mut bench = bench.stdin(end()).stdout(end()).stderr(end()).spawn().unwrap();
+    scratch.wait_for_event("inserting");
+    drop(terminal);
+    send_signal(bench.id(), "HUP");
+    assert_eq!(bench.wait().unwrap().code(), Some(1));
+    let manifest = programs::manifest(&scratch.run_dir());
+    assert_eq!(manifest["stop_reason"], "operator: interrupted");
+    stage.assert_it_stands();
+}
+
 /// A tmux server of its own, which ends with the test.
 struct Tmux {
     socket: String,
