@@ -7,7 +7,7 @@ use crate::canopen::cia402::DriveState;
 use crate::config::{Config, GoalKind, OnFailure};
 use crate::runtime::RunReport;
 use crate::session::{Outcome, StageAtEnd};
-use crate::stage::{Axis, DriveReport};
+use crate::stage::{Axis, DriveReport, Reference};
 use crate::study::{OFF_PLANE_LIMIT_MM, PlanStatus};
 use crate::text::{fixed, shell_word};
 use derive_more::Display;
@@ -107,11 +107,20 @@ pub(super) fn after_insertion(
     let depth_mm = depth_mm(config, report);
     let next = match (required(config, &report.stage_at_end), possible_withdrawal(config, report)) {
         (Some(required), _) => next_stage(&required.to_string(), "", path, report),
-        (None, Err(_)) if depth_mm.is_none() => next_stage("status", "", path, report),
+        (None, Err(_)) if depth_mm.is_none() => match unhomed_withdrawal(config, report) {
+            Some(options) => next_stage("withdraw", &options, path, report),
+            None => next_stage("status", "", path, report),
+        },
         (None, Err(_)) => next_review(report)?,
         (None, Ok(withdrawal)) => next_stage("withdraw", &withdrawal.options(), path, report),
     };
-    let needle = needle_at(config, depth_mm);
+    let needle = match depth_mm {
+        None => format!(
+            "its depth is not known, this run inserted {:.1} mm",
+            report.figures.report().insertion_mm
+        ),
+        Some(mm) => needle_at(config, mm),
+    };
     Some(format!("needle      {needle}; {}\n{next}", drives(&report.stage_at_end)))
 }
 
@@ -123,13 +132,21 @@ fn depth_mm(config: &Config, report: &RunReport) -> Option<f64> {
     (depth_mm >= least_mm - config.insertion.arrival_mm).then_some(depth_mm)
 }
 
+/// The options of the `stage withdraw` after a run whose drive has lost its home, by a restart.
+fn unhomed_withdrawal(config: &Config, report: &RunReport) -> Option<String> {
+    let is_lost = config.stage.insertion.reference == Reference::Homing
+        && report.stage_at_end.position.is_some();
+    let inserted_mm = report.figures.report().insertion_mm;
+    (is_lost && inserted_mm >= BY_ROUNDING_MM)
+        .then(|| format!(" --by {inserted_mm:.1}mm --unhomed"))
+}
+
 /// Where the needle is. An axis without a configured zero knows only its travel in the run.
-fn needle_at(config: &Config, depth_mm: Option<f64>) -> String {
-    match (depth_mm, config.stage.insertion.zero) {
-        (None, _) => "its depth is not known".to_owned(),
-        (Some(mm), None) => format!("{mm:.1} mm in from where the run began"),
-        (Some(mm), Some(_)) if mm <= config.insertion.arrival_mm => format!("out, at {mm:.2} mm"),
-        (Some(mm), Some(_)) => format!("{mm:.1} mm in"),
+fn needle_at(config: &Config, depth_mm: f64) -> String {
+    match config.stage.insertion.zero {
+        None => format!("{depth_mm:.1} mm in from where the run began"),
+        Some(_) if depth_mm <= config.insertion.arrival_mm => format!("out, at {depth_mm:.2} mm"),
+        Some(_) => format!("{depth_mm:.1} mm in"),
     }
 }
 
@@ -295,7 +312,7 @@ pub(super) fn possible_withdrawal(
         return Err("the needle's depth is not known; look at the stage".to_owned());
     };
     if depth_mm <= config.insertion.arrival_mm {
-        return Err(format!("the needle is {}", needle_at(config, Some(depth_mm))));
+        return Err(format!("the needle is {}", needle_at(config, depth_mm)));
     }
     match required(config, &report.stage_at_end) {
         None => Ok(Withdrawal::from_depth(config, depth_mm)),

@@ -26,8 +26,13 @@ use nalgebra::Vector3;
 /// An operation of the stage.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Operation {
-    /// Home these axes, one after the other.
-    Home(PerAxis<bool>),
+    /// Home axes, one after the other.
+    Home {
+        /// These.
+        axes: PerAxis<bool>,
+        /// Even if an axis is homed already and stands away from home.
+        again: bool,
+    },
     /// Move one axis; the other is held.
     Move(Move),
     /// Hold both axes and stop the bench's heartbeat; SYNC and set-points go on. Both drives must notice.
@@ -50,12 +55,14 @@ pub struct AnswerSettings {
 }
 
 impl Operation {
-    /// Homes the axis `only`, or, for `None`, every axis of `config` that can be homed.
-    pub fn home(config: &StageConfig, only: Option<Axis>) -> Self {
-        Operation::Home(PerAxis::from_fn(|axis| match only {
+    /// Homes the axis `only`, or, for `None`, every axis of `config` that can be homed; `again` even one that is homed
+    /// already and stands away from home.
+    pub fn home(config: &StageConfig, only: Option<Axis>, again: bool) -> Self {
+        let axes = PerAxis::from_fn(|axis| match only {
             Some(only) => axis == only,
             None => config.axis(axis).homing.is_some(),
-        }))
+        });
+        Operation::Home { axes, again }
     }
 
     /// Whether the operation needs a tracker.
@@ -81,13 +88,13 @@ impl RunConfig {
             RunConfig::Operation(config, operation) => (config, operation),
         };
         let purpose = PerAxis::from_fn(|axis| match &operation {
-            Operation::Home(axes) if axes[axis] => AxisUse::Home,
+            Operation::Home { axes, again } if axes[axis] => AxisUse::Home { again: *again },
             Operation::Move(request) if request.axis == axis => AxisUse::Move,
-            Operation::Home(_) | Operation::Move(_) => AxisUse::Hold,
+            Operation::Home { .. } | Operation::Move(_) => AxisUse::Hold,
             Operation::Prove | Operation::Answer(_) => AxisUse::Steer,
         });
         let task: Box<dyn Task> = match operation {
-            Operation::Home(axes) => Box::new(Homing::new(axes)),
+            Operation::Home { axes, .. } => Box::new(Homing::new(axes)),
             Operation::Move(request) => Box::new(MoveOneAxis::new(request)),
             Operation::Prove => Box::new(Prove::default()),
             Operation::Answer(settings) => Box::new(Answering::new(*settings)),

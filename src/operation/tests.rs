@@ -325,7 +325,7 @@ fn homing_finds_the_switch_and_ends_without_power() {
         "stage.insertion.homing.acceleration_mm_per_s2=10.0",
     ]);
     let stage = config.to_stage().unwrap();
-    let mut bench = Bench::new(&config, Operation::home(&stage, None));
+    let mut bench = Bench::new(&config, Operation::home(&stage, None, false));
     assert_eq!(bench.run(), Outcome::Completed);
     let (insertion_mm, rotation_rad) = bench.travel();
     assert!((insertion_mm + 1.8).abs() < 1e-3, "{insertion_mm}");
@@ -441,7 +441,7 @@ fn a_home_outside_the_axis_limits_is_an_error() {
     bench.stage.handle_frame(bench.now, &left);
     drives.stage.rotation.homing = None;
     let stage = drives.to_stage().unwrap();
-    let operation = Operation::home(&stage, None);
+    let operation = Operation::home(&stage, None, false);
     let operation = RunConfig::Operation(Box::new(stage), operation).begin(bench.now);
     let mut bench = Bench { operation, ..bench };
     let reason = bench.reason();
@@ -463,7 +463,7 @@ fn a_home_on_the_limit_is_inside_it() {
         "stage.insertion.min_mm=-1",
     ]);
     let stage = config.to_stage().unwrap();
-    let mut bench = Bench::new(&config, Operation::home(&stage, None));
+    let mut bench = Bench::new(&config, Operation::home(&stage, None, false));
     assert_eq!(bench.run(), Outcome::Completed);
     let home_mm = bench.operation.moves()[0].to;
     assert!(home_mm < -1.0 && home_mm > -1.001, "{home_mm}");

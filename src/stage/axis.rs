@@ -89,6 +89,9 @@ pub enum AxisUse {
     Move,
     /// It is held while the other axis is homed or moved.
     Hold,
-    /// It is homed.
-    Home,
+    /// It is homed. If it is homed already and stands away from home, only `again` homes it.
+    Home {
+        /// Even then.
+        again: bool,
+    },
 }

@@ -78,6 +78,8 @@ pub(super) struct BringUpState {
     pub(super) statusword: Option<Statusword>,
     /// The fault that the drive was in when its statusword was read.
     pub(super) found_in_fault: Option<FoundFault>,
+    /// The drive's position when it is at home, counts: minus its home offset, if it is to be homed and has one.
+    pub(super) home_counts: Option<i32>,
 }
 
 impl BringUp {
@@ -110,7 +112,7 @@ impl BringUp {
     }
 
     pub(super) fn state(&self) -> BringUpState {
-        self.script.state.get()
+        self.script.state()
     }
 }
 
@@ -146,6 +148,10 @@ pub(super) struct Script {
 impl Script {
     pub(super) fn drive(&self) -> &AxisConfig {
         self.config.axis(self.axis)
+    }
+
+    pub(super) fn state(&self) -> BringUpState {
+        self.state.get()
     }
 
     pub(super) fn note(&self, change: impl FnOnce(&mut BringUpState)) {

@@ -6,6 +6,7 @@ use super::answers::Answers;
 use super::bring_up::BringUpState;
 use super::cycle::Reading;
 use super::event::{DriveReport, may_have_power};
+use super::homing::is_at_home;
 use super::standstill::Standstill;
 use super::{Axis, AxisConfig, AxisUse, Commanded, DriveFlag, LimitCheck, StageConfig, Unwrapper};
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
@@ -78,6 +79,8 @@ pub(super) struct Drive {
     held_syncs: u32,
     held_syncs_max: u32,
     pub(super) reading: Reading,
+    /// Its position at home, counts, if it is to be homed and that is known.
+    home_counts: Option<i32>,
     /// How far its bring-up had come, if that was abandoned.
     pub(super) abandoned: BringUpState,
     /// It has restarted since its bring-up.
@@ -119,6 +122,7 @@ impl Drive {
             held_syncs: 0,
             held_syncs_max: config.bus.missed_feedback_max.max(1).into(),
             reading: Reading::begun(Time::ZERO),
+            home_counts: None,
             abandoned: BringUpState::default(),
             restarted: false,
             emcy: (None, 0),
@@ -129,11 +133,20 @@ impl Drive {
 
     /// True in homing mode: the drive follows no target, and its position is not known.
     pub(super) fn in_homing_mode(&self) -> bool {
-        self.purpose == AxisUse::Home
+        matches!(self.purpose, AxisUse::Home { .. })
+    }
+
+    /// Begins where the bring-up has found the axis.
+    pub(super) fn take_bring_up(&mut self, position: i32, state: BringUpState) {
+        self.seed(position);
+        self.home_counts = state.home_counts;
+        if let Some(fault) = state.found_in_fault {
+            self.allow_reset(fault.error_code);
+        }
     }
 
     /// Makes `position`, where the axis stands, its target.
-    pub(super) fn seed(&mut self, position: i32) {
+    fn seed(&mut self, position: i32) {
         self.position = Unwrapper::new(position);
         self.commanded = Commanded { counts: position.into(), step_counts: 0 };
     }
@@ -218,7 +231,7 @@ impl Drive {
     }
 
     /// Allows one reset, of the fault with this code that the drive was found in.
-    pub(super) fn allow_reset(&mut self, error_code: Option<EmcyCode>) {
+    fn allow_reset(&mut self, error_code: Option<EmcyCode>) {
         self.reset = FaultReset::Due(error_code);
     }
 
@@ -355,6 +368,15 @@ impl Drive {
         let scale = self.config.scale(self.axis, self.commanded.counts);
         LimitCheck::new(self.axis, scale, limits, self.sync_period, wraps)
             .with_quick_stop(quick_stop_deceleration)
+    }
+
+    /// Where the axis reads and where its home is, mm or rad, if it is not there; `None` also if that is not known.
+    pub(super) fn off_home(&self) -> Option<(f64, f64)> {
+        let scale = self.config.scale(self.axis, 0);
+        // The low 32 bits of the unwrapped position are the last reading.
+        let here = i64::from(self.position.counts() as i32);
+        let [here, home] = [here, self.home_counts?.into()].map(|counts| scale.value(counts));
+        (!is_at_home(self.axis, here - home)).then_some((here, home))
     }
 
     /// Begins anew at the drive's last reading after homing, which has changed the drive's zero. Returns the

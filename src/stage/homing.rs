@@ -7,6 +7,7 @@ use super::{Axis, Stage, StageEvent};
 use crate::canopen::cia402::{Controlword, Statusword};
 use crate::keys::{Rule, choice, over, section, within};
 use crate::units::Time;
+use std::f64::consts::PI;
 use std::time::Duration;
 
 choice! {
@@ -70,6 +71,12 @@ impl HomingConfig {
 /// were never seen to clear: some methods take no time at all, and no drive takes this long to begin.
 const BEGUN_AFTER: Duration = Duration::from_secs(1);
 
+/// How far an axis may stand from its home, mm or rad, and still count as being there: a drive stops a little past the
+/// switch or index at which home is.
+const HOME_TOLERANCE: [f64; 2] = [1.0, 5.0 * PI / 180.0];
+/// A drive that says that it is home gives its position from there by this time.
+const POSITION_DELAY: Duration = Duration::from_secs(1);
+
 /// A homing under way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Homing {
@@ -79,6 +86,8 @@ pub(super) struct Homing {
     started: Time,
     /// The homing bits of the statusword belong to this homing, not to an earlier one.
     bits_are_valid: bool,
+    /// When the drive first said that it is home.
+    attained: Option<Time>,
     give_up: Time,
 }
 
@@ -100,6 +109,7 @@ impl Stage {
             first_sync: self.sync_count + 1,
             started: now,
             bits_are_valid: false,
+            attained: None,
             give_up: now + config.timeout,
         });
         Ok(())
@@ -131,20 +141,37 @@ impl Stage {
         let has_ended = has_failed || statusword.has(Statusword::HOMING_ATTAINED);
         let must_have_begun = now.since(started) >= BEGUN_AFTER && self.drives[axis].stands();
         homing.bits_are_valid |= !has_ended || must_have_begun;
+        let is_home = homing.bits_are_valid && is_home(statusword);
+        homing.attained = homing.attained.or(is_home.then_some(now));
         self.phase = Phase::Homing(homing);
+        let off = self.drives[axis].off_home();
         if homing.bits_are_valid && has_failed {
             let fault = format!(
                 "{axis}: homing failed (statusword {statusword}); check switches, method (0x6098) and \
                  speeds"
             );
             self.fail(now, fault);
-        } else if homing.bits_are_valid && is_home(statusword) {
+        } else if let Some((here, home)) = off.filter(|_| is_home) {
+            if homing.attained.is_some_and(|attained| now.since(attained) >= POSITION_DELAY) {
+                let [here, home] = [here, home].map(|at| axis.shown(at));
+                let fault = format!(
+                    "{axis}: the drive says that it is home, but reads {here} where home is {home} by its home \
+                     offset (0x607C): it did not move, or counts the offset otherwise; set zero instead"
+                );
+                self.fail(now, fault);
+            }
+        } else if is_home {
             self.drives[axis].controlword = Controlword::ENABLE_OPERATION;
             let position = self.drives[axis].take_home();
             self.phase = Phase::Ready;
             self.emit(StageEvent::Homed { axis, position });
         }
     }
+}
+
+/// True if `apart`, mm or rad, is no farther from home than a drive may stop.
+pub(super) fn is_at_home(axis: Axis, apart: f64) -> bool {
+    apart.abs() <= HOME_TOLERANCE[axis as usize]
 }
 
 /// True if the homing has succeeded and the axis stands (CiA 402-2, bits 12 and 10 in homing mode).

@@ -387,10 +387,8 @@ impl Stage {
 
     fn finish_bring_up(&mut self, now: Time, axis: Axis, position: i32) {
         let bring_up = self.bring_ups[axis].take();
-        self.drives[axis].seed(position);
-        if let Some(fault) = bring_up.and_then(|bring_up| bring_up.state().found_in_fault) {
-            self.drives[axis].allow_reset(fault.error_code);
-        }
+        let state = bring_up.map(|bring_up| bring_up.state()).unwrap_or_default();
+        self.drives[axis].take_bring_up(position, state);
         // Only a heartbeat that comes from here on can say that this stage's start command was obeyed.
         self.monitors[axis].expect_by(now + self.config.bus.heartbeat_timeout());
         if self.bring_ups.all(Option::is_none) {

@@ -3,6 +3,7 @@
 use super::bring_up::{FoundFault, Identity, Object, POLL_PERIOD, Script, optional};
 use super::config::unsigned_counts;
 use super::event::may_have_power;
+use super::homing::is_at_home;
 use super::{Axis, AxisConfig, AxisUse, HomingConfig, Reference, Sign, StageEvent};
 use crate::canopen::cia402::{Controlword, Mode, Statusword, object as drive};
 use crate::canopen::emcy::EmcyCode;
@@ -41,6 +42,7 @@ impl Script {
         self.check_homed().await?;
         self.set_modes().await?;
         let position = self.seed_target().await?;
+        self.check_not_homed_elsewhere(position).await?;
         self.check_node_number()?;
         Ok(position)
     }
@@ -111,7 +113,7 @@ impl Script {
         let identity = Identity { vendor, product, revision, serial };
         self.sdo.emit(StageEvent::Identity(self.axis, identity));
         let mode = match self.purpose {
-            AxisUse::Home => Mode::HOMING,
+            AxisUse::Home { .. } => Mode::HOMING,
             _ => Mode::CSP,
         };
         match supported.map(SdoValue::to_u32) {
@@ -300,12 +302,38 @@ impl Script {
         if homing.says_homed(statusword) {
             return Ok(());
         }
-        let axis = self.axis;
-        let first = if axis == Axis::Insertion { "take the needle off and " } else { "" };
+        let (axis, bit) = (self.axis, homing.homed_bit);
+        let first = match (axis, self.purpose) {
+            (Axis::Insertion, AxisUse::Move) => {
+                "pull a needle out by its depth (stage withdraw CONFIG --by 20mm --unhomed), then "
+            }
+            (Axis::Insertion, _) => "take the needle off and ",
+            _ => "",
+        };
         Err(format!(
-            "not homed (statusword {statusword}, bit {} clear), {first}home it first: \
-             needle-bench stage home CONFIG --axis {axis}",
-            homing.homed_bit
+            "not homed (statusword {statusword}, bit {bit} clear), {first}home it first: \
+             needle-bench stage home CONFIG --axis {axis}"
+        ))
+    }
+
+    /// Refuses to home an axis once more that stands elsewhere: homing where it stands would make a twisted cable
+    /// or an inserted needle its zero, and any other method would move it.
+    async fn check_not_homed_elsewhere(&self, position: i32) -> Result<(), String> {
+        let (AxisUse::Home { again: false }, Some(homing)) = (self.purpose, self.drive().homing)
+        else {
+            return Ok(());
+        };
+        let axis = self.axis;
+        // A drive without a home offset has its home at 0.
+        let counts = f64::from(position) - f64::from(self.state().home_counts.unwrap_or(0));
+        let apart = counts / self.drive().scale(axis, 0).counts_per_unit();
+        if is_at_home(axis, apart) || !homing.says_homed(self.read_statusword().await?) {
+            return Ok(());
+        }
+        let apart = axis.shown(apart.abs());
+        Err(format!(
+            "homed already, and {apart} from its home, which would be lost; jog it back there, or home it \
+             --again (take the needle off, untwist the cable)"
         ))
     }
 
@@ -315,7 +343,7 @@ impl Script {
         self.write(drive::INTERPOLATION_PERIOD_EXPONENT, -3_i8).await?;
         self.write(drive::INTERPOLATION_PERIOD_VALUE, self.config.bus.sync_ms as u8).await?;
         match self.drive().homing {
-            Some(homing) if self.purpose == AxisUse::Home => {
+            Some(homing) if matches!(self.purpose, AxisUse::Home { .. }) => {
                 self.configure_homing(homing).await?;
                 self.set_mode(Mode::HOMING).await
             }
@@ -328,10 +356,18 @@ impl Script {
         self.write_counts(drive::HOMING_SPEED_SWITCH, homing.speed_switch).await?;
         self.write_counts(drive::HOMING_SPEED_ZERO, homing.speed_zero).await?;
         self.write_counts(drive::HOMING_ACCELERATION, homing.acceleration).await?;
-        let Some(offset) = homing.offset else { return Ok(()) };
-        let counts = self.drive().scale(self.axis, 0).relative_counts(offset);
         let object = drive::HOME_OFFSET;
-        self.write(object, counts.ok_or_else(|| unfit(object, offset))?).await
+        let offset_counts = match homing.offset {
+            None => self.sdo.read_optional(object).await?.map(|value| value.to_u32() as i32),
+            Some(offset) => {
+                let counts = self.drive().scale(self.axis, 0).relative_counts(offset);
+                let counts = counts.ok_or_else(|| unfit(object, offset))?;
+                self.write(object, counts).await?;
+                Some(counts)
+            }
+        };
+        self.note(|state| state.home_counts = offset_counts.map(i32::wrapping_neg));
+        Ok(())
     }
 
     async fn set_mode(&self, mode: Mode) -> Result<(), String> {
@@ -351,7 +387,7 @@ impl Script {
             // A wrapping axis needs no limits in the drive. Limits from an earlier use of the drive would stop it.
             self.write(optional(min), i32::MIN).await?;
             self.write(optional(max), i32::MAX).await?;
-        } else if self.purpose != AxisUse::Home {
+        } else if !matches!(self.purpose, AxisUse::Home { .. }) {
             let [lower, upper] = self.limit_counts(position);
             // In this order the upper limit is never under the lower one, whatever the drive had before.
             self.write(min, i32::MIN).await?;

@@ -397,3 +397,20 @@ fn an_axis_without_homing_is_refused_before_a_record_is_made() {
     );
     assert!(!scratch.path().join("runs").exists(), "{}", said.screen());
 }
+
+/// A drive that has restarted with the needle in has lost its home. The needle comes out all the same.
+#[test]
+fn a_needle_is_withdrawn_although_its_drive_is_not_homed() {
+    let scratch = Scratch::new();
+    let withdraw = ["stage", "withdraw", "bench-config/rig-epos4.toml", "--rehearse", "-q"];
+    let lost = ["--set", "emulator.homed=false", "--set", "emulator.insertion_start_mm=15"];
+    let said = needle_bench(&scratch, &[&withdraw[..], &lost].concat());
+    assert_eq!(said.status, 1, "{}{}", said.stdout, said.stderr);
+    assert!(said.stdout.contains("stage withdraw CONFIG --by 20mm --unhomed"), "{}", said.stdout);
+    let by = ["--by", "12mm", "--unhomed"];
+    let said = needle_bench(&scratch, &[&withdraw[..], &lost, &by].concat());
+    assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
+    assert_eq!(said.stdout.lines().next(), Some("insertion   from 0.000 to -12.000 mm"));
+    let said = needle_bench(&scratch, &["replay", said.run_dir(&scratch).to_str().unwrap()]);
+    assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
+}

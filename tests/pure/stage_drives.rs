@@ -279,7 +279,7 @@ fn both_axes_are_homed_by_their_drives_and_a_run_may_begin() {
     let fault = bench.fault();
     assert!(fault.contains("not homed"), "{fault}");
 
-    let both = PerAxis::from_fn(|_| AxisUse::Home);
+    let both = PerAxis::from_fn(|_| AxisUse::Home { again: false });
     bench.stage = Stage::for_use(config.clone(), both, bench.now);
     bench.run_until(|event| matches!(event, StageEvent::Ready).then_some(()));
     for axis in Axis::BOTH {

@@ -151,7 +151,7 @@ fn the_depth_after_a_run_is_that_of_the_axis_not_the_travel_of_the_run() {
     assert!(lines.starts_with("needle      out, at 0.01 mm; "), "{lines}");
     assert_eq!(withdrawal.unwrap_err(), "the needle is out, at 0.01 mm");
     let (lines, withdrawal) = said(StageAtEnd::default());
-    let expected = "needle      its depth is not known; no power was given\n\
+    let expected = "needle      its depth is not known, this run inserted 0.0 mm; no power was given\n\
                     next        needle-bench stage status rig.toml";
     assert_eq!(lines, expected);
     assert_eq!(withdrawal.unwrap_err(), "the needle's depth is not known; look at the stage");
@@ -165,8 +165,8 @@ fn the_position_of_a_drive_that_has_restarted_is_not_known() {
     stage.drives.insertion.restarted = true;
     let report = stopped(stage);
     let rig = Some(Path::new(RIG));
-    let expected = "needle      its depth is not known; both axes stand, power is off\n\
-                    next        needle-bench stage status rig.toml";
+    let expected = "needle      its depth is not known, this run inserted 0.0 mm; both axes stand, power is \
+                    off\nnext        needle-bench stage status rig.toml";
     assert_eq!(after_insertion(&real, rig, &report).unwrap(), expected);
     let withdrawal = possible_withdrawal(&real, &report).unwrap_err();
     assert_eq!(withdrawal, "the needle's depth is not known; look at the stage");
@@ -182,10 +182,16 @@ fn a_position_of_less_than_was_inserted_is_no_depth() {
     let mut restarted = stopped(at(0.0));
     restarted.figures.take_scored(15.0, None, None);
     let lines = after_insertion(&real, Some(Path::new(RIG)), &restarted).unwrap();
-    assert!(lines.starts_with("needle      its depth is not known; "), "{lines}");
+    let inserted = "needle      its depth is not known, this run inserted 15.0 mm; ";
+    assert!(lines.starts_with(inserted), "{lines}");
     assert!(lines.ends_with("stage status rig.toml"), "{lines}");
     let why = possible_withdrawal(&real, &restarted).unwrap_err();
     assert_eq!(why, "the needle's depth is not known; look at the stage");
+    // A drive that has lost its home moves only by a distance.
+    let mut homed = real;
+    homed.stage.insertion.reference = Reference::Homing;
+    let lines = after_insertion(&homed, Some(Path::new(RIG)), &restarted).unwrap();
+    assert!(lines.ends_with("stage withdraw rig.toml --by 15.0mm --unhomed"), "{lines}");
 }
 
 #[test]

@@ -16,7 +16,7 @@ use super::{Failure, Result};
 use crate::config::{CanInterface, Config};
 use crate::operation::{AnswerSettings, Goal, Move, Operation, RunConfig};
 use crate::session::AxisMove;
-use crate::stage::{Axis, StageConfig};
+use crate::stage::{Axis, Reference, StageConfig};
 use crate::tracker::{Gate, Registration};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand};
@@ -108,6 +108,9 @@ pub(super) enum Motion {
         /// Home this axis only, instead of every axis with a [homing] section.
         #[arg(long, value_parser = axis())]
         axis: Option<Axis>,
+        /// Also an axis that is homed already and stands away from home: that home is lost.
+        #[arg(long)]
+        again: bool,
         #[command(flatten)]
         common: Common,
     },
@@ -135,6 +138,10 @@ pub(super) enum Motion {
         /// Distance to withdraw, instead of to depth 0: 20mm.
         #[arg(long, value_parser = Distance::parse, allow_hyphen_values = true)]
         by: Option<Distance>,
+        /// Although the drive has lost its home, by a restart for example. The limits then count from where the
+        /// axis stands.
+        #[arg(long, requires = "by")]
+        unhomed: bool,
         /// How fast, instead of at its withdraw speed: 0.5mm/s.
         #[arg(long, value_parser = Distance::parse_speed, allow_hyphen_values = true)]
         speed: Option<Distance>,
@@ -185,7 +192,6 @@ impl Motion {
             Motion::Home { axis, .. } => (*axis, None, None, None),
             Motion::Jog { axis, by, to, speed, .. } => (Some(*axis), *by, *to, *speed),
             Motion::Withdraw { by, speed, .. } => (None, *by, None, *speed),
-            Motion::Prove { handedness: true, .. } => return vec!["--handedness".to_owned()],
             Motion::Prove { .. } => (None, None, None, None),
         };
         let options = [
@@ -195,22 +201,29 @@ impl Motion {
             ("--speed", speed.map(|speed| format!("{speed}/s"))),
         ];
         let given = options.into_iter().filter_map(|(name, value)| Some([name.to_owned(), value?]));
-        given.flatten().collect()
+        let flag = match self {
+            Motion::Home { again: true, .. } => Some("--again"),
+            Motion::Withdraw { unhomed: true, .. } => Some("--unhomed"),
+            Motion::Prove { handedness: true, .. } => Some("--handedness"),
+            _ => None,
+        };
+        given.flatten().chain(flag.map(str::to_owned)).collect()
     }
 
     /// The options of the `stage withdraw` that finishes this withdrawal after it went as far as `done`. `None` if it
     /// has not begun, since it may have been refused, if nothing remains, if the limit `min_mm` would refuse the
     /// remainder, and for another motion.
     fn remaining(&self, done: &[AxisMove], min_mm: f64) -> Option<String> {
-        let Motion::Withdraw { by, .. } = self else { return None };
+        let Motion::Withdraw { by, unhomed, .. } = self else { return None };
         let (from_mm, to_mm) = done.iter().find_map(|done| Some((done.from?, done.to)))?;
         let Some(by_mm) = by.and_then(|by| by.along(Axis::Insertion).ok()) else {
             return Some(String::new());
         };
         // Rounded down to a tenth: rounded up, the remainder might pass the limit.
         let remaining_mm = (10.0 * (by_mm - (from_mm - to_mm)) + 1e-6).floor() / 10.0;
-        (remaining_mm >= 0.05 && from_mm - by_mm >= min_mm)
-            .then(|| format!(" --by {remaining_mm:.1}mm"))
+        let flag = if *unhomed { " --unhomed" } else { "" };
+        (remaining_mm >= 0.05 && (*unhomed || from_mm - by_mm >= min_mm))
+            .then(|| format!(" --by {remaining_mm:.1}mm{flag}"))
     }
 
     /// The configuration key that an emulated stage also needs for this motion to have an effect.
@@ -228,15 +241,15 @@ impl Motion {
 
     /// The operation that this motion asks of the stage of `config`.
     pub(super) fn plan(&self, config: &Config) -> Result<RunConfig> {
-        let stage = config.to_stage()?;
+        let mut stage = config.to_stage()?;
         let operation = match self {
             Motion::Home { axis: Some(axis), .. } if stage.axis(*axis).homing.is_none() => {
                 return Err(Failure::configuration(format_args!(
                     "stage: {axis}: no homing is configured (stage.{axis}.homing)"
                 )));
             }
-            Motion::Home { axis, .. } => match Operation::home(&stage, *axis) {
-                Operation::Home(axes) if axes.all(|chosen| !chosen) => {
+            Motion::Home { axis, again, .. } => match Operation::home(&stage, *axis, *again) {
+                Operation::Home { axes, .. } if axes.all(|chosen| !chosen) => {
                     return Err(Failure::configuration(
                         "no axis can be homed: neither [stage.insertion.homing] nor \
                          [stage.rotation.homing] is configured",
@@ -248,10 +261,16 @@ impl Motion {
                 .and_then(|goal| with_speed(jog_move(config, *axis, goal), *speed, &stage))
                 .map(Operation::Move)
                 .map_err(Failure::configuration)?,
-            Motion::Withdraw { by, speed, .. } => withdrawal_move(config, *by)
-                .and_then(|withdrawal| with_speed(withdrawal, *speed, &stage))
-                .map(Operation::Move)
-                .map_err(Failure::configuration)?,
+            Motion::Withdraw { by, unhomed, speed, .. } => {
+                let withdrawal = withdrawal_move(config, *by)
+                    .and_then(|withdrawal| with_speed(withdrawal, *speed, &stage))
+                    .map_err(Failure::configuration)?;
+                if let (true, Goal::By(mm)) = (unhomed, withdrawal.goal) {
+                    let axis = &mut stage.insertion;
+                    (axis.reference, axis.zero, axis.limits.min) = (Reference::Absolute, None, mm);
+                }
+                Operation::Move(withdrawal)
+            }
             Motion::Prove { handedness: false, .. } => Operation::Prove,
             Motion::Prove { handedness: true, .. } => {
                 let gate = config.tracker.to_gate()?;
@@ -465,6 +484,8 @@ mod tests {
         };
         assert_eq!(rest("withdraw --by 20mm", 24.5).as_deref(), Some(" --by 14.5mm"));
         assert_eq!(rest("withdraw --by 20mm", 10.01), None);
+        let unhomed = rest("withdraw --by 32mm --unhomed", 24.46);
+        assert_eq!(unhomed.as_deref(), Some(" --by 26.4mm --unhomed"));
         assert_eq!(rest("withdraw --by 31mm", 24.46).as_deref(), Some(" --by 25.4mm"));
         assert_eq!(rest("withdraw", 24.5).as_deref(), Some(""), "to depth 0");
         assert_eq!(rest("withdraw --by 32mm", 30.0), None, "was refused");

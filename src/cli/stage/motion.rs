@@ -62,7 +62,7 @@ fn job<'a>(config: &'a Config, motion: &'a Motion, options: Options) -> Result<J
         ));
     }
     let run_config = motion.plan(config)?;
-    if let RunConfig::Operation(_, Operation::Home(axes)) = &run_config
+    if let RunConfig::Operation(_, Operation::Home { axes, .. }) = &run_config
         && config.is_emulated()
     {
         for axis in Axis::BOTH.into_iter().filter(|axis| axes[*axis]) {

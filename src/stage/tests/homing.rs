@@ -4,7 +4,8 @@ use super::drive::Homing;
 use super::*;
 use crate::canopen::cia402::DriveState;
 
-const INSERTION: PerAxis<AxisUse> = PerAxis { insertion: AxisUse::Home, rotation: AxisUse::Hold };
+const INSERTION: PerAxis<AxisUse> =
+    PerAxis { insertion: AxisUse::Home { again: false }, rotation: AxisUse::Hold };
 
 fn homing_config() -> StageConfig {
     let mut config = config();
@@ -129,6 +130,53 @@ fn a_homing_that_fails_or_never_ends_stops_the_stage() {
     let fault = bench.until_fault();
     assert!(fault.starts_with("insertion: not home within 60.0 s (statusword 0x0237"), "{fault}");
     bench.until_stopped();
+}
+
+/// The drive ignores the command and shows the bits of an earlier homing; or takes the offset with the other sign; or
+/// moves its position some SYNCs after it says that it is home.
+#[test]
+fn a_position_that_is_not_that_of_home_stops_the_stage() {
+    let reads = |moved: fn(&mut Bench)| {
+        let mut bench = ready_to_home(|bench| bench.insertion.homing_cycles = 0);
+        home(&mut bench);
+        bench.run_for(Duration::from_millis(500));
+        moved(&mut bench);
+        bench
+    };
+    let mut bench = reads(|bench| bench.insertion.counts = -COUNTS_PER_MM);
+    assert_eq!(
+        bench.until_fault(),
+        "insertion: the drive says that it is home, but reads -1.000 mm where home is 1.000 mm by its home \
+         offset (0x607C): it did not move, or counts the offset otherwise; set zero instead"
+    );
+    bench.until_stopped();
+
+    let mut bench = reads(|_| ());
+    assert_eq!(until_homed(&mut bench).0, 1.0);
+}
+
+/// Its home would be lost, and with it where the cable is untwisted and the needle out.
+#[test]
+fn a_homed_axis_away_from_home_is_homed_again_only_if_asked() {
+    let far = |again, bits| {
+        let purpose = PerAxis { insertion: AxisUse::Home { again }, ..INSERTION };
+        let config = homing_config();
+        let nodes = config.nodes();
+        let stage = Stage::for_use(config, purpose, Time::from_secs_f64(1.0));
+        let mut bench = Bench::with(stage, nodes);
+        bench.insertion.counts = 41 * COUNTS_PER_MM;
+        bench.insertion.homing = bits;
+        bench
+    };
+    let mut bench = far(false, Homing::Attained);
+    assert_eq!(
+        bench.until_fault(),
+        "node 1 (insertion): homed already, and 40.000 mm from its home, which would be lost; jog it back \
+         there, or home it --again (take the needle off, untwist the cable)"
+    );
+    bench.until_stopped();
+    far(true, Homing::Attained).until_ready();
+    far(false, Homing::NotDone).until_ready();
 }
 
 #[test]
