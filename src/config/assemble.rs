@@ -94,7 +94,15 @@ impl Config {
     /// The stage refuses the settings, for example a following-error window of less than a count.
     pub fn to_stage(&self) -> Result<StageConfig, ConfigError> {
         self.stage.validate()?;
-        Ok(self.stage.clone())
+        let mut stage = self.stage.clone();
+        if self.emulator.rehearse {
+            for axis in [&mut stage.insertion, &mut stage.rotation] {
+                // The raw value has the real drive's unit. The emulated drive takes the key's.
+                let is_told = axis.quick_stop_deceleration.is_some();
+                axis.sdo.retain(|raw| !(is_told && raw.is_quick_stop()));
+            }
+        }
+        Ok(stage)
     }
 
     /// The settings of the virtual stage: the drives that the bench expects, and the emulator's needle.

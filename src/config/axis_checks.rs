@@ -67,9 +67,8 @@ const STOPPING: [(&str, &[i16], &str); 4] = [
 
 /// Objects that the bench writes if a key of the axis is given. If not, a raw SDO may write them, in the
 /// drive's own unit.
-const SET_BY: [((u16, u8), &str); 6] = [
+const SET_BY: [((u16, u8), &str); 5] = [
     ((0x607C, 0), "homing.offset_UNIT"),
-    ((0x6085, 0), "quick_stop_deceleration_UNIT_per_s2"),
     ((0x6098, 0), "homing.method"),
     ((0x6099, 1), "homing.speed_switch_UNIT_per_s"),
     ((0x6099, 2), "homing.speed_zero_UNIT_per_s"),

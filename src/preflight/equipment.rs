@@ -10,11 +10,14 @@ use crate::stage::{Axis, AxisConfig, AxisLimits, AxisStatus, Reference, may_have
 use crate::tracker::{StampPolicy, Workspace};
 use crate::units::IN_METRES;
 use nalgebra::Vector3;
+use std::f64::consts::TAU;
 
 /// Bits on the wire in one SYNC period: SYNC, two set-points, two answers, and a share of heartbeats.
 const CYCLE_BITS: f64 = 600.0;
 /// Largest load of a bus that does not delay set-points.
 const LOAD_MAX: f64 = 0.5;
+/// A rotation should begin at least so far from its limits, rad, or a quarter of its range: it turns by itself.
+const ROTATION_ROOM_RAD: f64 = TAU;
 /// Error counter at which a node reports "error warning" (ISO 11898-1).
 const ERRORS_WARN: u16 = 96;
 /// Largest ratio of the noise that is measured in a short rest to the configured noise.
@@ -101,6 +104,8 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
     let is_light = bit_rate.is_none_or(|rate| load_of(rate) <= LOAD_MAX);
     let rate = figure("bus bit rate", found, &format!("load up to {:.0}%", LOAD_MAX * 1e2));
     let rate = rate.unless(is_light, Warn, "raise can.sync_ms");
+    let is_possible = bit_rate.is_none_or(|rate| load_of(rate) < 1.0);
+    let rate = rate.unless(is_possible, Fail, "raise can.sync_ms, or the bit rate");
 
     let found = restart_ms.map(|ms| format!("{ms} ms"));
     let restart = figure("bus restart-ms", found, "0: a bus-off is final");
@@ -144,10 +149,18 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
     let is_healthy = !statusword.is_fault() || config.stage.power.fault_reset_on_start;
     let is_named = drive.vendor_id.is_some() && drive.product_code.is_some();
     let is_right = drive.vendor_id.is_none_or(|vendor| vendor == identity.vendor)
-        && drive.product_code.is_none_or(|product| product == identity.product);
+        && drive.product_code.is_none_or(|product| product == identity.product)
+        && drive.serial.is_none_or(|serial| Some(serial) == identity.serial);
+    let types =
+        Axis::BOTH.map(|axis| config.stage.axis(axis)).map(|of| (of.vendor_id, of.product_code));
+    let may_be_exchanged = config.stage.hardware && drive.serial.is_none() && types[0] == types[1];
+    let alike = format!(
+        "both drives are of one type: write serial into [stage.{axis}], or exchanged ones go unnoticed"
+    );
     let id = |expected: Option<u32>| expected.map_or("any".to_owned(), |id| format!("{id:#010X}"));
     let (vendor, product) = (id(drive.vendor_id), id(drive.product_code));
-    let limit = format!("vendor {vendor}, product {product}; no fault, no power");
+    let serial = drive.serial.map(|serial| format!(", serial {serial:#010X}")).unwrap_or_default();
+    let limit = format!("vendor {vendor}, product {product}{serial}; no fault, no power");
     let write = format!("write vendor_id and product_code into [stage.{axis}]");
     let other = format!("not the drive of [stage.{axis}]: is node right?");
     let reset = "find the cause, then needle-bench stage reset CONFIG";
@@ -158,6 +171,7 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
     let twin = format!("two drives have node number {node}: give one of them another");
     let mut checks = vec![
         Check::new(&name, found, limit)
+            .unless(!may_be_exchanged, Warn, alike)
             .unless(is_named, Warn, write)
             .unless(!may_have_power(statusword.state()), Warn, POWERED)
             .unless(is_healthy, Fail, reset)
@@ -200,7 +214,10 @@ fn room(axis: Axis, position: f64, travel: f64, drive: &AxisConfig) -> Check {
     let check = Check::new(format!("{axis} room"), found, limit);
     let is_allowed = |at| drive.limits.check_counts(axis, at, &scale).is_ok();
     let is_inside = is_allowed(position) && is_allowed(goal);
-    check.unless(is_inside, Fail, next)
+    let room = (max - position).min(position - min);
+    let has_room = travel != 0.0 || room >= ROTATION_ROOM_RAD.min(0.25 * (max - min));
+    let back = "with the needle out: needle-bench stage jog CONFIG --axis rotation --to 0deg";
+    check.unless(has_room, Warn, back).unless(is_inside, Fail, next)
 }
 
 /// Checks the tracker by a report about the tool at rest.

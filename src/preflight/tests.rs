@@ -61,6 +61,8 @@ fn a_bus_that_restarts_by_itself_or_is_down_fails() {
     assert_eq!(verdicts(&bus(&config, Ok(Some(restarting)))), "PPFP");
     let slow = BusFacts { bit_rate: Some(100_000), errors: Some([96, 0]), ..facts() };
     assert_eq!(verdicts(&bus(&config, Ok(Some(slow)))), "PWPW");
+    let too_slow = BusFacts { bit_rate: Some(50_000), ..facts() };
+    assert_eq!(verdicts(&bus(&config, Ok(Some(too_slow)))), "PFPP");
     let off = BusFacts { may_send: false, ..facts() };
     assert_eq!(verdicts(&bus(&config, Ok(Some(off)))), "FPPP");
     let down = BusFacts { is_up: false, ..facts() };
@@ -120,6 +122,23 @@ fn a_drive_that_a_run_would_refuse_fails() {
         assert_eq!(of(silent), "F");
     }
     assert_eq!(verdicts(&drive(&config, Axis::Insertion, Err("silent".to_owned()))), "F");
+    // The rotation turns by itself, and the last run may have left it near its limit of 720 degrees.
+    let turned = |deg: f64| {
+        let config = rig(&["stage.rotation.product_code=7"]);
+        let status = AxisStatus { position: Some(deg.to_radians()), ..status() };
+        verdicts(&drive(&config, Axis::Rotation, Ok(status)))
+    };
+    assert_eq!([turned(359.0), turned(-361.0), turned(721.0)], ["PPPP", "PPPW", "PPPF"]);
+    // Two drives of one type can be exchanged, unless their serial numbers are given.
+    let types = ["stage.insertion.product_code=7", "stage.rotation.product_code=7"];
+    let numbered = Identity { serial: Some(9), ..status().identity };
+    let numbered = || AxisStatus { identity: numbered, ..status() };
+    let with = |serial: &[&str]| {
+        let config = rig(&[&types[..], serial].concat());
+        verdicts(&drive(&config, Axis::Insertion, Ok(numbered())))
+    };
+    assert_eq!([with(&[]), with(&["stage.insertion.serial=9"])], ["WPPP", "PPPP"]);
+    assert_eq!(with(&["stage.insertion.serial=8"]), "FPPP");
     // The example file accepts any product code.
     assert_eq!(verdicts(&drive(&rig(&[]), Axis::Insertion, Ok(status()))), "WPPP");
     let resets = rig(&["stage.fault_reset_on_start=true", "stage.insertion.product_code=7"]);

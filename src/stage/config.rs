@@ -6,6 +6,7 @@ use super::limits::{ACCELERATION, SPEED};
 use super::scale::CountsPer;
 use super::standstill::Standstill;
 use super::{Axis, AxisLimits, CountsRatio, HomingConfig, PerAxis, Reference, Scale, Sign};
+use crate::canopen::cia402::object::QUICK_STOP_DECELERATION;
 use crate::canopen::sdo::SdoValue;
 use crate::canopen::{NodeId, ObjectAddress};
 use crate::keys::{NO_KEY, Rule, hardware_is_decided, over, section, within};
@@ -32,6 +33,8 @@ section! {
         vendor_id: Option<u32> [IDENTITY] = 0x0000_02F1, hardware_must_give;
         /// The expected product code (1018:2), or "any".
         product_code: Option<u32> [IDENTITY] = 0x0000_0402, hardware_must_give;
+        /// The expected serial number (1018:4), or "any". It alone distinguishes two drives of the same type.
+        serial: Option<u32> [IDENTITY] = "any", hardware_may_omit;
         /// 1, or -1 if the drive counts in the opposite direction to the axis.
         sign: Sign [Rule::Integers(&[1, -1])] = 1, hardware_must_give;
         /// Where the position of the drive comes from.
@@ -72,7 +75,9 @@ section! {
         /// two SYNC periods at the highest speed. If omitted: the travel of 30 ms at the highest speed.
         following_error_max as (["following_error_mm", "following_error_deg"][AXIS]): Option<f64>
             [[over(0.0, 100.0), over(0.0, 3600.0)][AXIS]], hardware_may_omit;
-        /// Quick-stop deceleration (6085). With hardware it may be omitted: the drive keeps its own.
+        /// Quick-stop deceleration (6085). With hardware it may be omitted: the drive keeps its own, and the bench
+        /// does not know it. Beside a raw SDO to 6085, in the drive's unit, it is not written: it then only tells
+        /// the bench how the axis brakes.
         quick_stop_deceleration
             as (["quick_stop_deceleration_mm_per_s2", "quick_stop_deceleration_deg_per_s2"][AXIS]):
             Option<f64> [ACCELERATION[AXIS]] => ["21.5239", "475.147"][AXIS], hardware_must_give;
@@ -120,6 +125,11 @@ section! {
 }
 
 impl RawSdo {
+    /// True if it sets the quick-stop deceleration.
+    pub fn is_quick_stop(&self) -> bool {
+        ObjectAddress::new(self.index, self.subindex) == QUICK_STOP_DECELERATION
+    }
+
     /// The object, and the value to write to it.
     ///
     /// # Errors
@@ -134,6 +144,11 @@ impl RawSdo {
 }
 
 impl AxisConfig {
+    /// True if a raw SDO sets the quick-stop deceleration (6085).
+    pub fn has_raw_quick_stop(&self) -> bool {
+        self.sdo.iter().any(RawSdo::is_quick_stop)
+    }
+
     /// The drive's following-error window: how far its position may be from its demand, mm or rad.
     pub fn following_error_window(&self) -> f64 {
         let lag = self.limits.speed_max * FOLLOWING_LAG.as_secs_f64();
@@ -311,6 +326,18 @@ impl StageConfig {
                 "{axis}: a home offset of {offset}: more than 32 bits hold in counts"
             ));
         }
+        if !config.wraps
+            && let Some(zero) = config.zero
+        {
+            let ends = [min, max].map(|end| scale.counts(end).map(i32::try_from));
+            if !ends.iter().all(|end| matches!(end, Some(Ok(_)))) {
+                let [min, max] = [min, max].map(|value| axis.shown(value));
+                return Err(format!(
+                    "{axis}: limits {min} to {max} with zero at {zero}: more than the 32 bits of the drive's \
+                     position; set nearer limits, another zero, or wraps"
+                ));
+            }
+        }
         // The axis brakes first, and the answer to a SYNC counts only when the next is due.
         let braking_s =
             config.quick_stop_deceleration.map_or(0.0, |by| config.limits.speed_max / by);
@@ -370,6 +397,10 @@ mod tests {
         assert!(
             text(|c| c.insertion.quick_stop_deceleration = Some(1e9))
                 .starts_with("insertion: a quick-stop deceleration of 1000000000 mm/s²: ")
+        );
+        assert!(
+            text(|c| c.insertion.zero = Some(i32::MAX))
+                .contains("with zero at 2147483647: more than the 32 bits")
         );
         assert_eq!(
             text(|c| c.insertion.ratio = CountsRatio::new(20, 1).expect("not zero")),

@@ -104,6 +104,9 @@ impl Script {
         self.read_statusword().await?;
         let vendor = self.read_identity(1, self.drive().vendor_id).await?;
         let product = self.read_identity(2, self.drive().product_code).await?;
+        if self.drive().serial.is_some() {
+            self.read_identity(4, self.drive().serial).await?;
+        }
         self.note(|state| state.identified = true);
         // The node is not reset: the drive may hold a load.
         self.sdo.leave_operational();
@@ -213,7 +216,8 @@ impl Script {
         }
         let window = Some(config.following_error_window());
         self.write_counts(drive::FOLLOWING_ERROR_WINDOW, window).await?;
-        self.write_counts(drive::QUICK_STOP_DECELERATION, config.quick_stop_deceleration).await
+        let deceleration = config.quick_stop_deceleration.filter(|_| !config.has_raw_quick_stop());
+        self.write_counts(drive::QUICK_STOP_DECELERATION, deceleration).await
     }
 
     /// Writes `value`, in mm or rad (per second, per second squared), in counts; nothing for `None`.
@@ -304,9 +308,7 @@ impl Script {
         }
         let (axis, bit) = (self.axis, homing.homed_bit);
         let first = match (axis, self.purpose) {
-            (Axis::Insertion, AxisUse::Move) => {
-                "pull a needle out by its depth (stage withdraw CONFIG --by 20mm --unhomed), then "
-            }
+            (Axis::Insertion, AxisUse::Move) => "withdraw --by 20mm --unhomed, or ",
             (Axis::Insertion, _) => "take the needle off and ",
             _ => "",
         };

@@ -7,7 +7,7 @@ use std::net::SocketAddrV4;
 
 /// The changes of the operator's file on this bus, with their reasons, as in docs/rig.md.
 const CHANGES: [Change; 3] = [
-    // The bench refuses hardware = true on a UDP bus. The emulated stage has its own quick-stop deceleration.
+    // The bench refuses hardware = true on a UDP bus. Without the raw values it writes those of the keys, in counts/s².
     ("hardware = true\n", "hardware = false\n"),
     (
         "[[stage.insertion.sdo]]\nindex = 0x6085\nsubindex = 0\nvalue = 10_000                        # \

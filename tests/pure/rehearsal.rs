@@ -402,15 +402,17 @@ fn an_axis_without_homing_is_refused_before_a_record_is_made() {
 #[test]
 fn a_needle_is_withdrawn_although_its_drive_is_not_homed() {
     let scratch = Scratch::new();
-    let withdraw = ["stage", "withdraw", "bench-config/rig-epos4.toml", "--rehearse", "-q"];
+    let rig = repository("bench-config/rig-epos4.toml");
+    let withdraw = ["stage", "withdraw", &rig, "--rehearse", "-q"];
     let lost = ["--set", "emulator.homed=false", "--set", "emulator.insertion_start_mm=15"];
     let said = needle_bench(&scratch, &[&withdraw[..], &lost].concat());
     assert_eq!(said.status, 1, "{}{}", said.stdout, said.stderr);
-    assert!(said.stdout.contains("stage withdraw CONFIG --by 20mm --unhomed"), "{}", said.stdout);
-    let by = ["--by", "12mm", "--unhomed"];
+    assert!(said.stdout.contains("withdraw --by 20mm --unhomed, or home"), "{}", said.stdout);
+    let by = ["--by", "12mm", "--unhomed", "--json"];
     let said = needle_bench(&scratch, &[&withdraw[..], &lost, &by].concat());
     assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
-    assert_eq!(said.stdout.lines().next(), Some("insertion   from 0.000 to -12.000 mm"));
+    let to_mm = said.json()["axes"][0]["to_mm"].as_f64().unwrap();
+    assert!((to_mm + 12.0).abs() < 1e-3, "{to_mm}");
     let said = needle_bench(&scratch, &["replay", said.run_dir(&scratch).to_str().unwrap()]);
     assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
 }

@@ -36,6 +36,7 @@ fn axis(id: u8, counts: u32, speed_max: f64) -> AxisConfig {
         node: node(id),
         vendor_id: Some(VENDOR),
         product_code: None,
+        serial: None,
         ratio,
         sign: Sign::Positive,
         zero: None,

@@ -7,9 +7,9 @@ use std::collections::HashSet;
 
 /// The changes of the operator's file on this bus, with their reasons, as in docs/rig.md.
 const CHANGES: [Change; 2] = [
-    // An EPOS4 reads 0x6085 in rpm/s, an emulated drive in counts/s²: these are 21.5 mm/s² and 475°/s².
-    ("value = 10_000  ", "value = 100_000  "),
-    ("value = 10_000\n", "value = 100_000\n"),
+    // An EPOS4 reads 0x6085 in rpm/s, an emulated drive in counts/s²: these are 71.7 mm/s² and 316°/s².
+    ("value = 10_000  ", "value = 333_000 "),
+    ("value = 10_000\n", "value = 66_500\n"),
 ];
 
 fn opens_the_bus(line: &str) -> bool {

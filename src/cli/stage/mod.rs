@@ -231,6 +231,10 @@ impl Motion {
         let emulator = &config.emulator;
         let is_needle_out = emulator.rehearse && emulator.insertion_start_mm == 0.0;
         match self {
+            // As after power-on.
+            Motion::Home { .. } if is_needle_out && emulator.rotation_start_deg == 0.0 => {
+                Some("emulator.homed=false".to_owned())
+            }
             Motion::Prove { handedness: true, .. } => sensor_off_axis(config),
             Motion::Withdraw { .. } if is_needle_out => {
                 Some(format!("emulator.insertion_start_mm={:?}", config.insertion.depth_mm))

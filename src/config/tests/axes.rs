@@ -255,7 +255,6 @@ fn raw_sdos_to_objects_that_the_bench_writes_are_refused() {
         (0x607D, "max_mm"),
         (0x6065, "following_error_mm"),
         (0x6066, "following_error_timeout_ms"),
-        (0x6085, "quick_stop_deceleration_mm_per_s2"),
         (0x6098, "homing.method"),
         (0x60C2, "can.sync_ms"),
         (0x1400, "maps the PDOs"),
@@ -275,6 +274,6 @@ fn raw_sdos_to_objects_that_the_bench_writes_are_refused() {
         assert!(error.contains("not for raw SDOs: homing."), "{error}");
     }
     loaded("", &[&raw(0x2000)]);
-    // The rig sets 6085 in the drive's own units, and no key sets it.
+    // The rig sets 6085 in the drive's own units, and the key tells the bench what that is.
     loaded(RIG, &[]);
 }

@@ -202,6 +202,13 @@ fn a_drive_of_another_vendor_profile_or_mode_is_refused() {
         "node 2 (rotation): 0x1018:01: expected 0x00000022, received 0x000000FB, \
          is this the drive of the configuration?"
     );
+    // The same type, but not the same drive.
+    let mut exchanged = config();
+    exchanged.rotation.serial = Some(0x11);
+    let fault = fault_of(exchanged, |bench| bench.rotation.set(0x1018, 4, 0x12_u32));
+    let expected =
+        "node 2 (rotation): 0x1018:04: expected 0x00000011, received 0x00000012, is this";
+    assert!(fault.starts_with(expected), "{fault}");
     let fault = fault_of(config(), |bench| bench.insertion.set(0x1000, 0, 0x0003_0191_u32));
     assert!(
         fault.starts_with("node 1 (insertion): 0x1000:00: device profile 401 where 402"),
@@ -373,6 +380,10 @@ fn the_soft_limits_and_windows_are_written_to_the_drives() {
     config.insertion.zero = Some(500);
     config.insertion.following_error_max = Some(0.5);
     config.insertion.quick_stop_deceleration = Some(20.0);
+    // In the drive's own unit: the bench is told what it is, and leaves it.
+    config.rotation.quick_stop_deceleration = Some(6.0);
+    let raw = RawSdo { bits: 32, index: 0x6085, subindex: 0, value: 77, read_back: true };
+    config.rotation.sdo.push(raw);
     let mut bench = Bench::new(config);
     bench.until_ready();
     let limits = |drive: &TestDrive| [1, 2].map(|end| drive.value(0x607d, end) as i32);
@@ -383,7 +394,7 @@ fn the_soft_limits_and_windows_are_written_to_the_drives() {
     assert_eq!(bench.insertion.value(0x6065, 0), 2323);
     assert_eq!(bench.rotation.value(0x6065, 0), 7235);
     assert_eq!(bench.insertion.value(0x6085, 0), 92_920);
-    assert_eq!(bench.rotation.value(0x6085, 0), 10_000, "the drive's own value");
+    assert_eq!(bench.rotation.value(0x6085, 0), 77);
 }
 
 /// The rotation drive has no 0x6066; its bring-up succeeds too.

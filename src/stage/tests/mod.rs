@@ -64,6 +64,7 @@ impl AxisConfig {
             node,
             vendor_id: None,
             product_code: None,
+            serial: None,
             ratio,
             sign: Sign::Positive,
             zero: None,
