@@ -49,7 +49,7 @@ impl<'a> CandumpLine<'a> {
         let stamp = words.next()?.strip_prefix('(')?.strip_suffix(')')?;
         let (s, us) = stamp.split_once('.')?;
         let (s, us): (i64, i64) = (s.parse().ok()?, us.parse().ok().filter(|_| us.len() == 6)?);
-        let (interface, frame) = (words.next()?, words.next()?.parse().ok()?);
+        let (interface, frame) = (words.next()?, Frame::parse(words.next()?)?);
         let direction = match (words.next()?, words.next()) {
             ("T", None) => Direction::Sent,
             ("R", None) => Direction::Received,

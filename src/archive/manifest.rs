@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
-use thiserror::Error;
 
 /// Format of the manifest that this version of the bench writes and reads.
 const FORMAT: u32 = 2;
@@ -197,27 +196,6 @@ pub struct Manifest {
     pub verdicts: Vec<Verdict>,
 }
 
-/// Why a manifest was refused.
-#[derive(Debug, Error)]
-pub enum ManifestError {
-    /// Not JSON, or a key is missing or wrong.
-    #[error("not a run's manifest: {0} (restore it from a copy)")]
-    NotAManifest(#[from] serde_json::Error),
-    /// Written in the format of another version of the bench.
-    #[error(
-        "format {found}, this bench reads format {FORMAT}; use the bench it was made by ({version})"
-    )]
-    Format {
-        /// Its format.
-        found: u64,
-        /// The version of the bench that wrote it.
-        version: String,
-    },
-    /// Edited since it was written.
-    #[error("edited since the bench wrote it: its seal does not fit (restore it from a copy)")]
-    Edited,
-}
-
 impl Manifest {
     /// The manifest of a run that starts at `started_utc`.
     pub fn new(name: &str, started_utc: String) -> Self {
@@ -252,20 +230,25 @@ impl Manifest {
     /// Reads what [`Manifest::to_text`] wrote.
     ///
     /// # Errors
-    /// [`ManifestError`]: not a manifest, of another format, or edited.
-    pub fn from_text(text: &str) -> Result<Self, ManifestError> {
-        let mut value: Value = serde_json::from_str(text)?;
+    /// Not a manifest, of another format, or edited, with the next step.
+    pub fn from_text(text: &str) -> Result<Self, String> {
+        let foreign = |error| format!("not a run's manifest: {error} (restore it from a copy)");
+        let mut value: Value = serde_json::from_str(text).map_err(foreign)?;
         if let Some(found) = value.get("format").and_then(Value::as_u64)
             && found != u64::from(FORMAT)
         {
             let version = value.get("version").and_then(Value::as_str).unwrap_or("unknown");
-            return Err(ManifestError::Format { found, version: version.to_owned() });
+            return Err(format!(
+                "format {found}, this bench reads format {FORMAT}; use the bench it was made by ({version})"
+            ));
         }
         // `shift_remove` keeps the order of the others.
         let seal = value.as_object_mut().and_then(|keys| keys.shift_remove(SEAL));
         let is_sealed = seal.as_ref().and_then(Value::as_str) == Some(seal_of(&value).as_str());
-        let manifest = serde_json::from_value(value)?;
-        if is_sealed { Ok(manifest) } else { Err(ManifestError::Edited) }
+        let manifest = serde_json::from_value(value).map_err(foreign)?;
+        let edited =
+            "edited since the bench wrote it: its seal does not fit (restore it from a copy)";
+        if is_sealed { Ok(manifest) } else { Err(edited.to_owned()) }
     }
 }
 

@@ -18,8 +18,8 @@ pub use events::{EventKind, EventLine, proof};
 pub use inputs::{Inputs, RecordedInput, input_line, inputs_header};
 pub use lines::Lines;
 pub use manifest::{
-    Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,
-    VerdictKind, hex, sha256_hex,
+    Counts, DriveIdentity, Dropped, FileSeal, Manifest, RunOutcome, Verdict, VerdictKind, hex,
+    sha256_hex,
 };
 pub use steps_csv::{
     RecordedColumns, STEP_COLUMNS, StepColumn, StepRow, is_truth_column, steps_csv_header,

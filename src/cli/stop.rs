@@ -80,7 +80,7 @@ fn report(quick_stop: &QuickStop, trouble: &BusTrouble, as_json: bool) -> Result
     let (mut errors, mut confirmed) = (Vec::new(), Vec::new());
     for axis in Axis::BOTH {
         let counts =
-            quick_stop.result(axis).and_then(|result| result.map_err(|e| errors.push(e)).ok());
+            quick_stop.outcome(axis).and_then(|result| result.map_err(|e| errors.push(e)).ok());
         let line = |counts| format!("{axis:<11} stands without power, at {counts} counts");
         confirmed.extend(counts.map(line));
         let is_standing = counts.is_some();

@@ -1,7 +1,7 @@
 //! The law that bends the needle along a path: toward any side, by any curvature up to its own.
 
 use super::nested_saturation::{NestedSaturation, NestedSaturationConfig};
-use super::{Command, ControlError};
+use super::{Command, NOT_FINITE};
 use crate::math;
 use crate::needle::{Needle, Reduced};
 use crate::observer::Estimate;
@@ -72,13 +72,13 @@ impl BendLaw {
     /// The command for the next `step_mm` of insertion, from the estimate at its start.
     ///
     /// # Errors
-    /// [`ControlError`] if there is no valid command; the run must stop for that reason.
+    /// Why there is no valid command; the run must stop for that reason.
     pub fn command(
         &mut self,
         estimate: &Estimate,
         bend: &Bend,
         step_mm: f64,
-    ) -> Result<Command, ControlError> {
+    ) -> Result<Command, String> {
         let rotation = &estimate.x_pb.rotation;
         let wanted = self.wanted_bend(estimate, bend, step_mm);
         let share = wanted.norm();
@@ -86,7 +86,7 @@ impl BendLaw {
         let seen = rotation.inverse() * wanted;
         let off_rad = math::atan2(seen.x, -seen.y);
         if !(off_rad + share).is_finite() {
-            return Err(ControlError::NotFinite);
+            return Err(NOT_FINITE.to_owned());
         }
         let transmission = self.plane.transmission(estimate, step_mm);
         let limit_rad_per_mm = self.plane.rotation_max_rad_per_mm();
@@ -124,7 +124,7 @@ impl BendLaw {
         };
         let wanted_rad_per_mm = turn_rad / step_mm;
         if !wanted_rad_per_mm.is_finite() {
-            return Err(ControlError::NotFinite);
+            return Err(NOT_FINITE.to_owned());
         }
         let rotation_rad_per_mm = wanted_rad_per_mm.clamp(-limit_rad_per_mm, limit_rad_per_mm);
         Ok(Command { rotation_rad_per_mm, saturated: share > 1.0 })

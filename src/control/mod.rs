@@ -12,7 +12,6 @@ pub use nested_saturation::{NestedSaturation, NestedSaturationConfig};
 use crate::keys::{Rule, choice, over, section};
 use crate::needle::{Needle, Reduced};
 use crate::observer::Estimate;
-use thiserror::Error;
 
 /// The effect of a pole faster than 1 per mm decays within a sample.
 const RATE: Rule = over(0.0, 1.0);
@@ -28,62 +27,22 @@ pub struct Command {
     pub saturated: bool,
 }
 
-/// Why a controller has no command; the run must stop.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-pub enum ControlError {
-    /// The estimate or the command is not finite, for example with a needle of zero curvature.
-    #[error("estimate or command is not finite; check needle.curvature_per_mm and the observer")]
-    NotFinite,
-    /// Pitch is outside the domain of the law.
-    #[error(
-        "estimated pitch is {:.1} deg, the control law holds within {:.0} deg; start nearer to the plane",
-        .pitch_rad.to_degrees(), .limit_rad.to_degrees()
-    )]
-    PitchOutOfDomain {
-        /// Estimated pitch, rad.
-        pitch_rad: f64,
-        /// The limit, rad.
-        limit_rad: f64,
-    },
-    /// The roll estimate stays near the singularity of the law.
-    #[error(
-        "estimated roll has been over {:.0} deg from the plane for {depth_mm:.0} mm: the control law divides by its cosine there; check the assumed start and the observer's poles",
-        .limit_rad.to_degrees()
-    )]
-    RollOutOfDomain {
-        /// The limit, rad.
-        limit_rad: f64,
-        /// Insertion with that roll estimate, mm.
-        depth_mm: f64,
-    },
-    /// The law keeps turning the needle in one direction: it follows an error of the estimate.
-    #[error(
-        "the needle was asked to turn {:.0} deg within {window_mm:.0} mm (limit {:.0}): the control law is spinning it",
-        .turned_rad.to_degrees(), .limit_rad.to_degrees()
-    )]
-    Spinning {
-        /// Net rotation commanded, rad.
-        turned_rad: f64,
-        /// Length of the window, mm.
-        window_mm: f64,
-        /// The limit, rad.
-        limit_rad: f64,
-    },
-}
+/// Why there is no command, for example with a needle of zero curvature.
+const NOT_FINITE: &str =
+    "estimate or command is not finite; check needle.curvature_per_mm and the observer";
 
 /// The reduced state of `estimate`, which must be finite, with a pitch of at most `limit_rad`.
-fn state_within(
-    estimate: &Estimate,
-    step_mm: f64,
-    limit_rad: f64,
-) -> Result<Reduced, ControlError> {
+fn state_within(estimate: &Estimate, step_mm: f64, limit_rad: f64) -> Result<Reduced, String> {
     if !estimate.x_pb.is_finite() || !step_mm.is_finite() {
-        return Err(ControlError::NotFinite);
+        return Err(NOT_FINITE.to_owned());
     }
     let (state, _) = Reduced::split(&estimate.x_pb);
-    let pitch_rad = state.pitch_rad;
-    match pitch_rad.abs() > limit_rad {
-        true => Err(ControlError::PitchOutOfDomain { pitch_rad, limit_rad }),
+    match state.pitch_rad.abs() > limit_rad {
+        true => Err(format!(
+            "estimated pitch is {:.1} deg, the control law holds within {:.0} deg; start nearer to the plane",
+            state.pitch_rad.to_degrees(),
+            limit_rad.to_degrees()
+        )),
         false => Ok(state),
     }
 }
@@ -93,8 +52,8 @@ pub trait Controller: Send {
     /// The command for the next `step_mm` of insertion, from the estimate at its start.
     ///
     /// # Errors
-    /// [`ControlError`] if the law has no valid command; the run must stop for that reason.
-    fn command(&mut self, estimate: &Estimate, step_mm: f64) -> Result<Command, ControlError>;
+    /// Why the law has no valid command; the run must stop for that reason.
+    fn command(&mut self, estimate: &Estimate, step_mm: f64) -> Result<Command, String>;
 }
 
 section! {

@@ -2,7 +2,7 @@
 //! shaft's torsion.
 
 use super::spin_guard::{SEARCHING_SPIN_RAD, SpinGuard};
-use super::{Command, ControlError, Controller, RATE, ROTATION, state_within};
+use super::{Command, Controller, NOT_FINITE, RATE, ROTATION, state_within};
 use crate::keys::{over, section, within};
 use crate::math;
 use crate::needle::{Needle, Reduced};
@@ -188,7 +188,7 @@ impl Transmission {
 }
 
 impl Controller for NestedSaturation {
-    fn command(&mut self, estimate: &Estimate, step_mm: f64) -> Result<Command, ControlError> {
+    fn command(&mut self, estimate: &Estimate, step_mm: f64) -> Result<Command, String> {
         let state = state_within(estimate, step_mm, PITCH_LIMIT_RAD)?;
         let curvature = self.curvature_per_mm(estimate);
         let demand = self.demand(&state, curvature, step_mm);
@@ -200,7 +200,7 @@ impl Controller for NestedSaturation {
         let wanted = self.base_turn(to, hold, &transmission) / step_mm;
         let spin_limit_rad = SEARCHING_SPIN_RAD + transmission.band_rad();
         if !spin_limit_rad.is_finite() {
-            return Err(ControlError::NotFinite);
+            return Err(NOT_FINITE.to_owned());
         }
         let limit = self.config.rotation_max_rad_per_mm;
         let command = self.spin.command(wanted, limit, step_mm, spin_limit_rad)?;
@@ -386,9 +386,9 @@ mod tests {
         assert!(steep.to_string().starts_with("estimated pitch is 85.9 deg"), "{steep}");
         let rotation = FixedAngles::default().to_rotation();
         let nan = Pose { rotation, translation: Vector3::new(f64::NAN, 0.0, 0.0) };
-        assert_eq!(law().command(&Estimate::of_pose(nan), 1.0), Err(ControlError::NotFinite));
+        assert_eq!(law().command(&Estimate::of_pose(nan), 1.0), Err(NOT_FINITE.to_owned()));
         let mut for_straight = NestedSaturation::new(Needle::new(0.0).unwrap(), law().config);
         let at = Estimate::of_pose(pose(1.0, 0.1, 0.0));
-        assert_eq!(for_straight.command(&at, 1.0), Err(ControlError::NotFinite));
+        assert_eq!(for_straight.command(&at, 1.0), Err(NOT_FINITE.to_owned()));
     }
 }

@@ -1,6 +1,6 @@
 //! A guard against a law that keeps turning the needle in one direction.
 
-use super::{Command, ControlError};
+use super::{Command, NOT_FINITE};
 use std::collections::VecDeque;
 use std::f64::consts::TAU;
 
@@ -22,17 +22,16 @@ impl SpinGuard {
     /// The command to turn the base at `wanted_rad_per_mm`, limited to ± `limit_rad_per_mm`.
     ///
     /// # Errors
-    /// [`ControlError::NotFinite`], and [`ControlError::Spinning`] if the net rotation over the window
-    /// is beyond `spin_limit_rad`.
+    /// The rate is not finite, or the net rotation over the window is beyond `spin_limit_rad`.
     pub(super) fn command(
         &mut self,
         wanted_rad_per_mm: f64,
         limit_rad_per_mm: f64,
         step_mm: f64,
         spin_limit_rad: f64,
-    ) -> Result<Command, ControlError> {
+    ) -> Result<Command, String> {
         if !wanted_rad_per_mm.is_finite() {
-            return Err(ControlError::NotFinite);
+            return Err(NOT_FINITE.to_owned());
         }
         let rotation_rad_per_mm = wanted_rad_per_mm.clamp(-limit_rad_per_mm, limit_rad_per_mm);
         self.recent.push_back((rotation_rad_per_mm * step_mm, step_mm));
@@ -43,8 +42,11 @@ impl SpinGuard {
         }
         let turned_rad = self.recent.iter().map(|&(turn, _)| turn).sum::<f64>();
         if turned_rad.abs() > spin_limit_rad {
-            let limit_rad = spin_limit_rad;
-            return Err(ControlError::Spinning { turned_rad, window_mm, limit_rad });
+            return Err(format!(
+                "the needle was asked to turn {:.0} deg within {window_mm:.0} mm (limit {:.0}): the control law is spinning it",
+                turned_rad.to_degrees(),
+                spin_limit_rad.to_degrees()
+            ));
         }
         let saturated = wanted_rad_per_mm.abs() > limit_rad_per_mm;
         Ok(Command { rotation_rad_per_mm, saturated })

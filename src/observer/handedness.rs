@@ -19,7 +19,6 @@ use crate::geometry::FixedAngles;
 use crate::needle::{Increment, Needle, TipPosition, Torsion};
 use derive_more::Display;
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI};
-use thiserror::Error;
 
 /// An alternative that is `e^7` times as likely as the configured model ends the run …
 const LOG_ODDS_MAX: f64 = 7.0;
@@ -39,23 +38,7 @@ pub const ROLL_JUDGED_SD_MAX_RAD: f64 = FRAC_PI_2;
 /// The first positions show the heading at the start. It is no longer judged after this depth.
 const HEADING_JUDGED_MM: f64 = 30.0;
 
-/// The positions fit an alternative much better than the configuration.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-#[error(
-    "the positions fit {alternative} e^{log_odds:.0} times better after {depth_mm:.1} mm (limit \
-     e^{:.0}): {}",
-    .alternative.log_odds_max(),
-    .alternative.question()
-)]
-pub struct StreamContradiction {
-    /// The alternative that they fit.
-    alternative: Alternative,
-    /// Logarithm of the likelihood ratio.
-    log_odds: f64,
-    /// Insertion since the first position, mm.
-    depth_mm: f64,
-}
-
+/// A model that the positions may fit better than the configured one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
 enum Alternative {
     /// The base turns the other way.
@@ -101,7 +84,8 @@ pub struct HandednessWatch {
     insertion_mm: f64,
     /// Insertion at the last correction, mm.
     corrected_mm: f64,
-    contradiction: Option<StreamContradiction>,
+    /// Why the run must stop, once an alternative has won.
+    contradiction: Option<String>,
 }
 
 impl HandednessWatch {
@@ -169,11 +153,12 @@ impl HandednessWatch {
             // innovations of the alternative itself show by how much.
             let log_odds = (model.log_evidence() - configured) / model.innovation_excess();
             if log_odds > alternative.log_odds_max() {
-                let alternative = *alternative;
-                contradiction.get_or_insert(StreamContradiction {
-                    alternative,
-                    log_odds,
-                    depth_mm,
+                let (limit, question) = (alternative.log_odds_max(), alternative.question());
+                contradiction.get_or_insert_with(|| {
+                    format!(
+                        "the positions fit {alternative} e^{log_odds:.0} times better after {depth_mm:.1} mm (limit \
+                         e^{limit:.0}): {question}"
+                    )
                 });
             }
             let is_too_deep = *alternative == Alternative::Tilted && depth_mm > HEADING_JUDGED_MM;
@@ -194,9 +179,9 @@ impl HandednessWatch {
     /// Whether the positions still fit the configured model.
     ///
     /// # Errors
-    /// [`StreamContradiction`] once an alternative has won: the run must stop with that reason.
-    pub fn check(&self) -> Result<(), StreamContradiction> {
-        self.contradiction.map_or(Ok(()), Err)
+    /// Once an alternative has won: the run must stop with that reason.
+    pub fn check(&self) -> Result<(), String> {
+        self.contradiction.clone().map_or(Ok(()), Err)
     }
 
     /// True once the comparison is over, for or against the configured model.

@@ -20,7 +20,7 @@ mod whiteness;
 pub use coupled::{Coupled, CoupledConfig, Gains};
 pub use estimate::{Belief, Estimate, Shaft, Slack, standard_deviations};
 pub use finite_difference::{FiniteDifference, FiniteDifferenceConfig};
-pub use handedness::{HandednessWatch, ROLL_JUDGED_SD_MAX_RAD, StreamContradiction};
+pub use handedness::{HandednessWatch, ROLL_JUDGED_SD_MAX_RAD};
 pub use invariant::{Invariant, InvariantConfig, NoiseConfig};
 pub use whiteness::{PositionNoise, Whiteness};
 
@@ -28,34 +28,6 @@ use crate::geometry::FixedAngles;
 use crate::needle::{Increment, Needle, TipPosition, Torsion};
 use nalgebra::Vector3;
 use std::f64::consts::PI;
-use thiserror::Error;
-
-/// Why an estimate must not be used for steering any more.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-pub enum Divergence {
-    /// No hypothesis has a finite state and a positive covariance any more.
-    #[error(
-        "the estimate is no longer finite, or its covariance no longer positive, at {depth_mm:.1} mm"
-    )]
-    NotSound {
-        /// Insertion since the first measurement, mm.
-        depth_mm: f64,
-    },
-    /// The measurements contradict the model of the invariant observer. The other observers do not check this.
-    #[error(
-        "the last {samples} tip positions are {times:.1} times as far from their predictions as \
-         observer.invariant.position_sd_mm explains (limit {limit:.1}); check the registration and \
-         the needle that is configured"
-    )]
-    InnovationsOff {
-        /// Number of measurements averaged.
-        samples: usize,
-        /// Root mean square of the innovations, normalised by their covariance.
-        times: f64,
-        /// The limit.
-        limit: f64,
-    },
-}
 
 /// An observer of the tip's pose. It has no estimate before the first [`correct`](Self::correct), since it takes
 /// its start position from there; some need more positions.
@@ -74,8 +46,8 @@ pub trait Observer: Send {
     /// Whether the estimate may be used for steering.
     ///
     /// # Errors
-    /// [`Divergence`] if not: the run must stop with that reason.
-    fn check(&self) -> Result<(), Divergence> {
+    /// Why not: the run must stop with that reason.
+    fn check(&self) -> Result<(), String> {
         Ok(())
     }
 
@@ -157,23 +129,6 @@ impl ObserverConfig {
             ObserverConfig::Invariant(_) => "invariant",
             ObserverConfig::Coupled(_) => "coupled",
             ObserverConfig::FiniteDifference(_) => "finite-difference",
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// An operator must be able to read the message at a glance, with the component as prefix.
-    #[test]
-    fn divergence_messages_fit_200_characters() {
-        for divergence in [
-            Divergence::NotSound { depth_mm: 1000.0 },
-            Divergence::InnovationsOff { samples: 20, times: 1234.5, limit: 100.0 },
-        ] {
-            let text = format!("observer: {divergence}");
-            assert!(text.len() <= 200, "{} characters: {text}", text.len());
         }
     }
 }

@@ -69,7 +69,7 @@ impl Silence {
                 ))
             });
         }
-        let [insertion, rotation] = Axis::BOTH.map(|axis| self.watch.result(axis));
+        let [insertion, rotation] = Axis::BOTH.map(|axis| self.watch.outcome(axis));
         let moving: Vec<String> =
             [insertion?, rotation?].into_iter().filter_map(Result::err).collect();
         Some(match moving.is_empty() {

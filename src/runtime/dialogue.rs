@@ -167,8 +167,8 @@ mod tests {
             "can0"
         }
 
-        fn dropped(&self) -> Result<u64, CanError> {
-            Ok(0)
+        fn dropped(&self) -> Option<u64> {
+            Some(0)
         }
     }
 
@@ -208,7 +208,7 @@ mod tests {
             let (bus, quick_stop, trouble, _) = stop(refuses, 2);
             for axis in Axis::BOTH {
                 assert!(
-                    quick_stop.result(axis).is_some_and(|result| result.is_ok()),
+                    quick_stop.outcome(axis).is_some_and(|result| result.is_ok()),
                     "{count}: {axis}"
                 );
             }
@@ -233,8 +233,8 @@ mod tests {
         let (bus, quick_stop, trouble, took) = stop(of_insertion, 0);
         let sent: Vec<String> = bus.sent.iter().take(2).map(Frame::to_string).collect();
         assert_eq!(sent, ["000#8002", "602#2B40600002000000"]);
-        assert!(quick_stop.result(Axis::Rotation).is_some_and(|result| result.is_ok()));
-        let error = quick_stop.result(Axis::Insertion).expect("over").expect_err("not confirmed");
+        assert!(quick_stop.outcome(Axis::Rotation).is_some_and(|result| result.is_ok()));
+        let error = quick_stop.outcome(Axis::Insertion).expect("over").expect_err("not confirmed");
         assert!(error.ends_with("power off was not confirmed"), "{error}");
         let unsent: Vec<String> = trouble.unsent.iter().map(Frame::to_string).collect();
         for frame in ["000#8001", "601#2B40600002000000", "601#2B40600000000000"] {
@@ -251,7 +251,7 @@ mod tests {
         let (bus, quick_stop, trouble, took) = stop(|_| true, u32::MAX);
         assert!(bus.sent.is_empty());
         for axis in Axis::BOTH {
-            let error = quick_stop.result(axis).expect("over").expect_err("not confirmed");
+            let error = quick_stop.outcome(axis).expect("over").expect_err("not confirmed");
             assert!(error.ends_with("power off was not confirmed"), "{axis}: {error}");
         }
         assert!(trouble.unsent.len() >= 4, "{:?}", trouble.unsent);

@@ -271,7 +271,7 @@ pub fn run_live(
     run.spin = if realtime.is_some() { SPIN } else { Duration::ZERO };
     let outcome = drive(&mut run);
     let figures = run.timing.report(run.session.stage_counters());
-    let timing = TimingReport { frames_dropped: run.bus.dropped().ok(), realtime, ..figures };
+    let timing = TimingReport { frames_dropped: run.bus.dropped(), realtime, ..figures };
     run.witness.finish(run.session, outcome, clock.now(), Some(timing))
 }
 

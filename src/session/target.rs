@@ -213,7 +213,7 @@ impl TargetTracking {
             Some(refusal) => refusal.to_string(),
             None => format!("is \"{}\" in view? See goal.tool", self.tool.gate.tool),
         };
-        Some(Trouble { what, why })
+        Some(Trouble { of: "target", what, why })
     }
 }
 

@@ -29,6 +29,8 @@ const TOO_MANY_WAIT: &str = "too many positions wait for the stage's position at
 /// Why the needle cannot be steered for now.
 #[derive(Debug, Clone)]
 pub(super) struct Trouble {
+    /// What is not seen, or not believed: "tip" or "target".
+    pub(super) of: &'static str,
     /// What is wrong, with its numbers and limits.
     pub(super) what: String,
     /// What led to it, or what the operator should check.

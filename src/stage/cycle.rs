@@ -205,9 +205,7 @@ impl Stage {
     /// that answers late, else one that is not enabled, else one without a heartbeat.
     fn fail_enabling(&mut self, now: Time) {
         let timeout_ms = self.config.power.enable_timeout.as_millis();
-        let first = |fails: &dyn Fn(&Drive) -> bool| {
-            Axis::BOTH.into_iter().find(|axis| fails(&self.drives[*axis]))
-        };
+        let first = |fails: &dyn Fn(Axis) -> bool| Axis::BOTH.into_iter().find(|axis| fails(*axis));
         let other_state = Axis::BOTH.into_iter().find_map(|axis| {
             let state = self.monitors[axis].state()?;
             (state != NmtState::Operational).then_some((axis, state))
@@ -217,7 +215,7 @@ impl Stage {
                 "{axis}: NMT state {state} instead of operational {timeout_ms} ms after the start command, \
                  is there another master?"
             )
-        } else if let Some(axis) = first(&|drive| drive.statusword.is_none()) {
+        } else if let Some(axis) = first(&|axis| self.drives[axis].statusword.is_none()) {
             format!(
                 "{axis}: not in operation enabled within {timeout_ms} ms (no TPDO1 was heard), check \
                  cable and the drive"
@@ -228,22 +226,21 @@ impl Stage {
                  their positions would be too old; what delays frames on the bus, or this bench?",
                 self.config.bus.sync_ms
             )
-        } else if let Some(axis) = Axis::BOTH
-            .into_iter()
-            .find(|axis| !self.drives[*axis].is_armed() && !self.is_steady(*axis))
+        } else if let Some(axis) =
+            first(&|axis| !self.drives[axis].is_armed() && !self.is_steady(axis))
         {
             format!(
                 "{axis}: its position still changed from one SYNC to the next after {timeout_ms} ms without a \
                  target; does the axis move, or is its encoder faulty?"
             )
-        } else if let Some(axis) = first(&|drive| !drive.is_enabled()) {
+        } else if let Some(axis) = first(&|axis| !self.drives[axis].is_enabled()) {
             let statusword = self.drives[axis].statusword.unwrap_or_default();
             format!(
                 "{axis}: not in operation enabled within {timeout_ms} ms (statusword {statusword}), \
                  check power stage, enable input and brake"
             )
         } else {
-            match Axis::BOTH.into_iter().find(|axis| self.monitors[*axis].state().is_none()) {
+            match first(&|axis| self.monitors[axis].state().is_none()) {
                 Some(axis) => format!(
                     "{axis}: enabled, but no heartbeat within {timeout_ms} ms, is can.heartbeat_ms longer?"
                 ),
@@ -367,14 +364,8 @@ impl Stage {
 
     /// Begins a quick stop in a phase in which SYNC runs, unless one is under way.
     pub(super) fn begin_quick_stop(&mut self, now: Time) {
-        match self.phase {
-            Phase::Standby { .. }
-            | Phase::Enabling { .. }
-            | Phase::Ready
-            | Phase::Homing(_)
-            | Phase::Stopping { quick: false, .. }
-            | Phase::Disabling { quick: false, .. } => {}
-            _ => return,
+        if !self.sync_runs() || self.is_quick_stopping() {
+            return;
         }
         self.begin_stop(now, true);
         self.set_controlwords(Controlword::QUICK_STOP);
@@ -412,8 +403,7 @@ impl Stage {
     /// While the stage stops, reads the statusword and the position of a drive that sends no TPDO, such as
     /// one that has left Operational: in turn, each after the answer to the other.
     fn read_by_sdo(&mut self, now: Time, axis: Axis) {
-        let stops = matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. });
-        if !stops || self.drives[axis].answers.fresh {
+        if !self.is_ending() || self.drives[axis].answers.fresh {
             return;
         }
         let Reading { object, sent, is_answered } = self.drives[axis].reading;

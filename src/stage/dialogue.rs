@@ -306,7 +306,10 @@ impl<T> WithBothDrives<T> {
 
 impl<T: Clone> WithBothDrives<T> {
     /// The outcome of the script with the drive of `axis`; `None` while it goes on.
-    pub(super) fn outcome(&self, axis: Axis) -> Option<Result<T, String>> {
+    ///
+    /// # Errors
+    /// Why the script failed, with the axis.
+    pub fn outcome(&self, axis: Axis) -> Option<Result<T, String>> {
         let outcome = self.axes[axis].outcome()?.clone();
         Some(outcome.map_err(|error| format!("{axis}: {error}")))
     }

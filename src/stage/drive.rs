@@ -34,6 +34,23 @@ enum FaultReset {
     Sent(u32),
 }
 
+/// How often a bit of the statusword was set anew while the drive had to follow.
+#[derive(Debug, Default)]
+pub(super) struct RisingEdges {
+    was_set: bool,
+    count: u64,
+}
+
+impl RisingEdges {
+    /// Takes the bit of the next statusword. Returns the count if it is set anew, for the 1st, 2nd, 4th, 8th … time.
+    pub(super) fn take(&mut self, is_set: bool) -> Option<u64> {
+        let was_set = std::mem::replace(&mut self.was_set, is_set);
+        let rises = is_set && !was_set;
+        self.count += u64::from(rises);
+        (rises && self.count.is_power_of_two()).then_some(self.count)
+    }
+}
+
 /// A drive as the SYNC cycle sees it.
 #[derive(Debug)]
 pub(super) struct Drive {
@@ -64,17 +81,13 @@ pub(super) struct Drive {
     reset: FaultReset,
     /// SYNCs that the drive has stayed in a state that it is commanded to leave.
     transition_syncs: u32,
-    /// Bit 11 (internal limit active) was set in the last statusword.
-    was_limited: bool,
-    /// How often bit 11 was set anew.
-    limited: u64,
+    /// Bit 11 (internal limit active).
+    pub(super) limited: RisingEdges,
     /// The bits that the statusword has shown since the drive was enabled; those of `BEFORE_POWER` count from
     /// the first statusword.
     shown: u16,
-    /// Bit 7 (warning) was set in the last statusword.
-    was_warning: bool,
-    /// How often bit 7 was set anew.
-    warnings: u64,
+    /// Bit 7 (warning).
+    pub(super) warnings: RisingEdges,
     /// SYNCs in a row without a new target, and how many of them may be due to lost answers.
     held_syncs: u32,
     held_syncs_max: u32,
@@ -114,11 +127,9 @@ impl Drive {
             sequence: EnableSequence::default(),
             reset: FaultReset::None,
             transition_syncs: 0,
-            was_limited: false,
-            limited: 0,
+            limited: RisingEdges::default(),
             shown: 0,
-            was_warning: false,
-            warnings: 0,
+            warnings: RisingEdges::default(),
             held_syncs: 0,
             held_syncs_max: config.bus.missed_feedback_max.max(1).into(),
             reading: Reading::begun(Time::ZERO),
@@ -277,19 +288,6 @@ impl Drive {
         self.statusword.filter(|_| waited > timeout)
     }
 
-    /// To be called for each statusword while the drive must follow. True if it shows anew that a limit inside the
-    /// drive is active, and this is the 1st, 2nd, 4th, 8th … time. In homing that is normal: the axis may rest on a
-    /// limit switch.
-    pub(super) fn note_internal_limit(&mut self) -> bool {
-        let is_limited = self.statusword.is_some_and(|word| word.has(Statusword::INTERNAL_LIMIT));
-        let was_limited = std::mem::replace(&mut self.was_limited, is_limited);
-        if !is_limited || was_limited || self.in_homing_mode() {
-            return false;
-        }
-        self.limited += 1;
-        self.limited.is_power_of_two()
-    }
-
     /// The bits that an enabled drive must show.
     fn flags(&self) -> impl Iterator<Item = DriveFlag> + use<> {
         // In homing mode bit 12 says that the axis is homed.
@@ -314,18 +312,6 @@ impl Drive {
     pub(super) fn flags_not_shown(&self) -> impl Iterator<Item = DriveFlag> + use<> {
         let shown = self.shown;
         self.flags().filter(move |flag| shown & *flag as u16 == 0)
-    }
-
-    /// To be called for each statusword while the drive must follow. Returns how often bit 7 (warning) was set, if
-    /// this statusword sets it for the 1st, 2nd, 4th, 8th … time.
-    pub(super) fn note_warning(&mut self) -> Option<u64> {
-        let is_warning = self.statusword.is_some_and(|word| word.has(Statusword::WARNING));
-        let was_warning = std::mem::replace(&mut self.was_warning, is_warning);
-        if !is_warning || was_warning {
-            return None;
-        }
-        self.warnings += 1;
-        self.warnings.is_power_of_two().then_some(self.warnings)
     }
 
     /// Notes `emcy`. Returns whether to report it: a repeated one is reported only the 2nd, 4th, 8th … time.

@@ -40,21 +40,13 @@ pub struct DriveReport {
 impl DriveReport {
     /// True if the drive has said that its motor may have power.
     pub fn says_power(&self) -> bool {
-        self.state.is_some() && may_have_power(self.state)
+        self.state.is_some_and(DriveState::may_have_power)
     }
 }
 
 /// Whether the motor may have power in `state`, which may be undefined or not known.
 pub fn may_have_power(state: Option<DriveState>) -> bool {
-    matches!(
-        state,
-        None | Some(
-            DriveState::SwitchedOn
-                | DriveState::OperationEnabled
-                | DriveState::QuickStopActive
-                | DriveState::FaultReactionActive
-        )
-    )
+    state.is_none_or(DriveState::may_have_power)
 }
 
 /// Both axes at one SYNC.

@@ -288,7 +288,7 @@ impl Stage {
     pub fn disable(&mut self, now: Time) {
         match self.phase {
             Phase::Ready => self.begin_stop(now, false),
-            Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped => {}
+            _ if self.is_ending() => {}
             _ => self.quick_stop(now),
         }
     }
@@ -306,6 +306,11 @@ impl Stage {
     /// Where the axes were last measured; `None` before both drives have answered a SYNC.
     pub fn position(&self) -> Option<SetPoint> {
         self.both_heard().then(|| self.positions(Drive::measured))
+    }
+
+    /// True once a stop has begun.
+    pub(super) fn is_ending(&self) -> bool {
+        matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped)
     }
 
     pub(super) fn sync_runs(&self) -> bool {

@@ -23,7 +23,8 @@ use crate::units::Time;
 /// Interval between two reads of a drive.
 const READ_PERIOD: Duration = Duration::from_millis(20);
 
-/// Stops both axes, or watches them stop; returns where each stands, counts.
+/// Stops both axes, or watches them stop. The [outcome](WithBothDrives::outcome) is where an axis stands, counts: its
+/// drive has left Operation Enabled, and has no power unless it was only watched.
 pub type QuickStop = WithBothDrives<i32>;
 
 impl QuickStop {
@@ -47,15 +48,6 @@ impl QuickStop {
             let sdo = drive.sdo.clone();
             ScriptRunner::begin(&sdo, now, async move { drive.come_to_stand(None).await })
         })
-    }
-
-    /// Where `axis` stands, counts. The drive has left Operation Enabled, and has no power unless it was only
-    /// watched. `None` until the end.
-    ///
-    /// # Errors
-    /// The axis was not seen to stand, or its power not to be off.
-    pub fn result(&self, axis: Axis) -> Option<Result<i32, String>> {
-        self.outcome(axis)
     }
 }
 

@@ -13,7 +13,7 @@ impl Stage {
     /// Stops if another master commands the drives. While this stage stops them, that is no fault:
     /// `needle-bench stop` may stop them as well.
     pub(super) fn watch_for_another_master(&mut self, now: Time, frame: &Frame) {
-        if matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped) {
+        if self.is_ending() {
             return;
         }
         let nodes = self.config.nodes();
@@ -41,20 +41,14 @@ impl Stage {
         if frame.data().len() != 8 {
             return self.ignore(Ignored::WrongLength, frame);
         }
-        match &mut self.bring_ups[axis] {
-            Some(bring_up) => {
-                self.flood.frames -= 1;
-                bring_up.runner.handle_frame(now, frame);
-                self.drain_bring_ups(now);
-            }
-            None if matches!(
-                self.phase,
-                Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped
-            ) =>
-            {
-                self.take_reading(axis, frame);
-            }
-            None => self.ignore(Ignored::Unexpected, frame),
+        if let Some(bring_up) = &mut self.bring_ups[axis] {
+            self.flood.frames -= 1;
+            bring_up.runner.handle_frame(now, frame);
+            self.drain_bring_ups(now);
+        } else if self.is_ending() {
+            self.take_reading(axis, frame);
+        } else {
+            self.ignore(Ignored::Unexpected, frame);
         }
     }
 
@@ -178,11 +172,18 @@ impl Stage {
             );
         let has_power =
             matches!(state, Some(S::SwitchedOn | S::OperationEnabled | S::QuickStopActive));
-        if must_follow && self.drives[axis].note_internal_limit() {
-            self.emit(StageEvent::InternalLimit(axis));
-        }
-        if must_follow && let Some(count) = self.drives[axis].note_warning() {
-            self.emit(StageEvent::Warns { axis, statusword, count });
+        if must_follow {
+            let drive = &mut self.drives[axis];
+            // In homing the axis may rest on a limit switch.
+            let is_limited = statusword.has(Statusword::INTERNAL_LIMIT) && !drive.in_homing_mode();
+            let limited = drive.limited.take(is_limited);
+            let warned = drive.warnings.take(statusword.has(Statusword::WARNING));
+            if limited.is_some() {
+                self.emit(StageEvent::InternalLimit(axis));
+            }
+            if let Some(count) = warned {
+                self.emit(StageEvent::Warns { axis, statusword, count });
+            }
         }
         let drive = &self.drives[axis];
         let fault = if standby && has_power {

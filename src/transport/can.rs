@@ -95,11 +95,9 @@ pub trait CanBus: Send {
     /// The interface's name, for messages and logs.
     fn name(&self) -> &str;
 
-    /// How many frames this endpoint lost so far because they were not received in time.
-    ///
-    /// # Errors
-    /// [`CanError::Io`] if the kernel does not count them.
-    fn dropped(&self) -> Result<u64, CanError>;
+    /// How many frames this endpoint lost so far because they were not received in time; `None` if the kernel does
+    /// not count them.
+    fn dropped(&self) -> Option<u64>;
 }
 
 /// Why a bus could not be opened or used.

@@ -71,7 +71,7 @@ impl SocketCan {
         };
         match set_up() {
             Ok(None) => Ok(bus),
-            Ok(Some(error)) | Err(error) => Err(failed(&bus.interface, "set the socket up", error)),
+            Ok(Some(error)) | Err(error) => Err(failed(&bus.interface, "set the socket up")(error)),
         }
     }
 
@@ -82,9 +82,7 @@ impl SocketCan {
     /// # Errors
     /// [`CanError::Io`] if the kernel gives no echoes.
     pub fn confirm_sending(&mut self, syncs_max: usize) -> Result<(), CanError> {
-        self.socket
-            .set_recv_own_msgs(true)
-            .map_err(|error| failed(&self.interface, "ask for echoes", error))?;
+        self.socket.set_recv_own_msgs(true).map_err(failed(&self.interface, "ask for echoes"))?;
         self.unconfirmed = Some(Unconfirmed::new(syncs_max));
         Ok(())
     }
@@ -106,9 +104,7 @@ impl SocketCan {
             .chain(numbers)
             .map(|number| CanFilter::new(number, NODE_BITS | CAN_EFF_FLAG))
             .collect();
-        self.socket
-            .set_filters(&filters)
-            .map_err(|error| failed(&self.interface, "set filters", error))?;
+        self.socket.set_filters(&filters).map_err(failed(&self.interface, "set filters"))?;
         // Bounded, since a flood that passes the filters would never let this end.
         for _ in 0..DRAIN_MAX {
             if self.receive(Duration::ZERO)?.is_none() {
@@ -171,7 +167,7 @@ impl CanBus for SocketCan {
             }
             Err(error) => {
                 self.give_up_unconfirmed();
-                Err(failed(&self.interface, "send", error))
+                Err(failed(&self.interface, "send")(error))
             }
         }
     }
@@ -182,8 +178,7 @@ impl CanBus for SocketCan {
             let remaining = timeout.saturating_sub(start.elapsed());
             match self.socket.read_frame_with_timestamps() {
                 Ok((frame, stamps)) => {
-                    let event = to_event(&frame)
-                        .map_err(|error| failed(&self.interface, "receive", error))?;
+                    let event = to_event(&frame).map_err(failed(&self.interface, "receive"))?;
                     if self.take_echo(&event) {
                         continue;
                     }
@@ -192,11 +187,11 @@ impl CanBus for SocketCan {
                 }
                 Err(error) if !is_nothing_yet(&error) => {
                     self.give_up_unconfirmed();
-                    return Err(failed(&self.interface, "receive", error));
+                    return Err(failed(&self.interface, "receive")(error));
                 }
                 Err(_) if remaining.is_zero() => return Ok(None),
                 Err(_) => wait_readable(self.socket.as_fd(), remaining)
-                    .map_err(|error| failed(&self.interface, "receive", error))?,
+                    .map_err(failed(&self.interface, "receive"))?,
             }
         }
     }
@@ -207,33 +202,26 @@ impl CanBus for SocketCan {
 
     fn report(&mut self, error: &BusError) -> Result<(), CanError> {
         let sent = self.socket.write_frame(&CanFrame::Error(error.0));
-        sent.map_err(|error| failed(&self.interface, "put an error frame on the bus", error))
+        sent.map_err(failed(&self.interface, "put an error frame on the bus"))
     }
 
     fn name(&self) -> &str {
         &self.interface
     }
 
-    fn dropped(&self) -> Result<u64, CanError> {
+    fn dropped(&self) -> Option<u64> {
         let mut info = [0; MEMINFO_BYTES];
         let read = self.socket.get_socket_option_bytes(SOL_SOCKET, SO_MEMINFO, &mut info);
-        let error = match read {
-            Ok(MEMINFO_BYTES) => {
-                let [.., a, b, c, d] = info;
-                return Ok(u32::from_ne_bytes([a, b, c, d]).into());
-            }
-            Ok(_) => ErrorKind::Unsupported.into(),
-            Err(error) => error,
-        };
-        Err(failed(&self.interface, "count drops", error))
+        let [.., a, b, c, d] = info;
+        (read.ok()? == MEMINFO_BYTES).then(|| u32::from_ne_bytes([a, b, c, d]).into())
     }
 }
 
 /// An error of the operating system as a [`CanError`]. For an interface that vanished, the first error is
 /// ENODEV, and ENXIO at each later frame.
-fn failed(interface: &str, action: &'static str, reason: io::Error) -> CanError {
+fn failed(interface: &str, action: &'static str) -> impl FnOnce(io::Error) -> CanError {
     let interface = interface.to_owned();
-    match errno(&reason) {
+    move |reason| match errno(&reason) {
         Some(Errno::ENETDOWN) => CanError::Down(interface),
         Some(Errno::ENODEV | Errno::ENXIO) => CanError::Gone(interface),
         _ => CanError::Io { interface, action, reason },
@@ -325,10 +313,10 @@ mod tests {
     #[test]
     fn a_vanished_interface_is_reported_as_gone() {
         for errno in [Errno::ENODEV, Errno::ENXIO] {
-            let error = failed("can0", "send", errno.into());
+            let error = failed("can0", "send")(errno.into());
             assert_eq!(error.to_string(), "interface can0 is gone, was the adapter unplugged?");
         }
-        let other = failed("can0", "send", Errno::EPERM.into()).to_string();
+        let other = failed("can0", "send")(Errno::EPERM.into()).to_string();
         assert!(other.starts_with("can0: cannot send: Operation not permitted"), "{other}");
     }
 

@@ -154,8 +154,8 @@ impl CanBus for UdpBus {
         &self.name
     }
 
-    fn dropped(&self) -> Result<u64, CanError> {
-        Ok(self.dropped.into())
+    fn dropped(&self) -> Option<u64> {
+        Some(self.dropped.into())
     }
 }
 

@@ -4,6 +4,7 @@
 //! in the controller, and leave in a burst when another node acknowledges again. By then the set-points
 //! among them are stale. So the number of SYNCs whose frames may wait is limited.
 
+use crate::canopen::sync::is_sync;
 use crate::canopen::{Frame, cob};
 use std::collections::VecDeque;
 
@@ -53,7 +54,7 @@ impl Unconfirmed {
 
     /// Adds a frame that the kernel accepted; `dropped` is the socket's count of dropped frames at that time.
     pub fn sent(&mut self, frame: Frame, dropped: u64) {
-        if is_sync(&frame) {
+        if is_sync(&frame, cob::SYNC) {
             self.dropped_before.push_back(dropped);
             let [newest, before] = &mut self.overtaken;
             *before = std::mem::take(newest);
@@ -68,7 +69,8 @@ impl Unconfirmed {
     pub fn take_echo(&mut self, frame: &Frame) -> bool {
         let find = |frames: &VecDeque<Frame>| frames.iter().position(|sent| sent == frame);
         if let Some(index) = find(&self.frames) {
-            let syncs = self.frames.iter().take(index + 1).filter(|frame| is_sync(frame)).count();
+            let confirmed = self.frames.iter().take(index + 1);
+            let syncs = confirmed.filter(|frame| is_sync(frame, cob::SYNC)).count();
             self.dropped_before.drain(..syncs);
             self.overtaken[0].extend(self.frames.drain(..index));
             self.frames.pop_front();
@@ -94,10 +96,6 @@ impl Unconfirmed {
         let old = self.given_up.len().saturating_sub(GIVEN_UP_MAX);
         self.given_up.drain(..old);
     }
-}
-
-fn is_sync(frame: &Frame) -> bool {
-    frame.cob_id() == Some(cob::SYNC)
 }
 
 #[cfg(test)]

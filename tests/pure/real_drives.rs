@@ -28,7 +28,7 @@ const SDO_TRANSFERS: [[&str; 2]; 9] = [
 ];
 
 fn frame(text: &str) -> Frame {
-    text.parse().unwrap_or_else(|error| panic!("{text}: {error}"))
+    Frame::parse(text).unwrap_or_else(|| panic!("{text}"))
 }
 
 #[test]

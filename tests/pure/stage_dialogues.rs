@@ -138,11 +138,11 @@ fn a_stop_from_outside_ends_a_run_that_is_moving() {
     let mut bench = Bench::moving();
     let at_mm = bench.depth_mm();
     let mut quick_stop = QuickStop::new(&bench.config, bench.now);
-    assert_eq!(quick_stop.result(Axis::Insertion), None);
+    assert_eq!(quick_stop.outcome(Axis::Insertion), None);
     bench.talk(&mut quick_stop);
     assert!((bench.depth_mm() - at_mm).abs() < 0.2, "{} mm", bench.depth_mm() - at_mm);
-    assert!(quick_stop.result(Axis::Insertion).unwrap().is_ok());
-    assert!(quick_stop.result(Axis::Rotation).unwrap().is_ok());
+    assert!(quick_stop.outcome(Axis::Insertion).unwrap().is_ok());
+    assert!(quick_stop.outcome(Axis::Rotation).unwrap().is_ok());
     let first: Vec<String> = bench.sent.iter().take(4).map(Frame::to_string).collect();
     let quick_stop = ["601#2B40600002000000", "602#2B40600002000000"];
     assert_eq!(first[..2], ["000#8001", "000#8002"]);
@@ -162,9 +162,9 @@ fn a_drive_that_does_not_answer_a_stop_is_named_and_the_other_is_stopped() {
     config.rotation.node = NodeId::new(9).unwrap();
     let mut quick_stop = QuickStop::new(&config, bench.now);
     bench.talk(&mut quick_stop);
-    assert!(quick_stop.result(Axis::Insertion).unwrap().is_ok());
+    assert!(quick_stop.outcome(Axis::Insertion).unwrap().is_ok());
     assert_eq!(
-        quick_stop.result(Axis::Rotation).unwrap().unwrap_err(),
+        quick_stop.outcome(Axis::Rotation).unwrap().unwrap_err(),
         "rotation: node 9 0x6040:00: no SDO reply within 150 ms (attempt 3 of 3), is the drive \
          powered, node-id and bitrate right?; power off was not confirmed"
     );
@@ -214,7 +214,7 @@ fn a_drive_whose_answers_are_lost_is_stopped_and_loses_power() {
         };
         bench.talk(&mut stop);
         assert_eq!(bench.states(), [DriveState::SwitchOnDisabled; 2], "{lost} lost");
-        let error = stop.dialogue.result(Axis::Rotation).unwrap().unwrap_err();
+        let error = stop.dialogue.outcome(Axis::Rotation).unwrap().unwrap_err();
         assert!(error.ends_with("; power off was not confirmed"), "{error}");
         let sent = |word: &str| {
             let frame = format!("602#2B406000{word}000000");
@@ -237,10 +237,10 @@ fn a_stop_without_statuswords_takes_power_off_and_says_it_is_unconfirmed() {
         is_sent: Box::new(move |frame| *frame != statusword),
     };
     bench.talk(&mut stop);
-    let error = stop.dialogue.result(Axis::Rotation).unwrap().unwrap_err();
+    let error = stop.dialogue.outcome(Axis::Rotation).unwrap().unwrap_err();
     assert!(error.starts_with("rotation: node 2 0x6041:00: no SDO reply within 150 ms"), "{error}");
     assert!(error.ends_with(": power off was not seen, press the emergency stop"), "{error}");
-    assert!(stop.dialogue.result(Axis::Insertion).unwrap().is_ok());
+    assert!(stop.dialogue.outcome(Axis::Insertion).unwrap().is_ok());
     assert_eq!(bench.states(), [DriveState::SwitchOnDisabled; 2]);
     // The node has to leave Operational.
     assert_eq!(bench.sent.last().map(Frame::to_string).as_deref(), Some("000#8002"));

@@ -38,6 +38,12 @@ impl DriveState {
     pub fn is_fault(self) -> bool {
         matches!(self, DriveState::Fault | DriveState::FaultReactionActive)
     }
+
+    /// True if the motor may have power.
+    pub fn may_have_power(self) -> bool {
+        use DriveState::{FaultReactionActive, OperationEnabled, QuickStopActive, SwitchedOn};
+        matches!(self, SwitchedOn | OperationEnabled | QuickStopActive | FaultReactionActive)
+    }
 }
 
 /// Object 0x6041.

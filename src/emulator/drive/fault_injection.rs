@@ -4,7 +4,6 @@ use super::axis::Axis;
 use super::device::Device;
 use super::inputs::End;
 use super::motion::Motion;
-use crate::canopen::cia402::DriveState;
 use crate::canopen::emcy::EmcyCode;
 use crate::emulator::fault::{Fault, FaultKind};
 use crate::units::Time;
@@ -55,14 +54,7 @@ impl Axis {
 
     /// Stops an axis that has lost its torque at once, also in its fault reaction, and raises `code`.
     fn handle_torque_loss(&mut self, now: Time, code: EmcyCode, device: &mut Device) {
-        let powered = matches!(
-            self.state(),
-            DriveState::SwitchedOn
-                | DriveState::OperationEnabled
-                | DriveState::QuickStopActive
-                | DriveState::FaultReactionActive
-        );
-        if !self.has_torque() && powered {
+        if !self.has_torque() && self.state().may_have_power() {
             self.motion = Motion::Hold { at: self.motion.position_at(now) };
             self.fault(now, code, device);
         }

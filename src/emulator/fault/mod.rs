@@ -305,7 +305,7 @@ impl FaultKind {
 
 /// A data frame as candump writes it.
 fn data_frame(text: &str) -> Option<Frame> {
-    text.parse().ok().filter(|frame: &Frame| !frame.is_remote())
+    Frame::parse(text).filter(|frame| !frame.is_remote())
 }
 
 #[cfg(test)]

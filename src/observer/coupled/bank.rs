@@ -50,7 +50,7 @@ const FIBRE: [usize; 3] = [1, 2, 3];
 pub(super) struct CoupledBank {
     needle: Needle,
     config: CoupledConfig,
-    bank: Vec<RollHypothesis>,
+    pub(super) bank: Vec<RollHypothesis>,
     /// The tip's motion since the last correction, in its frame then, and its depth.
     motion: Pose,
     motion_mm: f64,
@@ -62,7 +62,7 @@ pub(super) struct CoupledBank {
 
 /// One copy, at the depth of the last correction.
 #[derive(Debug, Clone)]
-struct RollHypothesis {
+pub(super) struct RollHypothesis {
     x_pb: Pose,
     /// Covariance of the left-invariant error.
     covariance: Matrix6<f64>,
@@ -228,14 +228,6 @@ impl CoupledBank {
         let mut ahead = self.bank.clone();
         ahead.iter_mut().for_each(|copy| copy.propagate(&motion, forgetting));
         ahead
-    }
-}
-
-#[cfg(test)]
-impl CoupledBank {
-    /// Number of copies left.
-    pub(super) fn copies(&self) -> usize {
-        self.bank.len()
     }
 }
 

@@ -270,7 +270,7 @@ impl Transition {
     }
 
     /// Replaces an error vector, of which the first N states count, by F times it.
-    fn apply<const N: usize>(&self, error: &mut ErrorState) {
+    pub(super) fn apply<const N: usize>(&self, error: &mut ErrorState) {
         let mut pose = adjoint_inverse(&self.motion, &std::array::from_fn(|i| error[i]));
         for (p, by) in pose.iter_mut().zip(&self.by_curvature) {
             *p += by * error[CURVATURE];
@@ -292,13 +292,5 @@ impl Transition {
             }
         }
         error[..6].copy_from_slice(&pose);
-    }
-}
-
-#[cfg(test)]
-impl Transition {
-    /// F times a whole error vector.
-    pub(super) fn apply_all(&self, error: &mut ErrorState) {
-        self.apply::<STATES>(error);
     }
 }

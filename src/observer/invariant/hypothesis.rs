@@ -275,7 +275,7 @@ impl Hypothesis {
     }
 
     /// The transition since the covariance was last propagated.
-    fn transition(&self) -> Transition {
+    pub(super) fn transition(&self) -> Transition {
         Transition { push_edge: self.edge(self.stroke.sign).0, ..self.pending }
     }
 
@@ -324,7 +324,7 @@ impl Hypothesis {
     }
 
     /// Moves the mean by `delta`. Returns the pose part of `delta`.
-    fn apply(&mut self, delta: &ErrorState) -> Twist {
+    pub(super) fn apply(&mut self, delta: &ErrorState) -> Twist {
         let xi = Twist {
             v: Vector3::new(delta[0], delta[1], delta[2]),
             w: Vector3::new(delta[3], delta[4], delta[5]),
@@ -347,21 +347,5 @@ impl Hypothesis {
                 .iter()
                 .all(|v| v.is_finite())
             && self.covariance.is_sound()
-    }
-}
-
-#[cfg(test)]
-impl Hypothesis {
-    /// Moves the mean alone.
-    pub(super) fn nudge(&mut self, delta: &ErrorState) {
-        self.apply(delta);
-    }
-
-    /// The pose part of the transition's column for `state`.
-    pub(super) fn transition_column(&self, state: usize) -> [f64; 6] {
-        let mut error = [0.0; super::error_state::STATES];
-        error[state] = 1.0;
-        self.transition().apply_all(&mut error);
-        std::array::from_fn(|i| error[i])
     }
 }

@@ -17,7 +17,7 @@ mod tests;
 
 pub use config::{InvariantConfig, NoiseConfig};
 
-use super::{Divergence, Estimate, Observer, mixture};
+use super::{Estimate, Observer, mixture};
 use crate::needle::{Increment, Needle, TipPosition, Torsion};
 use hypothesis::Hypothesis;
 use nalgebra::Vector3;
@@ -127,17 +127,21 @@ impl Observer for Invariant {
         mixture::position_mm(&self.bank)
     }
 
-    fn check(&self) -> Result<(), Divergence> {
+    fn check(&self) -> Result<(), String> {
         if self.is_lost {
-            return Err(Divergence::NotSound { depth_mm: self.insertion_mm });
+            return Err(format!(
+                "the estimate is no longer finite, or its covariance no longer positive, at {:.1} mm",
+                self.insertion_mm
+            ));
         }
-        let samples = self.innovations.len();
-        if samples == INNOVATIONS {
-            let mean = self.innovations.iter().sum::<f64>() / (3.0 * samples as f64);
-            let (times, limit) = (mean.sqrt(), self.config.innovation_max);
-            if times > limit {
-                return Err(Divergence::InnovationsOff { samples, times, limit });
-            }
+        let (samples, limit) = (self.innovations.len(), self.config.innovation_max);
+        let times = self.innovation_excess().sqrt();
+        if samples == INNOVATIONS && times > limit {
+            return Err(format!(
+                "the last {samples} tip positions are {times:.1} times as far from their predictions as \
+                 observer.invariant.position_sd_mm explains (limit {limit:.1}); check the registration and \
+                 the needle that is configured"
+            ));
         }
         Ok(())
     }

@@ -46,8 +46,6 @@ enum HeldBy {
         /// How long and how far the insertion went on blind, or how the stream contradicts the model; and why the
         /// tip was not seen, or what the operator should check.
         trouble: Trouble,
-        /// Whose trouble it is: "tip" or "target".
-        lost: &'static str,
         /// The hold interrupted a single step, which never goes on by itself.
         in_step: bool,
         /// What the operator was told last: that the insertion may go on, or not.
@@ -73,12 +71,12 @@ impl InsertTask {
     ) -> Result<(), String> {
         let found = self.trouble(now, insertion_meas_mm, insertion);
         let Some(hold) = &self.hold else {
-            if let Some((lost, trouble)) = found {
+            if let Some(trouble) = found {
                 let text = format!("{}; insertion held; {}", trouble.what, trouble.why);
                 let text = clipped(&text, MESSAGE_MAX).into_owned();
                 insertion.profile.hold(self.config.tracker.hold.braking_mm_per_s2);
                 let in_step = insertion.profile.is_stepping();
-                let by = HeldBy::Tracker { trouble, lost, in_step, is_told: false };
+                let by = HeldBy::Tracker { trouble, in_step, is_told: false };
                 let before = self.ended_hold.map_or(Duration::ZERO, |ended| {
                     ended.lasted.saturating_sub(now.since(ended.at))
                 });
@@ -90,9 +88,10 @@ impl InsertTask {
             }
             return Ok(());
         };
-        let HeldBy::Tracker { trouble: first, lost, in_step, is_told } = &hold.by else {
+        let HeldBy::Tracker { trouble: first, in_step, is_told } = &hold.by else {
             return Ok(());
         };
+        let lost = first.of;
         let tracker = &self.config.tracker;
         let is_standing = insertion.is_standing(insertion_meas_mm);
         let may_go_on = is_standing && found.is_none() && self.is_seen(now);
@@ -143,7 +142,7 @@ impl InsertTask {
                     let nobody = "but the operator did not resume (tracker.hold_timeout_s)";
                     return Err(format!("tracker: the {lost} is seen again, {nobody}; {end}"));
                 }
-                _ => (end, found.as_ref().map_or(first, |(_, trouble)| trouble)),
+                _ => (end, found.as_ref().unwrap_or(first)),
             }
         } else {
             return Ok(());
@@ -189,8 +188,11 @@ impl InsertTask {
         let hold = self.hold.as_ref().ok_or("the insertion is not held; hold it first")?;
         match (&hold.by, self.config.tracker.hold.resume) {
             (HeldBy::Tracker { .. }, Resume::Stop) => return Err(RUN_WILL_END.to_owned()),
-            (HeldBy::Tracker { lost, .. }, Resume::Automatic) => {
-                return Err(format!("the tracker holds it, until the {lost} is seen again"));
+            (HeldBy::Tracker { trouble, .. }, Resume::Automatic) => {
+                return Err(format!(
+                    "the tracker holds it, until the {} is seen again",
+                    trouble.of
+                ));
             }
             _ => {}
         }
@@ -221,7 +223,7 @@ impl InsertTask {
                 None => "the needle is still braking; try again once it stands".to_owned(),
             });
         }
-        if let Some((_, Trouble { what, why })) = self.trouble(shell.now, insertion_mm, insertion) {
+        if let Some(Trouble { what, why, .. }) = self.trouble(shell.now, insertion_mm, insertion) {
             return Err(clipped(&format!("{what}; {why}"), MESSAGE_MAX).into_owned());
         }
         let remaining_mm = insertion.remaining_mm();
@@ -238,22 +240,16 @@ impl InsertTask {
         Ok(format!("{what} at {insertion_mm:.2} mm, held for {held_s:.2} s"))
     }
 
-    /// Why the insertion must be held, after whose trouble it is, "tip" or "target"; `None` if nothing calls for a
-    /// hold.
-    fn trouble(
-        &self,
-        now: Time,
-        insertion_meas_mm: f64,
-        insertion: &Insertion,
-    ) -> Option<(&'static str, Trouble)> {
+    /// Why the insertion must be held; `None` if nothing calls for a hold.
+    fn trouble(&self, now: Time, insertion_meas_mm: f64, insertion: &Insertion) -> Option<Trouble> {
+        let of = "tip";
         if let Some(jump) = &self.tracking.jump {
-            return Some(("tip", Trouble { what: jump.clone(), why: JUMP_ADVICE.to_owned() }));
+            return Some(Trouble { of, what: jump.clone(), why: JUMP_ADVICE.to_owned() });
         }
         if let Some(what) = self.blindness(now, insertion_meas_mm, insertion) {
-            return Some(("tip", Trouble { what, why: self.tracking.explain_silence() }));
+            return Some(Trouble { of, what, why: self.tracking.explain_silence() });
         }
-        let trouble = self.target.as_ref()?.trouble(now)?;
-        Some(("target", trouble))
+        self.target.as_ref()?.trouble(now)
     }
 
     /// How long and how far the insertion has gone on blind, if it must be held for that: the tip is too old,

@@ -284,7 +284,7 @@ impl InsertTask {
         let limit_s = self.config.tracker.timeout.as_secs_f64();
         let target = self.target.as_ref().filter(|_| self.tracking.is_seen(now));
         let text = match target.and_then(|target| target.trouble(now)) {
-            Some(Trouble { what, why }) => {
+            Some(Trouble { what, why, .. }) => {
                 format!("tracker: no target within {limit_s:.1} s; {what}; {why}")
             }
             None => {

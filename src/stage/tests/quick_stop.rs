@@ -93,7 +93,7 @@ fn result_of(
     drives[0].state = DriveState::OperationEnabled;
     let seen = run(&mut quick_stop, &mut drives, change);
     let [drive, _] = drives;
-    (quick_stop.result(Axis::Insertion).expect("it is over"), drive, seen)
+    (quick_stop.outcome(Axis::Insertion).expect("it is over"), drive, seen)
 }
 
 /// The result for an insertion drive that ignores controlwords before `obeys`, and the state of the drive.
@@ -201,9 +201,9 @@ fn a_short_answer_is_neither_statusword_nor_position() {
     let result_after = |answers: [&str; 3]| {
         let mut quick_stop = QuickStop::watch(&config(), BEGUN, BEGUN);
         for answer in answers {
-            quick_stop.handle_frame(BEGUN, &answer.parse().expect("a frame"));
+            quick_stop.handle_frame(BEGUN, &Frame::parse(answer).expect("a frame"));
         }
-        quick_stop.result(Axis::Insertion)
+        quick_stop.outcome(Axis::Insertion)
     };
     let (short, disabled, unsized_) =
         ("581#4F41600040000000", "581#4B41600050020000", "581#4241600050020000");
