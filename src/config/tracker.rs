@@ -143,6 +143,11 @@ impl TrackerSection {
         Ok(Registration::new(x_wt).with_tip(self.x_sb()))
     }
 
+    /// True if the tip's place on the sensor is known. The default is that of a sensor in the tip itself.
+    pub fn has_tip(&self) -> bool {
+        self.tip_fit.is_some() || self.tip_offset_mm != [0.0; 3]
+    }
+
     /// `X_SB`: the tip in the sensor's frame.
     pub fn x_sb(&self) -> Pose {
         Pose { rotation: self.tip_tilt.to_rotation(), translation: self.tip_offset_mm.into() }

@@ -3,9 +3,10 @@
 use super::Check;
 use super::Verdict::{Fail, Warn};
 use crate::archive::unix_us_of;
-use crate::calibration::Provenance;
+use crate::calibration::{Provenance, RegistrationRecord};
 use crate::config::{Config, RegistrationConfig};
 use crate::observer::ROLL_JUDGED_SD_MAX_RAD;
+use nalgebra::Vector3;
 
 const DAY_US: f64 = 86_400e6;
 /// A date may be ahead of this machine's clock by an hour; a later one is wrong.
@@ -16,6 +17,9 @@ const SAME_POSE: f64 = 1e-6;
 
 /// The largest standard error of a calibrated curvature, as a part of it.
 const CURVATURE_PART_MAX: f64 = 0.2;
+
+/// The tip's offset may differ from that with which the fiducials were touched by this, mm.
+const TIP_MOVED_MAX_MM: f64 = 0.05;
 
 /// A run before this one.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -84,11 +88,16 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
             let provenance = fit.map(|fit| &fit.provenance);
             let rms_mm = fit.map_or(0.0, |fit| fit.rms_mm);
             let old = "its file has no fiducials to compute its error from: sd_mm is of the depth and plane of that time";
-            close(dated("registration", found, &limit, provenance, &collect), rms_mm).unless(
-                fit.is_none() || of_fiducials.is_some(),
-                Warn,
-                format!("{old}: {register}"),
-            )
+            let check = close(dated("registration", found, &limit, provenance, &collect), rms_mm)
+                .unless(
+                    fit.is_none() || of_fiducials.is_some(),
+                    Warn,
+                    format!("{old}: {register}"),
+                );
+            match fit {
+                Some(fit) => collected_with_tip(check, fit, tracker.tip_offset_mm),
+                None => check,
+            }
         }
         Some(RegistrationConfig::Fiducials(fiducials)) => match fiducials.fit() {
             Ok(fit) => {
@@ -108,8 +117,7 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
     };
     let days_limit = format!("up to {days_max:.0} days");
     let fit = tracker.tip_fit.as_ref();
-    // The default is that of a sensor in the tip itself.
-    let is_placeholder = fit.is_none() && tracker.tip_offset_mm == [0.0; 3];
+    let is_placeholder = !tracker.has_tip();
     let found = match fit {
         Some(fit) => format!("{:.2} mm RMS", fit.rms_mm),
         None if is_placeholder => "0 mm from the sensor".to_owned(),
@@ -129,6 +137,22 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
         "its curvature is known to no better than a fifth: calibrate it from more insertions";
     let needle = needle.unless(part.is_none_or(|part| part <= CURVATURE_PART_MAX), Warn, vague);
     vec![registration, tip, needle]
+}
+
+/// This check of a registration, unless its fiducials were touched with another offset of the tip than the present
+/// one. The difference went into the pose.
+fn collected_with_tip(check: Check, fit: &RegistrationRecord, now_mm: [f64; 3]) -> Check {
+    let Some(then_mm) = fit.tip_offset_mm else {
+        let next = "its file does not say with which tip_offset_mm its points were touched: \
+                    needle-bench calibrate registration";
+        return check.unless(now_mm == [0.0; 3], Warn, next);
+    };
+    let moved_mm = (Vector3::from(now_mm) - Vector3::from(then_mm)).norm();
+    let next = format!(
+        "collected with tip_offset_mm {then_mm:.2?}, now {now_mm:.2?}: the tip's offset would count twice; collect \
+         the fiducials again"
+    );
+    check.unless(moved_mm <= TIP_MOVED_MAX_MM, Fail, next)
 }
 
 /// Checks that the roll at the start is known. Only against it does a run notice a registration that is turned

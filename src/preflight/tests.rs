@@ -337,6 +337,37 @@ fn a_registration_is_judged_by_its_fiducials() {
     );
 }
 
+/// A tip that was calibrated after the fiducials were touched with it is in the pose already.
+#[test]
+fn a_registration_collected_with_another_tip_fails() {
+    let of = |kept: &str, tip: &str| {
+        let fit = FIT.replace("points = 4,", &format!("points = 4, {kept}"));
+        let sets = [&*fit, "calibration.max_age_days=120", tip];
+        let check = calibrations(&rig(&sets), NOW_UNIX_US).swap_remove(0);
+        (check.verdict, check.next_step.unwrap_or_default())
+    };
+    let (before, with) = ("tip_offset_mm = [0.0, 0.0, 0.0],", "tip_offset_mm = [-3.0, 0.0, 7.0],");
+    let at = |x_mm: f64| format!("tracker.tip_offset_mm=[{x_mm:.3}, 0.0, 7.0]");
+    assert_eq!(of(with, &at(-3.0)), (Verdict::Pass, String::new()));
+    assert_eq!(of(with, &at(-3.049)).0, Verdict::Pass);
+    assert_eq!(of(with, &at(-3.051)).0, Verdict::Fail);
+    assert_eq!(of(before, "tracker.tip_offset_mm=[0.0, 0.0, 0.0]").0, Verdict::Pass);
+    let (verdict, next) = of(before, &at(-3.0));
+    assert_eq!(
+        (verdict, next.as_str()),
+        (
+            Verdict::Fail,
+            "collected with tip_offset_mm [0.00, 0.00, 0.00], now [-3.00, 0.00, 7.00]: the tip's offset would count \
+             twice; collect the fiducials again"
+        )
+    );
+    // A file of an earlier version.
+    assert_eq!(of("", "tracker.tip_offset_mm=[0.0, 0.0, 0.0]").0, Verdict::Pass);
+    let (verdict, next) = of("", &at(-3.0));
+    assert_eq!(verdict, Verdict::Warn);
+    assert!(next.starts_with("its file does not say with which tip_offset_mm"), "{next}");
+}
+
 #[test]
 fn a_curvature_that_is_poorly_known_is_warned_about() {
     const TORSION: &str = "half_width_deg = 0.0, half_width_deg_per_mm = 0.0, offset_deg = 0.0, creep_mm = 0.0, \

@@ -2,8 +2,8 @@
 
 Prints "listening PORT" once it serves; with port 0 the system chooses the port. Every new position keeps its stamp.
 The relay ends with its only client, or after DURATION s; with --stay it serves one client after the other until then.
-While the file CARRIED exists, the tool is at the position "x y z" (mm) in it, with 0.1 mm of noise, as if an operator
-held it there.
+While the file CARRIED exists, the tool's TIP is at the position "x y z" (mm) in it, with 0.1 mm of noise, as if an
+operator held it there.
 """
 
 import argparse
@@ -32,7 +32,8 @@ def main():
     parser.add_argument("--device", default="NeedleToTracker")
     parser.add_argument("--duration", type=float, default=300.0, help="s, at most")
     parser.add_argument("--stay", action="store_true", help="serve one client after the other")
-    parser.add_argument("--carried", type=Path, help="file with the position of the tool")
+    parser.add_argument("--carried", type=Path, help="file with the position of the tool's tip")
+    parser.add_argument("--tip", type=float, nargs=3, default=[0.0, 0.0, 0.0], help="the tip on the sensor, mm")
     args = parser.parse_args()
     # pyigtl logs the end of a client as an error.
     logging.disable(logging.ERROR)
@@ -51,7 +52,8 @@ def main():
         message = source.wait_for_message(args.device, timeout=1.0)
         place_mm = carried_to_mm(args.carried)
         if message is not None and place_mm:
-            message.matrix[:3, 3] = noise.normal(place_mm, 0.1)
+            sensor_mm = place_mm - message.matrix[:3, :3] @ np.array(args.tip)
+            message.matrix[:3, 3] = noise.normal(sensor_mm, 0.1)
         if server.is_connected() and message is not None:
             server.send_message(message, wait=False)
             served += 1

@@ -1,6 +1,6 @@
 //! `needle-bench calibrate`, the use of its results, and the presets of the emulated tracker.
 
-use crate::support::program::{Said, Scratch, needle_bench, refusals};
+use crate::support::program::{Said, Scratch, needle_bench, refusals, repository};
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
@@ -81,6 +81,7 @@ fn a_registration_is_computed_used_from_its_file_and_recorded() {
     let sd_mm = number(&config, "tracker.registration.sd_mm");
     assert!((0.05..1.0).contains(&sd_mm), "{sd_mm}");
     let fit = &config["tracker"]["registration"]["fit"];
+    assert_eq!(fit.get("tip_offset_mm"), None, "no configuration was given");
     assert_eq!(fit["file"].as_str(), Some("points.csv"));
     assert_eq!(fit["sha256"].as_str().map(str::len), Some(64));
     assert_eq!(fit["fiducials"].as_array().map(Vec::len), Some(6));
@@ -104,6 +105,35 @@ fn a_registration_is_computed_used_from_its_file_and_recorded() {
         needle_bench(&scratch, &["run", dir.join("config.toml").to_str().unwrap(), "--json"]);
     let steps = |dir: PathBuf| std::fs::read_to_string(dir.join("steps.csv")).unwrap();
     assert_eq!(steps(dir), steps(again.run_dir(&scratch)));
+}
+
+/// The preflight compares it with that of the run.
+#[test]
+fn a_registration_keeps_the_tip_that_touched_its_points() {
+    let scratch = Scratch::new();
+    scratch.write("points.csv", &fiducials(0.3));
+    scratch.write("rig.toml", "tracker.tip_offset_mm = [-3.0, 0.0, 7.0]");
+    let said = calibrate(&scratch, &["registration", "points.csv", "rig.toml", "--json"]);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    let kept = &said.json()["registration"]["fit"]["tip_offset_mm"];
+    assert_eq!(kept, &serde_json::json!([-3.0, 0.0, 7.0]));
+}
+
+#[test]
+fn a_collection_without_a_tip_on_hardware_is_warned_about() {
+    let scratch = Scratch::new();
+    let rig = repository("bench-config/rig-epos4.toml");
+    let collect = |more: &[&str]| {
+        // It ends before a point is asked for: the operator's lines cannot come from there too.
+        let source = "tracker={ source = \"ndjson\", address = \"-\" }";
+        let common = ["registration", "points.csv", &*rig, "--collect", "--set", source];
+        let said = calibrate(&scratch, &[&common, more].concat());
+        assert_eq!(said.status, 2, "{}", said.stderr);
+        said.stderr
+            .contains("warning: without tracker.tip_offset_mm each point is where the sensor")
+    };
+    assert!(collect(&[]));
+    assert!(!collect(&["--set", "tracker.tip_offset_mm=[0.0, 0.0, 7.0]"]));
 }
 
 #[test]

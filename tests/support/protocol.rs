@@ -158,7 +158,7 @@ impl Rig {
         fs::write(self.path("points.csv"), csv).expect("a file");
     }
 
-    /// Holds the tool at this position of the tracker's frame until the file `carried` is removed.
+    /// Holds the tool's tip at this position of the tracker's frame until the file `carried` is removed.
     fn carry(&self, [x, y, z]: [f64; 3]) {
         fs::write(self.path("new"), format!("{x} {y} {z}")).expect("a file");
         fs::rename(self.path("new"), self.path("carried")).expect("a file");
@@ -372,7 +372,7 @@ pub(crate) fn follow(
         stage(&[file.to_str().expect("UTF-8")].into_iter().chain(sets).collect::<Vec<_>>());
     let (port, carried) = (source.port().to_string(), rig.path("carried"));
     let relay = ["--from-port", &port, "--port", "0", "--stay", "--duration", "3600", "--carried"];
-    let relay = [&relay[..], &[carried.to_str().expect("UTF-8")]].concat();
+    let relay = [&relay[..], &[carried.to_str().expect("UTF-8"), "--tip", "-3", "0", "7"]].concat();
     let (_tracker, port) = serving_peer("pyigtl_relay.py", &relay).expect("NEEDLE_PEERS_PYTHON");
     rig.change(&[("127.0.0.1:18944", &format!("127.0.0.1:{port}"))]);
 

@@ -287,6 +287,12 @@ fn registration(arguments: &RegistrationArguments) -> Result<()> {
     let config = arguments.configured.load(None)?;
     arguments.output.refuse_unwritable()?;
     if arguments.collect {
+        if config.stage.hardware && !config.tracker.has_tip() {
+            print_stderr(
+                "warning: without tracker.tip_offset_mm each point is where the sensor is, not the tip: if you touch with \
+                 the needle's tip, run needle-bench calibrate tip first",
+            );
+        }
         collect_fiducials(path, &arguments.configured)?;
     }
     let text = text_of(path)?;
@@ -300,6 +306,9 @@ fn registration(arguments: &RegistrationArguments) -> Result<()> {
         "spread_mm": fit.spread_mm,
         "fiducials": fiducials,
     });
+    let knows_tip = arguments.collect || arguments.configured.path().is_some();
+    let tip = knows_tip.then(|| json!({ "tip_offset_mm": config.tracker.tip_offset_mm }));
+    let found = merged(found, &tip.unwrap_or_else(|| json!({})));
     let [x_mm, y_mm, z_mm]: [f64; 3] = fit.x_wt.translation.into();
     let registration = json!({
         "x_mm": x_mm,
