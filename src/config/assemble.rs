@@ -79,6 +79,8 @@ impl Config {
             tracker: TrackerConfig {
                 gate: self.tracker.to_gate()?,
                 judges_stream: self.tracker.gates.stream,
+                is_exact: self.tip_source() == TrackerSource::Emulated
+                    && self.emulator.to_tracker().is_exact(),
                 clock: AcquisitionClock::new(self.tracker.stamp, self.tracker.latency),
                 track: self.tracker.to_track(),
                 noise: self.tracker.noise,

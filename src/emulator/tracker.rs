@@ -32,6 +32,11 @@ impl TrackerModel {
         self.period * self.repeats.saturating_add(1)
     }
 
+    /// True if the positions have no noise.
+    pub fn is_exact(&self) -> bool {
+        self.noise.variance_mm2() == 0.0 && self.correlated.is_none()
+    }
+
     /// The noise of position number `k`, mm. It depends on the model and `k` only.
     pub fn noise_mm(&self, k: u64) -> Vector3<f64> {
         let white_mm = self.noise.draw(self.seed, k);

@@ -231,6 +231,8 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     }
     let two = "two tools of this name take turns: rename one, or unplug it";
     let stream = stream.unless(!report.has_two_tools, Fail, two);
+    let constant = report.constant_coordinate.as_deref().unwrap_or_default();
+    let stream = stream.unless(constant.is_empty(), Fail, constant);
     let stream = stream.unless(*accepted > 0, Fail, "every position was outside tracker.workspace");
 
     let hold = &config.tracker.hold;

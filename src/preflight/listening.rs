@@ -1,6 +1,6 @@
 //! Listens to the tracker for a while, without a run.
 
-use crate::tracker::{Event, Gate, GateCounts, GateName, Refusal, Workspace};
+use crate::tracker::{CoordinateWatch, Event, Gate, GateCounts, GateName, Refusal, Workspace};
 use crate::units::Time;
 use nalgebra::Vector3;
 use serde::Serialize;
@@ -34,6 +34,8 @@ pub struct TrackerReport {
     pub is_in_metres: bool,
     /// Positions jump back and forth, as they do if two tools have the same name.
     pub has_two_tools: bool,
+    /// The coordinate of the tracker that never changes, and what to look at.
+    pub constant_coordinate: Option<String>,
     /// Why no position was measured, and what to do; `None` if one was.
     pub trouble: Option<String>,
 }
@@ -48,6 +50,7 @@ pub struct Listening {
     origin_unix_ns: i64,
     counts: GateCounts,
     positions_mm: Vec<Vector3<f64>>,
+    coordinates: CoordinateWatch,
     heading: Option<Vector3<f64>>,
     is_in_metres: bool,
     skew_ns: Option<i64>,
@@ -64,6 +67,7 @@ impl Listening {
             origin_unix_ns,
             counts: GateCounts::default(),
             positions_mm: Vec::new(),
+            coordinates: CoordinateWatch::default(),
             heading: None,
             is_in_metres: false,
             skew_ns: None,
@@ -85,6 +89,7 @@ impl Listening {
                     .map(|outside| Refusal::new(GateName::Workspace, format!("tip at {outside}")));
                 self.counts.count(outside.as_ref());
                 self.positions_mm.push(position_mm);
+                self.coordinates.take(&sample.position_mm);
                 self.heading = self.gate.registration.heading(sample);
             }
             Err(refusal) => {
@@ -110,6 +115,7 @@ impl Listening {
         };
         let (to_next_mm, to_next_but_one_mm) = (jumps_mm(1), jumps_mm(2));
         let is_enough = self.positions_mm.len() >= POSITIONS_MIN;
+        let constant = self.coordinates.constant(CoordinateWatch::POSITIONS_AT_REST);
         let trouble = match (last, self.refusal) {
             (Some(_), _) => None,
             (None, Some(refusal)) => Some(refusal),
@@ -128,6 +134,8 @@ impl Listening {
             has_two_tools: is_enough
                 && to_next_mm > TURNS_MIN_MM
                 && to_next_mm > TURNS_RATIO * to_next_but_one_mm,
+            constant_coordinate: constant
+                .map(|constant| format!("{constant}: {}", CoordinateWatch::ADVICE)),
             trouble,
         }
     }

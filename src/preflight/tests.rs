@@ -189,6 +189,11 @@ fn a_tracker_is_judged_by_its_positions_noise_and_stamps() {
     // A tool that is moved is not noisy.
     let moved = listened(&config, 0.0, |k| Vector3::new(0.5 * f64::from(k) + 0.1, 0.0, 0.0));
     assert_eq!(verdicts(&tracker(&config, &moved)), "PPPPPW");
+    let flat = listened(&config, 0.0, |k| Vector3::new(0.3 + 0.01 * f64::from(k), 2.0, 3.0));
+    let [row, ..] = &tracker(&config, &flat)[..] else { panic!("a row") };
+    let next = "y of the tracker is 2.00 mm to the bit in 80 different positions: has it two dimensions, or its \
+                transform a row of zeros?";
+    assert_eq!((row.verdict, row.next_step.as_deref()), (Verdict::Fail, Some(next)));
     let two = listened(&config, 0.0, |k| Vector3::new(1.0, 2.0, f64::from(k % 2) * 80.0 + 0.1));
     assert!(two.has_two_tools);
     assert_eq!(verdicts(&tracker(&config, &two))[..1], *"F");

@@ -131,6 +131,8 @@ pub struct TrackerConfig {
     pub gate: Gate,
     /// The run ends if the stream as a whole contradicts the insertion.
     pub judges_stream: bool,
+    /// The tracker is emulated without noise: a coordinate may stay the same to the bit.
+    pub is_exact: bool,
     /// Determines the acquisition time of samples.
     pub clock: AcquisitionClock,
     /// Settings of the track, which judges a position against the others and the model.

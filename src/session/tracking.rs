@@ -9,8 +9,8 @@ use crate::session::{Lane, State};
 use crate::tracker::gate::is_same_tool;
 use crate::tracker::openigtlink::Status;
 use crate::tracker::{
-    AcquisitionClock, Census, Effect, Event, Fix, GateCounts, GateName, Refusal, Sample,
-    StageHistory, Track, TrackState, TravelCheck,
+    AcquisitionClock, Census, CoordinateWatch, Effect, Event, Fix, GateCounts, GateName, Refusal,
+    Sample, StageHistory, Track, TrackState, TravelCheck,
 };
 use crate::units::Time;
 use std::collections::VecDeque;
@@ -21,6 +21,8 @@ const PENDING_MAX: usize = 256;
 /// Once a run is being stopped, a position waits for the stage's feedback no longer than this or two SYNC
 /// periods, whichever is longer, so that samples are recorded until the end.
 const UNPAIRED_AGE_MAX: Duration = Duration::from_millis(100);
+/// A coordinate may stay the same to the bit up to this depth, mm.
+const COORDINATES_AFTER_MM: f64 = 5.0;
 /// Why a position that still waits at the end is refused.
 const NEVER_PAIRED: &str = "the stage gave no position at its acquisition before the run ended";
 /// Why the oldest of too many positions that wait is refused.
@@ -48,7 +50,9 @@ pub(crate) struct Tracking {
     x_pw: Pose,
     clock: AcquisitionClock,
     pub(super) track: Track,
-    pub(super) travel: TravelCheck,
+    travel: TravelCheck,
+    /// Watches the coordinates of the accepted positions.
+    coordinates: CoordinateWatch,
     /// Acquisition time of the last position that was accepted with its depth.
     accepted_at: Option<Time>,
     /// What the gates did with the samples so far.
@@ -91,6 +95,7 @@ impl Tracking {
             clock: tracker.clock.clone(),
             track: Track::new(tracker.track),
             travel: TravelCheck::new(tracker.track.noise_sd_mm, config.needle.curvature_per_mm()),
+            coordinates: CoordinateWatch::default(),
             accepted_at: None,
             counts: GateCounts::default(),
             census: Census::default(),
@@ -165,6 +170,9 @@ impl Tracking {
                     position = Some((acquisition_time, tip_meas));
                 } else {
                     let judged = self.track.seek(fix(&record, acquisition_time, &tip_meas, None));
+                    if judged.is_ok() {
+                        self.coordinates.take(&record.received.position_mm);
+                    }
                     self.note_verdict(now, &mut record, judged.err());
                 }
             }
@@ -216,6 +224,7 @@ impl Tracking {
             let judged =
                 self.judge_one(&sample.record, acquisition_time, &tip_meas, history, estimation);
             if let Ok(stage_insertion_meas_mm) = judged {
+                self.coordinates.take(&sample.record.received.position_mm);
                 let independent = self.independent(acquisition_time);
                 self.travel.take(stage_insertion_meas_mm, &tip_meas.mm(), independent);
                 believed.push(Measurement {
@@ -230,6 +239,26 @@ impl Tracking {
         self.waiting = waiting;
         self.release_records();
         believed
+    }
+
+    /// Checks that the stream as a whole does not contradict the insertion, now `insertion_mm` deep.
+    ///
+    /// # Errors
+    /// What contradicts it: the reason to stop the run.
+    pub(super) fn check_stream(&self, insertion_mm: f64) -> Result<(), String> {
+        if !self.config.judges_stream {
+            return Ok(());
+        }
+        let is_due = !self.config.is_exact && insertion_mm >= COORDINATES_AFTER_MM;
+        let constant =
+            is_due.then(|| self.coordinates.constant(CoordinateWatch::POSITIONS_INSERTED));
+        match constant.flatten() {
+            Some(constant) => Err(format!(
+                "tracker: {constant}, {insertion_mm:.1} mm inserted (limit {COORDINATES_AFTER_MM:.1}): {}",
+                CoordinateWatch::ADVICE
+            )),
+            None => self.travel.check().map_err(|error| format!("tracker: {error}")),
+        }
     }
 
     /// How many independent positions an accepted one is worth, by the configured noise.
@@ -427,47 +456,4 @@ fn fix(
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::config::Config;
-    use crate::tracker::Validity;
-    use nalgebra::Vector3;
-
-    /// The records of `count` samples, of which those in `lost` are out of view.
-    fn records(count: i64, lost: std::ops::Range<i64>, is_inserting: bool) -> Vec<Record> {
-        let config = Config::from_sources(&[], &[]).unwrap().session().unwrap();
-        let mut tracking = Tracking::new(&config);
-        for n in 0..count {
-            let now = Time::from_nanos(n * 2_000_000);
-            let validity = if lost.contains(&n) { Validity::OutOfView } else { Validity::Valid };
-            let sample = Sample {
-                tool: "NeedleToTracker".to_owned(),
-                receive_time: now,
-                source_unix_ns: None,
-                position_mm: Vector3::new(1.0, 0.01 * n as f64, 0.0),
-                orientation: None,
-                validity,
-            };
-            tracking.take(now, sample, is_inserting);
-        }
-        tracking.records.into()
-    }
-
-    #[test]
-    fn a_tip_lost_before_the_insertion_is_not_recovered_by_the_model() {
-        let records = records(9, 3..8, false);
-        let has_event = |part: &str| {
-            records
-                .iter()
-                .any(|record| matches!(record, Record::Event { text, .. } if text.contains(part)))
-        };
-        assert!(has_event("lost, 5 refused") && !has_event("found"), "{records:?}");
-    }
-
-    #[test]
-    fn the_oldest_of_too_many_waiting_positions_is_refused() {
-        let records = records(257, 0..0, true);
-        let [Record::Sample(sample), ..] = &records[..] else { panic!("{records:?}") };
-        assert_eq!(sample.refused.as_ref().map(|refusal| &*refusal.why), Some(TOO_MANY_WAIT));
-    }
-}
+mod tests;

@@ -8,6 +8,7 @@
 //! that refuses it says why in a [`refusal`].
 
 mod clock_offset;
+mod coordinate;
 pub mod csv;
 mod event;
 pub mod gate;
@@ -25,6 +26,7 @@ pub mod timing;
 pub mod track;
 mod travel;
 
+pub use coordinate::{ConstantCoordinate, CoordinateWatch};
 pub use csv::{CsvMapping, TimeColumns};
 pub use event::{Census, Event};
 pub use gate::{ContentChecks, Gate, Workspace};

@@ -8,6 +8,7 @@ pub use likelihood::{Measured, NoiseFit};
 
 use self::likelihood::Residuals;
 use super::check_distances;
+use crate::tracker::CoordinateWatch;
 use crate::units::Time;
 use nalgebra::Vector3;
 
@@ -113,12 +114,18 @@ impl TrackerFit {
     /// they span the same time as the receipts; else by their receipt.
     ///
     /// # Errors
-    /// A recording that is too short, that moves, or that has positions no bench reaches.
+    /// A recording that is too short, that moves, that has positions no bench reaches, or of which a coordinate never
+    /// changes.
     pub fn of(samples: &[RestSample]) -> Result<Self, String> {
         let mut valid: Vec<(&RestSample, Vector3<f64>)> =
             samples.iter().filter_map(|sample| Some((sample, sample.position_mm?))).collect();
         let positions_mm: Vec<Vector3<f64>> = valid.iter().map(|(_, position)| *position).collect();
         check_distances("position", "tracker", &positions_mm)?;
+        let mut coordinates = CoordinateWatch::default();
+        positions_mm.iter().for_each(|position_mm| coordinates.take(position_mm));
+        if let Some(constant) = coordinates.constant(CoordinateWatch::POSITIONS_AT_REST) {
+            return Err(format!("{constant}: {}", CoordinateWatch::ADVICE));
+        }
         valid.dedup_by_key(|(_, position)| *position);
         let repeats = positions_mm.len() - valid.len();
         let invalid = samples.len() - positions_mm.len();

@@ -44,6 +44,19 @@ fn refusal(samples: &[RestSample]) -> String {
     text
 }
 
+#[test]
+fn a_coordinate_that_never_changes_is_refused() {
+    let mut samples = rest(NEAR, 1, 1200, still);
+    for sample in &mut samples {
+        sample.position_mm = sample.position_mm.map(|mm| Vector3::new(mm.x, 0.0, mm.z));
+    }
+    assert_eq!(
+        refusal(&samples),
+        "y of the tracker is 0.00 mm to the bit in 100 different positions: has it two dimensions, or its \
+         transform a row of zeros?"
+    );
+}
+
 fn off(measured: Measured, truth: f64) -> f64 {
     (measured.value - truth) / measured.error
 }

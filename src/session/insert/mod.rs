@@ -174,9 +174,7 @@ impl InsertTask {
         insertion: &mut Insertion,
     ) -> Result<(), String> {
         self.catch_up_to = Some(feedback.time);
-        if self.config.tracker.judges_stream {
-            self.tracking.travel.check().map_err(|error| format!("tracker: {error}"))?;
-        }
+        self.tracking.check_stream(at.insertion_mm)?;
         self.watch_tip(shell, feedback.time, at.insertion_mm, insertion)?;
         insertion.check_arrival(feedback.time, at.insertion_mm)?;
         if let Some(due) = insertion.take_due_step(feedback.time, at.insertion_mm) {

@@ -242,6 +242,15 @@ fn a_wrong_scale_of_the_tracker() {
     is_documented("a_wrong_scale_of_the_tracker", 30.0, run);
 }
 
+/// A tracker of two dimensions, or a transform with a row of zeros.
+#[test]
+fn a_coordinate_that_never_changes() {
+    let flat = |sample: &mut Sample| sample.position_mm.x = 0.0;
+    let run = |speed: &str| contradicted(steered(&[speed]), 0.0, flat);
+    let bench = is_documented("a_coordinate_that_never_changes", 6.0, run);
+    assert!(bench.reason().contains("to the bit"), "{}", bench.reason());
+}
+
 /// Fresh noise on a position that does not change.
 #[test]
 fn a_frozen_position_with_noise() {
