@@ -28,6 +28,12 @@ const NOISE_MIN: f64 = 0.1;
 const BLIND_MAX_MM: f64 = 5.0;
 /// Largest difference between the clocks of two machines, s.
 const SKEW_MAX_S: f64 = 1.0;
+/// Angles of the tip's heading to the configured start heading, degrees: the check warns, and fails …
+const HEADING_DEG: [f64; 2] = [15.0, 30.0];
+/// … above them, and above this many standard deviations of the configured heading.
+const HEADING_SDS: f64 = 3.0;
+/// By how many seconds stamps may advance in a second.
+const STAMP_PACE: std::ops::Range<f64> = 0.5..2.0;
 /// Fewest positions while the needle advances by `tracker.hold_after_mm`.
 const POSITIONS_PER_HOLD: f64 = 2.0;
 
@@ -284,6 +290,15 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     let stamps = Check::new("tracker stamps", found, format!("within {SKEW_MAX_S} s"))
         .unless(skew_s.is_some() || !is_stamped, Warn, send)
         .unless(is_within(skew_s, SKEW_MAX_S), Warn, set);
+    let pace = report.stamp_pace.filter(|pace| is_stamped && !STAMP_PACE.contains(pace));
+    let slow = format!(
+        "they advance by {:.3} s in a second (allowed {:.1} to {:.1}): set tracker.stamp = \"receive\", or mend the \
+         source's clock",
+        pace.unwrap_or_default(),
+        STAMP_PACE.start,
+        STAMP_PACE.end
+    );
+    let stamps = stamps.unless(pace.is_none(), Warn, slow);
     vec![stream, rate, blind, noise, stamps, workspace(config, report)]
 }
 
@@ -319,19 +334,38 @@ fn workspace(config: &Config, report: &TrackerReport) -> Check {
     check.unless(is_inside, Fail, next)
 }
 
-/// Checks that the tip can reach the plane or the target from its last position on the bench. `None` without a
-/// registration, and for a target among masks, which only the run reads.
+/// Checks that the tip heads as the configuration says (`observer.start`), and can reach the plane or the target from
+/// its last position on the bench. `None` without a registration, and for a target among masks, which only the run
+/// reads.
 pub fn plane(config: &Config, report: &TrackerReport) -> Option<Check> {
     let session = config.session().ok()?;
     let x_pw = session.x_wp.inverse();
     let tip_mm = x_pw.transform(&Vector3::from(report.last_position_bench_mm?));
-    let heading = report.last_heading_bench.map(|heading| {
-        let x = (x_pw.rotation * Vector3::from(heading)).x.clamp(-1.0, 1.0);
-        format!(", heading {:+.1} deg", math::asin(x).to_degrees())
+    let start = config.observer.start.to_rotation() * Vector3::z();
+    let turned_deg = report.last_heading_bench.map(|heading| {
+        let heading = x_pw.rotation * Vector3::from(heading);
+        math::atan2(start.cross(&heading).norm(), start.dot(&heading)).to_degrees()
     });
-    let found = format!("tip {:+.2} mm off it{}", tip_mm.x, heading.unwrap_or_default());
-    let limit = format!("within reach of {:.0} mm of depth", session.insertion.depth_mm);
-    let check = Check::new("plane", found, limit);
+    let sd = session.observer.start_sd().map_or(config.observer.invariant.start_sd, |(sd, _)| sd);
+    let [warn_deg, fail_deg] =
+        HEADING_DEG.map(|deg| deg.max(HEADING_SDS * sd.yaw.max(sd.pitch).to_degrees()));
+    let (mut found, mut limit) = (
+        format!("tip {:+.2} mm off it", tip_mm.x),
+        format!("within reach of {:.0} mm of depth", session.insertion.depth_mm),
+    );
+    if let Some(turned_deg) = turned_deg {
+        found += &format!(", heading {turned_deg:.1} deg from observer.start");
+        limit += &format!(", heading up to {warn_deg:.0} deg");
+    }
+    // Without an offset a run does not use orientations.
+    let is_used = config.tracker.tip_offset_mm != [0.0; 3];
+    let verdict = match turned_deg {
+        Some(turned_deg) if is_used && turned_deg > fail_deg => Fail,
+        _ => Warn,
+    };
+    let next = "the sensor's orientation, tracker.tip_tilt (tip_file), the registration or observer.start is wrong";
+    let is_start = turned_deg.is_none_or(|turned_deg| turned_deg <= warn_deg);
+    let check = Check::new("plane", found, limit).unless(is_start, verdict, next);
     let runs_anyway = session.insertion.plane_out_of_reach == PlaneOutOfReach::Insert;
     Some(match session.check_reach(&tip_mm) {
         Ok(()) => check,

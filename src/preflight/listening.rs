@@ -7,6 +7,8 @@ use serde::Serialize;
 
 /// Fewest positions from which the noise is measured.
 pub(super) const POSITIONS_MIN: usize = 10;
+/// The pace of stamps is measured over at least this time, s.
+const STAMPS_MIN_S: f64 = 0.5;
 /// If two tools of one name take turns, a position is farther than this from the next, mm …
 const TURNS_MIN_MM: f64 = 3.0;
 /// … and farther by this factor than from the next but one.
@@ -30,6 +32,8 @@ pub struct TrackerReport {
     pub noise_sd_mm: Option<f64>,
     /// Smallest difference of receipt and stamp, each by its own clock, s.
     pub stamp_skew_s: Option<f64>,
+    /// Seconds by which the stamps advance in a second; `None` if the positions span less than half a second.
+    pub stamp_pace: Option<f64>,
     /// The last position is outside the workspace, and would be inside if it were in metres.
     pub is_in_metres: bool,
     /// Positions jump back and forth, as they do if two tools have the same name.
@@ -54,6 +58,8 @@ pub struct Listening {
     heading: Option<Vector3<f64>>,
     is_in_metres: bool,
     skew_ns: Option<i64>,
+    /// Receipt and stamp of the first and the last sample that has one, ns.
+    stamped_ns: Option<[[i64; 2]; 2]>,
     refusal: Option<String>,
 }
 
@@ -71,6 +77,7 @@ impl Listening {
             heading: None,
             is_in_metres: false,
             skew_ns: None,
+            stamped_ns: None,
             refusal: None,
         }
     }
@@ -99,6 +106,8 @@ impl Listening {
         }
         if let Some(stamp_ns) = sample.source_unix_ns {
             let received_ns = self.origin_unix_ns.saturating_add(sample.receive_time.as_nanos());
+            let newest_ns = [received_ns, stamp_ns];
+            self.stamped_ns.get_or_insert([newest_ns; 2])[1] = newest_ns;
             let skew_ns = received_ns.saturating_sub(stamp_ns);
             self.skew_ns = Some(self.skew_ns.map_or(skew_ns, |least| least.min(skew_ns)));
         }
@@ -113,6 +122,11 @@ impl Listening {
             let squares: Vec<f64> = pairs.map(|(a, b)| (b - a).norm_squared()).collect();
             (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
         };
+        let stamp_pace = self.stamped_ns.and_then(|[first, last]| {
+            let [received_s, stamp_s] =
+                [0, 1].map(|i| last[i].saturating_sub(first[i]) as f64 * 1e-9);
+            (received_s >= STAMPS_MIN_S).then(|| stamp_s / received_s)
+        });
         let (to_next_mm, to_next_but_one_mm) = (jumps_mm(1), jumps_mm(2));
         let is_enough = self.positions_mm.len() >= POSITIONS_MIN;
         let constant = self.coordinates.constant(CoordinateWatch::POSITIONS_AT_REST);
@@ -130,6 +144,7 @@ impl Listening {
             // A difference has twice the variance, in each of three coordinates.
             noise_sd_mm: is_enough.then(|| to_next_mm / 6f64.sqrt()),
             stamp_skew_s: self.skew_ns.map(|ns| ns as f64 * 1e-9),
+            stamp_pace,
             is_in_metres: self.is_in_metres,
             has_two_tools: is_enough
                 && to_next_mm > TURNS_MIN_MM

@@ -184,6 +184,17 @@ fn a_tracker_is_judged_by_its_positions_noise_and_stamps() {
     assert_eq!(verdicts(&tracker(&config, &unmeasured)), "PPPWWW");
     let unstamped = rig(&[REGISTRATION, "tracker.stamp=\"receive\""]);
     assert_eq!(verdicts(&tracker(&unstamped, &unmeasured)), "PPPWPW", "no stamp is used");
+    let stamped = rig(&[REGISTRATION, "tracker.stamp=\"source\""]);
+    assert_eq!(
+        (quiet.stamp_pace, verdicts(&tracker(&stamped, &quiet))),
+        (Some(1.0), "PPPPPW".to_owned())
+    );
+    let in_microseconds = TrackerReport { stamp_pace: Some(0.001), ..quiet.clone() };
+    let row = &tracker(&stamped, &in_microseconds)[4];
+    let next = "they advance by 0.001 s in a second (allowed 0.5 to 2.0): set tracker.stamp = \"receive\", or mend the \
+                source's clock";
+    assert_eq!((row.verdict, row.next_step.as_deref()), (Verdict::Warn, Some(next)));
+    assert_eq!(verdicts(&tracker(&unstamped, &in_microseconds)), "PPPPPW", "no stamp is used");
     let noisy = listened(&config, -2.0, jitter(3.0));
     assert_eq!(verdicts(&tracker(&config, &noisy)), "PPPWWW");
     // A tool that is moved is not noisy.
@@ -251,7 +262,7 @@ fn the_plane_is_checked_from_the_last_position() {
     let near = plane(&config, &at(1.5)).unwrap();
     assert_eq!(
         (near.verdict, near.found.as_str()),
-        (Verdict::Pass, "tip +1.50 mm off it, heading +0.0 deg")
+        (Verdict::Pass, "tip +1.50 mm off it, heading 0.0 deg from observer.start")
     );
     let far = plane(&config, &at(80.0)).unwrap();
     assert_eq!(far.verdict, Verdict::Fail);
@@ -259,6 +270,37 @@ fn the_plane_is_checked_from_the_last_position() {
     let inserts = rig(&[REGISTRATION, "insertion.plane_out_of_reach=\"insert\""]);
     assert_eq!(plane(&inserts, &at(80.0)).unwrap().verdict, Verdict::Warn, "as the run judges it");
     assert_eq!(plane(&rig(&[]), &at(1.5)), None, "not without a registration");
+}
+
+/// The x component of a heading hides that the sensor's frame is turned about x, or by nearly a half turn about y.
+#[test]
+fn a_tip_that_does_not_head_along_the_configured_start_is_found() {
+    const OFFSET: &str = "tracker.tip_offset_mm=[0.0, 0.0, 7.0]";
+    const SURE: &str =
+        "observer.invariant.start_sd={ yaw_deg = 2.0, pitch_deg = 2.0, roll_deg = 180.0 }";
+    let of = |sets: &[&str], axis: Vector3<f64>, deg: f64| {
+        let config = rig(&[&[REGISTRATION], sets].concat());
+        let still = listened(&config, 0.0, |k| Vector3::new(1.0, 0.1 * f64::from(k), 0.5));
+        let rotation = nalgebra::Rotation3::from_scaled_axis(axis * deg.to_radians());
+        let heading = Some((rotation * Vector3::z()).into());
+        plane(&config, &TrackerReport { last_heading_bench: heading, ..still }).unwrap()
+    };
+    for axis in [Vector3::x(), Vector3::y()] {
+        for (sets, deg, verdict) in [
+            (&[OFFSET][..], 35.0, Verdict::Pass),
+            (&[OFFSET], 37.0, Verdict::Fail),
+            (&[OFFSET], 180.0, Verdict::Fail),
+            (&[OFFSET, SURE], 14.0, Verdict::Pass),
+            (&[OFFSET, SURE], 16.0, Verdict::Warn),
+            (&[OFFSET, SURE], 31.0, Verdict::Fail),
+            (&[SURE], 150.0, Verdict::Warn),
+        ] {
+            let check = of(sets, axis, deg);
+            assert_eq!(check.verdict, verdict, "{deg} deg: {check:?}");
+            assert!(check.found.ends_with(&format!("heading {deg:.1} deg from observer.start")));
+        }
+    }
+    assert!(of(&[OFFSET], Vector3::x(), 90.0).next_step.unwrap().contains("tracker.tip_tilt"));
 }
 
 const FIT: &str = "tracker.registration={ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, \
