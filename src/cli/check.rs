@@ -1,7 +1,7 @@
 //! `needle-bench check`: checks a configuration and, with --connect, the equipment. Nothing moves.
 
 use super::arguments::{Configured, number_in};
-use super::mask::{file_crc32, mask_reader};
+use super::mask::{file_crc32, mask_reader, print_warning, warn_of_far_obstacles};
 use super::output::{print_stderr, print_stdout, print_wrapped};
 use super::preflight::{Preflight, troubles};
 use super::stage::drive_json;
@@ -46,8 +46,10 @@ pub(super) fn check(arguments: &Arguments) -> Result<()> {
         return print_stdout(text.trim_end());
     }
     let (config, warnings) = arguments.configured.load_with_warnings()?;
-    let goal = config.to_goal(&mask_reader(arguments.configured.path()))?;
-    goal.map_err(Failure::configuration)?;
+    let goal = config.to_goal(&mask_reader(arguments.configured.path(), print_warning))?;
+    if let Some(goal) = goal.map_err(Failure::configuration)? {
+        warn_of_far_obstacles(&goal.world, goal.problem.clearance_mm);
+    }
     // Without a registration the tracker can still be checked; the checks say that it is missing.
     if !arguments.connect || config.tracker.registration.is_some() {
         config.session_without_goal()?;

@@ -1,7 +1,8 @@
 //! Reads obstacles from masks: the NIfTI-1 images that `[goal]` names.
 
+use super::output::print_stderr;
 use crate::geometry::Pose;
-use crate::plan::{Mask, Obstacle};
+use crate::plan::{Mask, Obstacle, World};
 use crate::telemetry::open_regular;
 use flate2::CrcReader;
 use flate2::read::MultiGzDecoder;
@@ -13,9 +14,10 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 /// A reader of the masks that the configuration in `file` names. Their paths are relative to its folder. It reads
-/// each mask once: the trials of a study share it.
+/// each mask once: the trials of a study share it. `warn` gets what the operator should know about it.
 pub(super) fn mask_reader(
     file: Option<&Path>,
+    warn: fn(&str),
 ) -> impl Fn(&str, Option<u32>, &Pose) -> Result<Obstacle, String> + Sync {
     let read = Mutex::new(Vec::new());
     move |name, crc32, pose| {
@@ -25,7 +27,7 @@ pub(super) fn mask_reader(
             return Ok(Obstacle::clone(obstacle));
         }
         let path = file.map_or_else(|| PathBuf::from(name), |file| file.with_file_name(name));
-        let obstacle = read_mask(&path, crc32, pose)
+        let obstacle = read_mask(&path, crc32, pose, warn)
             .map_err(|error| format!("{}: {error}", path.display()))?;
         read.push((key, obstacle.clone()));
         Ok(obstacle)
@@ -33,7 +35,12 @@ pub(super) fn mask_reader(
 }
 
 /// The image in `path`, as an obstacle.
-fn read_mask(path: &Path, crc32: Option<u32>, pose: &Pose) -> Result<Obstacle, String> {
+fn read_mask(
+    path: &Path,
+    crc32: Option<u32>,
+    pose: &Pose,
+    warn: fn(&str),
+) -> Result<Obstacle, String> {
     check_name(path, open_regular(path).map_err(|error| error.to_string())?)?;
     let header = NiftiHeader::from_file(path).map_err(|error| reason(&error))?;
     // A record has one checksum for a mask, so the mask must be one file.
@@ -100,8 +107,54 @@ fn read_mask(path: &Path, crc32: Option<u32>, pose: &Pose) -> Result<Obstacle, S
             "all of its voxels are 0, so it is no obstacle: is it the right label?".to_owned()
         );
     }
+    if let Some(elsewhere) = elsewhere(&header, &pose.translation) {
+        warn(&format!("{}: {elsewhere}", path.display()));
+    }
     Mask::new(size, spacing_mm, &occupied, pose).map(Obstacle::Mask)
 }
+
+/// A warning that the header places the image elsewhere than `pose_mm`: the operator may have forgotten its origin.
+fn elsewhere(header: &NiftiHeader, pose_mm: &Vector3<f64>) -> Option<String> {
+    let origin_mm = match header {
+        _ if header.sform_code > 0 => [header.srow_x[3], header.srow_y[3], header.srow_z[3]],
+        _ if header.qform_code > 0 => [header.quatern_x, header.quatern_y, header.quatern_z],
+        _ => return None,
+    };
+    let origin_mm = Vector3::from(origin_mm.map(f64::from));
+    let differs = (origin_mm - pose_mm).norm() > ORIGIN_DIFFERENCE_MAX_MM;
+    let place = |mm: &Vector3<f64>| format!("({:.2}, {:.2}, {:.2})", mm.x, mm.y, mm.z);
+    (differs && origin_mm != Vector3::zeros()).then(|| {
+        format!(
+            "its header places voxel (0, 0, 0) at {} mm, pose at {}; the header's origin is not used",
+            place(&origin_mm),
+            place(pose_mm)
+        )
+    })
+}
+
+/// Warns of obstacles so far outside the workspace of `world` that no path comes near them.
+pub(super) fn warn_of_far_obstacles(world: &World, clearance_mm: f64) {
+    for (i, obstacle) in world.obstacles.iter().enumerate() {
+        let outside_mm = world.workspace.outside_mm(obstacle);
+        if outside_mm > clearance_mm {
+            print_warning(&format!(
+                "goal.obstacle[{i}] is {outside_mm:.1} mm outside goal.workspace_mm (goal.clearance_mm is \
+                 {clearance_mm}), so it has no effect: is it in the plane's frame?"
+            ));
+        }
+    }
+}
+
+/// Prints a warning to stderr.
+pub(super) fn print_warning(text: &str) {
+    print_stderr(format_args!("warning: {text}"));
+}
+
+/// Takes the warnings of a mask that another reader has warned of.
+pub(super) fn no_warning(_: &str) {}
+
+/// Origins that differ by more than this, mm, are two places.
+const ORIGIN_DIFFERENCE_MAX_MM: f64 = 0.01;
 
 /// The size of a NIfTI-1 header, and of the four bytes after it that say whether extensions follow.
 const HEADER_BYTES: usize = 352;
@@ -268,7 +321,7 @@ mod tests {
         image.extend([0, 1]);
         let file = std::env::temp_dir().join(format!("needle-once-{}.nii", std::process::id()));
         std::fs::write(&file, image).expect("a mask");
-        let (read, name) = (mask_reader(None), file.to_str().expect("text"));
+        let (read, name) = (mask_reader(None, no_warning), file.to_str().expect("text"));
         let first = read(name, None, &Pose::identity()).expect("a mask");
         std::fs::remove_file(&file).expect("the mask");
         assert_eq!(read(name, None, &Pose::identity()), Ok(first));
@@ -281,7 +334,11 @@ mod tests {
         nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRUSR).expect("a pipe");
         for path in [Path::new("/dev/zero"), &pipe] {
             assert_eq!(file_crc32(path).unwrap_err().to_string(), "not a regular file");
-            let read = mask_reader(None)(path.to_str().expect("text"), None, &Pose::identity());
+            let read = mask_reader(None, no_warning)(
+                path.to_str().expect("text"),
+                None,
+                &Pose::identity(),
+            );
             let error = read.expect_err("it is refused");
             assert!(error.ends_with(": not a regular file"), "{error}");
         }

@@ -3,7 +3,7 @@
 use super::arguments::{About, RealTimeArguments};
 use super::console::Console;
 use super::ending::possible_withdrawal;
-use super::mask::mask_reader;
+use super::mask::{mask_reader, no_warning};
 use super::operator::Terminal;
 use super::output::print_stderr;
 use super::records::describe;
@@ -314,8 +314,8 @@ pub(super) fn scene(config: &Config, is_motion: bool) -> Result<Scene, ConfigErr
         curvature_per_mm: config.needle.arc.curvature_per_mm(),
         goal: match config.goal.kind {
             GoalKind::Plane => None,
-            GoalKind::Target if is_motion => config.to_plan(&mask_reader(None)).ok(),
-            GoalKind::Target => Some(config.to_plan(&mask_reader(None))?),
+            GoalKind::Target if is_motion => config.to_plan(&mask_reader(None, no_warning)).ok(),
+            GoalKind::Target => Some(config.to_plan(&mask_reader(None, no_warning))?),
         },
         truth: config.knows_truth(),
         shadows: config

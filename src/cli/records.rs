@@ -1,7 +1,7 @@
 //! Recorded runs: their folders, their plans, and the insertions in them.
 
 use super::arguments::{Configured, text_of};
-use super::mask::mask_reader;
+use super::mask::{mask_reader, no_warning};
 use super::output::print_stderr;
 use super::perform::scene;
 use super::stage::Motion;
@@ -107,7 +107,7 @@ pub(super) fn describe(config: Config) -> Describe {
 /// What the run of `manifest` was to do, from its configuration and arguments.
 pub(super) fn recorded_run_config(manifest: &Manifest, config: &Config) -> Result<RunConfig> {
     let Some(name) = &manifest.operation else {
-        let session = config.session_reading(&mask_reader(None))?;
+        let session = config.session_reading(&mask_reader(None, no_warning))?;
         return Ok(RunConfig::Insertion(Box::new(session)));
     };
     // The record says `prove-handedness` for `prove --handedness`.

@@ -5,7 +5,7 @@ use super::console::Console;
 use super::ending::{
     after_insertion, ending, plan_status, plane_missed_by_mm, possible_withdrawal, status,
 };
-use super::mask::{file_crc32, mask_reader};
+use super::mask::{file_crc32, mask_reader, print_warning, warn_of_far_obstacles};
 use super::output::{merged, print_result, print_stderr};
 use super::perform::{Job, Options, Performed, end_json};
 use super::preflight::{before_rehearsal, before_run};
@@ -71,7 +71,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<()> {
     }
     // The record names each mask by its absolute path and checksum, for a replay to find and check it.
     config = configured.completed(&config, |mask| file_crc32(mask).ok());
-    let session = Box::new(config.session_reading(&mask_reader(None))?);
+    let session = Box::new(config.session_reading(&mask_reader(None, print_warning))?);
+    if let Some(goal) = &session.goal {
+        warn_of_far_obstacles(&goal.world, goal.problem.clearance_mm);
+    }
     let preflight = if arguments.rehearse {
         before_rehearsal(&config, &arguments.configured.load(None)?, arguments.options.quiet)
     } else {

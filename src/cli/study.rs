@@ -1,7 +1,7 @@
 //! `needle-bench study`: Monte Carlo trials of emulated insertions.
 
 use super::arguments::{Configured, parse_seed};
-use super::mask::mask_reader;
+use super::mask::{mask_reader, print_warning};
 use super::output::{print_result_despite, refuse_unwritable, write_new};
 use super::{Failure, Result, STOPPED};
 use crate::config::Config;
@@ -65,7 +65,7 @@ pub(super) fn study(arguments: &Arguments) -> Result<()> {
     session.insertion.plane_out_of_reach = PlaneOutOfReach::Insert;
     let drawn = |seed| config.drawn(seed).map_err(|error| error.to_string());
     let stage = |seed| drawn(seed)?.virtual_stage().map_err(|error| error.to_string());
-    let read_mask = mask_reader(arguments.configured.path());
+    let read_mask = mask_reader(arguments.configured.path(), print_warning);
     let goal = |seed| drawn(seed)?.to_goal(&read_mask).map_err(|error| error.to_string());
     let (tool, prior) = (&config.tracker.tool, config.prior());
     let study = Study { session, tool, prior, stage: &stage, goal: &goal };

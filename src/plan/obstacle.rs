@@ -66,6 +66,24 @@ impl Obstacle {
             Obstacle::Mask(mask) => mask.distance_mm(point_mm),
         }
     }
+
+    /// The corners of a box along the axes that contains the obstacle, mm.
+    fn bounds_mm(&self) -> [Vector3<f64>; 2] {
+        let around = |a: &Vector3<f64>, b: &Vector3<f64>, mm: f64| {
+            [a.inf(b).add_scalar(-mm), a.sup(b).add_scalar(mm)]
+        };
+        match self {
+            Obstacle::Sphere { centre_mm, radius_mm } => around(centre_mm, centre_mm, *radius_mm),
+            Obstacle::Cylinder { from_mm, to_mm, radius_mm } => around(from_mm, to_mm, *radius_mm),
+            Obstacle::Box { min_mm, max_mm } => [*min_mm, *max_mm],
+            Obstacle::Mask(mask) => {
+                let half_mm = 0.5 * mask.spacing_mm().norm();
+                let centres = mask.occupied_mm().map(|mm| around(&mm, &mm, half_mm));
+                let empty = [f64::INFINITY, f64::NEG_INFINITY].map(Vector3::repeat);
+                centres.fold(empty, |all, one| [all[0].inf(&one[0]), all[1].sup(&one[1])])
+            }
+        }
+    }
 }
 
 /// Signed distance to a box, negative inside. For each coordinate, `over` is how far the point is past the nearer
@@ -106,6 +124,13 @@ impl Workspace {
         let depth_mm = (point_mm - self.min_mm).inf(&(self.max_mm - point_mm)).min();
         let of_start_mm = |start_mm| START_ROOM_MM - distance_to_line_mm(point_mm, start_mm);
         self.start_mm.map_or(depth_mm, |start_mm| depth_mm.max(of_start_mm(start_mm)))
+    }
+
+    /// A lower bound of the distance of `obstacle` to the places where the tip may be, mm; 0 if they meet.
+    pub fn outside_mm(&self, obstacle: &Obstacle) -> f64 {
+        let [low_mm, high_mm] = obstacle.bounds_mm();
+        let gap_mm = (low_mm - self.max_mm).sup(&(self.min_mm - high_mm));
+        (gap_mm.sup(&Vector3::zeros()).norm() - START_ROOM_MM).max(0.0)
     }
 
     /// Lets a run begin with the tip at `tip_mm` and its path at `path_mm`, unless the tip is too far outside.

@@ -289,6 +289,39 @@ fn a_path_keeps_clear_of_a_mask() {
     assert!(said.status == 2 && said.stderr.contains("all of its voxels are 0"), "{}", said.stderr);
 }
 
+/// The origin in the header of an image is not used, and an obstacle elsewhere has no effect.
+#[test]
+fn a_mask_that_its_header_places_elsewhere_or_that_is_far_away_is_warned_of() {
+    let scratch = Scratch::new();
+    let mut image = nifti([20, 10, 10], [1.0; 3], &[1; 2000]);
+    let mut put = |at: usize, value: &[u8]| image[at..at + value.len()].copy_from_slice(value);
+    // The code of the qform, and its origin.
+    put(252, &1i16.to_le_bytes());
+    [-9.5f32, -4.5, 55.0]
+        .iter()
+        .enumerate()
+        .for_each(|(i, mm)| put(268 + 4 * i, &mm.to_le_bytes()));
+    std::fs::write(scratch.path().join("mask.nii"), image).unwrap();
+    let warned = |command: &str, mask: &str| {
+        scratch.write("goal.toml", mask);
+        let said = needle_bench(&scratch, &[command, "goal.toml"]);
+        assert_eq!(said.status, 0, "{}", said.stderr);
+        said.stderr.split_whitespace().collect::<Vec<_>>().join(" ")
+    };
+    for command in ["plan", "check"] {
+        assert_eq!(warned(command, MASK), "", "pose is the header's");
+        let away = warned(command, &MASK.replace("x_mm = -9.5", "x_mm = 10.5"));
+        let origins = "its header places voxel (0, 0, 0) at (-9.50, -4.50, 55.00) mm, pose at (10.50, -4.50, 55.00); \
+                       the header's origin is not used";
+        assert_eq!(away.matches(origins).count(), 1, "{away}");
+        assert!(!away.contains("no effect"), "{away}");
+        let far = warned(command, &MASK.replace("z_mm = 55.0", "z_mm = 1360.0"));
+        let effect = "goal.obstacle[0] is 1206.1 mm outside goal.workspace_mm (goal.clearance_mm is 2), so it has no \
+                      effect: is it in the plane's frame?";
+        assert!(far.contains(effect), "{far}");
+    }
+}
+
 /// Without a configuration file, the path of a mask is relative to the working directory.
 #[test]
 fn a_mask_of_the_command_line_is_recorded_with_its_path_and_checksum() {

@@ -4,7 +4,7 @@ mod picture;
 
 use self::picture::picture;
 use super::arguments::Configured;
-use super::mask::mask_reader;
+use super::mask::{mask_reader, print_warning, warn_of_far_obstacles};
 use super::output::{print_result_despite, refuse_unwritable, write_new};
 use super::{Result, STOPPED, finish_with};
 use crate::geometry::FixedAngles;
@@ -37,7 +37,9 @@ pub(super) struct Arguments {
 pub(super) fn plan(arguments: &Arguments) -> Result<()> {
     refuse_unwritable(arguments.out.as_deref())?;
     let (config, _) = arguments.configured.load_with_warnings()?;
-    let (world, problem) = config.to_plan(&mask_reader(arguments.configured.path()))?;
+    let (world, problem) =
+        config.to_plan(&mask_reader(arguments.configured.path(), print_warning))?;
+    warn_of_far_obstacles(&world, problem.clearance_mm);
     let begun = Instant::now();
     let answer = solve(&world, &problem);
     let seconds = begun.elapsed().as_secs_f64();
