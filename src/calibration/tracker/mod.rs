@@ -37,6 +37,8 @@ const SD_PER_MAD: f64 = 1.4826;
 const SWING_CORRELATION: f64 = -0.5;
 /// A delay ends within this many samples; a sample that is missing delays all those after it.
 const DELAYED_SAMPLES_MAX: usize = 12;
+/// Of noise that the tracker does not filter, at least this share is white.
+const WHITE_SHARE_MIN: f64 = 0.05;
 /// Stamps date the positions if they span the same time as the receipts, to within the larger of these.
 const SPAN_DIFFERENCE_MAX_NS: f64 = 1e9;
 const SPAN_DIFFERENCE_SHARE_MAX: f64 = 0.01;
@@ -227,6 +229,25 @@ impl TrackerFit {
             repeats,
             latency_jitter_ms,
             latency_p99_ms,
+        })
+    }
+}
+
+impl TrackerFit {
+    /// What the operator should know about this noise, if anything.
+    pub fn remark(&self) -> Option<String> {
+        let NoiseFit { sd_mm, white_sd_mm, correlated_sd_mm, correlation_time_s } = &self.together;
+        let share = white_sd_mm.value / sd_mm.value;
+        let is_filtered = correlated_sd_mm.value > 0.0 && share < WHITE_SHARE_MIN;
+        let time_s = correlation_time_s.value;
+        is_filtered.then(|| {
+            format!(
+                "only {:.0}% of the noise is white (under {:.0}%): the stream looks filtered, which delays a moving tip \
+                 by about {time_s:.2} s: set tracker.latency_ms = {:.0}, or switch the filter off",
+                100.0 * share,
+                100.0 * WHITE_SHARE_MIN,
+                1e3 * time_s
+            )
         })
     }
 }

@@ -87,6 +87,9 @@ fn fit_and_write(
 ) -> Result<()> {
     let bad_input = |error| Failure::bad_input(source.as_ref(), error);
     let fit = TrackerFit::of(samples).map_err(bad_input)?;
+    if let Some(remark) = fit.remark() {
+        print_stderr(format_args!("warning: {remark}"));
+    }
     let found = serde_json::to_value(&fit).map_err(Failure::environment)?;
     let all = &fit.together;
     let sd_mm = all.sd_mm.value;
