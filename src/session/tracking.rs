@@ -39,6 +39,15 @@ pub(super) struct Trouble {
     pub(super) why: String,
 }
 
+/// Positions that contradict the model.
+#[derive(Debug, Clone)]
+pub(super) struct Jump {
+    /// The refusal, with its numbers and limits.
+    pub(super) what: String,
+    /// They are those of a tip that does not move.
+    pub(super) is_frozen: bool,
+}
+
 /// The stream of the tracker.
 ///
 /// A sample first passes the gates that look at it alone ([`Tracking::take`]). During an insertion
@@ -55,6 +64,8 @@ pub(crate) struct Tracking {
     coordinates: CoordinateWatch,
     /// Acquisition time of the last position that was accepted with its depth.
     accepted_at: Option<Time>,
+    /// How late the newest sample came by its stamp, beyond the configured latency; 0 if it was not dated.
+    late: Duration,
     /// What the gates did with the samples so far.
     pub(super) counts: GateCounts,
     census: Census,
@@ -66,7 +77,7 @@ pub(crate) struct Tracking {
     reported_state: TrackState,
     last_refusal: Option<String>,
     /// The refusal by which the mean of the last positions contradicted the model, until a position is accepted.
-    pub(super) jump: Option<String>,
+    pub(super) jump: Option<Jump>,
     link_trouble: Option<String>,
     /// The error of the last malformed message, until a position is accepted.
     malformed: Option<String>,
@@ -97,6 +108,7 @@ impl Tracking {
             travel: TravelCheck::new(tracker.track.noise_sd_mm, config.needle.curvature_per_mm()),
             coordinates: CoordinateWatch::default(),
             accepted_at: None,
+            late: Duration::ZERO,
             counts: GateCounts::default(),
             census: Census::default(),
             unpaired_age_max: UNPAIRED_AGE_MAX.max(2 * config.stage.bus.sync_period()),
@@ -197,11 +209,15 @@ impl Tracking {
 
     /// Applies the gates that judge a sample by itself. Returns its acquisition time and tip position.
     fn admit(&mut self, sample: &Sample) -> Result<(Time, TipPosition), Refusal> {
+        self.late = Duration::ZERO;
         let position_bench_mm = self.config.gate.admit(sample)?;
         let position_plane_mm = self.x_pw.transform(&position_bench_mm);
         let tip_meas = TipPosition::new(position_plane_mm)
             .ok_or_else(|| Refusal::not_finite(&position_plane_mm))?;
-        Ok((self.clock.acquisition_time(sample)?, tip_meas))
+        let acquisition_time = self.clock.acquisition_time(sample)?;
+        let age = sample.receive_time.since(acquisition_time);
+        self.late = age.saturating_sub(self.clock.latency());
+        Ok((acquisition_time, tip_meas))
     }
 
     /// Judges the positions whose acquisition the stage's history now covers, in the order of receipt.
@@ -300,7 +316,10 @@ impl Tracking {
             }
             Some(refusal) => {
                 match refusal.effect {
-                    Effect::Loses => self.jump = Some(refusal.to_string()),
+                    Effect::Loses => {
+                        let (what, is_frozen) = (refusal.to_string(), self.travel.is_frozen());
+                        self.jump = Some(Jump { what, is_frozen });
+                    }
                     _ if refusal.gate == GateName::Innovation => self.warn_of_jump(now, &refusal),
                     _ => {}
                 }
@@ -426,6 +445,12 @@ impl Tracking {
     pub(crate) fn explain_silence(&self) -> String {
         if let Some(trouble) = &self.link_trouble {
             return trouble.clone();
+        }
+        if self.late > self.config.hold.after / 2 {
+            return format!(
+                "the newest came {:.2} s late by its stamp: mend its clock, or set tracker.stamp = \"receive\"",
+                self.late.as_secs_f64()
+            );
         }
         match &self.last_refusal {
             Some(refusal) if self.census.has(&self.config.gate.tool) => refusal.to_string(),

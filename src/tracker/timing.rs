@@ -42,6 +42,11 @@ impl AcquisitionClock {
         AcquisitionClock { policy, latency, offset: ClockOffset::default() }
     }
 
+    /// The fixed latency from measurement to stamp.
+    pub fn latency(&self) -> Duration {
+        self.latency
+    }
+
     /// When the sample was measured; never later than its receipt.
     ///
     /// # Errors

@@ -192,15 +192,26 @@ impl TravelCheck {
     /// travel shows it, otherwise a list.
     pub fn explain(&self, mut refusal: Refusal) -> Refusal {
         if refusal.effect == Effect::Loses {
-            let mut sums = Sums::default();
-            self.weighed_bins().take(EXPLAINED_BINS).for_each(|bin| sums += bin);
             refusal.why += &match self.change_over(EXPLAINED_BINS, SLOWER) {
-                _ if sums.is_in_metres() => format!(": {IN_METRES}"),
+                _ if self.is_in_metres() => format!(": {IN_METRES}"),
                 Some(change) => format!(": {change}"),
                 None => ": a jump, a drift, or too large a scale".to_owned(),
             };
         }
         refusal
+    }
+
+    /// Whether the last positions are in metres.
+    fn is_in_metres(&self) -> bool {
+        let mut sums = Sums::default();
+        self.weighed_bins().take(EXPLAINED_BINS).for_each(|bin| sums += bin);
+        sums.is_in_metres()
+    }
+
+    /// Whether the last positions are those of a tip that does not move.
+    pub fn is_frozen(&self) -> bool {
+        let change = self.change_over(EXPLAINED_BINS, SLOWER);
+        change.is_some_and(|change| change.is_frozen()) && !self.is_in_metres()
     }
 
     /// The change to a scale in this range that fits the last `bins` bins, if any does.

@@ -14,7 +14,9 @@ use std::time::Duration;
 /// A message about a tip that is not seen has at most this many characters.
 pub(super) const MESSAGE_MAX: usize = 200;
 /// What the operator should check when the stream contradicts the model.
-const JUMP_ADVICE: &str = "check the tracker, and needle.radius_mm";
+const JUMP_ADVICE: &str = "check the tracker, needle.radius_mm, tip_offset_mm";
+/// What the operator should check when the tip does not move: the needle may be loose, or the axes exchanged.
+const FROZEN_ADVICE: &str = "check the tracker, the needle's clamp, and which drive is which";
 /// Why a command is refused before the insertion.
 pub(super) const NOT_BEGUN: &str = "the insertion has not begun";
 /// Why the operator can neither prolong nor end a hold by the tracker with `tracker.resume = "stop"`.
@@ -244,7 +246,8 @@ impl InsertTask {
     fn trouble(&self, now: Time, insertion_meas_mm: f64, insertion: &Insertion) -> Option<Trouble> {
         let of = "tip";
         if let Some(jump) = &self.tracking.jump {
-            return Some(Trouble { of, what: jump.clone(), why: JUMP_ADVICE.to_owned() });
+            let why = if jump.is_frozen { FROZEN_ADVICE } else { JUMP_ADVICE };
+            return Some(Trouble { of, what: jump.what.clone(), why: why.to_owned() });
         }
         if let Some(what) = self.blindness(now, insertion_meas_mm, insertion) {
             return Some(Trouble { of, what, why: self.tracking.explain_silence() });

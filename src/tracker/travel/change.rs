@@ -35,6 +35,11 @@ impl fmt::Display for ScaleChange {
 }
 
 impl ScaleChange {
+    /// Whether the tip has not moved since the change.
+    pub(super) fn is_frozen(&self) -> bool {
+        self.scale == 0.0
+    }
+
     /// The change to a scale of `tenths` that fits the positions of these bins best, newest bin first, with
     /// noise of this variance in each coordinate, mm²; `None` if a stream without a change fits as well.
     pub(super) fn fitted(

@@ -237,6 +237,22 @@ fn another_tool_in_place_of_the_needle_is_reported_as_out_of_view() {
     assert!(stops.iter().all(|stop| stop.bench.reason().ends_with(end)));
 }
 
+/// A source whose stamps are in another unit, or stand still.
+#[test]
+fn stamps_that_hardly_advance_are_named() {
+    const START_NS: i64 = 1_700_000_000_000_000_000;
+    let mut bench = Bench::new(configured(&["tracker.stamp=\"source\""]));
+    bench.change_samples(|sample| {
+        sample.source_unix_ns = Some(START_NS + sample.receive_time.as_nanos() / 1000);
+    });
+    bench.run_to_end();
+    let reason = bench.reason();
+    let end = "s late by its stamp: mend its clock, or set tracker.stamp = \"receive\"";
+    assert!(reason.contains("the newest came 0.5") && reason.ends_with(end), "{reason}");
+    let (depth_mm, _) = bench.stage.position_true(bench.now);
+    assert!(depth_mm < 1.5, "{depth_mm} mm");
+}
+
 #[test]
 fn one_tip_and_then_silence_while_the_drives_are_slow() {
     let mut bench = Bench::new(configured(&[]));
