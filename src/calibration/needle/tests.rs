@@ -1,7 +1,7 @@
 //! Insertions of known needles are simulated, and their parameters are found from them.
 
 use super::*;
-use crate::geometry::{FixedAngles, Pose};
+use crate::geometry::{FixedAngles, Pose, so3};
 use crate::needle::{Increment, Needle, Play, Torsion, TorsionConfig};
 use nalgebra::Rotation3;
 use rand::{RngExt, SeedableRng};
@@ -146,12 +146,37 @@ fn positions_with_exchanged_or_mirrored_axes_are_refused() {
     let exchanged = |p: Vector3<f64>| Vector3::new(p.y, p.x, p.z);
     let mirrored = |p: Vector3<f64>| Vector3::new(-p.x, p.y, p.z);
     for change in [exchanged, mirrored] as [fn(Vector3<f64>) -> Vector3<f64>; 2] {
-        let mut insertions = recorded(CREEPING, 0.01);
-        for row in insertions.iter_mut().flatten() {
-            row.position_mm = change(row.position_mm);
+        // Across the shaft, and across the sensor, which is off the shaft by 5 deg.
+        for r in [mount(), Rotation3::identity()] {
+            let mut insertions = recorded(CREEPING, 0.01);
+            for row in insertions.iter_mut().flatten() {
+                row.position_mm = r * change(r.inverse() * row.position_mm);
+            }
+            let error = NeedleFit::of(&insertions, name, &NOISE).unwrap_err();
+            assert!(error.contains("is no axis mirrored or exchanged"), "{error}");
         }
-        let error = NeedleFit::of(&insertions, name, &NOISE).unwrap_err();
-        assert!(error.contains("is no axis mirrored or exchanged"), "{error}");
+    }
+}
+
+/// The curvature would be off by up to a half, and its standard error would not show it.
+#[test]
+fn orientations_in_another_frame_than_the_positions_are_refused() {
+    let turned = |turned_deg: [f64; 3]| {
+        let turn = so3::exp(&Vector3::from(turned_deg.map(f64::to_radians)));
+        let mut insertions = recorded(CREEPING, 0.01);
+        for row in &mut insertions[2] {
+            row.position_mm = turn * row.position_mm;
+        }
+        NeedleFit::of(&insertions, name, &NOISE).err()
+    };
+    assert_eq!(turned([0.0; 3]), None);
+    assert_eq!(turned([4.0, 0.0, 0.0]), None);
+    for (angle_deg, said_deg) in [(20.0, 17..=23), (45.0, 42..=48), (180.0, 155..=180)] {
+        let error = turned([angle_deg, 0.0, 0.0]).unwrap();
+        let found = said_deg.into_iter().any(|deg| {
+            error.starts_with(&format!("needle: c.csv points {deg} deg off its path (limit 10): "))
+        });
+        assert!(found, "{error}");
     }
 }
 
