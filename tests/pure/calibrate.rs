@@ -256,12 +256,53 @@ fn the_tip_on_the_sensor_is_computed_and_used() {
     let set = ["--set", "tracker.gates.noise_sd_mm=0.8"];
     let said = calibrate(&scratch, &[&["tip", "turn.csv", "--json"], &set[..]].concat());
     assert!(said.stderr.contains("RMS off a circle (limit 1.60)"), "{}", said.stderr);
-    // With a negative distance the sensor is ahead of the tip.
-    let behind = calibrate(&scratch, &["tip", "turn.csv", "--along-mm", "-7", "--json"]);
-    assert_eq!(behind.status, 0, "{}", behind.stderr);
-    let behind = behind.json();
-    let along_mm = behind["tracker"]["tip_offset_mm"][2].as_f64();
-    assert!((along_mm.unwrap() + 7.0).abs() < 1e-9, "{behind}");
+}
+
+/// The turn does not show it, and a run cannot notice it.
+#[test]
+fn the_distance_of_the_tip_ahead_of_the_sensor_is_asked_for() {
+    let scratch = Scratch::new();
+    scratch.write("turn.csv", &turning(8));
+    let of = |more: &[&str]| calibrate(&scratch, &[&["tip", "turn.csv"], more].concat());
+    let given = of(&["--along-mm", "7"]);
+    assert_eq!(given.status, 0, "{}", given.stderr);
+    let said = "the tip is 7.00 mm ahead of the sensor, along the needle";
+    assert!(given.stderr.contains(said) && !given.stderr.contains("warning"), "{}", given.stderr);
+    let forgotten = of(&[]);
+    assert_eq!(forgotten.status, 0, "{}", forgotten.stderr);
+    let said = "warning: the tip is taken to be level with the sensor";
+    assert!(forgotten.stderr.contains(said), "{}", forgotten.stderr);
+    assert!(forgotten.stderr.contains("the tip is 0.00 mm ahead"), "{}", forgotten.stderr);
+    let behind = of(&["--along-mm", "-7"]);
+    assert_eq!(behind.status, 2, "{}", behind.stderr);
+    let said = "--along-mm is -7 mm (at least 0): a sensor is not ahead of its own tip";
+    assert!(behind.stderr.contains(said), "{}", behind.stderr);
+}
+
+/// A tenth of the offset would be subtracted.
+#[test]
+fn a_turn_with_less_noise_than_the_tracker_has_is_warned_about() {
+    let scratch = Scratch::new();
+    // Off the circle by 0.05 mm RMS, along the needle.
+    let off = |(n, line): (usize, &str)| match n {
+        0 => format!("{line}\n"),
+        _ => line.replace(",50,", if n.is_multiple_of(2) { ",50.05," } else { ",49.95," }) + "\n",
+    };
+    scratch.write("turn.csv", &turning(8).lines().enumerate().map(off).collect::<String>());
+    let is_warned = |noise_mm: Option<&str>| {
+        let noise = noise_mm.map(|mm| {
+            format!("tracker.noise={{ white_sd_mm = {mm}, correlated_sd_mm = 0.0, correlation_time_s = 0.0 }}")
+        });
+        let mut arguments = vec!["tip", "turn.csv", "--along-mm", "7"];
+        arguments.extend(noise.iter().flat_map(|noise| ["--set", noise]));
+        let said = calibrate(&scratch, &arguments);
+        assert_eq!(said.status, 0, "{}", said.stderr);
+        said.stderr.contains("(a quarter needed): are they in cm or inches, or smoothed?")
+    };
+    assert!(!is_warned(None), "not without a measured noise");
+    // A quarter of sqrt(2) times 0.14 mm is 0.0495 mm, of 0.143 mm it is 0.0506 mm.
+    assert!(!is_warned(Some("0.14")));
+    assert!(is_warned(Some("0.143")));
 }
 
 /// A run could not apply such an offset, so the result is 0.

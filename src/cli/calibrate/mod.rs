@@ -24,11 +24,14 @@ use clap::{Args, Subcommand};
 use minijinja::{Value as Shown, context};
 use nalgebra::Rotation3;
 use serde_json::{Value, json};
+use std::f64::consts::SQRT_2;
 use std::path::PathBuf;
 use std::time::SystemTime;
 
 /// Default limit of the RMS distance from the circle, mm.
 const RMS_MAX_MM: f64 = 0.5;
+/// Positions that scatter about the circle by less than this part of what the tracker's noise gives are not its own.
+const SCATTER_PART_MIN: f64 = 0.25;
 
 #[derive(Debug, Subcommand)]
 pub(super) enum Calibration {
@@ -82,10 +85,9 @@ pub(super) struct TipArguments {
     /// and --out is refused: the result is not that of the rig.
     #[arg(long, requires = "run")]
     rehearse: bool,
-    /// Distance of the tip ahead of the sensor along the needle, mm.
-    #[arg(long, value_name = "MM", default_value_t = 0.0, allow_negative_numbers = true,
-          value_parser = number_in(-500.0..=500.0, "mm"))]
-    along_mm: f64,
+    /// Distance of the tip ahead of the sensor along the needle, mm; without it they are taken to be level.
+    #[arg(long, value_name = "MM", allow_negative_numbers = true, value_parser = number_in(-500.0..=500.0, "mm"))]
+    along_mm: Option<f64>,
     /// Refuse positions with a larger RMS distance from a circle than this, mm; by default 0.5, and
     /// with CONFIG or --run twice tracker.gates.noise_sd_mm where that is more.
     #[arg(long, value_name = "MM", value_parser = number_in(0.001..=100.0, "mm"))]
@@ -342,24 +344,51 @@ fn tip(arguments: &TipArguments) -> Result<()> {
             "--rehearse writes no calibration, since its needle and tracker are emulated: leave --out out",
         ));
     }
+    let along_mm = arguments.along_mm.unwrap_or_default();
+    if along_mm < 0.0 {
+        return Err(Failure::configuration(format_args!(
+            "--along-mm is {along_mm} mm (at least 0): a sensor is not ahead of its own tip; give the distance from the \
+             sensor forward to the tip"
+        )));
+    }
     arguments.output.refuse_unwritable()?;
-    let (text, noise_sd_mm) = match arguments.run {
-        true => record_turn(path, &arguments.configured, arguments.rehearse)?,
+    let (text, config) = match arguments.run {
+        true => {
+            let (text, config) = record_turn(path, &arguments.configured, arguments.rehearse)?;
+            (text, Some(config))
+        }
         false if arguments.configured.is_given() => {
             let config = arguments.configured.load(None)?;
-            (text_of(path)?, config.tracker.to_track().noise_sd_mm)
+            (text_of(path)?, Some(config))
         }
-        false => (text_of(path)?, 0.0),
+        false => (text_of(path)?, None),
     };
+    let noise_sd_mm = config.as_ref().map_or(0.0, |config| config.tracker.to_track().noise_sd_mm);
     let rms_max_mm = arguments.rms_max_mm.unwrap_or(RMS_MAX_MM.max(2.0 * noise_sd_mm));
     let samples = TurnSample::parse(&text).map_err(|error| Failure::bad_input(path, error))?;
     let fit = TipFit::of(&samples, rms_max_mm).map_err(|error| Failure::bad_input(path, error))?;
     let is_oriented = samples.iter().all(|sample| sample.orientation_meas.is_some());
-    if arguments.along_mm != 0.0 && !is_oriented {
+    if along_mm != 0.0 && !is_oriented {
         let why = "--along-mm needs the sensor's orientation: record qw,qx,qy,qz, or leave it out";
         return Err(Failure::bad_input(path, why));
     }
-    let x_sb = fit.x_sb(arguments.along_mm);
+    if arguments.along_mm.is_none() && is_oriented {
+        print_stderr(
+            "warning: the tip is taken to be level with the sensor: measure how far it is ahead along the needle, and \
+             give it as --along-mm",
+        );
+    }
+    // Each position scatters in the direction of the radius, and across the circle's plane.
+    let expected_mm =
+        config.and_then(|config| config.tracker.noise).map(|noise| SQRT_2 * noise.sd_mm());
+    if let Some(mm) = expected_mm.filter(|mm| fit.rms_mm < SCATTER_PART_MIN * mm) {
+        print_stderr(format_args!(
+            "warning: the positions scatter by {:.3} mm RMS, and tracker.noise gives {mm:.3} (a quarter needed): are they \
+             in cm or inches, or smoothed?",
+            fit.rms_mm
+        ));
+    }
+    let x_sb = fit.x_sb(along_mm);
     let found = json!({ "points": fit.points, "radius_mm": fit.radius_mm, "rms_mm": fit.rms_mm });
     let tracker = json!({
         "tip_offset_mm": <[f64; 3]>::from(x_sb.translation),
@@ -378,6 +407,8 @@ fn tip(arguments: &TipArguments) -> Result<()> {
     });
     let more = context! {
         rms_max_mm,
+        is_oriented,
+        along_mm,
         tilt_deg => fit.mount.map(|mount| mount.axis.z.clamp(-1.0, 1.0).acos().to_degrees()),
         overlay => to_toml(&json!({ "tracker": tracker }))?,
     };

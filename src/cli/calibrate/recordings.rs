@@ -14,6 +14,7 @@ use crate::cli::records::{RunMeasurements, position_at, read_run};
 use crate::cli::stage::{load_stage, perform, sensor_off_axis};
 use crate::cli::tracker::{Listener, listen};
 use crate::cli::{Failure, Result, STOPPED, finish_with};
+use crate::config::Config;
 use crate::geometry::Pose;
 use crate::session::MovingMean;
 use crate::tracker::{Event, Registration};
@@ -201,13 +202,13 @@ const TURNS: [&str; 2] = ["360deg", "-360deg"];
 const ROWS_APART_DEG: f64 = 0.5;
 
 /// Turns the base of the stage that `configured` names and writes the sensor's positions into the new
-/// file `path`; returns the text of the file and the configured noise of the positions, mm. Writes nothing after a
-/// turn that did not complete, and nothing in a rehearsal, whose sensor is emulated.
+/// file `path`; returns the text of the file and the configuration. Writes nothing after a turn that did not complete,
+/// and nothing in a rehearsal, whose sensor is emulated.
 pub(super) fn record_turn(
     path: &Path,
     configured: &Configured,
     rehearse: bool,
-) -> Result<(String, f64)> {
+) -> Result<(String, Config)> {
     // A rehearsal does not write it.
     refuse_unwritable(Some(path).filter(|_| !rehearse))?;
     let configured = configured.clone().rehearsed(rehearse);
@@ -236,7 +237,7 @@ pub(super) fn record_turn(
     if !rehearse {
         write_new(path, &text)?;
     }
-    Ok((text, config.tracker.to_track().noise_sd_mm))
+    Ok((text, config))
 }
 
 /// Rows of the base's rotation, the sensor's position and, if the tracker gives it, its orientation. The rotation
