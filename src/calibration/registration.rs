@@ -213,6 +213,9 @@ impl RegistrationFit {
     /// principal axis k, f_k their RMS distance from it. The trace is TRE² of Fitzpatrick, West and Maurer
     /// (1998).
     ///
+    /// The residuals of few points show the error poorly: with ν = 3N − 6 degrees of freedom the factor √(ν/(ν − 2))
+    /// gives the standard deviation of Student's t, √3 for three points.
+    ///
     /// It is the same for all samples of a run; averaging does not reduce it.
     pub fn target_sd_mm(&self, p_w_mm: &Vector3<f64>) -> f64 {
         let along = self.axes.tr_mul(&(p_w_mm - self.centre_bench));
@@ -223,7 +226,8 @@ impl RegistrationFit {
             spread += moved * moved.transpose() / distance2;
         }
         let variance = self.localisation_error_mm().powi(2) / (3 * self.points) as f64;
-        (variance * spread.symmetric_eigenvalues().max()).sqrt()
+        let freedom = (3 * self.points - 6) as f64;
+        (variance * freedom / (freedom - 2.0) * spread.symmetric_eigenvalues().max()).sqrt()
     }
 }
 

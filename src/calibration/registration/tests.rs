@@ -128,7 +128,9 @@ fn fre_and_target_error_are_as_predicted() {
         fre2 += fit.rms_mm.powi(2) / f64::from(sets);
         let error_mm = fit.x_wt.transform(&target_mm) - x_wt.transform(&target_mm);
         covariance += error_mm * error_mm.transpose() / f64::from(sets);
-        predicted2 += fit.target_sd_mm(&x_wt.transform(&target_mm)).powi(2) / f64::from(sets);
+        // 18 degrees of freedom.
+        let without_t2 = fit.target_sd_mm(&x_wt.transform(&target_mm)).powi(2) * (16.0 / 18.0);
+        predicted2 += without_t2 / f64::from(sets);
     }
     let fle2 = 3.0 * sd_mm * sd_mm;
     assert!((fre2 / (fle2 * (1.0 - 2.0 / 8.0)) - 1.0).abs() < 0.05, "FRE² {fre2}");
@@ -169,6 +171,23 @@ fn points_in_a_plane_are_reported() {
     assert_eq!(remarks(&solid), Vec::<String>::new());
 }
 
+/// The factor is √(ν/(ν − 2)) for ν = 3N − 6.
+#[test]
+fn the_error_at_a_target_allows_for_few_points() {
+    for (points, factor) in [(3, 3f64.sqrt()), (4, 1.5f64.sqrt()), (12, (30f64 / 28.0).sqrt())] {
+        let layout: Vec<_> = (0..points).map(|p| WhiteNoise::Uniform(60.0).draw(5, p)).collect();
+        let mut pairs = pairs(&Pose::identity(), &layout);
+        for (point, pair) in (0..).zip(&mut pairs) {
+            pair.tracker_mm += WhiteNoise::Gaussian(0.1).draw(1, point);
+        }
+        let fit = RegistrationFit::of(&pairs, 1.0).expect("fits");
+        // At the centroid it is that of the mean.
+        let of_mean_mm = fit.localisation_error_mm() / (3.0 * points as f64).sqrt();
+        let ratio = fit.target_sd_mm(&fit.centre_bench) / of_mean_mm;
+        assert!((ratio - factor).abs() < 1e-9, "{points} points: {ratio}");
+    }
+}
+
 #[test]
 fn the_error_at_a_target_grows_with_its_distance() {
     let noisy = pairs(&Pose::identity(), &square(100.0));
@@ -181,7 +200,8 @@ fn the_error_at_a_target_grows_with_its_distance() {
         .collect();
     let fit = RegistrationFit::of(&noisy, 1.0).expect("fits");
     let sd_mm = |z_mm: f64| fit.target_sd_mm(&Vector3::new(50.0, 50.0, z_mm));
-    let least_mm = fit.localisation_error_mm() / (3.0 * 4.0f64).sqrt();
+    // Four points have six degrees of freedom.
+    let least_mm = fit.localisation_error_mm() / (3.0 * 4.0f64).sqrt() * 1.5f64.sqrt();
     // At the centroid it is that of the mean. Above it a tilt adds: the points are 50 mm RMS from either axis.
     for z_mm in [0.0, 100.0, 250.0] {
         let expected_mm = least_mm * (z_mm / 50.0f64).hypot(1.0);
