@@ -7,6 +7,7 @@ use crate::table::Table;
 use crate::units::IN_METRES;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use std::cmp::Ordering;
+use std::f64::consts::PI;
 
 /// Columns of a file of fiducial pairs: each point in the tracker's frame and in the bench frame.
 pub const FIDUCIAL_COLUMNS: [&str; 6] =
@@ -85,6 +86,66 @@ const SCALE_ERROR_MIN: f64 = 0.002;
 const FLAT: &str = "the points lie in a plane, and so cannot show a mirrored axis of the tracker: touch one off it";
 const SCATTERED: &str =
     "measure that one again, and check that both frames have the points in the same order";
+
+/// Another order of the points is looked for up to this many; more are hardly symmetric by chance.
+const ORDER_POINTS_MAX: usize = 12;
+/// No more partial orders are tried than this. Points that all lie close together have billions.
+const ORDER_TRIES_MAX: usize = 100_000;
+/// In another order two points may be farther apart or closer than in the given one by this, mm.
+const ORDER_DISTANCE_MM: f64 = 3.0;
+/// A frame that another order turns by less than this is the same one, with two close points exchanged.
+const TURNED_MIN_RAD: f64 = 2.0 * PI / 180.0;
+
+/// The orders of the bench's points in which they are as far apart as in the tracker's frame, by backtracking: the
+/// tracker's point k goes with the bench's point `order[k]`.
+struct Orders<'a> {
+    pairs: &'a [FiducialPair],
+    order: Vec<usize>,
+    /// The first of the bench's points to try next.
+    next: usize,
+    tries: usize,
+}
+
+impl<'a> Orders<'a> {
+    fn new(pairs: &'a [FiducialPair]) -> Self {
+        Orders { pairs, order: Vec::new(), next: 0, tries: 0 }
+    }
+
+    /// True if the bench's point `n` may come next.
+    fn fits(&self, n: usize) -> bool {
+        let of = self.pairs[self.order.len()].tracker_mm;
+        !self.order.contains(&n)
+            && self.order.iter().zip(self.pairs).all(|(&other, pair)| {
+                let bench_mm = (self.pairs[n].bench_mm - self.pairs[other].bench_mm).norm();
+                ((of - pair.tracker_mm).norm() - bench_mm).abs() <= ORDER_DISTANCE_MM
+            })
+    }
+}
+
+impl Iterator for Orders<'_> {
+    type Item = Vec<usize>;
+
+    fn next(&mut self) -> Option<Vec<usize>> {
+        let count = self.pairs.len();
+        while self.tries < ORDER_TRIES_MAX {
+            self.tries += 1;
+            let fitting = (self.order.len() < count)
+                .then(|| (self.next..count).find(|&n| self.fits(n)))
+                .flatten();
+            match fitting {
+                Some(n) => {
+                    self.order.push(n);
+                    self.next = 0;
+                    if self.order.len() == count {
+                        return Some(self.order.clone());
+                    }
+                }
+                None => self.next = self.order.pop()? + 1,
+            }
+        }
+        None
+    }
+}
 
 impl RegistrationFit {
     /// The rigid motion with the smallest sum of squared distances `|p_W − X_WT p_T|²` (Umeyama
@@ -188,8 +249,9 @@ impl RegistrationFit {
         Ok(fit)
     }
 
-    /// Remarks on what the residuals may hide: points in a plane, a wrong scale.
-    pub fn remarks(&self) -> Vec<String> {
+    /// Remarks on what the residuals of the `pairs` may hide: points in a plane, a wrong scale, another order of the
+    /// points that fits as well, to `rms_max_mm`.
+    pub fn remarks(&self, pairs: &[FiducialPair], rms_max_mm: f64) -> Vec<String> {
         let mut remarks = Vec::new();
         let flat_max_mm =
             (BREADTH_PER_LENGTH_MIN * self.spread_mm[0]).max(self.localisation_error_mm());
@@ -197,7 +259,33 @@ impl RegistrationFit {
             remarks.push(FLAT.to_owned());
         }
         remarks.extend(self.scale.map(scale_remark));
+        remarks.extend(self.other_order(pairs, rms_max_mm));
         remarks
+    }
+
+    /// A remark on the first other order of the bench's points that fits to `rms_max_mm` and turns the frame: a wrong
+    /// order of a symmetric layout fits as well as the right one.
+    fn other_order(&self, pairs: &[FiducialPair], rms_max_mm: f64) -> Option<String> {
+        if pairs.len() > ORDER_POINTS_MAX {
+            return None;
+        }
+        let (order, fit, turned_rad) = Orders::new(pairs).find_map(|order| {
+            let bench_mm = order.iter().map(|&n| pairs[n].bench_mm);
+            let pairs = pairs.iter().zip(bench_mm);
+            let pairs: Vec<_> =
+                pairs.map(|(pair, bench_mm)| FiducialPair { bench_mm, ..*pair }).collect();
+            let fit = Self::of(&pairs, rms_max_mm).ok()?;
+            let turned_rad = fit.x_wt.rotation.angle_to(&self.x_wt.rotation);
+            (turned_rad > TURNED_MIN_RAD).then_some((order, fit, turned_rad))
+        })?;
+        let order: Vec<String> = order.iter().map(|n| (n + 1).to_string()).collect();
+        Some(format!(
+            "the bench's points fit in the order {} as well ({:.2} mm RMS), turned by {:.0} deg: is the order right? \
+             Touch one more that breaks the symmetry",
+            order.join(","),
+            fit.rms_mm,
+            turned_rad.to_degrees()
+        ))
     }
 
     /// The RMS error of locating one fiducial (FLE), mm, from the remaining distances:

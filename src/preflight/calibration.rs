@@ -3,7 +3,7 @@
 use super::Check;
 use super::Verdict::{Fail, Warn};
 use crate::archive::unix_us_of;
-use crate::calibration::{Provenance, RegistrationRecord};
+use crate::calibration::{FiducialPair, Provenance, RegistrationFit, RegistrationRecord};
 use crate::config::{Config, RegistrationConfig};
 use crate::observer::ROLL_JUDGED_SD_MAX_RAD;
 use nalgebra::Vector3;
@@ -20,6 +20,9 @@ const CURVATURE_PART_MAX: f64 = 0.2;
 
 /// The tip's offset may differ from that with which the fiducials were touched by this, mm.
 const TIP_MOVED_MAX_MM: f64 = 0.05;
+
+/// The largest error of the registration at the tip, mm, one standard deviation.
+const SD_MAX_MM: f64 = 1.0;
 
 /// A run before this one.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -74,6 +77,15 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
     let close = |check: Check, rms_mm: f64| {
         check.unless(rms_mm <= rms_max_mm, Fail, format!("over {rms_max_mm} mm RMS: {register}"))
     };
+    let sd_mm = config.registration_sd_mm().unwrap_or_default();
+    let vague = format!(
+        "the tip would be off by over {SD_MAX_MM} mm: touch more points, around the needle's path"
+    );
+    let fits = |rms_mm: f64| format!("{rms_mm:.2} mm RMS, {sd_mm:.2} mm at the tip");
+    let judged = |check: Check, fit: &RegistrationFit, pairs: &[FiducialPair], rms_max_mm: f64| {
+        let remarks = fit.remarks(pairs, rms_max_mm);
+        check.unless(remarks.is_empty(), Warn, remarks.join("\n"))
+    };
     let registration = match &tracker.registration {
         None => {
             let next = format!("{register}, then name its file in tracker.registration_file");
@@ -84,7 +96,7 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
             let off = of_fiducials.map(|fit| (fit.x_wt.inverse() * given.x_wt).log().to_vector());
             // A pose that was changed by hand has no origin.
             let fit = given.fit.as_ref().filter(|_| off.is_none_or(|off| off.amax() < SAME_POSE));
-            let found = fit.map(|fit| format!("{:.2} mm RMS", fit.rms_mm)).unwrap_or_default();
+            let found = fit.map(|fit| fits(fit.rms_mm)).unwrap_or_default();
             let provenance = fit.map(|fit| &fit.provenance);
             let rms_mm = fit.map_or(0.0, |fit| fit.rms_mm);
             let old = "its file has no fiducials to compute its error from: sd_mm is of the depth and plane of that time";
@@ -94,6 +106,12 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
                     Warn,
                     format!("{old}: {register}"),
                 );
+            let check = match (fit, &of_fiducials) {
+                (Some(RegistrationRecord { fiducials, .. }), Some(of_fiducials)) => {
+                    judged(check, of_fiducials, fiducials, rms_max_mm)
+                }
+                _ => check,
+            };
             match fit {
                 Some(fit) => collected_with_tip(check, fit, tracker.tip_offset_mm),
                 None => check,
@@ -101,13 +119,10 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
         }
         Some(RegistrationConfig::Fiducials(fiducials)) => match fiducials.fit() {
             Ok(fit) => {
-                let found = format!("{} points, {:.2} mm RMS", fit.points, fit.rms_mm);
-                let remarks = fit.remarks().join("; ");
-                close(dated("registration", found, &limit, None, &collect), fit.rms_mm).unless(
-                    remarks.is_empty(),
-                    Warn,
-                    remarks,
-                )
+                let found = format!("{} points, {}", fit.points, fits(fit.rms_mm));
+                let check = dated("registration", found, &limit, None, &collect);
+                let check = close(check, fit.rms_mm);
+                judged(check, &fit, &fiducials.fiducials, fiducials.rms_max_mm)
             }
             Err(error) => {
                 let check = Check::new("registration", error.to_string(), limit);
@@ -115,6 +130,7 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
             }
         },
     };
+    let registration = registration.unless(sd_mm <= SD_MAX_MM, Warn, vague);
     let days_limit = format!("up to {days_max:.0} days");
     let fit = tracker.tip_fit.as_ref();
     let is_placeholder = !tracker.has_tip();

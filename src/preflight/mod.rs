@@ -41,7 +41,7 @@ pub struct Check {
     pub found: String,
     /// What is allowed.
     pub limit: String,
-    /// What to do, if the check did not pass.
+    /// What to do, if the check did not pass; a line for each thing.
     pub next_step: Option<String>,
 }
 
@@ -78,8 +78,8 @@ impl Check {
 /// The list for a screen: a line for each check; below a check that did not pass, its next step.
 pub fn to_text(checks: &[Check]) -> String {
     let lines = checks.iter().map(|Check { name, verdict, found, limit, next_step }| {
-        let next_step =
-            next_step.as_ref().map(|next| format!("\n      {next}")).unwrap_or_default();
+        let next_step = next_step.iter().flat_map(|next| next.lines());
+        let next_step: String = next_step.map(|line| format!("\n      {line}")).collect();
         format!("{verdict}  {name:<NAME_WIDTH$}  {found} ({limit}){next_step}")
     });
     lines.collect::<Vec<_>>().join("\n")

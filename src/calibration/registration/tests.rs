@@ -156,19 +156,58 @@ fn a_wrong_scale_is_reported_and_noise_is_not() {
     assert!(scales.len() >= 95, "named in {} of 100", scales.len());
     assert!(scales.iter().all(|scale| (scale - 1.01).abs() < 0.004), "{scales:?}");
     assert_eq!((0..1000).filter(|&set| fit(set, 1.0).scale.is_some()).count(), 0);
-    let remarks = fit(1, 1.01).remarks().join("; ");
+    let remarks = fit(1, 1.01).remarks(&[], 3.0).join("; ");
     assert!(remarks.starts_with("the tracker has the points 1.0"), "{remarks}");
 }
 
 #[test]
 fn points_in_a_plane_are_reported() {
     let remarks = |points_mm: &[Vector3<f64>]| {
-        RegistrationFit::of(&pairs(&Pose::identity(), points_mm), 1.0).expect("fits").remarks()
+        let pairs = pairs(&Pose::identity(), points_mm);
+        RegistrationFit::of(&pairs, 1.0).expect("fits").remarks(&pairs, 1.0)
     };
     let flat = square(100.0);
     assert!(remarks(&flat)[0].contains("lie in a plane"));
-    let solid = [flat, vec![Vector3::new(50.0, 50.0, 20.0)]].concat();
+    let solid = [flat, vec![Vector3::new(70.0, 40.0, 20.0)]].concat();
     assert_eq!(remarks(&solid), Vec::<String>::new());
+}
+
+/// Points that were read from another corner fit as well, and turn the frame.
+#[test]
+fn points_that_fit_in_another_order_are_reported() {
+    let corner = |lengths_mm: [f64; 3]| {
+        let ends = (0..3).map(|k| Vector3::ith(k, lengths_mm[k]));
+        [Vector3::zeros()].into_iter().chain(ends).collect::<Vec<_>>()
+    };
+    let top = square(60.0).into_iter().map(|p| p + Vector3::z() * 60.0);
+    let cube: Vec<_> = square(60.0).into_iter().chain(top).collect();
+    let remarks = |points_mm: &[Vector3<f64>], rms_max_mm: f64| {
+        let mut pairs = pairs(&Pose::identity(), points_mm);
+        for (point, pair) in pairs.iter_mut().enumerate() {
+            pair.tracker_mm += WhiteNoise::Gaussian(0.1).draw(3, point as u64);
+        }
+        let fit = RegistrationFit::of(&pairs, 3.0).expect("fits");
+        fit.remarks(&pairs, rms_max_mm).pop().filter(|remark| remark.contains(" fit in the order "))
+    };
+    for (layout, order, turned) in [
+        (square(60.0), "1,4,3,2 as well (0.", "turned by 180 deg"),
+        (corner([60.0; 3]), "1,3,4,2 as well (0.", "turned by 120 deg"),
+        (cube, "1,4,8,5,2,3,7,6 as well (0.", "turned by 120 deg"),
+    ] {
+        let remark = remarks(&layout, 1.0).expect("a remark");
+        assert!(remark.contains(order) && remark.contains(turned), "{remark}");
+        assert!(remark.len() + "warning: ".len() <= 200, "{remark}");
+    }
+    // Nothing can be exchanged, or it does not fit within the limit.
+    assert_eq!(remarks(&corner([50.0, 60.0, 70.0]), 1.0), None);
+    assert_eq!(remarks(&corner([60.0, 60.0, 62.5]), 1.0), None);
+    assert!(remarks(&corner([60.0, 60.0, 62.5]), 3.0).is_some());
+    let unlike: Vec<_> = (0..9u64).map(|p| WhiteNoise::Uniform(80.0).draw(5, p)).collect();
+    assert_eq!(remarks(&unlike, 1.0), None);
+    // All orders of points this close together are too many to try.
+    let close: Vec<_> = (0..12u64).map(|p| WhiteNoise::Uniform(1.5).draw(5, p)).collect();
+    let count = Orders::new(&pairs(&Pose::identity(), &close)).count();
+    assert!(count < ORDER_TRIES_MAX, "{count}");
 }
 
 /// The factor is √(ν/(ν − 2)) for ν = 3N − 6.

@@ -329,7 +329,7 @@ fn registration(arguments: &RegistrationArguments) -> Result<()> {
     let overlay = json!({ "tracker": { "registration": registration } });
     let more = context! {
         rms_max_mm => arguments.rms_max_mm,
-        remarks => fit.remarks(),
+        remarks => fit.remarks(&pairs, arguments.rms_max_mm),
         overlay => to_toml(&overlay)?,
     };
     let toml = Some(include_str!("registration.toml"));
