@@ -164,11 +164,13 @@ fn collected_with_tip(check: Check, fit: &RegistrationRecord, now_mm: [f64; 3]) 
         return check.unless(now_mm == [0.0; 3], Warn, next);
     };
     let moved_mm = (Vector3::from(now_mm) - Vector3::from(then_mm)).norm();
-    let next = format!(
-        "collected with tip_offset_mm {then_mm:.2?}, now {now_mm:.2?}: the tip's offset would count twice; collect \
-         the fiducials again"
-    );
-    check.unless(moved_mm <= TIP_MOVED_MAX_MM, Fail, next)
+    // A needle that is replaced has another offset, and the registration stays right.
+    let (verdict, why) = match then_mm == [0.0; 3] {
+        true => (Fail, "the tip's offset would count twice; collect the fiducials again"),
+        false => (Warn, "if the needle is the same, collect the fiducials again"),
+    };
+    let next = format!("collected with tip_offset_mm {then_mm:.2?}, now {now_mm:.2?}: {why}");
+    check.unless(moved_mm <= TIP_MOVED_MAX_MM, verdict, next)
 }
 
 /// Checks that the roll at the start is known. Only against it does a run notice a registration that is turned
