@@ -19,7 +19,9 @@ section! {
         rms_mm: f64 [LENGTH];
         /// RMS extent of the fiducials along their principal axes, mm.
         spread_mm: [f64; 3] [LENGTH];
-        /// `tracker.tip_offset_mm` while the fiducials were touched, mm.
+        /// `tracker.tool` with which the bench collected the fiducials.
+        tool: Option<String>;
+        /// `tracker.tip_offset_mm` while the bench collected the fiducials, mm.
         tip_offset_mm: Option<[f64; 3]> [within(-1000.0, 1000.0)];
         /// The fiducials. From them follows how well the tip is known at the depth of a run.
         fiducials: Vec<FiducialPair> [Rule::Fields("tracker_mm, bench_mm")] = [], everywhere;

@@ -148,6 +148,11 @@ impl TrackerSection {
         self.tip_fit.is_some() || self.tip_offset_mm != [0.0; 3]
     }
 
+    /// True if it is known how the sensor is turned on the needle.
+    pub fn has_tilt(&self) -> bool {
+        self.tip_fit.is_some() || self.tip_tilt != FixedAngles::default()
+    }
+
     /// `X_SB`: the tip in the sensor's frame.
     pub fn x_sb(&self) -> Pose {
         Pose { rotation: self.tip_tilt.to_rotation(), translation: self.tip_offset_mm.into() }

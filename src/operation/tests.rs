@@ -368,7 +368,7 @@ fn an_axis_is_moved_although_the_other_is_not_homed() {
     let mut bench = Bench::new(&config, Operation::Move(by(Axis::Rotation, 1.0)));
     let reason = bench.reason();
     assert!(
-        reason.ends_with("), home it first: needle-bench stage home CONFIG --axis rotation"),
+        reason.ends_with("); home it first: needle-bench stage home CONFIG --axis rotation"),
         "{reason}"
     );
 }

@@ -4,7 +4,7 @@ use super::Check;
 use super::Verdict::{Fail, Warn};
 use crate::archive::unix_us_of;
 use crate::calibration::{FiducialPair, Provenance, RegistrationFit, RegistrationRecord};
-use crate::config::{Config, RegistrationConfig};
+use crate::config::{Config, RegistrationConfig, TrackerSection};
 use crate::observer::ROLL_JUDGED_SD_MAX_RAD;
 use nalgebra::Vector3;
 
@@ -113,7 +113,7 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
                 _ => check,
             };
             match fit {
-                Some(fit) => collected_with_tip(check, fit, tracker.tip_offset_mm),
+                Some(fit) => collected_with_tip(check, fit, tracker),
                 None => check,
             }
         }
@@ -157,10 +157,15 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
 
 /// This check of a registration, unless its fiducials were touched with another offset of the tip than the present
 /// one. The difference went into the pose.
-fn collected_with_tip(check: Check, fit: &RegistrationRecord, now_mm: [f64; 3]) -> Check {
+fn collected_with_tip(check: Check, fit: &RegistrationRecord, tracker: &TrackerSection) -> Check {
+    let now_mm = tracker.tip_offset_mm;
+    // A probe of its own has its own tip.
+    if fit.tool.as_ref().is_some_and(|tool| *tool != tracker.tool) {
+        return check;
+    }
     let Some(then_mm) = fit.tip_offset_mm else {
-        let next = "its file does not say with which tip_offset_mm its points were touched: \
-                    needle-bench calibrate registration";
+        let next = "its file does not say with which tip_offset_mm its points were touched; if with this needle, \
+                    collect them anew: calibrate registration --collect";
         return check.unless(now_mm == [0.0; 3], Warn, next);
     };
     let moved_mm = (Vector3::from(now_mm) - Vector3::from(then_mm)).norm();

@@ -221,8 +221,11 @@ fn room(axis: Axis, position: f64, travel: f64, drive: &AxisConfig) -> Check {
     let is_allowed = |at| drive.limits.check_counts(axis, at, &scale).is_ok();
     let is_inside = is_allowed(position) && is_allowed(goal);
     let room = (max - position).min(position - min);
-    let has_room = travel != 0.0 || room >= ROTATION_ROOM_RAD.min(0.25 * (max - min));
-    let back = "with the needle out: needle-bench stage jog CONFIG --axis rotation --to 0deg";
+    let has_room = axis == Axis::Insertion || room >= ROTATION_ROOM_RAD.min(0.25 * (max - min));
+    let middle = axis.in_unit(0.5 * (min + max)).0;
+    let back = format!(
+        "with the needle out: needle-bench stage jog CONFIG --axis rotation --to {middle:.0}deg"
+    );
     check.unless(has_room, Warn, back).unless(is_inside, Fail, next)
 }
 
@@ -357,10 +360,10 @@ pub fn plane(config: &Config, report: &TrackerReport) -> Option<Check> {
         found += &format!(", heading {turned_deg:.1} deg from observer.start");
         limit += &format!(", heading up to {warn_deg:.0} deg");
     }
-    // Without an offset a run does not use orientations.
-    let is_used = config.tracker.tip_offset_mm != [0.0; 3];
+    // Without an offset a run does not use orientations. A typed offset may go with a sensor whose tilt is not given.
+    let is_known = config.tracker.tip_offset_mm != [0.0; 3] && config.tracker.has_tilt();
     let verdict = match turned_deg {
-        Some(turned_deg) if is_used && turned_deg > fail_deg => Fail,
+        Some(turned_deg) if is_known && turned_deg > fail_deg => Fail,
         _ => Warn,
     };
     let next = "the sensor's orientation, tracker.tip_tilt (tip_file), the registration or observer.start is wrong";

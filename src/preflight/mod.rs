@@ -66,11 +66,17 @@ impl Check {
         if passes { self } else { self.with(verdict, next_step) }
     }
 
-    /// This check with that verdict and the next step; unchanged if its verdict is worse already.
+    /// This check with that verdict and the next step, added to those of the same verdict; unchanged if its verdict is
+    /// worse already.
     pub fn with(self, verdict: Verdict, next_step: impl Into<String>) -> Self {
+        let next_step = next_step.into();
+        let next_step = match self.next_step.as_ref().filter(|_| self.verdict == verdict) {
+            Some(first) => format!("{first}\n{next_step}"),
+            None => next_step,
+        };
         match self.verdict > verdict {
             true => self,
-            false => Check { verdict, next_step: Some(next_step.into()), ..self },
+            false => Check { verdict, next_step: Some(next_step), ..self },
         }
     }
 }

@@ -202,7 +202,7 @@ fn a_tracker_is_judged_by_its_positions_noise_and_stamps() {
     // A tool that is moved is not noisy.
     let moved = listened(&config, 0.0, |k| Vector3::new(0.5 * f64::from(k) + 0.1, 0.0, 0.0));
     assert_eq!(verdicts(&tracker(&config, &moved)), "PPPPPW");
-    let flat = listened(&config, 0.0, |k| Vector3::new(0.3 + 0.01 * f64::from(k), 2.0, 3.0));
+    let flat = listened(&config, 0.0, |k| Vector3::new(0.3 + 0.004 * f64::from(k), 2.0, 3.0));
     let [row, ..] = &tracker(&config, &flat)[..] else { panic!("a row") };
     let next = "y of the tracker is 2.00 mm to the bit in 80 different positions: has it two dimensions, or its \
                 transform a row of zeros?";
@@ -278,6 +278,7 @@ fn the_plane_is_checked_from_the_last_position() {
 #[test]
 fn a_tip_that_does_not_head_along_the_configured_start_is_found() {
     const OFFSET: &str = "tracker.tip_offset_mm=[0.0, 0.0, 7.0]";
+    const TILT: &str = "tracker.tip_tilt={ yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 90.0 }";
     const SURE: &str =
         "observer.invariant.start_sd={ yaw_deg = 2.0, pitch_deg = 2.0, roll_deg = 180.0 }";
     let of = |sets: &[&str], axis: Vector3<f64>, deg: f64| {
@@ -289,13 +290,14 @@ fn a_tip_that_does_not_head_along_the_configured_start_is_found() {
     };
     for axis in [Vector3::x(), Vector3::y()] {
         for (sets, deg, verdict) in [
-            (&[OFFSET][..], 35.0, Verdict::Pass),
-            (&[OFFSET], 37.0, Verdict::Fail),
-            (&[OFFSET], 180.0, Verdict::Fail),
-            (&[OFFSET, SURE], 14.0, Verdict::Pass),
-            (&[OFFSET, SURE], 16.0, Verdict::Warn),
-            (&[OFFSET, SURE], 31.0, Verdict::Fail),
-            (&[SURE], 150.0, Verdict::Warn),
+            (&[OFFSET, TILT][..], 35.0, Verdict::Pass),
+            (&[OFFSET, TILT], 37.0, Verdict::Fail),
+            (&[OFFSET, TILT], 180.0, Verdict::Fail),
+            (&[OFFSET, TILT, SURE], 14.0, Verdict::Pass),
+            (&[OFFSET, TILT, SURE], 16.0, Verdict::Warn),
+            (&[OFFSET, TILT, SURE], 31.0, Verdict::Fail),
+            (&[OFFSET, SURE], 150.0, Verdict::Warn),
+            (&[TILT, SURE], 150.0, Verdict::Warn),
         ] {
             let check = of(sets, axis, deg);
             assert_eq!(check.verdict, verdict, "{deg} deg: {check:?}");

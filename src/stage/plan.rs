@@ -303,18 +303,24 @@ impl Script {
             self.set_mode(Mode::HOMING).await?;
         }
         let statusword = self.read_statusword().await?;
-        if homing.says_homed(statusword) {
-            return Ok(());
+        // An axis without a zero is pulled back because it has lost its home.
+        match (homing.says_homed(statusword), self.drive().zero) {
+            (true, Some(_)) | (false, None) => return Ok(()),
+            (true, None) => return Err("homed: withdraw it without --unhomed".to_owned()),
+            (false, Some(_)) => {}
         }
         let (axis, bit) = (self.axis, homing.homed_bit);
         let first = match (axis, self.purpose) {
-            (Axis::Insertion, AxisUse::Move) => "withdraw --by 20mm --unhomed, or ",
+            (Axis::Insertion, AxisUse::Move) => {
+                "needle in: withdraw --by DEPTH --unhomed; needle out: "
+            }
             (Axis::Insertion, _) => "take the needle off and ",
             _ => "",
         };
         Err(format!(
-            "not homed (statusword {statusword}, bit {bit} clear), {first}home it first: \
-             needle-bench stage home CONFIG --axis {axis}"
+            "not homed (bit {bit} of statusword {:#06X} is clear); {first}home it first: \
+             needle-bench stage home CONFIG --axis {axis}",
+            statusword.0
         ))
     }
 
@@ -333,9 +339,12 @@ impl Script {
             return Ok(());
         }
         let apart = axis.shown(apart.abs());
+        let home = match self.state().home_counts {
+            Some(_) => "its home, which would be lost; jog it back there",
+            None => "0 of the drive; is it at its home",
+        };
         Err(format!(
-            "homed already, and {apart} from its home, which would be lost; jog it back there, or home it \
-             --again (take the needle off, untwist the cable)"
+            "homed already, and {apart} from {home}, or home it --again (take the needle off, untwist the cable)"
         ))
     }
 

@@ -8,7 +8,7 @@ use std::fmt;
 /// Positions that differ from one another are counted up to this number.
 const COUNTED_MAX: usize = 100;
 /// Where no coordinate ever changes by less than this, mm, the stream is rounded: one that is held may stay the same.
-const ROUNDED_MM: f64 = 0.09;
+const ROUNDED_MM: f64 = 0.009;
 
 /// Watches the positions of a stream, in the tracker's frame, from the first on.
 #[derive(Debug, Clone, Default)]
@@ -66,7 +66,7 @@ impl CoordinateWatch {
     }
 
     /// The coordinate that is the same to the bit in every position so far, of which at least `positions` differ from
-    /// one another; the first one, if there are two. `None` for a stream that is rounded to 0.1 mm or more.
+    /// one another; the first one, if there are two. `None` for a stream that is rounded to 0.01 mm or more.
     pub fn constant(&self, positions: usize) -> Option<ConstantCoordinate> {
         let is_fine = self.finest_mm.is_some_and(|mm| mm < ROUNDED_MM);
         let axis = self.has_changed.iter().position(|has_changed| !has_changed)?;
@@ -96,21 +96,21 @@ mod tests {
 
     #[test]
     fn a_coordinate_that_never_changes_is_named() {
-        let flat = |k: f64| Vector3::new(noise(k), 0.01 * k, 7.25);
+        let flat = |k: f64| Vector3::new(noise(k), 0.003 * k, 7.25);
         let text = "z of the tracker is 7.25 mm to the bit in 10 different positions";
         assert_eq!(found(10, flat).as_deref(), Some(text));
         assert_eq!(found(9, flat), None);
         assert!(found(300, flat).unwrap().contains("in 100 different"));
         // One other value, however late, is enough.
-        let once = |k: f64| Vector3::new(noise(k), 0.01 * k, if k == 299.0 { 7.3 } else { 7.25 });
+        let once = |k: f64| Vector3::new(noise(k), 0.003 * k, if k == 299.0 { 7.3 } else { 7.25 });
         assert_eq!(found(300, once), None);
     }
 
     #[test]
     fn a_stream_that_rounds_or_repeats_may_have_one() {
-        for step_mm in [0.1, 0.5, 1.0] {
+        for step_mm in [0.01, 0.1, 0.5, 1.0] {
             let rounded = |k: f64| {
-                let p = Vector3::new(0.02 * noise(k), noise(k + 5.0), 0.05 * k);
+                let p = Vector3::new(0.009 * noise(k), noise(k + 5.0), 0.05 * k);
                 p.map(|mm| (mm / step_mm).round() * step_mm)
             };
             assert_eq!(found(3000, rounded), None, "{step_mm}");

@@ -249,6 +249,8 @@ fn a_registration_is_collected_point_by_point() {
         assert!((found - expected).abs() < 0.5, "{json}");
     }
     assert_eq!(registration["fit"]["points"], 4);
+    assert_eq!(registration["fit"]["tool"], "NeedleToTracker");
+    assert_eq!(registration["fit"]["tip_offset_mm"], serde_json::json!([0.0, 0.0, 7.0]));
     let points = std::fs::read_to_string(scratch.path().join("points.csv")).unwrap();
     assert_eq!(points.lines().count(), 5, "{points}");
 }

@@ -407,12 +407,15 @@ fn a_needle_is_withdrawn_although_its_drive_is_not_homed() {
     let lost = ["--set", "emulator.homed=false", "--set", "emulator.insertion_start_mm=15"];
     let said = needle_bench(&scratch, &[&withdraw[..], &lost].concat());
     assert_eq!(said.status, 1, "{}{}", said.stdout, said.stderr);
-    assert!(said.stdout.contains("withdraw --by 20mm --unhomed, or home"), "{}", said.stdout);
+    assert!(said.stdout.contains("needle in: withdraw --by DEPTH --unhomed; "), "{}", said.stdout);
     let by = ["--by", "12mm", "--unhomed", "--json"];
     let said = needle_bench(&scratch, &[&withdraw[..], &lost, &by].concat());
     assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
     let to_mm = said.json()["axes"][0]["to_mm"].as_f64().unwrap();
     assert!((to_mm + 12.0).abs() < 1e-3, "{to_mm}");
+    let homed = needle_bench(&scratch, &[&withdraw[..], &lost[2..], &by].concat());
+    assert_eq!(homed.status, 1, "{}{}", homed.stdout, homed.stderr);
+    assert!(homed.stdout.contains("homed: withdraw it without --unhomed"), "{}", homed.stdout);
     let said = needle_bench(&scratch, &["replay", said.run_dir(&scratch).to_str().unwrap()]);
     assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
 }

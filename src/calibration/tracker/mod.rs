@@ -243,10 +243,9 @@ impl TrackerFit {
         is_filtered.then(|| {
             format!(
                 "only {:.0}% of the noise is white (under {:.0}%): the stream looks filtered, which delays a moving tip \
-                 by about {time_s:.2} s: set tracker.latency_ms = {:.0}, or switch the filter off",
+                 by about {time_s:.2} s: switch the filter off, or add that to tracker.latency_ms",
                 100.0 * share,
                 100.0 * WHITE_SHARE_MIN,
-                1e3 * time_s
             )
         })
     }

@@ -308,9 +308,14 @@ fn registration(arguments: &RegistrationArguments) -> Result<()> {
         "spread_mm": fit.spread_mm,
         "fiducials": fiducials,
     });
-    let knows_tip = arguments.collect || arguments.configured.path().is_some();
-    let tip = knows_tip.then(|| json!({ "tip_offset_mm": config.tracker.tip_offset_mm }));
-    let found = merged(found, &tip.unwrap_or_else(|| json!({})));
+    // How the points of a file were touched is not known.
+    let touched = match arguments.collect {
+        true => {
+            json!({ "tool": config.tracker.tool, "tip_offset_mm": config.tracker.tip_offset_mm })
+        }
+        false => json!({}),
+    };
+    let found = merged(found, &touched);
     let [x_mm, y_mm, z_mm]: [f64; 3] = fit.x_wt.translation.into();
     let registration = json!({
         "x_mm": x_mm,

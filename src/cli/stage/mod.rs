@@ -139,7 +139,7 @@ pub(super) enum Motion {
         #[arg(long, value_parser = Distance::parse, allow_hyphen_values = true)]
         by: Option<Distance>,
         /// Although the drive has lost its home, by a restart for example. The limits then count from where the
-        /// axis stands.
+        /// axis stands: nothing but the distance keeps it from the end of its travel.
         #[arg(long, requires = "by")]
         unhomed: bool,
         /// How fast, instead of at its withdraw speed: 0.5mm/s.
@@ -271,7 +271,12 @@ impl Motion {
                     .map_err(Failure::configuration)?;
                 if let (true, Goal::By(mm)) = (unhomed, withdrawal.goal) {
                     let axis = &mut stage.insertion;
-                    (axis.reference, axis.zero, axis.limits.min) = (Reference::Absolute, None, mm);
+                    if axis.reference != Reference::Homing {
+                        return Err(Failure::configuration(
+                            "--unhomed: the insertion axis needs no homing (stage.insertion.reference): leave it out",
+                        ));
+                    }
+                    (axis.zero, axis.limits.min) = (None, mm);
                 }
                 Operation::Move(withdrawal)
             }

@@ -202,8 +202,8 @@ fn an_axis_that_needs_homing_is_not_enabled_without_it() {
     let mut bench = Bench::new(homing_config());
     assert_eq!(
         bench.until_fault(),
-        "node 1 (insertion): not homed (statusword 0x0650 switch on disabled, bit 12 clear), take the \
-         needle off and home it first: needle-bench stage home CONFIG --axis insertion"
+        "node 1 (insertion): not homed (bit 12 of statusword 0x0650 is clear); take the needle off and home it \
+         first: needle-bench stage home CONFIG --axis insertion"
     );
     bench.until_stopped();
 
@@ -220,7 +220,7 @@ fn a_configured_homed_bit_is_read_in_any_mode() {
     let mut config = homing_config();
     config.insertion.homing = Some(HomingConfig { homed_bit: 15, ..homing_by(17) });
     let mut bench = Bench::new(config.clone());
-    assert!(bench.until_fault().contains("bit 15 clear"));
+    assert!(bench.until_fault().contains("bit 15 of statusword"));
 
     let mut bench = Bench::new(config);
     bench.insertion.extra_bits = 1 << 15;
