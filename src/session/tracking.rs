@@ -448,7 +448,7 @@ impl Tracking {
         }
         if self.late > self.config.hold.after / 2 {
             return format!(
-                "the newest came {:.2} s late by its stamp: a slow link, or the source's clock (then tracker.stamp = \"receive\")",
+                "the newest came {:.2} s late by its stamp: a slow link, or its clock (tracker.stamp)",
                 self.late.as_secs_f64()
             );
         }

@@ -311,9 +311,7 @@ impl Script {
         }
         let (axis, bit) = (self.axis, homing.homed_bit);
         let first = match (axis, self.purpose) {
-            (Axis::Insertion, AxisUse::Move) => {
-                "needle in: withdraw --by DEPTH --unhomed; needle out: "
-            }
+            (Axis::Insertion, AxisUse::Move) => "needle in: withdraw --by DEPTH --unhomed; out: ",
             (Axis::Insertion, _) => "take the needle off and ",
             _ => "",
         };

@@ -247,7 +247,7 @@ fn stamps_that_hardly_advance_are_named() {
     });
     bench.run_to_end();
     let reason = bench.reason();
-    let end = "s late by its stamp: a slow link, or the source's clock (then tracker.stamp = \"receive\")";
+    let end = "s late by its stamp: a slow link, or its clock (tracker.stamp)";
     assert!(reason.contains("the newest came 0.5") && reason.ends_with(end), "{reason}");
     let (depth_mm, _) = bench.stage.position_true(bench.now);
     assert!(depth_mm < 1.5, "{depth_mm} mm");
