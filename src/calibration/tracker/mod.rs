@@ -123,11 +123,6 @@ impl TrackerFit {
             samples.iter().filter_map(|sample| Some((sample, sample.position_mm?))).collect();
         let positions_mm: Vec<Vector3<f64>> = valid.iter().map(|(_, position)| *position).collect();
         check_distances("position", "tracker", &positions_mm)?;
-        let mut coordinates = CoordinateWatch::default();
-        positions_mm.iter().for_each(|position_mm| coordinates.take(position_mm));
-        if let Some(constant) = coordinates.constant(CoordinateWatch::POSITIONS_AT_REST) {
-            return Err(format!("{constant}: {}", CoordinateWatch::ADVICE));
-        }
         valid.dedup_by_key(|(_, position)| *position);
         let repeats = positions_mm.len() - valid.len();
         let invalid = samples.len() - positions_mm.len();
@@ -211,6 +206,12 @@ impl TrackerFit {
                 "the positions wander by {wander_mm:.3} mm (limit {WANDER_MAX_MM}) over more than \
                  {refused_s:.1} s of {duration_s:.0} s; the sensor moved, or record longer"
             ));
+        }
+        // Last: a sensor that moves along an axis is told that it moves.
+        let mut coordinates = CoordinateWatch::default();
+        positions_mm.iter().for_each(|position_mm| coordinates.take(position_mm));
+        if let Some(constant) = coordinates.constant(CoordinateWatch::POSITIONS_AT_REST) {
+            return Err(format!("{constant}: {}", CoordinateWatch::ADVICE));
         }
         let by_stamp = valid.iter().filter(|_| dated_by == DatedBy::Stamp);
         let (latency_jitter_ms, latency_p99_ms) =
