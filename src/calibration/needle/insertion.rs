@@ -17,7 +17,7 @@ const TURN_MIN_RAD_PER_MM: f64 = 0.05;
 
 /// The heading is compared with chords of this length, mm.
 const CHORD_MM: f64 = 10.0;
-/// The mean angle between heading and chord may be this large, deg: 59 insertions of a real needle have up to 3.5, and
+/// The mean angle between heading and chord may be this large, deg: 59 insertions of a real needle have up to 3.6, and
 /// orientations whose frame is turned by 15 deg have 12 to 15.
 const HEADING_OFF_MAX_DEG: f64 = 10.0;
 

@@ -207,7 +207,7 @@ impl TrackerFit {
                  {refused_s:.1} s of {duration_s:.0} s; the sensor moved, or record longer"
             ));
         }
-        // Last: a sensor that moves along an axis is told that it moves.
+        // After the checks of motion, since a sensor that moves along one axis also keeps its other coordinates.
         let mut coordinates = CoordinateWatch::default();
         positions_mm.iter().for_each(|position_mm| coordinates.take(position_mm));
         if let Some(constant) = coordinates.constant(CoordinateWatch::POSITIONS_AT_REST) {

@@ -380,7 +380,7 @@ fn the_soft_limits_and_windows_are_written_to_the_drives() {
     config.insertion.zero = Some(500);
     config.insertion.following_error_max = Some(0.5);
     config.insertion.quick_stop_deceleration = Some(20.0);
-    // In the drive's own unit: the bench is told what it is, and leaves it.
+    // The raw value is in the drive's own unit. The key tells the bench what it is, and is not written.
     config.rotation.quick_stop_deceleration = Some(6.0);
     let raw = RawSdo { bits: 32, index: 0x6085, subindex: 0, value: 77, read_back: true };
     config.rotation.sdo.push(raw);
