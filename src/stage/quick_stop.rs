@@ -23,7 +23,7 @@ use crate::units::Time;
 /// Interval between two reads of a drive.
 const READ_PERIOD: Duration = Duration::from_millis(20);
 
-/// Stops both axes, or watches them stop. The [outcome](WithBothDrives::outcome) is where an axis stands, counts: its
+/// Stops both axes, or watches them stop. Its `outcome` is where an axis stands, counts: its
 /// drive has left Operation Enabled, and has no power unless it was only watched.
 pub type QuickStop = WithBothDrives<i32>;
 
