@@ -4,39 +4,7 @@ use super::Config;
 use super::checks::{ROTATION_ACCELERATION_MAX, rounded_down};
 use super::reader::{Reader, contradictions};
 use crate::session::PROFILE_PEAK;
-use crate::stage::{Axis, AxisConfig, Reference};
-
-/// Objects that `optional_objects` may not name, each with the reason. Of the objects that the bring-up writes,
-/// a drive may lack:
-///
-/// - 605A: by CiA 402 the drive then brakes on its quick-stop ramp, as with option 2
-/// - 6065 and 6066: the bench compares target and position itself
-/// - 60C2: the drive takes the period from SYNC; if it gets the period wrong, a following error shows it
-/// - 6099 and 609A: the drive homes at a speed of its own, as it does without the keys
-/// - 6502: the bench reads back the mode (6061)
-/// - 1029: by CiA 301 the drive then goes to Pre-operational, as with option 0
-///
-/// The bring-up never insists on 1005, 1018:3, 1018:4, 605E, and PDOs beyond the first.
-const NEEDED: [(&[u16], &str); 7] = [
-    (&[0x1000, 0x1018], "it tells which drive this is"),
-    (
-        &[0x1016, 0x1017, 0x6007],
-        "it stops the axis when the bench falls silent, or the bench when the drive does",
-    ),
-    (
-        &[0x1400, 0x1600, 0x1800, 0x1A00],
-        "without it set-points and positions are not where the bench takes them to be",
-    ),
-    (&[0x6040, 0x6041, 0x6060, 0x6061, 0x6064, 0x607A], "no drive is moved or watched without it"),
-    (
-        &[0x6085],
-        "a configured quick-stop deceleration must hold: omit it if the drive has no such object",
-    ),
-    (&[0x6098, 0x607C], "the drive would home in a way, or to a place, that is not configured"),
-    (&[SOFTWARE_LIMITS], "the drive keeps its limits itself, unless wraps is true"),
-];
-/// The drive's own position limits.
-const SOFTWARE_LIMITS: u16 = 0x607D;
+use crate::stage::{Axis, AxisConfig, Reference, SOFTWARE_LIMITS, why_needed};
 
 /// Settings that make a real drive brake on quick stop, on its own faults and when the bench dies: key, allowed
 /// values, and these in words.
@@ -188,8 +156,7 @@ impl Checks<'_> {
             }
         }
         for (n, index) in self.axis.optional_objects.iter().enumerate() {
-            let needed = NEEDED.iter().find(|(indexes, _)| indexes.contains(index));
-            let Some((_, why)) = needed else { continue };
+            let Some(why) = why_needed(*index) else { continue };
             let key = &*self.key(&format!("optional_objects[{n}]"));
             contradictions! { reader;
                 [key] if *index != SOFTWARE_LIMITS || !self.axis.wraps =>
@@ -236,6 +203,9 @@ impl Checks<'_> {
 /// `None` if a raw SDO may write it.
 fn reserved(index: u16) -> Option<&'static str> {
     Some(match index {
+        0x1010 | 0x1011 => {
+            "it would be written at every command: store or restore once, with the maker's tool"
+        }
         0x1014 | 0x1015 => {
             "the bench needs every emergency message, under the drive's own identifier"
         }

@@ -14,8 +14,8 @@ pub(crate) fn stage_news(event: &StageEvent) -> Option<(Severity, String)> {
         }
         StageEvent::Emergency(axis, emcy) => format!("{axis}: emergency {emcy}"),
         StageEvent::InternalLimit(axis) => format!(
-            "{axis}: a limit inside the drive holds (statusword bit 11); are its 0x607D, 0x607B and \
-             current limits those of this rig?"
+            "{axis}: a limit inside the drive holds (statusword bit 11); are its limits of position \
+             (0x607D), speed, current and I2t those of this rig?"
         ),
         StageEvent::NotShown(axis, flag) => format!(
             "{axis}: the enabled drive has not set statusword {flag}, so the bench could not notice the \

@@ -11,6 +11,7 @@ use super::{Axis, AxisConfig, AxisUse, Progress, StageConfig, StageEvent};
 use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::Statusword;
 use crate::canopen::emcy::EmcyCode;
+use crate::canopen::object::communication::consumer_heartbeat;
 use crate::canopen::sdo::{AbortCode, SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::units::Time;
 
@@ -194,10 +195,16 @@ impl Script {
             self.emit(Progress::Skipped(self.axis, object));
             return Ok(None);
         }
-        let hint = if is_absent {
-            "; list it in optional_objects if the bench can do without"
-        } else {
-            ""
+        let hint = match (why_needed(object.index), &error) {
+            (None, _) if is_absent => {
+                "; list it in optional_objects if the bench can do without".to_owned()
+            }
+            (Some(why), _) if is_absent => format!("; it is needed: {why}"),
+            (_, SdoError::Aborted(AbortCode::PARAMETER_INCOMPATIBLE)) if object == consumer_heartbeat(1) => {
+                "; does another entry of it watch that node? Clear it, or set another can.bench_node"
+                    .to_owned()
+            }
+            _ => String::new(),
         };
         let attempts = self.config.bus.sdo_attempts;
         Err(match (error, request) {
@@ -241,7 +248,7 @@ impl Script {
         self.ask(SdoRequest::Download(object, value), false).await.map(drop)
     }
 
-    /// Writes `value` to `object`, reads it back and compares.
+    /// Writes `value` to `object`, reads it back and compares. A drive may refuse to be given the value that it has.
     pub(super) async fn write(
         &self,
         object: impl Into<Object>,
@@ -249,8 +256,18 @@ impl Script {
     ) -> Result<(), String> {
         let (object, value) = (object.into(), value.into());
         let request = SdoRequest::Download(object.address, value);
-        if self.ask(request, object.is_optional).await?.is_none() {
-            return Ok(());
+        let answer = self.sdo.ask(request).await;
+        let is_refused = matches!(answer, Err(SdoError::Aborted(_)));
+        match self.accept(request, object.is_optional, answer) {
+            Ok(None) => return Ok(()),
+            Ok(Some(_)) => {}
+            Err(error) if is_refused => {
+                let received = self.sdo.read_optional(object.address).await.ok().flatten();
+                let Some(received) = received else { return Err(error) };
+                let checked = check_read_back(object.address, value, received);
+                return checked.map_err(|_| format!("{error}; the drive has {received}"));
+            }
+            Err(error) => return Err(error),
         }
         match self.read(object).await? {
             Some(received) => check_read_back(object.address, value, received),
@@ -276,6 +293,45 @@ impl Script {
         }
         Ok(())
     }
+}
+
+/// Objects that no drive may lack, each with the reason. Of the objects that the bring-up writes, a drive may lack:
+///
+/// - 605A: by CiA 402 the drive then brakes on its quick-stop ramp, as with option 2
+/// - 6065 and 6066: the bench compares target and position itself
+/// - 60C2: the drive takes the period from SYNC; if it gets the period wrong, a following error shows it
+/// - 6099 and 609A: the drive homes at a speed of its own, as it does without the keys
+/// - 6502: the bench reads back the mode (6061)
+/// - 1029: by CiA 301 the drive then goes to Pre-operational, as with option 0
+///
+/// The bring-up never insists on 1005, 1018:3, 1018:4, 605E, 607B, and PDOs beyond the first. A drive whose position
+/// wraps needs no limits of its own (607D).
+const NEEDED: [(&[u16], &str); 8] = [
+    (&[0x1000, 0x1018], "it tells which drive this is"),
+    (
+        &[0x1016, 0x1017, 0x6007],
+        "it stops the axis when the bench falls silent, or the bench when the drive does",
+    ),
+    (
+        &[0x1400, 0x1600, 0x1800, 0x1A00],
+        "without it set-points and positions are not where the bench takes them to be",
+    ),
+    (&[0x6040, 0x6041, 0x6060, 0x6061, 0x6064, 0x607A], "no drive is moved or watched without it"),
+    (&[0x607C], "leave out homing.offset if the drive has no such object, and set zero"),
+    (&[SOFTWARE_LIMITS], "the drive keeps its limits itself, unless wraps is true"),
+    (
+        &[0x6085],
+        "a configured quick-stop deceleration must hold: omit it if the drive has no such object",
+    ),
+    (&[0x6098], "the drive would home in a way that is not configured"),
+];
+/// The drive's own position limits.
+pub const SOFTWARE_LIMITS: u16 = 0x607D;
+
+/// Why a drive must have the object at `index`; `None` if `optional_objects` may name it.
+pub fn why_needed(index: u16) -> Option<&'static str> {
+    let needed = NEEDED.iter().find(|(indexes, _)| indexes.contains(&index));
+    needed.map(|(_, why)| *why)
 }
 
 /// Checks that the value read back, `received`, is the `expected` one. An expedited answer need not say how

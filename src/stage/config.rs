@@ -119,7 +119,7 @@ section! {
         /// Value, signed or unsigned; it must fit `bits`.
         value: i64 [within(i32::MIN as f64, u32::MAX as f64)];
         /// Whether the bench reads the object back and compares. Use false for objects that read back
-        /// another value than was written, such as 1010.
+        /// another value than was written.
         read_back: bool = true, everywhere;
     }
 }

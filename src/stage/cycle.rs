@@ -213,7 +213,7 @@ impl Stage {
         let fault = if let Some((axis, state)) = other_state {
             format!(
                 "{axis}: NMT state {state} instead of operational {timeout_ms} ms after the start command, \
-                 is there another master?"
+                 is there another master, or an error in its error register (0x1001)?"
             )
         } else if let Some(axis) = first(&|axis| self.drives[axis].statusword.is_none()) {
             format!(

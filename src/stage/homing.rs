@@ -121,9 +121,13 @@ impl Stage {
         if now >= give_up {
             let timeout_s = give_up.since(started).as_secs_f64();
             let statusword = self.drives[axis].statusword.unwrap_or_default();
+            let has = |bits| statusword.has(bits);
+            let hint = match has(Statusword::HOMING_ATTAINED) && !has(Statusword::TARGET_REACHED) {
+                true => "it is homed by bit 12, but by bit 10 has not reached its target",
+                false => "is the switch too far, or the homing speed too low?",
+            };
             let fault = format!(
-                "{axis}: not home within {timeout_s:.1} s (statusword {statusword}); is the switch too \
-                 far, or the homing speed too low?"
+                "{axis}: not home within {timeout_s:.1} s (statusword {statusword}); {hint}"
             );
             self.fail(now, fault);
         }
@@ -155,8 +159,8 @@ impl Stage {
             if homing.attained.is_some_and(|attained| now.since(attained) >= POSITION_DELAY) {
                 let [here, home] = [here, home].map(|at| axis.shown(at));
                 let fault = format!(
-                    "{axis}: the drive says that it is home, but reads {here} where home is {home} by its home \
-                     offset (0x607C): it did not move, or counts the offset otherwise; set zero instead"
+                    "{axis}: the drive says that it is home, but reads {here}, and home is {home} by its offset \
+                     (0x607C; EPOS4: 0x30B0): it did not move, or counts the offset otherwise; set zero instead"
                 );
                 self.fail(now, fault);
             }

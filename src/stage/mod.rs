@@ -60,7 +60,7 @@ mod supervision;
 mod tests;
 
 pub use axis::{Axis, AxisUse, PerAxis};
-pub use bring_up::Identity;
+pub use bring_up::{Identity, SOFTWARE_LIMITS, why_needed};
 pub use config::{AxisConfig, BusConfig, PowerConfig, RawSdo, StageConfig};
 pub use dialogue::Dialogue;
 pub use event::{

@@ -22,6 +22,9 @@ pub(super) const RPDO1: [MappedObject; 2] =
 pub(super) const TPDO1: [MappedObject; 2] =
     [MappedObject::new(0x6041, 0, 16), MappedObject::new(0x6064, 0, 32)];
 
+/// PDOs beyond the usual four of each direction are switched off up to this number: some drives have eight.
+const PDOS_MAX: u16 = 8;
+
 /// CiA 402, the low word of 0x1000.
 const DRIVE_PROFILE: u16 = 402;
 /// The bits of 0x1005 that are checked: the identifier, and bit 30, which makes the node produce SYNC.
@@ -260,8 +263,11 @@ impl Script {
             let communication = |sub| ObjectAddress::new(direction.communication_index(0), sub);
             let mapping = |sub| ObjectAddress::new(direction.mapping_index(0), sub);
             self.disable_pdo(communication(1).into()).await?;
-            for offset in 1..PDOS {
+            for offset in 1..PDOS_MAX {
                 let cob_id = ObjectAddress::new(direction.communication_index(offset), 1);
+                if offset >= PDOS && self.sdo.read_optional(cob_id).await?.is_none() {
+                    break;
+                }
                 self.disable_pdo(optional(cob_id)).await?;
             }
             let (entries, enabled) = match direction {
@@ -367,15 +373,17 @@ impl Script {
         self.write_counts(drive::HOMING_ACCELERATION, homing.acceleration).await?;
         let object = drive::HOME_OFFSET;
         let offset_counts = match homing.offset {
-            None => self.sdo.read_optional(object).await?.map(|value| value.to_u32() as i32),
+            // Without the object home is 0. An EPOS4 has 0x30B0 in its place, and any value of it but 0 shows after the
+            // homing.
+            None => self.sdo.read_optional(object).await?.map_or(0, |value| value.to_u32() as i32),
             Some(offset) => {
                 let counts = self.drive().scale(self.axis, 0).relative_counts(offset);
                 let counts = counts.ok_or_else(|| unfit(object, offset))?;
                 self.write(object, counts).await?;
-                Some(counts)
+                counts
             }
         };
-        self.note(|state| state.home_counts = offset_counts.map(i32::wrapping_neg));
+        self.note(|state| state.home_counts = Some(offset_counts.wrapping_neg()));
         Ok(())
     }
 
@@ -391,6 +399,7 @@ impl Script {
             let counts = value.at_least(4).map(|counts| counts as i32);
             counts.ok_or_else(|| format!("{object}: expected 4 bytes, received {value}"))
         })?;
+        self.check_position_range(position).await?;
         let (min, max) = (drive::SOFTWARE_LIMIT_MIN, drive::SOFTWARE_LIMIT_MAX);
         if self.drive().wraps {
             // A wrapping axis needs no limits in the drive. Limits from an earlier use of the drive would stop it.
@@ -403,17 +412,44 @@ impl Script {
             self.write(max, upper).await?;
             self.write(min, lower).await?;
         }
-        self.clear_offset().await?;
+        self.clear_offset(drive::POSITION_OFFSET, SdoValue::from(0_i32)).await?;
+        self.clear_offset(drive::VELOCITY_OFFSET, SdoValue::from(0_i32)).await?;
+        self.clear_offset(drive::TORQUE_OFFSET, SdoValue::from(0_i16)).await?;
         self.write(drive::TARGET_POSITION, position).await?;
         Ok(position)
     }
 
-    /// Sets the drive's position offset to 0: one from an earlier use would move the axis as soon as it follows.
-    async fn clear_offset(&self) -> Result<(), String> {
-        match self.sdo.read_optional(drive::POSITION_OFFSET).await?.map(SdoValue::to_u32) {
-            None | Some(0) => Ok(()),
-            Some(_) => self.write(drive::POSITION_OFFSET, 0_i32).await,
+    /// Sets an offset to 0: one from an earlier use would move the axis as soon as it follows.
+    async fn clear_offset(&self, object: ObjectAddress, zero: SdoValue) -> Result<(), String> {
+        match self.sdo.read_optional(object).await? {
+            Some(value) if value.to_u32() != 0 => self.write(object, zero).await,
+            _ => Ok(()),
         }
+    }
+
+    /// Refuses a drive whose position wraps within the axis's travel, where one reading would stand for several
+    /// positions. The bench unwraps a position of 32 bits only.
+    async fn check_position_range(&self, position: i32) -> Result<(), String> {
+        let number = async |object| {
+            let value = self.sdo.read_optional(object).await?;
+            Ok::<_, String>(value.map_or(0, |value| value.to_u32() as i32))
+        };
+        let range =
+            [number(drive::POSITION_RANGE_MIN).await?, number(drive::POSITION_RANGE_MAX).await?];
+        let [lower, upper] = match self.drive().wraps {
+            true => [i32::MIN, i32::MAX],
+            false => self.limit_counts(position),
+        };
+        let [low, high] = range;
+        if range == [0, 0] || (low <= lower && upper <= high) {
+            return Ok(());
+        }
+        let object = drive::POSITION_RANGE_MIN;
+        Err(format!(
+            "{object}: the drive's position wraps at {low} and {high} counts, allowed: 0 and 0 (no wrapping), or \
+             beyond {lower} to {upper}; set it in the drive, or by [[stage.{}.sdo]]",
+            self.axis
+        ))
     }
 
     /// The drive's own limits, counts: the soft limits and where the axis stands, widened by the following-error

@@ -92,8 +92,10 @@ impl Stage {
             }
             HeartbeatEvent::State(_) if self.may_leave_operational(axis) => return,
             HeartbeatEvent::State(state) if state != NmtState::Operational && !may_be_old => {
-                let fault =
-                    format!("NMT state {state} instead of operational, is there another master?");
+                let fault = format!(
+                    "NMT state {state} instead of operational, is there another master, or an error in its \
+                     error register (0x1001)?"
+                );
                 return self.fail_drive(now, axis, &fault);
             }
             HeartbeatEvent::State(_) => return,

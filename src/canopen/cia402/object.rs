@@ -40,6 +40,10 @@ objects! {
     VELOCITY_ACTUAL = 0x606c:0;
     /// i32, counts.
     TARGET_POSITION = 0x607a:0;
+    /// i32, counts: beyond these two the position wraps to the other one; 0 and 0 for no wrapping.
+    POSITION_RANGE_MIN = 0x607b:1;
+    /// i32, counts.
+    POSITION_RANGE_MAX = 0x607b:2;
     /// i32, counts: from the home position to zero.
     HOME_OFFSET = 0x607c:0;
     /// i32, counts.
@@ -62,6 +66,10 @@ objects! {
     HOMING_ACCELERATION = 0x609a:0;
     /// i32, counts: the drive adds it to each target in cyclic synchronous position.
     POSITION_OFFSET = 0x60b0:0;
+    /// i32, counts per second: the same for the velocity.
+    VELOCITY_OFFSET = 0x60b1:0;
+    /// i16, thousandths of the rated torque: the same for the torque.
+    TORQUE_OFFSET = 0x60b2:0;
     /// u8: mantissa of the interpolation period.
     INTERPOLATION_PERIOD_VALUE = 0x60c2:1;
     /// i8: power of ten, in seconds, of the interpolation period.

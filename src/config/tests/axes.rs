@@ -257,6 +257,7 @@ fn raw_sdos_to_objects_that_the_bench_writes_are_refused() {
         (0x6066, "following_error_timeout_ms"),
         (0x6098, "homing.method"),
         (0x60C2, "can.sync_ms"),
+        (0x1010, "maker's tool"),
         (0x1400, "maps the PDOs"),
         (0x1BFF, "maps the PDOs"),
     ] {

@@ -18,9 +18,9 @@ pub(super) const ACCELERATION_MAX_COUNTS_PER_S2: f64 = 100_000_000.0;
 const GENERIC: &str = include_str!("drive.eds");
 
 /// Objects of CiA 301 and 402 that an EPOS4 does not have: communication cycle, window and
-/// counter of SYNC, following error time out, gear ratio and feed constant (its unit is the
+/// counter of SYNC, following error time out, home offset, gear ratio and feed constant (its unit is the
 /// increment).
-const NOT_IN_EPOS4: [u16; 6] = [0x1006, 0x1007, 0x1019, 0x6066, 0x6091, 0x6092];
+const NOT_IN_EPOS4: [u16; 7] = [0x1006, 0x1007, 0x1019, 0x6066, 0x607c, 0x6091, 0x6092];
 
 pub(super) fn data_sheet(config: &DriveConfig) -> Eds {
     let mut eds = Eds::parse(GENERIC);

@@ -98,6 +98,51 @@ fn a_position_offset_from_an_earlier_use_does_not_move_the_axis() {
     assert_eq!((bench.rotation.counts, bench.rotation.value(0x60b0, 0)), (-20, 0));
 }
 
+/// A modulo axis of an earlier use: a reading would stand for several positions.
+#[test]
+fn a_drive_whose_position_wraps_within_its_travel_gets_no_power() {
+    let with_range = |wraps: bool, range: [i32; 2]| {
+        let mut config = config();
+        config.insertion.wraps = wraps;
+        let mut bench = Bench::new(config);
+        (1..).zip(range).for_each(|(sub, counts)| bench.insertion.set(0x607b, sub, counts));
+        bench
+    };
+    for (wraps, range) in
+        [(false, [0, 75_759]), (false, [5, 0]), (true, [-1_000_000_000, 1_000_000_000])]
+    {
+        let fault = with_range(wraps, range).until_fault();
+        let [low, high] = range;
+        let expected = format!("0x607B:01: the drive's position wraps at {low} and {high} counts");
+        assert!(fault.contains(&expected), "{fault}");
+    }
+    for (wraps, range) in [
+        (false, [0, 0]),
+        (true, [0, 0]),
+        (true, [i32::MIN, i32::MAX]),
+        (false, [-1_000_000_000, 1_000_000_000]),
+    ] {
+        with_range(wraps, range).until_ready();
+    }
+}
+
+/// A drive may have a fixed value of an object, and refuse every write to it.
+#[test]
+fn a_refused_value_that_the_drive_has_already_is_accepted() {
+    let exponent = ObjectAddress::new(0x60c2, 2);
+    let with = |value: i8| {
+        let mut bench = Bench::new(config());
+        bench.insertion.set(0x60c2, 2, value);
+        bench.insertion.read_only = Some(exponent);
+        bench
+    };
+    with(-3).until_ready();
+    let fault = with(-4).until_fault();
+    let expected = "0x60C2:02: writing 0xFD was refused with SDO abort 0x06010002 attempt to write a \
+                    read-only object; the drive has 0xFC";
+    assert!(fault.contains(expected), "{fault}");
+}
+
 /// CiA leaves it to the manufacturer whether a drive has it, and when it may be read.
 #[test]
 fn a_drive_that_does_not_give_its_position_offset_is_brought_up() {

@@ -34,6 +34,8 @@ pub(super) struct TestDrive {
     pub(super) mute: Option<(ObjectAddress, u32)>,
     /// Reads of this object are refused.
     pub(super) refused: Option<(ObjectAddress, AbortCode)>,
+    /// Writes of this object are refused.
+    pub(super) read_only: Option<ObjectAddress>,
     /// Whether an object was written while the motor had power.
     pub(super) configured_under_power: bool,
     /// Number of next TPDOs that are lost.
@@ -146,6 +148,7 @@ impl TestDrive {
             off: false,
             mute: None,
             refused: None,
+            read_only: None,
             configured_under_power: false,
             tpdos_lost: 0,
             forgets: None,
@@ -269,7 +272,8 @@ impl TestDrive {
         }
         self.homing = if self.homing_fails { Homing::Failed } else { Homing::Attained };
         if !self.homing_fails {
-            self.counts = -(self.value(0x607c, 0) as i32);
+            self.counts =
+                -(self.objects.get(&at(0x607c, 0)).map_or(0, |offset| offset.to_u32() as i32));
         }
         0
     }
@@ -363,6 +367,9 @@ impl TestDrive {
         let Some(before) = self.objects.get(&object).copied() else {
             return refuse(AbortCode::NO_SUCH_OBJECT);
         };
+        if self.read_only == Some(object) {
+            return refuse(AbortCode::READ_ONLY);
+        }
         if before.as_bytes().len() != value.as_bytes().len() {
             return refuse(AbortCode(0x0607_0010));
         }

@@ -153,7 +153,7 @@ fn a_node_whose_heartbeat_does_not_say_operational_is_a_fault() {
         (
             Some(NmtState::PreOperational),
             "rotation: NMT state pre-operational instead of operational 3000 ms after the start command, \
-             is there another master?",
+             is there another master, or an error in its error register (0x1001)?",
         ),
     ] {
         let mut config = config();

@@ -2,6 +2,7 @@
 
 use super::drive::Homing;
 use super::*;
+use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::DriveState;
 
 const INSERTION: PerAxis<AxisUse> =
@@ -146,10 +147,26 @@ fn a_position_that_is_not_that_of_home_stops_the_stage() {
     let mut bench = reads(|bench| bench.insertion.counts = -COUNTS_PER_MM);
     assert_eq!(
         bench.until_fault(),
-        "insertion: the drive says that it is home, but reads -1.000 mm where home is 1.000 mm by its home \
-         offset (0x607C): it did not move, or counts the offset otherwise; set zero instead"
+        "insertion: the drive says that it is home, but reads -1.000 mm, and home is 1.000 mm by its offset \
+         (0x607C; EPOS4: 0x30B0): it did not move, or counts the offset otherwise; set zero instead"
     );
     bench.until_stopped();
+
+    // Without the object home is 0.
+    let mut config = homing_config();
+    config.insertion.homing =
+        config.insertion.homing.map(|homing| HomingConfig { offset: None, ..homing });
+    let nodes = config.nodes();
+    let stage = Stage::for_use(config, INSERTION, Time::from_secs_f64(1.0));
+    let mut bench = Bench::with(stage, nodes);
+    bench.insertion.objects.remove(&ObjectAddress::new(0x607c, 0));
+    bench.insertion.homing_cycles = 0;
+    bench.until_ready();
+    home(&mut bench);
+    bench.run_for(Duration::from_millis(500));
+    bench.insertion.counts = 5 * COUNTS_PER_MM;
+    let fault = bench.until_fault();
+    assert!(fault.contains("but reads 5.000 mm, and home is 0.000 mm by its offset"), "{fault}");
 
     let mut bench = reads(|_| ());
     assert_eq!(until_homed(&mut bench).0, 1.0);

@@ -155,7 +155,7 @@ fn a_drive_that_falls_silent_restarts_or_leaves_operational_stops_the_run() {
         fault_in_mid_run(|bench| {
             bench.receive(heartbeat_frame(bench.rotation.node, NmtState::PreOperational));
         }),
-        "rotation: NMT state pre-operational instead of operational, is there another master?"
+        "rotation: NMT state pre-operational instead of operational, is there another master, or an error in its error register (0x1001)?"
     );
 }
 
