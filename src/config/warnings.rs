@@ -13,6 +13,7 @@ pub(super) fn all(config: &Config, tree: &Tree) -> Vec<String> {
     let mut warnings = unused_sections(config, tree);
     warnings.extend(missing_registration(config, tree));
     warnings.extend(unsuitable_pair(config));
+    warnings.extend(exact_model(config));
     warnings
 }
 
@@ -64,6 +65,20 @@ fn missing_registration(config: &Config, tree: &Tree) -> Option<String> {
             "{REGISTRATION} is missing: this rehearsal takes the tracker's frame for the bench's; before \
              a run measure it by needle-bench calibrate registration"
         )
+    })
+}
+
+/// A warning for a real stage whose default observer takes needle and tissue to be exactly like the model. Where
+/// they differ, its standard deviation is far too small (`docs/hazards.md`).
+fn exact_model(config: &Config) -> Option<String> {
+    let walks = ["position_mm", "axial_mm", "heading_deg", "roll_deg", "curvature"];
+    let is_exact =
+        walks.iter().all(|key| config.number(&format!("observer.invariant.noise.{key}")) == 0.0);
+    let is_real = config.stage.hardware && config.observer.kind == ObserverKind::Invariant;
+    (is_real && is_exact).then(|| {
+        "observer.invariant.noise is 0: where tissue or shaft differ from the model, the estimate is wrong by far \
+         more than it states; rig-epos4.toml has values to start with"
+            .to_owned()
     })
 }
 

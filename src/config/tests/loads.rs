@@ -159,6 +159,18 @@ fn shipped_files_give_no_warning_and_keys_without_effect_do() {
         assert!(warnings[0].len() < 200, "{}", warnings[0]);
     }
     assert_eq!(warnings("a.toml", "observer.kind = \"coupled\""), [""; 0]);
+
+    // A real needle is not exactly like its model.
+    let noise = "[observer.invariant.noise]";
+    let (before, after) = RIG.split_once(noise).expect("the section");
+    let (_, after) = after.split_once("\n\n").expect("its end");
+    let exact = warnings("rig.toml", &format!("{before}{after}"));
+    assert!(
+        matches!(&exact[..], [warning] if warning.starts_with("observer.invariant.noise is 0"))
+    );
+    assert!(exact[0].len() < 200, "{}", exact[0]);
+    let some = format!("{before}{noise}\nheading_deg = 0.1\n\n{after}");
+    assert_eq!(warnings("rig.toml", &some), [""; 0]);
 }
 
 #[test]
@@ -228,7 +240,7 @@ fn the_stage_gets_counts_mm_and_radians() {
          [stage.rotation]\nfollowing_error_deg = 3.6\ncounts_per_turn = { counts = 1000, turns = 1 }\n\
          optional_objects = [0x60C2]\nsign = -1\n\
          [[stage.rotation.sdo]]\nindex = 0x2310\nsubindex = 1\nvalue = -2\nbits = 16\n\
-         [[stage.rotation.sdo]]\nindex = 0x1010\nsubindex = 1\nvalue = 0x65766173\nbits = 32\n\
+         [[stage.rotation.sdo]]\nindex = 0x2311\nsubindex = 1\nvalue = 0x65766173\nbits = 32\n\
          read_back = false\n",
         &[],
     );
@@ -240,7 +252,7 @@ fn the_stage_gets_counts_mm_and_radians() {
     assert!(rotation.optional_objects.contains(&0x60C2));
     let (first, second) = (
         RawSdo { bits: 16, index: 0x2310, subindex: 1, value: -2, read_back: true },
-        RawSdo { bits: 32, index: 0x1010, subindex: 1, value: 0x6576_6173, read_back: false },
+        RawSdo { bits: 32, index: 0x2311, subindex: 1, value: 0x6576_6173, read_back: false },
     );
     assert_eq!(rotation.sdo, [first, second]);
     let windows = |stage: &StageConfig| {
