@@ -25,8 +25,8 @@ enum StepPhase {
 }
 
 /// The state of an insertion. Depth and rotation count from where it started: measured ones from the
-/// position measured there, set-points from the target held there. The two differ by what the drive
-/// stays off its target at rest, and neither may jump when the insertion begins.
+/// position measured there, set-points from the target held there. The two origins differ by the drive's
+/// position error at rest, so that neither value jumps when the insertion begins.
 #[derive(Debug, Clone)]
 pub(crate) struct Insertion {
     config: InsertionConfig,
@@ -48,9 +48,9 @@ pub(crate) struct Insertion {
     newest: Option<Measurement>,
     /// The tip was seen since the insertion began.
     is_seen: bool,
-    /// Since when the set-points have been at their end while the measured depth is still short of it.
+    /// The time since which the set-points have stood at their end while the needle has not settled there.
     short_since: Option<Time>,
-    /// Since when the needle has been at their end without a break.
+    /// The time since which the needle has been within its tolerance of that end without a break.
     here_since: Option<Time>,
 }
 
@@ -188,8 +188,8 @@ impl Insertion {
         (self.profile.position_mm() - insertion_meas_mm).abs()
     }
 
-    /// Checks that the needle arrives where its set-points end; otherwise the run would wait there for
-    /// ever. An error is the reason to stop the run.
+    /// Checks that the needle arrives where its set-points end; otherwise the run would wait there forever. An error
+    /// is the reason to stop the run.
     pub(crate) fn check_arrival(
         &mut self,
         time: Time,
@@ -225,7 +225,7 @@ impl Insertion {
         ))
     }
 
-    /// The step that is due at the measured depth, if any. It is then no longer due.
+    /// Takes the step that is due at the measured depth, if one is due.
     pub(crate) fn take_due_step(&mut self, time: Time, insertion_meas_mm: f64) -> Option<DueStep> {
         let goal_mm = self.step_depth_mm(self.next_step);
         let measurement = match self.config.mode {

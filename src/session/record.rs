@@ -77,7 +77,7 @@ impl SampleRecord {
     }
 }
 
-/// One millimetre of the run, in the plane frame: a row of `steps.csv`.
+/// One step of an insertion, in the plane frame: a row of `steps.csv`.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct StepRecord {
     /// Number of the step, from 0 at the start of the insertion.

@@ -256,7 +256,7 @@ impl Shell {
         self.enter(State::Stopping);
     }
 
-    /// The longest that a stop may take: the stage's own timeouts, plus a margin.
+    /// The longest time that a stop may take: the stage's own timeouts, plus a margin.
     fn stop_timeout(&self) -> Duration {
         self.config().power.stop_timeout * 2 + STOP_MARGIN
     }

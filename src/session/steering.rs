@@ -49,7 +49,7 @@ pub struct Decision {
 }
 
 impl Steering {
-    /// The observers and the law that `config` names.
+    /// Builds the observers and the law that `config` names.
     pub fn new(config: &SessionConfig) -> Self {
         let build =
             |observer: &ObserverConfig| observer.build(config.needle, config.needle_torsion);
@@ -99,7 +99,7 @@ impl Steering {
         };
         self.observers().for_each(|observer| observer.correct(tip_meas, independent));
         let innovation_mm = tip_meas.mm() - predicted_mm?;
-        // The watch expects the noise of one position; a mean of independent ones has √positions less.
+        // The watch expects the noise of one position. The mean of n independent positions has 1/√n of it.
         self.whiteness.take(innovation_mm * f64::from(positions).sqrt());
         Some(innovation_mm)
     }

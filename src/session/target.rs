@@ -40,7 +40,7 @@ impl MovingMean {
         MovingMean { over, newest: VecDeque::new() }
     }
 
-    /// Adds a position, mm, unless it is the newest that was added.
+    /// Adds a position, mm, unless it was the last one added.
     pub fn take(&mut self, acquisition_time: Time, position_mm: Vector3<f64>) {
         if self.newest.back() == Some(&(acquisition_time, position_mm)) {
             return;
@@ -101,7 +101,7 @@ impl TargetTracking {
         is_same_tool(&sample.tool, &self.tool.gate.tool)
     }
 
-    /// A new connection may have another sender's clock.
+    /// Forgets the offset of the sender's clock: a new connection may be another sender's.
     pub(super) fn reconnected(&mut self) {
         self.clock.reconnected();
     }

@@ -32,9 +32,9 @@ pub(super) struct Hold {
     by: HeldBy,
 }
 
-/// A hold by the tracker that has ended by itself, together with those before it. The next hold has that much
-/// less time before it ends the run, but gets back the time for which the insertion went on in between. So
-/// the run ends when the stream causes holds for longer than it is believed.
+/// The last hold by the tracker that ended by itself. Its time, which includes that of the holds before it, counts
+/// towards `tracker.hold_timeout_s` of the next hold, less the time for which the insertion went on in between. So
+/// the run ends if the stream causes holds for longer than it is believed.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct EndedHold {
     at: Time,
@@ -50,7 +50,7 @@ enum HeldBy {
         trouble: Trouble,
         /// The hold interrupted a single step, which never goes on by itself.
         in_step: bool,
-        /// What the operator was told last: that the insertion may go on, or not.
+        /// The last message to the operator about this hold said that the insertion may go on.
         is_told: bool,
     },
     Operator,

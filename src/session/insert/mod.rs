@@ -43,14 +43,14 @@ pub(super) struct InsertTask {
     /// Measured stage positions, with a depth that never decreases: the path that the needle has cut.
     history: StageHistory,
     estimation: Estimation,
-    /// `None` until the stage is brought up and the first tip position has come.
+    /// `None` until the axes have power and the tip is seen at an accepted start.
     insertion: Option<Insertion>,
     hold: Option<Hold>,
     /// The last hold by the tracker that ended by itself.
     ended_hold: Option<EndedHold>,
     /// Measurements that have not corrected the observers yet.
     pending: Vec<Measurement>,
-    /// The time of the feedback after which the observers still must be corrected.
+    /// The time of the feedback up to which the observers must still be corrected.
     catch_up_to: Option<Time>,
     progress: Progress,
 }
@@ -84,7 +84,7 @@ impl InsertTask {
         shell.enter(self.tracking.state(shell.now));
     }
 
-    /// Refuses an insertion from here that would run into a soft limit.
+    /// Refuses an insertion from `at` that would end beyond a soft limit.
     fn check_depth(&self, shell: &Shell, at: SetPoint) -> Result<(), String> {
         let depth_mm = self.config.insertion.depth_mm;
         let end = SetPoint { insertion_mm: at.insertion_mm + depth_mm, ..at };
@@ -96,10 +96,11 @@ impl InsertTask {
         })
     }
 
-    /// Both drives have answered a SYNC: pair, estimate, decide, command.
+    /// Handles the answers of both drives to a SYNC: pairs, estimates, decides and commands.
     fn take_feedback(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
         let cut_mm = self.history.newest().map_or(f64::NEG_INFINITY, |point| point.insertion_mm);
-        // A wrong reading must not count as cut until the needle is there. In a stop the axis passes its last target.
+        // A reading deeper than the set-point is wrong and must not count as cut. In a stop the axis may pass its
+        // last target, so there this limit does not apply.
         let inserting = self.insertion.as_ref().filter(|_| shell.is_running());
         let deepest_mm = inserting
             .map_or(f64::INFINITY, |insertion| insertion.deepest_stage_mm(feedback.commanded));
@@ -164,8 +165,8 @@ impl InsertTask {
         self.estimation.carry_to(time - self.config.tracker.hold.after, &self.history)
     }
 
-    /// One SYNC of the insertion: checks, the step that is due, the next set-point. An error is
-    /// the reason to stop the run.
+    /// Handles one SYNC of the insertion: makes the checks, takes the step that is due, and sends the next set-point.
+    /// An error is the reason to stop the run.
     fn insert(
         &mut self,
         shell: &mut Shell,
@@ -373,7 +374,7 @@ impl Task for InsertTask {
     fn deadline(&self, shell: &Shell) -> Time {
         match self.insertion {
             None => self.tip_due(shell.power()),
-            // At once. The SYNC up to which it catches up may be long past, without that the bench is late.
+            // Now, not at `catch_up_to`: that SYNC may be long past although the bench is not late.
             Some(_) => self.catch_up_to.map_or(Time::NEVER, |_| shell.now),
         }
     }
