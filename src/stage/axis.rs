@@ -27,7 +27,7 @@ impl Axis {
         ["mm", "deg"][self as usize]
     }
 
-    /// `value`, mm or rad, as an operator reads it: `1.500 mm`, `90.000 deg`.
+    /// `value`, mm or rad, as text for the operator: `1.500 mm`, `90.000 deg`.
     pub fn shown(self, value: f64) -> String {
         let (value, unit) = self.in_unit(value);
         format!("{value:.3} {unit}")

@@ -64,7 +64,7 @@ pub(super) struct BringUp {
 /// How far a bring-up has come.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct BringUpState {
-    /// The part of the bring-up that is under way, as an operator reads it.
+    /// The part of the bring-up that is under way, as text for the operator.
     part: &'static str,
     /// The drive has answered.
     pub(super) found: bool,

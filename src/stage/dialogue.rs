@@ -262,7 +262,7 @@ impl<T> ScriptRunner<T> {
         line.client.deadline().min(line.wake)
     }
 
-    /// Ends the transfer under way.
+    /// Cancels the transfer that is under way, and the script's pause.
     pub(super) fn cancel(&mut self) {
         let mut line = self.sdo.0.borrow_mut();
         line.client.cancel();

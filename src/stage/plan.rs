@@ -322,8 +322,8 @@ impl Script {
         ))
     }
 
-    /// Refuses to home an axis once more that stands elsewhere: homing where it stands would make a twisted cable
-    /// or an inserted needle its zero, and any other method would move it.
+    /// Refuses to home again an axis that stands away from its home. Homing in place would set its zero with the cable
+    /// twisted or the needle inserted, and any other method would move it.
     async fn check_not_homed_elsewhere(&self, position: i32) -> Result<(), String> {
         let (AxisUse::Home { again: false }, Some(homing)) = (self.purpose, self.drive().homing)
         else {

@@ -75,7 +75,7 @@ impl Stage {
             return;
         }
         if event == HeartbeatEvent::State(NmtState::Stopped) {
-            // A command that was sent to this drive by SDO was lost.
+            // In Stopped a node takes no SDO, so a command that was sent to this drive by SDO was lost.
             self.repeat_due = now;
         }
         // The heartbeat may have been sent before the drive took the start command.
