@@ -7,7 +7,8 @@ use std::fmt;
 
 /// Positions that differ from one another are counted up to this number.
 const COUNTED_MAX: usize = 100;
-/// Where no coordinate ever changes by less than this, mm, the stream is rounded: one that is held may stay the same.
+/// If no coordinate ever changes by less than this, mm, the stream is rounded, and a coordinate of a tool at rest may
+/// stay the same.
 const ROUNDED_MM: f64 = 0.009;
 
 /// Watches the positions of a stream, in the tracker's frame, from the first on.

@@ -114,7 +114,7 @@ const NO_MODEL: &str = "no observer has an estimate yet to find the tip again";
 /// The period is averaged over about this many positions.
 const PERIOD_MEMORY: f64 = 16.0;
 
-/// The track of a tip: believes positions that follow from the ones before and from the model.
+/// The track of a tip: accepts positions that follow from the ones before and from the model.
 ///
 /// Before an insertion the tip may be anywhere: it is found once some positions in a row are
 /// within a step of one another ([`Track::seek`]). During an insertion ([`Track::judge`]) a position must
@@ -149,7 +149,7 @@ pub struct Track {
 }
 
 impl Track {
-    /// A track of which nothing is known yet.
+    /// A track without positions.
     pub fn new(settings: TrackSettings) -> Self {
         Track {
             settings,
