@@ -81,8 +81,8 @@ pub trait CanBus: Send {
         None
     }
 
-    /// Puts an error frame on the bus, as if every controller on it had reported `error`. Real buses
-    /// carry no error frames.
+    /// Sends an error frame to every other endpoint of a virtual bus, as if its own controller had reported `error`.
+    /// Real buses carry no error frames.
     ///
     /// # Errors
     /// [`CanError::Io`] on a bus that cannot do so; otherwise as [`send`](Self::send).
