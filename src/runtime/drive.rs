@@ -8,7 +8,7 @@ use crate::session::{
 use crate::transport::can::CanError;
 use crate::units::Time;
 
-/// Takes the records of a run, and passes on what the operator wants.
+/// Receives the records and the progress of a run, and supplies the operator's commands and the reason for a stop.
 pub(super) trait Witness {
     /// Takes one record; in an emulated run with the true pose at that time.
     fn take(&mut self, record: Record, truth: Option<Truth>);
@@ -21,8 +21,7 @@ pub(super) trait Witness {
         None
     }
 
-    /// Why the operator or the record stops the run, if one of them does; `None` if the run `is_stopping`
-    /// already.
+    /// The reason to stop the run, if the operator or the record gives one; `None` if the run `is_stopping` already.
     fn stop_reason(&mut self, _now: Time, _is_stopping: bool) -> Option<String> {
         None
     }
@@ -109,7 +108,7 @@ pub(super) fn carry_out(world: &mut impl World) {
         match world.send(time, &frame) {
             Ok(true) => records.push(Record::Can { time, direction: Direction::Sent, frame }),
             Ok(false) => {}
-            // The frames that follow the fault are tried all the same.
+            // The frames with which the machine answers the fault are still tried.
             Err(_) if has_failed => {}
             Err(error) => {
                 has_failed = true;

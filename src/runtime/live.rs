@@ -44,7 +44,7 @@ struct Live<'a, W> {
     stale_before: Option<Time>,
     /// The time of the last input.
     last: Time,
-    /// When the SYNC was due, if a deadline was met since everything was sent.
+    /// When the SYNC was due; `Some` from the handling of a deadline until the frames that follow from it are sent.
     met: Option<Time>,
 }
 
@@ -245,7 +245,7 @@ impl<W: Witness> World for Live<'_, W> {
     }
 }
 
-/// Names so many messages from the tracker in this time as the cause of a gap, if they are a flood.
+/// The cause of a gap in which the tracker sent this many messages in this time, if they are a flood.
 fn flood(messages: u64, time: Duration) -> Option<String> {
     let per_s = messages as f64 / time.max(READ_PERIOD).as_secs_f64();
     (per_s > FLOOD_PER_S)

@@ -29,7 +29,7 @@ pub trait Operator {
     fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: &str);
     /// Takes each record as it is made.
     fn record(&mut self, _record: &Record) {}
-    /// Shows a trouble with the record; an event reports it too.
+    /// Shows a problem with the record; an event reports it too.
     fn record_trouble(&mut self, _text: &str) {}
     /// Takes the folder in which the run is recorded.
     fn recorded_to(&mut self, _folder: &Path) {}
@@ -56,7 +56,7 @@ pub struct Sink<'a> {
     recorder: Result<Recorder, TelemetryError>,
     figures: RunFigures,
     holds: Holds,
-    /// What a warning says of the run, if it goes on when recording fails; `None` to stop it.
+    /// If the run goes on when recording fails, what the warning says about it; `None` if the run stops.
     goes_on: Option<&'static str>,
     /// How long it took to hand each record to the recorder, ns.
     record_times: DurationHistogram,
@@ -90,9 +90,9 @@ pub struct RunReport {
 }
 
 impl<'a> Sink<'a> {
-    /// Passes records to `recorder` and news to `operator`; stops the run once `interrupt` is raised. If
-    /// recording fails, the run is stopped, unless `goes_on` says what goes on; lost records are then
-    /// reported and counted.
+    /// Passes records to `recorder` and events to `operator`, and stops the run once `interrupt` is raised. If
+    /// recording fails, the run is stopped, unless `goes_on` has the text of a warning about what goes on. Lost records
+    /// are then reported and counted.
     pub fn new(
         recorder: Result<Recorder, TelemetryError>,
         goes_on: Option<&'static str>,
