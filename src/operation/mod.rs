@@ -28,9 +28,9 @@ use nalgebra::Vector3;
 pub enum Operation {
     /// Home axes, one after the other.
     Home {
-        /// These.
+        /// The axes to home.
         axes: PerAxis<bool>,
-        /// Even if an axis is homed already and stands away from home.
+        /// Home an axis even if it is homed already and stands away from home.
         again: bool,
     },
     /// Move one axis; the other is held.

@@ -10,20 +10,20 @@ use std::time::Duration;
 /// A drive may notice a missing heartbeat this much later than its configured timeout.
 const MARGIN: Duration = Duration::from_millis(200);
 
-/// A silence under way. The drives are read by SDO: a drive that notices the silence usually leaves
-/// Operational, and then sends no PDO.
+/// The time without a heartbeat of the bench. The drives are read by SDO: a drive that notices the missing heartbeat
+/// usually leaves Operational, and then sends no PDO.
 #[derive(Debug)]
 struct Silence {
     /// When the last heartbeat was sent.
     since: Time,
-    /// Within this time a drive must notice.
+    /// The time within which a drive must notice.
     within: Duration,
     noticed_after: PerAxis<Option<Duration>>,
     watch: QuickStop,
 }
 
 impl Silence {
-    /// A silence that begins at `now`, after the last heartbeat at `since`.
+    /// Begins at `now`, after the last heartbeat at `since`.
     fn new(config: &StageConfig, now: Time, since: Time) -> Self {
         let within = config.bus.heartbeat_timeout() + MARGIN;
         let watch = QuickStop::watch(config, now, since + within + config.power.stop_timeout);

@@ -91,7 +91,7 @@ pub enum AxisUse {
     Hold,
     /// It is homed. If it is homed already and stands away from home, only `again` homes it.
     Home {
-        /// Even then.
+        /// Home it even if it is homed already and stands away from home.
         again: bool,
     },
 }
