@@ -61,7 +61,7 @@ impl Alternative {
         }
     }
 
-    /// What the operator should check.
+    /// Advice to the operator, as a question.
     fn question(self) -> &'static str {
         match self {
             Alternative::Mirrored => {

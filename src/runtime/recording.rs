@@ -24,7 +24,7 @@ const PROGRESS_PERIOD: Duration = Duration::from_secs(2);
 /// After this many intervals without progress the disk counts as stalled, and the recording is given up.
 const STALLED_PERIODS_MAX: u32 = 8;
 
-/// What the recording of a run needs beside the record.
+/// The data that the recording of a run needs besides the record.
 pub struct RecordedRun {
     /// The configuration of the run.
     pub run_config: RunConfig,

@@ -42,11 +42,11 @@ pub trait Operator {
 /// How often an insertion was held, by cause.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
 pub struct Holds {
-    /// By the tracker: the tip was not seen, or the stream contradicted the model.
+    /// Holds by the tracker: the tip was not seen, or the stream contradicted the model.
     pub tracker: u32,
-    /// By the operator.
+    /// Holds by the operator.
     pub operator: u32,
-    /// After a single step.
+    /// Holds after a single step.
     pub step: u32,
 }
 
@@ -75,7 +75,7 @@ pub struct RunReport {
     pub stage_at_end: StageAtEnd,
     /// How often it was held.
     pub holds: Holds,
-    /// What the tracker's gates did with its samples.
+    /// The numbers of samples that the tracker's gates accepted and refused.
     pub gates: GateCounts,
     /// The session's time at the end.
     pub end: Time,
@@ -85,7 +85,7 @@ pub struct RunReport {
     pub run_dir: Option<PathBuf>,
     /// The manifest of the closed record. An error if the run was not recorded, or the record not closed.
     pub record: Result<Manifest, TelemetryError>,
-    /// What is known only in an emulated run; `None` in any other.
+    /// The facts that are known only in an emulated run; `None` in any other.
     pub emulated: Option<EmulationReport>,
 }
 

@@ -16,7 +16,7 @@ use crate::units::Time;
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// Where a run in virtual time gets its tip positions from.
+/// The source of the tip positions of a run in virtual time.
 #[derive(Debug)]
 pub enum TipSource {
     /// The virtual stage's own tracker.
@@ -245,7 +245,7 @@ pub struct DriveOutcome {
     pub left_operation_enabled: Option<Moment>,
 }
 
-/// What is known only in an emulated run.
+/// The facts that are known only in an emulated run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EmulationReport {
     /// The scripted faults that began, in order.

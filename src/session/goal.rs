@@ -1,4 +1,4 @@
-//! Steering to a target: the path is planned anew each step, and a control law follows it.
+//! Steering to a target: each step plans the path again, and a control law follows it.
 
 use super::config::SessionConfig;
 use super::target::TargetTool;
@@ -134,7 +134,7 @@ fn shown(at_mm: &Vector3<f64>) -> String {
     format!("[{:.1}, {:.1}, {:.1}]", at_mm.x, at_mm.y, at_mm.z)
 }
 
-/// What is known of the target at a step.
+/// Distances to the target and the obstacles at a step, and the path to the target.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Approach {
     /// The target, plane frame, mm.

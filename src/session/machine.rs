@@ -38,7 +38,7 @@ pub enum Input {
     Tick,
 }
 
-/// What the operator can ask of an insertion.
+/// A command of the operator to an insertion.
 #[derive(Debug, Clone, Copy, PartialEq, Display)]
 pub enum OperatorCommand {
     /// Brake the insertion to a standstill; both axes stay enabled.
@@ -150,7 +150,7 @@ pub trait Machine {
         StageAtEnd::default()
     }
 
-    /// What the tracker's gates did with its samples.
+    /// The numbers of samples that the tracker's gates accepted and refused.
     fn gate_counts(&self) -> GateCounts {
         GateCounts::default()
     }

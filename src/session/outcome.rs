@@ -37,7 +37,8 @@ pub struct StageAtEnd {
 }
 
 impl StageAtEnd {
-    /// Where `axis` stands, mm or rad; `None` if that is not known. A drive that has restarted may count anew.
+    /// Where `axis` stands, mm or rad; `None` if that is not known: a drive that has restarted may count from another
+    /// zero.
     pub fn position_of(&self, axis: Axis) -> Option<f64> {
         let position = self.position.filter(|_| !self.drives[axis].restarted);
         position.map(|position| position.along(axis))

@@ -1,4 +1,4 @@
-//! What a session writes to its record. A session never reads its record.
+//! The records that a session writes. A session never reads them.
 
 use super::machine::Input;
 use super::state::State;

@@ -42,7 +42,7 @@ pub struct Decision {
     pub rotation_cmd_rad_per_mm: Option<f64>,
     /// The law demanded more than its own limits allow.
     pub command_saturated: bool,
-    /// What is known of the target; `None` without a target or without an estimate.
+    /// The approach to the target; `None` without a target or without an estimate.
     pub approach: Option<Approach>,
     /// Why there is no command: the run must be stopped for this reason.
     pub refused: Option<String>,
@@ -182,7 +182,7 @@ impl Steering {
         self.observer.check().map_err(|error| format!("observer: {error}"))
     }
 
-    /// What is known of the target at this step, and the command; no command if the insertion ends here.
+    /// Returns the approach to the target at this step, and the command; no command if the insertion ends here.
     fn command(
         &mut self,
         estimate: &Estimate,

@@ -84,7 +84,7 @@ pub(crate) trait Task {
         Progress::default()
     }
 
-    /// What the tracker's gates did with its samples.
+    /// The numbers of samples that the tracker's gates accepted and refused.
     fn gate_counts(&self) -> GateCounts {
         GateCounts::default()
     }

@@ -31,11 +31,11 @@ const TOO_MANY_WAIT: &str = "too many positions wait for the stage's position at
 /// Why the needle cannot be steered for now.
 #[derive(Debug, Clone)]
 pub(super) struct Trouble {
-    /// What is not seen, or not believed: "tip" or "target".
+    /// The tool that is not seen, or whose positions are refused: "tip" or "target".
     pub(super) of: &'static str,
-    /// What is wrong, with its numbers and limits.
+    /// The problem, with its numbers and limits.
     pub(super) what: String,
-    /// What led to it, or what the operator should check.
+    /// Its cause, or the advice to the operator.
     pub(super) why: String,
 }
 
@@ -66,7 +66,7 @@ pub(crate) struct Tracking {
     accepted_at: Option<Time>,
     /// How late the newest sample came by its stamp, beyond the configured latency; 0 if it was not dated.
     late: Duration,
-    /// What the gates did with the samples so far.
+    /// The numbers of samples that the gates have accepted and refused so far.
     pub(super) counts: GateCounts,
     census: Census,
     unpaired_age_max: Duration,
@@ -260,7 +260,7 @@ impl Tracking {
     /// Checks that the stream as a whole does not contradict the insertion, now `insertion_mm` deep.
     ///
     /// # Errors
-    /// What contradicts it: the reason to stop the run.
+    /// The contradiction, which is the reason to stop the run.
     pub(super) fn check_stream(&self, insertion_mm: f64) -> Result<(), String> {
         if !self.config.judges_stream {
             return Ok(());
@@ -277,7 +277,7 @@ impl Tracking {
         }
     }
 
-    /// How many independent positions an accepted one is worth, by the configured noise.
+    /// The number of independent positions that carry as much information as an accepted one, by the configured noise.
     fn independent(&mut self, acquisition_time: Time) -> f64 {
         let last = self.accepted_at.replace(acquisition_time);
         let spacing_s = last.map_or(f64::INFINITY, |last| acquisition_time.seconds_after(last));

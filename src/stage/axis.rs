@@ -80,7 +80,7 @@ impl<T> IndexMut<Axis> for PerAxis<T> {
     }
 }
 
-/// What an axis is used for.
+/// The purpose for which an axis is used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum AxisUse {
     /// It steers a needle, or is put to a test: it must be homed, and stand within its soft limits.

@@ -1,4 +1,4 @@
-//! What the stage gives to its caller: frames to send, and events.
+//! The outputs of the stage: frames to send, and events.
 
 use super::{Axis, Identity};
 use crate::canopen::cia402::{DriveState, Statusword};
@@ -33,7 +33,7 @@ pub struct DriveReport {
     pub state: Option<DriveState>,
     /// The last error that it reported, unless it has reported its end since.
     pub error: Option<EmcyCode>,
-    /// It has restarted since its bring-up, and may count its position anew.
+    /// It has restarted since its bring-up, and may count its position from another zero.
     pub restarted: bool,
 }
 

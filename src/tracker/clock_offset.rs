@@ -93,7 +93,7 @@ struct Late {
 }
 
 impl ClockOffset {
-    /// What to add to `source_ns` to bring it to our time line: at most `receive − source`.
+    /// Returns the offset, ns, that converts `source_ns` to our time line: at most `receive − source`.
     ///
     /// # Errors
     /// [`Refusal`]; the stamp must not be used.
@@ -174,7 +174,7 @@ impl ClockOffset {
         ns
     }
 
-    /// What to tell the operator about the sender's clock.
+    /// Takes the message to the operator about the sender's clock, if there is one.
     pub(super) fn news(&mut self) -> Option<String> {
         self.news.take()
     }
@@ -265,7 +265,7 @@ struct Settling {
 }
 
 impl Settling {
-    /// By how much a stamp goes back from the one before; `None` for the first.
+    /// How far a stamp goes back from the one before, ns; `None` for the first stamp.
     fn back_ns(&self, source_ns: i64) -> Option<i64> {
         self.since.map(|_| self.last_source_ns.saturating_sub(source_ns))
     }

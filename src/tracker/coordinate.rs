@@ -45,7 +45,7 @@ impl CoordinateWatch {
     pub const POSITIONS_AT_REST: usize = 10;
     /// The fewest that show it during an insertion.
     pub const POSITIONS_INSERTED: usize = COUNTED_MAX;
-    /// What the operator should look at.
+    /// Advice to the operator.
     pub const ADVICE: &str = "has it two dimensions, or its transform a row of zeros?";
 
     /// Takes the next position, mm, finite.

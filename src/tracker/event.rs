@@ -17,7 +17,7 @@ pub enum Event {
     },
     /// No connection could be made; another attempt follows.
     Unreachable {
-        /// What happened and what to check.
+        /// The error, and what to check.
         reason: String,
     },
     /// Another client wanted to connect; the bench reads one at a time.

@@ -71,7 +71,7 @@ pub struct Prediction {
     pub since_correction_mm: f64,
 }
 
-/// What the operator sees of the track.
+/// The state of a track, for the operator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TrackState {
     /// Too few positions have come yet that agree with one another.
@@ -207,7 +207,7 @@ impl Track {
         }
     }
 
-    /// What the operator sees at `now`.
+    /// The state at `now`, for the operator.
     pub fn state(&self, now: Time) -> TrackState {
         match self.last_believed {
             _ if self.is_lost => TrackState::Lost,

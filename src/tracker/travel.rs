@@ -52,7 +52,7 @@ const RECORDED_STRETCHES_MAX: f64 = 100.0;
 /// needle and the noise of a recording are not known: over 20 mm an arc with a radius of 10 mm has 0.9.
 const RECORDED_TRAVEL: std::ops::Range<f64> = 0.5..1.5;
 
-/// What is tolerated besides noise.
+/// The deviation that is tolerated besides noise.
 struct Tolerance {
     /// A share of the travel.
     share: f64,

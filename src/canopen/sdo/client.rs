@@ -15,8 +15,8 @@ use crate::units::Time;
 /// Fence objects. If an old answer may still come, the client first reads the first of these that the next request
 /// does not name. Every node has both.
 const FENCES: [ObjectAddress; 2] = [ERROR_REGISTER, DEVICE_TYPE];
-/// A repeated answer is recognized if it belongs to one of the last so many requests: a second drive with the same
-/// node number may answer later than the first.
+/// Extra answers are recognized for this many of the last requests: a second drive with the same node number may
+/// answer later than the first.
 const ANSWERED_MAX: usize = 8;
 
 #[derive(Debug, Clone, Copy)]

@@ -13,9 +13,9 @@ use std::time::Duration;
 
 /// A message about a tip that is not seen has at most this many characters.
 pub(super) const MESSAGE_MAX: usize = 200;
-/// What the operator should check when the stream contradicts the model.
+/// Advice to the operator when the stream contradicts the model.
 const JUMP_ADVICE: &str = "check the tracker, needle.radius_mm, tip_offset_mm";
-/// What the operator should check when the tip does not move: the needle may be loose, or the axes exchanged.
+/// Advice to the operator when the tip does not move: the needle may be loose, or the axes exchanged.
 const FROZEN_ADVICE: &str = "check the tracker, the needle's clamp, and which drive is which";
 /// Why a command is refused before the insertion.
 pub(super) const NOT_BEGUN: &str = "the insertion has not begun";
@@ -41,7 +41,7 @@ pub(super) struct EndedHold {
     lasted: Duration,
 }
 
-/// What holds an insertion. A hold by the operator or by a step lasts until the operator ends it.
+/// The cause of a hold. A hold by the operator or by a step lasts until the operator ends it.
 #[derive(Debug, Clone)]
 enum HeldBy {
     Tracker {
