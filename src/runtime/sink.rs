@@ -1,6 +1,6 @@
 //! Passes a session's records on to the recorder, to the figures and to the operator's screen.
 
-use super::drive::Witness;
+use super::drive::RunMonitor;
 use super::interrupt::Interrupt;
 use super::timing::{DurationHistogram, TimingReport};
 use super::virtual_time::EmulationReport;
@@ -127,7 +127,7 @@ impl<'a> Sink<'a> {
 
     /// Reports the recorder's news, and records them as far as possible. Returns the reason to stop the run if
     /// recording has failed, unless the run continues without a record or `is_ending` anyway.
-    fn look_after_record(&mut self, now: Time, is_ending: bool) -> Option<String> {
+    fn check_record(&mut self, now: Time, is_ending: bool) -> Option<String> {
         let mut reason = None;
         while let Some(news) = self.recorder.as_mut().ok().and_then(Recorder::news) {
             let trouble = match (news, self.goes_on) {
@@ -182,7 +182,7 @@ impl<'a> Sink<'a> {
     }
 }
 
-impl Witness for Sink<'_> {
+impl RunMonitor for Sink<'_> {
     fn take(&mut self, record: Record, truth: Option<Truth>) {
         self.operator.record(&record);
         match &record {
@@ -215,7 +215,7 @@ impl Witness for Sink<'_> {
 
     fn stop_reason(&mut self, now: Time, is_stopping: bool) -> Option<String> {
         let is_interrupted = self.interrupt.is_raised();
-        let record_reason = self.look_after_record(now, is_stopping || is_interrupted);
+        let record_reason = self.check_record(now, is_stopping || is_interrupted);
         if is_stopping {
             None
         } else if is_interrupted {
