@@ -49,9 +49,9 @@ pub(crate) struct Insertion {
     /// The tip was seen since the insertion began.
     is_seen: bool,
     /// The time since which the set-points have stood at their end while the needle has not settled there.
-    short_since: Option<Time>,
+    unsettled_since: Option<Time>,
     /// The time since which the needle has been within its tolerance of that end without a break.
-    here_since: Option<Time>,
+    in_tolerance_since: Option<Time>,
 }
 
 /// A step that is due, with the measurement that it uses.
@@ -79,8 +79,8 @@ impl Insertion {
             sampling: Duration::ZERO,
             newest: None,
             is_seen: false,
-            short_since: None,
-            here_since: None,
+            unsettled_since: None,
+            in_tolerance_since: None,
         }
     }
 
@@ -196,7 +196,7 @@ impl Insertion {
         insertion_meas_mm: f64,
     ) -> Result<(), String> {
         let goal_mm = self.profile.goal_mm();
-        let (here_mm, settle) = match self.config.mode {
+        let (tolerance_mm, settle) = match self.config.mode {
             // Step 0 needs the axis only near to where the insertion began.
             InsertionMode::Continuous if self.next_step == 0 => {
                 (self.config.arrival_mm, Duration::ZERO)
@@ -205,16 +205,16 @@ impl Insertion {
             InsertionMode::Stepwise => (self.config.arrival_mm, self.config.settle),
         };
         let off_mm = (goal_mm - insertion_meas_mm).abs();
-        let is_here = off_mm <= here_mm;
-        self.here_since = is_here.then(|| self.here_since.unwrap_or(time));
+        let is_in_tolerance = off_mm <= tolerance_mm;
+        self.in_tolerance_since = is_in_tolerance.then(|| self.in_tolerance_since.unwrap_or(time));
         // An axis that hunts about its target crosses it again and again, and does not arrive.
-        let has_settled = self.here_since.is_some_and(|since| time.since(since) >= settle);
+        let has_settled = self.in_tolerance_since.is_some_and(|since| time.since(since) >= settle);
         if self.profile.position_mm() < goal_mm || has_settled {
-            self.short_since = None;
+            self.unsettled_since = None;
             return Ok(());
         }
-        let waited = time.since(*self.short_since.get_or_insert(time));
-        if is_here || waited < ARRIVAL_TIMEOUT + settle {
+        let waited = time.since(*self.unsettled_since.get_or_insert(time));
+        if is_in_tolerance || waited < ARRIVAL_TIMEOUT + settle {
             return Ok(());
         }
         Err(format!(
@@ -263,7 +263,7 @@ impl Insertion {
     /// their end: a real drive may hold its target a few counts off.
     fn has_nearly_arrived(&self, time: Time, insertion_meas_mm: f64) -> bool {
         (self.profile.goal_mm() - insertion_meas_mm).abs() <= self.config.arrival_mm
-            && self.short_since.is_some_and(|since| time.since(since) >= ARRIVAL_PATIENCE)
+            && self.unsettled_since.is_some_and(|since| time.since(since) >= ARRIVAL_PATIENCE)
     }
 
     /// The mean of the step's samples, once the needle has settled and the samples are complete.

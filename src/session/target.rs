@@ -2,7 +2,7 @@
 
 use super::config::TrackerConfig;
 use super::record::SampleRecord;
-use super::tracking::Trouble;
+use super::tracking::HoldReason;
 use crate::geometry::Pose;
 use crate::tracker::gate::is_same_tool;
 use crate::tracker::refusal::short;
@@ -193,7 +193,7 @@ impl TargetTracking {
     }
 
     /// Why the needle cannot be steered to the target at `now`; `None` while it can.
-    pub(super) fn trouble(&self, now: Time) -> Option<Trouble> {
+    pub(super) fn hold_reason(&self, now: Time) -> Option<HoldReason> {
         let limit_s = self.hold_after.as_secs_f64();
         let what = match self.last_acquisition().map(|last| now.seconds_after(last)) {
             None => "the target has not been seen".to_owned(),
@@ -213,7 +213,7 @@ impl TargetTracking {
             Some(refusal) => refusal.to_string(),
             None => format!("is \"{}\" in view? See goal.tool", self.tool.gate.tool),
         };
-        Some(Trouble { of: "target", what, why })
+        Some(HoldReason { of: "target", what, why })
     }
 }
 

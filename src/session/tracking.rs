@@ -30,7 +30,7 @@ const TOO_MANY_WAIT: &str = "too many positions wait for the stage's position at
 
 /// Why the needle cannot be steered for now.
 #[derive(Debug, Clone)]
-pub(super) struct Trouble {
+pub(super) struct HoldReason {
     /// The tool that is not seen, or whose positions are refused: "tip" or "target".
     pub(super) of: &'static str,
     /// The problem, with its numbers and limits.
@@ -78,7 +78,7 @@ pub(crate) struct Tracking {
     last_refusal: Option<String>,
     /// The refusal by which the mean of the last positions contradicted the model, until a position is accepted.
     pub(super) jump: Option<Jump>,
-    link_trouble: Option<String>,
+    link_error: Option<String>,
     /// The error of the last malformed message, until a position is accepted.
     malformed: Option<String>,
     /// The last STATUS of the server was OK and came after the last accepted position.
@@ -118,7 +118,7 @@ impl Tracking {
             reported_state: TrackState::Waiting,
             last_refusal: None,
             jump: None,
-            link_trouble: None,
+            link_error: None,
             malformed: None,
             status_is_ok: false,
             dropped: 0,
@@ -133,11 +133,11 @@ impl Tracking {
         match event {
             Event::Connected { .. } => {
                 self.clock.reconnected();
-                self.link_trouble = None;
+                self.link_error = None;
                 self.status_is_ok = false;
             }
             Event::Unreachable { reason } | Event::Disconnected { reason } => {
-                self.link_trouble = Some(reason.clone());
+                self.link_error = Some(reason.clone());
             }
             Event::Status { status, .. } => self.status_is_ok = status.code == Status::OK,
             Event::Malformed(error) => self.malformed = Some(error.clone()),
@@ -413,7 +413,7 @@ impl Tracking {
     /// The state of the stream, for the operator.
     pub(crate) fn state(&self, now: Time) -> State {
         match self.track.state(now) {
-            _ if self.link_trouble.is_some() => State::Disconnected,
+            _ if self.link_error.is_some() => State::Disconnected,
             TrackState::Waiting => State::AwaitingTip,
             TrackState::Tracking => State::Tracking,
             TrackState::Coasting => State::Coasting,
@@ -443,8 +443,8 @@ impl Tracking {
 
     /// Why there is no tip to steer by, and what to do: for the operator.
     pub(crate) fn explain_silence(&self) -> String {
-        if let Some(trouble) = &self.link_trouble {
-            return trouble.clone();
+        if let Some(error) = &self.link_error {
+            return error.clone();
         }
         if self.late > self.config.hold.after / 2 {
             return format!(

@@ -16,7 +16,7 @@ use super::state::State;
 use super::steering::Decision;
 use super::target::TargetTracking;
 use super::task::Task;
-use super::tracking::{Tracking, Trouble};
+use super::tracking::{HoldReason, Tracking};
 use super::{OperatorCommand, Progress, tracker_news};
 use crate::geometry::coordinates;
 use crate::observer::Estimate;
@@ -123,7 +123,7 @@ impl InsertTask {
         let mut inserted = Ok(());
         if shell.is_running() {
             measurements.into_iter().for_each(|measurement| {
-                self.estimation.gather(&measurement);
+                self.estimation.add_to_batch(&measurement);
                 self.pending.extend(insertion.take_measurement(measurement));
             });
             inserted = self.insert(shell, feedback, at, &mut insertion);
@@ -162,7 +162,7 @@ impl InsertTask {
                 self.estimation.take(newest, &self.history)?;
             }
         }
-        self.estimation.carry_to(time - self.config.tracker.hold.after, &self.history)
+        self.estimation.predict_to(time - self.config.tracker.hold.after, &self.history)
     }
 
     /// Handles one SYNC of the insertion: makes the checks, takes the step that is due, and sends the next set-point.
@@ -256,7 +256,8 @@ impl InsertTask {
 
     /// True while the tip is seen, and the target if that is a tool of its own.
     fn is_seen(&self, now: Time) -> bool {
-        let sees_target = self.target.as_ref().is_none_or(|target| target.trouble(now).is_none());
+        let sees_target =
+            self.target.as_ref().is_none_or(|target| target.hold_reason(now).is_none());
         self.tracking.is_seen(now) && sees_target
     }
 
@@ -268,7 +269,7 @@ impl InsertTask {
         let target = self.target.as_ref().map_or(tip, TargetTracking::last_acquisition);
         let last_seen = tip.min(target).unwrap_or(self.begun).max(self.begun);
         let waiting_since = match power {
-            Power::Off | Power::ComingOn => last_seen,
+            Power::Off | Power::Enabling => last_seen,
             // The start is accepted; power comes on, or the insertion begins, at the next SYNC.
             Power::Awaited(_) | Power::On(_) if matches!(self.start, Start::Accepted(_)) => {
                 last_seen
@@ -282,8 +283,8 @@ impl InsertTask {
     fn explain_no_tip(&self, now: Time) -> String {
         let limit_s = self.config.tracker.timeout.as_secs_f64();
         let target = self.target.as_ref().filter(|_| self.tracking.is_seen(now));
-        let text = match target.and_then(|target| target.trouble(now)) {
-            Some(Trouble { what, why, .. }) => {
+        let text = match target.and_then(|target| target.hold_reason(now)) {
+            Some(HoldReason { what, why, .. }) => {
                 format!("tracker: no target within {limit_s:.1} s; {what}; {why}")
             }
             None => {
@@ -321,7 +322,7 @@ impl Task for InsertTask {
         let Some(time) = self.catch_up_to.take() else { return Ok(()) };
         self.correct(time)?;
         let after = self.config.tracker.hold.after;
-        self.estimation.watch(time - after / 2, time - after, &self.history)
+        self.estimation.correct_watch(time - after / 2, time - after, &self.history)
     }
 
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
