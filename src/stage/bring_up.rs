@@ -71,7 +71,7 @@ pub(super) struct BringUpState {
     /// Its identity is that of the configuration.
     pub(super) identified: bool,
     /// Power is off, and the statusword was read: any fault from here on is a new one.
-    pub(super) disarmed: bool,
+    pub(super) is_power_off: bool,
     /// The drive may have been configured to monitor the bench's heartbeat; its power was taken off before.
     pub(super) may_be_supervised: bool,
     /// The last statusword that was read.

@@ -486,7 +486,7 @@ impl Drive {
     }
 
     /// True if the drive is in Operation Enabled although it has had time to take the command to stop.
-    pub(super) fn disobeys_stop(&self) -> bool {
+    pub(super) fn ignores_stop(&self) -> bool {
         let syncs = OBEYS_WITHIN.div_duration_f64(self.sync_period) as u64;
         self.is_enabled() && self.statusword_sync >= self.stop_sync + syncs.max(STOP_SYNCS)
     }

@@ -35,7 +35,7 @@ impl Script {
         self.identify().await?;
         // Two drives must not be configured as one.
         self.check_node_number()?;
-        self.disarm().await?;
+        self.take_power_off().await?;
         self.configure().await?;
         self.supervise().await?;
         self.map_pdos().await?;
@@ -143,11 +143,11 @@ impl Script {
 
     /// Takes power off first: a drive that an earlier run left enabled is not reconfigured under power. If
     /// the drive is in Fault, the cause is read; unless it may be reset, bring-up ends there.
-    async fn disarm(&self) -> Result<(), String> {
+    async fn take_power_off(&self) -> Result<(), String> {
         self.begin("taking power off, looking for faults");
         self.write_unchecked(drive::CONTROLWORD, Controlword::DISABLE_VOLTAGE.0.into()).await?;
         let statusword = self.wait_for_power_off().await?;
-        self.note(|state| state.disarmed = true);
+        self.note(|state| state.is_power_off = true);
         if !statusword.is_fault() {
             return Ok(());
         }
