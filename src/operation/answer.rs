@@ -28,7 +28,7 @@ const CHORD_SDS: f64 = 8.0;
 const TURN_TOLERANCE_DEG: f64 = 15.0;
 const TILT_MAX_DEG: f64 = 20.0;
 
-/// The phase of the check.
+/// The part of the check that is under way.
 #[derive(Debug, Clone)]
 enum Leg {
     Resting {
@@ -55,7 +55,7 @@ impl AnswerSettings {
 
 /// A check under way: rest, turn, rest, turn, rest, and back.
 #[derive(Debug)]
-pub(super) struct Answering {
+pub(super) struct HandednessCheck {
     settings: AnswerSettings,
     counts: GateCounts,
     leg: Leg,
@@ -69,9 +69,9 @@ pub(super) struct Answering {
     failed: Option<String>,
 }
 
-impl Answering {
+impl HandednessCheck {
     pub(super) fn new(settings: AnswerSettings) -> Self {
-        Answering {
+        HandednessCheck {
             settings,
             counts: GateCounts::default(),
             leg: Leg::Resting { since: None },
@@ -98,7 +98,7 @@ impl Answering {
     }
 
     /// Handles the answers of both drives to a SYNC.
-    fn go_on(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
+    fn handle_feedback(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
         if let Leg::Turning(moving) | Leg::Returning(moving) = &mut self.leg
             && !moving.has_arrived(feedback)?
         {
@@ -221,7 +221,7 @@ impl Answering {
     }
 }
 
-impl Task for Answering {
+impl Task for HandednessCheck {
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
         match event {
             // Before the axes have power.
@@ -232,7 +232,7 @@ impl Task for Answering {
             }
             StageEvent::Feedback(feedback) => {
                 shell.record(Record::Stage(*feedback));
-                if shell.is_running() { self.go_on(shell, feedback) } else { Ok(()) }
+                if shell.is_running() { self.handle_feedback(shell, feedback) } else { Ok(()) }
             }
             _ => Ok(()),
         }

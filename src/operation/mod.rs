@@ -13,7 +13,7 @@ mod tests;
 
 pub use moving::{Goal, Move};
 
-use self::answer::Answering;
+use self::answer::HandednessCheck;
 use self::home::Homing;
 use self::moving::MoveOneAxis;
 use self::prove::Prove;
@@ -97,7 +97,7 @@ impl RunConfig {
             Operation::Home { axes, .. } => Box::new(Homing::new(axes)),
             Operation::Move(request) => Box::new(MoveOneAxis::new(request)),
             Operation::Prove => Box::new(Prove::default()),
-            Operation::Answer(settings) => Box::new(Answering::new(*settings)),
+            Operation::Answer(settings) => Box::new(HandednessCheck::new(*settings)),
         };
         Session::begin(Stage::for_use(*config, purpose, now), task, now)
     }
