@@ -24,7 +24,7 @@ const BINS_MAX: usize = 256;
 const POSITIONS_MIN: f64 = 6.0;
 /// A bin counts for at most this many times the usual number of positions. A bin in which the needle was held would
 /// otherwise outweigh the others, and a stretch with it would not be checked.
-const CROWDED: f64 = 4.0;
+const BIN_WEIGHT_MAX: f64 = 4.0;
 /// At most this many positions per mm count as independent: real noise is correlated.
 const INDEPENDENT_PER_MM: f64 = 10.0;
 /// Standard deviations of the slope's length that are allowed for noise, besides the tolerance.
@@ -164,7 +164,7 @@ impl TravelCheck {
     }
 
     /// The median number of positions in the bins that have any; 0 if there are none.
-    fn usual_count(&self) -> f64 {
+    fn median_count(&self) -> f64 {
         let counts = self.bins.iter().map(|bin| bin.count).filter(|count| *count > 0.0);
         let mut counts: Vec<f64> = counts.collect();
         counts.sort_by(f64::total_cmp);
@@ -174,16 +174,16 @@ impl TravelCheck {
     /// Checks every stretch that ends with the newest bin, the shortest first.
     fn check_stretches(&mut self) {
         let mut sums = Sums::default();
-        let error = (1..).zip(self.weighed_bins()).find_map(|(bins, bin)| {
+        let error = (1..).zip(self.weighted_bins()).find_map(|(bins, bin)| {
             sums += bin;
             STRETCHES.contains(&bins).then(|| self.contradiction(&sums, bins))?
         });
         self.error = self.error.take().or(error);
     }
 
-    /// The bins, the newest first, none with more weight than [`CROWDED`] allows.
-    fn weighed_bins(&self) -> impl Iterator<Item = Sums> {
-        let count_max = CROWDED * self.usual_count();
+    /// The bins, the newest first, none with more weight than [`BIN_WEIGHT_MAX`] allows.
+    fn weighted_bins(&self) -> impl Iterator<Item = Sums> {
+        let count_max = BIN_WEIGHT_MAX * self.median_count();
         let limited = move |bin: &Sums| *bin * (count_max / bin.count).min(1.0);
         self.bins.iter().rev().map(move |bin| if bin.count > 0.0 { limited(bin) } else { *bin })
     }
@@ -204,7 +204,7 @@ impl TravelCheck {
     /// Whether the last positions are in metres.
     fn is_in_metres(&self) -> bool {
         let mut sums = Sums::default();
-        self.weighed_bins().take(EXPLAINED_BINS).for_each(|bin| sums += bin);
+        self.weighted_bins().take(EXPLAINED_BINS).for_each(|bin| sums += bin);
         sums.is_in_metres()
     }
 
@@ -216,7 +216,7 @@ impl TravelCheck {
 
     /// The change to a scale in this range that fits the last `bins` bins, if any does.
     fn change_over(&self, bins: usize, tenths: Tenths) -> Option<ScaleChange> {
-        ScaleChange::fitted(self.weighed_bins().take(bins), tenths, self.noise_sd_mm.powi(2))
+        ScaleChange::fitted(self.weighted_bins().take(bins), tenths, self.noise_sd_mm.powi(2))
     }
 
     /// How the positions over the last `bins` bins, with these sums, contradict the insertion, if they do.
