@@ -147,7 +147,7 @@ impl HandednessCheck {
         match verdict {
             Ok(text) => shell.report(Lane::Session, Severity::Info, text),
             Err(reason) => {
-                // At once: the turn back may be stopped, and then the run ends for another reason.
+                // Report it now: the turn back may be stopped, and then the run ends for another reason.
                 shell.report(Lane::Session, Severity::Warning, reason.clone());
                 self.failed = Some(reason);
             }
@@ -224,7 +224,7 @@ impl HandednessCheck {
 impl Task for HandednessCheck {
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
         match event {
-            // Before the axes have power.
+            // Refuses the turn before the axes have power.
             StageEvent::Located(at) => shell.check_goal(self.settings.farthest(*at)),
             StageEvent::Ready => {
                 shell.enter(State::TurningInAir);

@@ -56,7 +56,7 @@ impl<'a, M: RunMonitor> Live<'a, M> {
         clock: Clock,
         monitor: M,
     ) -> Self {
-        // Frames that wait on the bus are older than the session; it is given them at its start.
+        // Frames that wait on the bus are older than the session, which gets them with the time of its start.
         let last = clock.now();
         let counted = tracker.as_ref().map_or(0, |link| link.messages());
         Live {
@@ -235,7 +235,7 @@ impl<M: RunMonitor> RunIo for Live<'_, M> {
         self.take_events();
         flush_outputs(self);
         self.pending_sync_due = None;
-        // Also if more events are queued: the kernel throttles a real-time thread that never sleeps.
+        // Sleep even if more events are queued: the kernel throttles a real-time thread that never sleeps.
         let deadline = self.session.deadline();
         let wait = deadline.since(self.clock.now()).saturating_sub(self.spin).min(WAIT_MAX);
         match wait.is_zero() {

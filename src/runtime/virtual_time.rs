@@ -177,7 +177,7 @@ impl<M: RunMonitor> RunIo for VirtualRun<'_, M> {
         if let Record::State { state: State::Stopping, .. } = &record {
             self.emulated.stopping = Some(Moment::of(&self.stage, self.now));
         }
-        // A recording is of another needle than the emulated one.
+        // A recording comes from another needle than the emulated one, so its true pose is not known.
         let truth = self.replay().is_none().then(|| self.stage.truth(self.now));
         self.monitor.take(record, truth);
     }

@@ -231,7 +231,7 @@ impl Insertion {
         let measurement = match self.config.mode {
             InsertionMode::Continuous => {
                 let is_due = match self.next_step {
-                    // At rest, with the first measurement.
+                    // Step 0 is due at rest, once there is a measurement.
                     0 => self.is_seen && self.off_mm(insertion_meas_mm) <= self.config.arrival_mm,
                     // A depth beyond the set-point may be a wrong reading: it makes no step due.
                     _ => {

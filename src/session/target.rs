@@ -118,7 +118,7 @@ impl TargetTracking {
                 self.last_refusal = None;
             }
             Err(refusal) => {
-                // Before the insertion the target may have been moved, so it is searched for anew.
+                // Before the insertion the target may have been moved, so it is searched for again.
                 if insertion_mm.is_none() && refusal.gate == GateName::Step {
                     self.mean = MovingMean::new(self.tool.average);
                 }

@@ -363,7 +363,7 @@ impl Tracking {
                 let refused = self.track.refused_in_a_row();
                 (Severity::Warning, format!("lost, {refused} refused in a row; the last: {last}"))
             }
-            // Before an insertion the tip is searched for anew, without a model.
+            // Before an insertion the tip is searched for again, without a model.
             (TrackState::Lost, TrackState::Waiting) => return,
             (TrackState::Lost, _) => {
                 (Severity::Info, "found again: it agrees with the model".to_owned())

@@ -411,7 +411,7 @@ impl Stage {
         let answer_time = if is_answered { Duration::ZERO } else { self.config.bus.sdo_timeout() };
         let wait = answer_time.max(READ_PERIOD);
         let waited = now.since(sent);
-        // If it can be avoided, not at once after a controlword: an SDO server takes one request at a time.
+        // Leave the drive time for a controlword sent just before: an SDO server takes one request at a time.
         let is_commanded = self.repeat_due == now + REPEAT_PERIOD;
         if waited < wait || is_commanded && waited < 2 * wait {
             return;

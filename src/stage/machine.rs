@@ -184,7 +184,7 @@ impl Stage {
             self.note_skipped(periods);
             self.cycle(now);
         }
-        // Only after the SYNC, which must not wait.
+        // This comes after the SYNC, which must not wait.
         if let Some(frames) = self.flood.check(now) {
             self.emit(StageEvent::Flood(frames));
         }

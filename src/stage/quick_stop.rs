@@ -83,7 +83,7 @@ impl AxisStop {
     async fn stop(mut self) -> Result<i32, String> {
         let stood = self.come_to_stand(Some(Controlword::QUICK_STOP)).await;
         let result = self.take_power_off(stood).await;
-        // Once more: the drive may have missed the first command.
+        // Send it again: the drive may have missed the first command.
         self.sdo.leave_operational();
         result
     }

@@ -138,7 +138,7 @@ impl ClockOffset {
                     );
                     return Ok(self.learn(offset, source_ns, Some(news)));
                 }
-                // Stamps were only overtaken.
+                // A stamp was only overtaken by others: the clock was not set.
                 Ok(_) => (self.candidate, self.went_back) = (Settling::default(), false),
                 Err(samples) if is_ahead || behind_ns > DATED_BEHIND_MAX_NS => {
                     return Err(if back_ns > 0 {
@@ -192,7 +192,7 @@ impl ClockOffset {
             late.samples = late.samples.saturating_add(1);
             late.least_ns = late.least_ns.min(late_ns);
             let lasts = late.samples >= LATE_SAMPLES && receive.since(late.since) >= time;
-            // A run over the first limit is over the second as well.
+            // A run that exceeds the first limit exceeds the second, too.
             if lasts && !late.is_reported && !is_reported {
                 self.news = Some(format!(
                     "by their stamps, positions come {:.3} s later than before: delayed, or the sender's \

@@ -388,7 +388,7 @@ impl Track {
             .last_believed
             .map(|last| fix.acquisition_time.seconds_after(last.acquisition_time));
         if let Some(interval_s) = interval_s.filter(|interval_s| *interval_s > 0.0) {
-            // Cut, so that a gap hardly changes the period; a stream that has become slower is still learnt.
+            // Limited, so that a gap hardly changes the period. The period of a slower stream is still learnt.
             let period_s = self.period_s.unwrap_or(interval_s);
             let interval_s = interval_s.min(self.settings.coast_after_periods * period_s);
             self.period_s = Some(period_s + (interval_s - period_s) / PERIOD_MEMORY);

@@ -210,7 +210,7 @@ impl InsertTask {
         let Decision { estimate, rotation_cmd_rad_per_mm, command_saturated, .. } = decision;
         let refused = decision.refused.clone();
         let path = decision.approach.as_ref().and_then(|approach| approach.path.as_ref());
-        // The path begins at the estimate, which was carried along the history.
+        // The path begins at the estimate, which was predicted along the history.
         let estimated_mm = history.newest().map(|point| insertion.depth_mm(point.insertion_mm));
         let end_mm = estimated_mm.zip(path).map(|(from_mm, path)| from_mm + path.length_mm());
         let observer = match &estimate {

@@ -156,7 +156,7 @@ impl<C: Fn() -> Time> LinkTask<C> {
                         *next = Some((stream, newcomer));
                         return reason;
                     }
-                    // Told once: a client may try again many times a second.
+                    // Reported once: a client may try again many times a second.
                     if !std::mem::replace(&mut is_reported, true) {
                         let reason = format!(
                             "tracker: {newcomer} turned away: {} is connected, and one tracker at a time is read",
