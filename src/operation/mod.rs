@@ -14,7 +14,7 @@ mod tests;
 pub use moving::{Goal, Move};
 
 use self::answer::HandednessCheck;
-use self::home::Homing;
+use self::home::HomeAxes;
 use self::moving::MoveOneAxis;
 use self::prove::Prove;
 use crate::session::{Session, SessionConfig, Task};
@@ -94,7 +94,7 @@ impl RunConfig {
             Operation::Prove | Operation::Answer(_) => AxisUse::Steer,
         });
         let task: Box<dyn Task> = match operation {
-            Operation::Home { axes, .. } => Box::new(Homing::new(axes)),
+            Operation::Home { axes, .. } => Box::new(HomeAxes::new(axes)),
             Operation::Move(request) => Box::new(MoveOneAxis::new(request)),
             Operation::Prove => Box::new(Prove::default()),
             Operation::Answer(settings) => Box::new(HandednessCheck::new(*settings)),
