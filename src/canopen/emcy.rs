@@ -73,7 +73,7 @@ const NAMES: &str = include_str!("emcy_codes.txt");
 /// An emergency message: 8 bytes, sent once when an error begins or ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Emcy {
-    /// What happened.
+    /// The error; [`EmcyCode::NO_ERROR`] when all errors are gone.
     pub code: EmcyCode,
     /// Object 0x1001 at that moment, see [`error_register`].
     pub register: u8,

@@ -7,7 +7,7 @@ use super::nmt::{NmtState, heartbeat_frame, parse_heartbeat};
 use super::{Frame, NodeId};
 use crate::units::Time;
 
-/// What a [`HeartbeatConsumer`] reports.
+/// An event that a [`HeartbeatConsumer`] reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum HeartbeatEvent {
     /// The node restarted. In the middle of a run this is a fault.

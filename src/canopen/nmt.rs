@@ -2,7 +2,7 @@
 
 use super::{Frame, NodeId, cob};
 
-/// What the NMT master asks of a node.
+/// A command of the NMT master to a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum NmtCommand {

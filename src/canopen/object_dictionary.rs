@@ -133,7 +133,7 @@ pub struct ObjectDictionary {
     entries: Vec<(ObjectAddress, Entry)>,
 }
 
-/// Of objects with the same address the last one counts.
+/// Collects objects. If several have the same address, the last one counts.
 impl FromIterator<(ObjectAddress, Entry)> for ObjectDictionary {
     fn from_iter<T: IntoIterator<Item = (ObjectAddress, Entry)>>(entries: T) -> Self {
         ObjectDictionary { entries: BTreeMap::from_iter(entries).into_iter().collect() }

@@ -1,5 +1,4 @@
-//! The SYNC object (CiA 301, 7.2.5): the beat at which set-points take effect and positions
-//! are sampled.
+//! The SYNC object (CiA 301, 7.2.5). At each SYNC the drives apply their set-points and sample their positions.
 
 use std::time::Duration;
 

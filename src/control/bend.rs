@@ -46,7 +46,7 @@ pub struct BendLaw {
     excess_mm: Vector3<f64>,
     /// The rest of a whole turn that is under way, rad; 0 while the roll is held.
     remaining_rad: f64,
-    /// By how much that may still become longer, rad.
+    /// By how much the rest of that turn may still grow, rad.
     spare_rad: f64,
     /// The direction of that turn, 1 or -1.
     side: f64,

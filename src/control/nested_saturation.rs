@@ -102,7 +102,7 @@ impl NestedSaturation {
         let (demand, slope) = if linear.min(brake) >= most {
             (most, 0.0)
         } else if linear <= brake || (brake == 0.0 && bend > 0.0) {
-            // The second: so near to the plane that `1 - bend * distance_mm` rounds to 1.
+            // The second condition holds so near to the plane that `1 - bend * distance_mm` rounds to 1.
             (linear, rate_per_mm)
         } else {
             (brake, bend / (1.0 - cos_brake * cos_brake).sqrt())

@@ -75,9 +75,9 @@ impl Increment {
 ///
 /// The paper calls κ the radius; κ is the inverse of the radius (122 mm there, so κ = 1/122 per
 /// mm). The paper's needle is a unicycle, `a = 0`. A real needle moves like a bicycle (Webster et
-/// al. 2006, where a is ℓ₂): one point of the shaft, the rear wheel of the bicycle, moves along the
-/// shaft's axis. The tip is ahead of that point by `a`, and slips sideways by the angle a κ; the
-/// direction of the slip turns with the roll.
+/// al. 2006, where a is ℓ₂): one point of the shaft, which corresponds to the rear wheel, moves along the shaft's
+/// axis. The tip is ahead of that point by `a`, and slips sideways by the angle a κ; the direction of the slip turns
+/// with the roll.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Needle {
     curvature_per_mm: f64,
@@ -100,7 +100,8 @@ impl Needle {
         Ok(Needle { curvature_per_mm, tip_ahead_mm: 0.0 })
     }
 
-    /// The same needle with its tip `tip_ahead_mm` ahead of the rear wheel (negative: behind it).
+    /// The same needle with its tip `tip_ahead_mm` ahead of the point that moves along the shaft's axis, mm
+    /// (negative: behind it).
     ///
     /// # Errors
     /// A distance that is not finite or over 1e6.
@@ -114,13 +115,13 @@ impl Needle {
         self.curvature_per_mm
     }
 
-    /// How far the tip is ahead of the rear wheel, a, mm.
+    /// How far the tip is ahead of the point that moves along the shaft's axis, a, mm.
     pub fn tip_ahead_mm(&self) -> f64 {
         self.tip_ahead_mm
     }
 
-    /// The body twist of `increment`: `(v; w) = (0, −a κ Δℓ, Δℓ; κ Δℓ, 0, Δθ)`. This is paper Eq. 1 at
-    /// the rear wheel, expressed at the tip: `v = e₃ Δℓ + w × a e₃`.
+    /// The body twist of `increment`: `(v; w) = (0, −a κ Δℓ, Δℓ; κ Δℓ, 0, Δθ)`. This is paper Eq. 1 for the point that
+    /// moves along the shaft's axis, expressed at the tip: `v = e₃ Δℓ + w × a e₃`.
     pub fn twist(&self, increment: Increment) -> Twist {
         let Increment { insertion_mm, rotation_rad } = increment;
         let bend_rad = self.curvature_per_mm * insertion_mm;

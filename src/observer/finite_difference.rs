@@ -35,7 +35,7 @@ pub struct FiniteDifference {
     baseline_mm: f64,
     depth_mm: f64,
     /// The pose of a tip that started at the identity and made every increment.
-    carried: Pose,
+    dead_reckoned: Pose,
     /// Oldest first.
     positions: VecDeque<Measured>,
     tip: Option<Pose>,
@@ -46,8 +46,8 @@ pub struct FiniteDifference {
 struct Measured {
     depth_mm: f64,
     position_mm: Vector3<f64>,
-    /// The rotation of [`FiniteDifference::carried`] at that depth.
-    carried: Rotation3<f64>,
+    /// The rotation of [`FiniteDifference::dead_reckoned`] at that depth.
+    dead_reckoned: Rotation3<f64>,
 }
 
 impl FiniteDifference {
@@ -57,7 +57,7 @@ impl FiniteDifference {
             needle,
             baseline_mm,
             depth_mm: 0.0,
-            carried: Pose::identity(),
+            dead_reckoned: Pose::identity(),
             positions: VecDeque::new(),
             tip: None,
         }
@@ -70,7 +70,7 @@ impl FiniteDifference {
     }
 
     /// The frame at the newest of three positions. The kinematics are left-invariant, so the increments since
-    /// the middle position turn its frame exactly as they turned the carried tip.
+    /// the middle position turn its frame exactly as they turned the dead-reckoned tip.
     fn frame(&self) -> Option<Rotation3<f64>> {
         let newest = self.positions.back()?;
         let middle = self.positions.get(self.index_before(newest.depth_mm, self.baseline_mm)?)?;
@@ -83,7 +83,7 @@ impl FiniteDifference {
         let e3 = first.try_normalize(1e-9)?;
         let e2 = (-(second - e3 * second.dot(&e3))).try_normalize(1e-12)?;
         let columns = Matrix3::from_columns(&[e2.cross(&e3), e2, e3]);
-        let since = middle.carried.inverse() * newest.carried;
+        let since = middle.dead_reckoned.inverse() * newest.dead_reckoned;
         Some(Rotation3::from_matrix_unchecked(columns) * since)
     }
 
@@ -103,7 +103,7 @@ impl FiniteDifference {
 impl Observer for FiniteDifference {
     fn predict(&mut self, increment: Increment) {
         self.depth_mm += increment.insertion_mm();
-        self.carried = self.needle.step(&self.carried, increment);
+        self.dead_reckoned = self.needle.step(&self.dead_reckoned, increment);
         self.tip = self.tip.map(|tip| self.needle.step(&tip, increment));
     }
 
@@ -112,14 +112,14 @@ impl Observer for FiniteDifference {
             return;
         }
         let position_mm = tip_meas.mm();
-        let carried = self.carried.rotation;
+        let dead_reckoned = self.dead_reckoned.rotation;
         // A slow needle has very dense positions. Each is used while it is the newest, but few are kept.
         let mut newest = self.positions.iter().rev().map(|measured| measured.depth_mm);
         let last = newest.next().zip(newest.next());
         if last.is_some_and(|(last, before)| last - before < self.spacing_mm()) {
             self.positions.pop_back();
         }
-        self.positions.push_back(Measured { depth_mm: self.depth_mm, position_mm, carried });
+        self.positions.push_back(Measured { depth_mm: self.depth_mm, position_mm, dead_reckoned });
         let rotation = self.frame().or(self.tip.map(|tip| tip.rotation));
         self.tip = rotation.map(|rotation| Pose { rotation, translation: position_mm });
         self.prune();

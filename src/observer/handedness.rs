@@ -20,10 +20,10 @@ use crate::needle::{Increment, Needle, TipPosition, Torsion};
 use derive_more::Display;
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI};
 
-/// An alternative that is `e^7` times as likely as the configured model ends the run …
+/// An alternative that is `e^7` times as likely as the configured model ends the run.
 const LOG_ODDS_MAX: f64 = 7.0;
-/// … but another roll at the start has to be `e^10` times as likely. Its odds grow so fast that this takes 2 to 4 mm
-/// more, and `e^7` stopped one correct run of 2,000.
+/// Another roll at the start ends the run only if it is `e^10` times as likely, because `e^7` stopped one correct run
+/// of 2,000. Its odds grow so fast that this takes only 2 to 4 mm more.
 const TURNED_LOG_ODDS_MAX: f64 = 10.0;
 /// At most this many positions per mm count as independent.
 const INDEPENDENT_PER_MM: f64 = 20.0;
@@ -61,7 +61,7 @@ impl Alternative {
         }
     }
 
-    /// What the operator should check.
+    /// Advice to the operator, as a question.
     fn question(self) -> &'static str {
         match self {
             Alternative::Mirrored => {

@@ -1,4 +1,4 @@
-//! What an observer with a covariance believes at the first measured position.
+//! The rolls and the covariance with which an observer starts at the first measured position.
 
 use crate::geometry::FixedAngles;
 use crate::math;

@@ -1,8 +1,8 @@
-//! The base turned in air, and how a sensor off its axis answers.
+//! The check of handedness: the base turns in air, and a sensor off its axis must turn in the same direction.
 //!
-//! A sensor at some distance from the needle's axis goes along a circle when the base turns. The sense
-//! in which it does, seen along the insertion, is the sense of the base: a mirrored tracker axis or a
-//! stage of the wrong sign shows at once, before anything is inserted.
+//! A sensor at some distance from the needle's axis moves along a circle when the base turns. Seen along the
+//! insertion, it moves in the direction in which the base turns. A mirrored tracker axis or a stage of the wrong sign
+//! shows at once, before anything is inserted.
 
 use super::moving::{Move, Moving};
 use super::{AnswerSettings, Goal};
@@ -15,12 +15,12 @@ use crate::tracker::{Event, GateCounts, Refusal, Sample};
 use crate::units::Time;
 use std::time::Duration;
 
-/// Rest before each mean, and the time over which it is taken.
+/// The base rests for `SETTLE` before each mean, which is taken over `SAMPLE`.
 const SETTLE: Duration = Duration::from_millis(300);
 const SAMPLE: Duration = Duration::from_secs(1);
 /// Fewer positions make no mean.
 const POSITIONS_MIN: usize = 5;
-/// One of so many positions counts as independent: real noise is correlated.
+/// One of this many positions counts as independent: real noise is correlated.
 const CORRELATED: f64 = 4.0;
 /// A chord shorter than this many standard deviations of the means has no direction.
 const CHORD_SDS: f64 = 8.0;
@@ -28,14 +28,14 @@ const CHORD_SDS: f64 = 8.0;
 const TURN_TOLERANCE_DEG: f64 = 15.0;
 const TILT_MAX_DEG: f64 = 20.0;
 
-/// What the base does now.
+/// The part of the check that is under way.
 #[derive(Debug, Clone)]
 enum Leg {
     Resting {
         since: Option<Time>,
     },
     Turning(Box<Moving>),
-    /// The last turn, back to where it began.
+    /// The base makes the last turn, back to where it began.
     Returning(Box<Moving>),
 }
 
@@ -55,23 +55,23 @@ impl AnswerSettings {
 
 /// A check under way: rest, turn, rest, turn, rest, and back.
 #[derive(Debug)]
-pub(super) struct Answering {
+pub(super) struct HandednessCheck {
     settings: AnswerSettings,
     counts: GateCounts,
     leg: Leg,
-    /// Of the rests that are over.
+    /// The means of the rests that have ended.
     means: Vec<MovingMean>,
-    /// Of this rest, or the last.
+    /// The mean of the present rest, or of the last one.
     mean: MovingMean,
     /// Why the last position was refused.
     refused: Option<Refusal>,
-    /// What the run is stopped for once the base is back.
+    /// The reason to stop the run once the base is back.
     failed: Option<String>,
 }
 
-impl Answering {
+impl HandednessCheck {
     pub(super) fn new(settings: AnswerSettings) -> Self {
-        Answering {
+        HandednessCheck {
             settings,
             counts: GateCounts::default(),
             leg: Leg::Resting { since: None },
@@ -97,8 +97,8 @@ impl Answering {
         shell.record(Record::Sample(SampleRecord { refused, ..SampleRecord::received(sample) }));
     }
 
-    /// One SYNC.
-    fn go_on(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
+    /// Handles the answers of both drives to a SYNC.
+    fn handle_feedback(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
         if let Leg::Turning(moving) | Leg::Returning(moving) = &mut self.leg
             && !moving.has_arrived(feedback)?
         {
@@ -139,7 +139,7 @@ impl Answering {
             return Ok(());
         }
         let verdict = if is_seen { self.verdict() } else { Err(self.too_few()) };
-        // Whatever it is, no cable is left wound up.
+        // The base turns back whatever the verdict is, so that no cable stays wound up.
         let turned = self.means.len() as f64 - 1.0;
         let goal = Goal::By(-turned * self.settings.turn_rad());
         let back = Moving::new(Move { goal, ..turn }, feedback.commanded)?;
@@ -147,7 +147,7 @@ impl Answering {
         match verdict {
             Ok(text) => shell.report(Lane::Session, Severity::Info, text),
             Err(reason) => {
-                // At once: the turn back may be stopped, and then the run ends for another reason.
+                // Report it now: the turn back may be stopped, and then the run ends for another reason.
                 shell.report(Lane::Session, Severity::Warning, reason.clone());
                 self.failed = Some(reason);
             }
@@ -167,8 +167,11 @@ impl Answering {
         )
     }
 
-    /// What the three means say: the way from the second to the third is that from the first to the
-    /// second, turned by what the base was turned.
+    /// Judges the three means: the vector from the second to the third must be the vector from the first to the
+    /// second, turned by as much as the base. Returns the text of the proof.
+    ///
+    /// # Errors
+    /// The reason to stop the run.
     fn verdict(&self) -> Result<String, String> {
         let rests = self.means.iter().filter_map(MovingMean::mean_and_variance);
         let (means_mm, variances_mm2): (Vec<_>, Vec<_>) = rests.unzip();
@@ -218,10 +221,10 @@ impl Answering {
     }
 }
 
-impl Task for Answering {
+impl Task for HandednessCheck {
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
         match event {
-            // Before the axes have power.
+            // Refuses the turn before the axes have power.
             StageEvent::Located(at) => shell.check_goal(self.settings.farthest(*at)),
             StageEvent::Ready => {
                 shell.enter(State::TurningInAir);
@@ -229,7 +232,7 @@ impl Task for Answering {
             }
             StageEvent::Feedback(feedback) => {
                 shell.record(Record::Stage(*feedback));
-                if shell.is_running() { self.go_on(shell, feedback) } else { Ok(()) }
+                if shell.is_running() { self.handle_feedback(shell, feedback) } else { Ok(()) }
             }
             _ => Ok(()),
         }

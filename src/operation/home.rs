@@ -6,15 +6,15 @@ use std::collections::VecDeque;
 
 /// Homes the chosen axes, the other held.
 #[derive(Debug)]
-pub(super) struct Homing {
+pub(super) struct HomeAxes {
     /// The axes that are not homed yet, beginning with the one that is being homed.
     remaining: VecDeque<Axis>,
     moves: Vec<AxisMove>,
 }
 
-impl Homing {
+impl HomeAxes {
     pub(super) fn new(axes: PerAxis<bool>) -> Self {
-        Homing {
+        HomeAxes {
             remaining: Axis::BOTH.into_iter().filter(|axis| axes[*axis]).collect(),
             moves: Vec::new(),
         }
@@ -46,7 +46,7 @@ impl Homing {
     }
 }
 
-impl Task for Homing {
+impl Task for HomeAxes {
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
         match *event {
             StageEvent::Ready => {

@@ -13,8 +13,8 @@ mod tests;
 
 pub use moving::{Goal, Move};
 
-use self::answer::Answering;
-use self::home::Homing;
+use self::answer::HandednessCheck;
+use self::home::HomeAxes;
 use self::moving::MoveOneAxis;
 use self::prove::Prove;
 use crate::session::{Session, SessionConfig, Task};
@@ -28,9 +28,9 @@ use nalgebra::Vector3;
 pub enum Operation {
     /// Home axes, one after the other.
     Home {
-        /// These.
+        /// The axes to home.
         axes: PerAxis<bool>,
-        /// Even if an axis is homed already and stands away from home.
+        /// Home an axis even if it is homed already and stands away from home.
         again: bool,
     },
     /// Move one axis; the other is held.
@@ -94,10 +94,10 @@ impl RunConfig {
             Operation::Prove | Operation::Answer(_) => AxisUse::Steer,
         });
         let task: Box<dyn Task> = match operation {
-            Operation::Home { axes, .. } => Box::new(Homing::new(axes)),
+            Operation::Home { axes, .. } => Box::new(HomeAxes::new(axes)),
             Operation::Move(request) => Box::new(MoveOneAxis::new(request)),
             Operation::Prove => Box::new(Prove::default()),
-            Operation::Answer(settings) => Box::new(Answering::new(*settings)),
+            Operation::Answer(settings) => Box::new(HandednessCheck::new(*settings)),
         };
         Session::begin(Stage::for_use(*config, purpose, now), task, now)
     }

@@ -108,7 +108,7 @@ impl Moving {
         if self.profile.position_mm() < self.profile.goal_mm() {
             return Ok(false);
         }
-        // What was sent: the goal, rounded to whole counts.
+        // The target that was sent: the goal, rounded to whole counts.
         let goal = feedback.commanded.along(axis);
         let off = (goal + offset - here).abs();
         let since = *self.ended.get_or_insert(feedback.time);

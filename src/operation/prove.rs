@@ -10,24 +10,24 @@ use std::time::Duration;
 /// A drive may notice a missing heartbeat this much later than its configured timeout.
 const MARGIN: Duration = Duration::from_millis(200);
 
-/// A silence under way. The drives are read by SDO: a drive that notices the silence usually leaves
-/// Operational, and then sends no PDO.
+/// The time without a heartbeat of the bench. The drives are read by SDO: a drive that notices the missing heartbeat
+/// usually leaves Operational, and then sends no PDO.
 #[derive(Debug)]
-struct Silence {
+struct HeartbeatTest {
     /// When the last heartbeat was sent.
     since: Time,
-    /// Within this time a drive must notice.
+    /// The time within which a drive must notice.
     within: Duration,
     noticed_after: PerAxis<Option<Duration>>,
     watch: QuickStop,
 }
 
-impl Silence {
-    /// A silence that begins at `now`, after the last heartbeat at `since`.
+impl HeartbeatTest {
+    /// Begins at `now`, after the last heartbeat at `since`.
     fn new(config: &StageConfig, now: Time, since: Time) -> Self {
         let within = config.bus.heartbeat_timeout() + MARGIN;
         let watch = QuickStop::watch(config, now, since + within + config.power.stop_timeout);
-        Silence { since, within, noticed_after: PerAxis::default(), watch }
+        HeartbeatTest { since, within, noticed_after: PerAxis::default(), watch }
     }
 
     /// When the verdict or the watch is due.
@@ -55,16 +55,16 @@ impl Silence {
     fn verdict(&self, now: Time) -> Option<Result<String, String>> {
         let in_time =
             |axis: &Axis| self.noticed_after[*axis].is_some_and(|after| after <= self.within);
-        let deaf: Vec<String> =
+        let not_noticed: Vec<String> =
             Axis::BOTH.iter().filter(|axis| !in_time(axis)).map(Axis::to_string).collect();
-        if !deaf.is_empty() {
+        if !not_noticed.is_empty() {
             let ended = now >= self.since + self.within;
             return ended.then(|| {
                 Err(format!(
                     "{}: no emergency 0x8130 within {} ms of the bench's last heartbeat: if the \
                      bench dies, it may go on; does the drive watch a heartbeat (0x1016), \
                      and send emergencies?",
-                    deaf.join(", "),
+                    not_noticed.join(", "),
                     self.within.as_millis()
                 ))
             });
@@ -86,7 +86,7 @@ impl Silence {
 /// The task that stops the bench's heartbeat while both axes are held. SYNC and set-points go on.
 #[derive(Debug, Default)]
 pub(super) struct Prove {
-    silence: Option<Silence>,
+    test: Option<HeartbeatTest>,
 }
 
 impl Task for Prove {
@@ -95,12 +95,12 @@ impl Task for Prove {
             StageEvent::Ready => {
                 shell.enter(State::Silent);
                 let since = shell.fall_silent();
-                self.silence = Some(Silence::new(shell.config(), shell.now, since));
+                self.test = Some(HeartbeatTest::new(shell.config(), shell.now, since));
             }
             StageEvent::Emergency(axis, emcy) if emcy.code == EmcyCode::HEARTBEAT => {
-                if let Some(silence) = &mut self.silence {
-                    let after = shell.now.since(silence.since);
-                    let after_ms = silence.noticed_after[*axis].get_or_insert(after).as_millis();
+                if let Some(test) = &mut self.test {
+                    let after = shell.now.since(test.since);
+                    let after_ms = test.noticed_after[*axis].get_or_insert(after).as_millis();
                     let text = format!("{axis}: noticed the bench's silence after {after_ms} ms");
                     shell.report(Lane::Session, Severity::Info, text);
                 }
@@ -112,20 +112,20 @@ impl Task for Prove {
     }
 
     fn take_frame(&mut self, shell: &Shell, frame: &Frame) {
-        if let Some(silence) = &mut self.silence {
-            silence.watch.handle_frame(shell.now, frame);
+        if let Some(test) = &mut self.test {
+            test.watch.handle_frame(shell.now, frame);
         }
     }
 
     fn handle_timeout(&mut self, shell: &mut Shell) -> Result<(), String> {
-        let Some(silence) = self.silence.as_mut().filter(|_| shell.is_running()) else {
+        let Some(test) = self.test.as_mut().filter(|_| shell.is_running()) else {
             return Ok(());
         };
-        if shell.now >= silence.watch.deadline() {
-            silence.watch.handle_timeout(shell.now);
+        if shell.now >= test.watch.deadline() {
+            test.watch.handle_timeout(shell.now);
         }
-        let verdict = silence.verdict(shell.now);
-        while let Some(frame) = silence.watch.poll_transmit() {
+        let verdict = test.verdict(shell.now);
+        while let Some(frame) = test.watch.poll_transmit() {
             shell.send(frame);
         }
         match verdict {
@@ -140,6 +140,6 @@ impl Task for Prove {
     }
 
     fn deadline(&self, _: &Shell) -> Time {
-        self.silence.as_ref().map_or(Time::NEVER, Silence::deadline)
+        self.test.as_ref().map_or(Time::NEVER, HeartbeatTest::deadline)
     }
 }

@@ -8,8 +8,8 @@ use crate::session::{
 use crate::transport::can::CanError;
 use crate::units::Time;
 
-/// Takes the records of a run, and passes on what the operator wants.
-pub(super) trait Witness {
+/// Receives the records and the progress of a run, and supplies the operator's commands and the reason for a stop.
+pub(super) trait RunMonitor {
     /// Takes one record; in an emulated run with the true pose at that time.
     fn take(&mut self, record: Record, truth: Option<Truth>);
 
@@ -21,25 +21,24 @@ pub(super) trait Witness {
         None
     }
 
-    /// Why the operator or the record stops the run, if one of them does; `None` if the run `is_stopping`
-    /// already.
+    /// The reason to stop the run, if the operator or the record gives one; `None` if the run `is_stopping` already.
     fn stop_reason(&mut self, _now: Time, _is_stopping: bool) -> Option<String> {
         None
     }
 }
 
 /// The records go to a function; there is no operator.
-impl<F: FnMut(Record, Option<Truth>)> Witness for F {
+impl<F: FnMut(Record, Option<Truth>)> RunMonitor for F {
     fn take(&mut self, record: Record, truth: Option<Truth>) {
         self(record, truth);
     }
 }
 
 /// The machine of a run with its bus, tracker and clock.
-pub(super) trait World {
+pub(super) trait RunIo {
     fn machine(&mut self) -> &mut dyn Machine;
 
-    fn witness(&mut self) -> &mut dyn Witness;
+    fn monitor(&mut self) -> &mut dyn RunMonitor;
 
     fn now(&self) -> Time;
 
@@ -59,35 +58,35 @@ pub(super) trait World {
     fn take_arrived(&mut self) -> bool;
 
     /// Waits for the next deadline or input, and gives it to the machine.
-    fn go_on(&mut self);
+    fn wait_for_input(&mut self);
 }
 
 /// Runs the machine to its end.
-pub(super) fn drive(world: &mut impl World) -> Outcome {
+pub(super) fn drive(io: &mut impl RunIo) -> Outcome {
     let mut is_stopping = false;
     loop {
-        carry_out(world);
-        if let Some(outcome) = world.machine().outcome() {
+        flush_outputs(io);
+        if let Some(outcome) = io.machine().outcome() {
             return outcome.clone();
         }
-        if world.take_arrived() {
+        if io.take_arrived() {
             continue;
         }
         // Outputs are sent before the machine does what is due.
-        carry_out(world);
-        let now = world.now();
-        match world.witness().stop_reason(now, is_stopping) {
+        flush_outputs(io);
+        let now = io.now();
+        match io.monitor().stop_reason(now, is_stopping) {
             Some(reason) => {
                 is_stopping = true;
-                world.give(Input::Stop(reason));
+                io.give(Input::Stop(reason));
             }
             None => {
                 // One command at a time, so that many commands delay nothing that is due.
-                if let Some(command) = world.witness().command() {
-                    world.give(Input::Operator(command));
-                    carry_out(world);
+                if let Some(command) = io.monitor().command() {
+                    io.give(Input::Operator(command));
+                    flush_outputs(io);
                 }
-                world.go_on();
+                io.wait_for_input();
             }
         }
     }
@@ -96,9 +95,9 @@ pub(super) fn drive(world: &mut impl World) -> Outcome {
 /// Sends the machine's frames, and only then records its records: a SYNC waits for no record. A frame is
 /// recorded only if it was sent. If the bus refuses a frame, the machine is given the fault, once. The frames
 /// queued behind the refused one are stale and never sent, so the frames that stop the axes are tried next.
-pub(super) fn carry_out(world: &mut impl World) {
+pub(super) fn flush_outputs(io: &mut impl RunIo) {
     let (mut records, mut has_failed) = (Vec::new(), false);
-    while let Some(output) = world.machine().poll() {
+    while let Some(output) = io.machine().poll() {
         let (time, frame) = match output {
             Output::Transmit { time, frame } => (time, frame),
             Output::Record(record) => {
@@ -106,21 +105,21 @@ pub(super) fn carry_out(world: &mut impl World) {
                 continue;
             }
         };
-        match world.send(time, &frame) {
+        match io.send(time, &frame) {
             Ok(true) => records.push(Record::Can { time, direction: Direction::Sent, frame }),
             Ok(false) => {}
-            // The frames that follow the fault are tried all the same.
+            // The frames with which the machine answers the fault are still tried.
             Err(_) if has_failed => {}
             Err(error) => {
                 has_failed = true;
-                while let Some(stale) = world.machine().poll() {
+                while let Some(stale) = io.machine().poll() {
                     if let Output::Record(record) = stale {
                         records.push(record);
                     }
                 }
-                world.give(Input::BusFault(error.to_string()));
+                io.give(Input::BusFault(error.to_string()));
             }
         }
     }
-    records.into_iter().for_each(|record| world.record(record));
+    records.into_iter().for_each(|record| io.record(record));
 }

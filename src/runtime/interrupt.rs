@@ -7,8 +7,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use tokio::signal::unix::{SignalKind, signal};
 
-/// A signal has come. This is never cleared, so that a command begins nothing more: no run after its preflight,
-/// for example.
+/// A signal has come. It is never cleared, so that the command begins nothing else, such as the run after its
+/// preflight.
 static SIGNALLED: AtomicBool = AtomicBool::new(false);
 
 /// A flag that is raised once the operator or the system has asked the program to end.

@@ -1,6 +1,6 @@
 //! A session on a CAN bus and a tracker, in real time.
 
-use super::drive::{Witness, World, carry_out, drive};
+use super::drive::{RunIo, RunMonitor, drive, flush_outputs};
 use super::realtime::{RealTime, wake_in_time};
 use super::sink::{RunReport, Sink};
 use super::timing::{Clock, TimingFigures, TimingReport};
@@ -28,12 +28,12 @@ const READ_PERIOD: Duration = Duration::from_millis(100);
 const FLOOD_PER_S: f64 = 5000.0;
 
 /// A session in real time, its bus and its tracker. Every input of the session passes through here.
-struct Live<'a, W> {
+struct Live<'a, M> {
     session: &'a mut dyn Machine,
     bus: &'a mut dyn CanBus,
     tracker: Option<&'a mut Link>,
     clock: Clock,
-    witness: W,
+    monitor: M,
     timing: TimingFigures,
     /// How long before a deadline the thread stops sleeping.
     spin: Duration,
@@ -44,19 +44,19 @@ struct Live<'a, W> {
     stale_before: Option<Time>,
     /// The time of the last input.
     last: Time,
-    /// When the SYNC was due, if a deadline was met since everything was sent.
-    met: Option<Time>,
+    /// When the SYNC was due; `Some` from the handling of a deadline until the frames that follow from it are sent.
+    pending_sync_due: Option<Time>,
 }
 
-impl<'a, W: Witness> Live<'a, W> {
+impl<'a, M: RunMonitor> Live<'a, M> {
     fn new(
         session: &'a mut dyn Machine,
         bus: &'a mut dyn CanBus,
         tracker: Option<&'a mut Link>,
         clock: Clock,
-        witness: W,
+        monitor: M,
     ) -> Self {
-        // Frames that wait on the bus are older than the session; it is given them at its start.
+        // Frames that wait on the bus are older than the session, which gets them with the time of its start.
         let last = clock.now();
         let counted = tracker.as_ref().map_or(0, |link| link.messages());
         Live {
@@ -64,14 +64,14 @@ impl<'a, W: Witness> Live<'a, W> {
             bus,
             tracker,
             clock,
-            witness,
+            monitor,
             timing: TimingFigures::default(),
             spin: Duration::ZERO,
             counts_read: last,
             counted,
             stale_before: None,
             last,
-            met: None,
+            pending_sync_due: None,
         }
     }
 
@@ -97,7 +97,7 @@ impl<'a, W: Witness> Live<'a, W> {
         let deadline = self.session.deadline();
         if now >= deadline {
             self.timing.deadline_lateness.add_us(now.since(deadline));
-            self.met.get_or_insert(self.session.sync_due());
+            self.pending_sync_due.get_or_insert(self.session.sync_due());
         }
         self.session.handle(now, input);
         self.last = now;
@@ -130,7 +130,7 @@ impl<'a, W: Witness> Live<'a, W> {
     /// Notes the delay of a frame that was made at `made` and has just been sent: of a SYNC after its deadline,
     /// of a set-point after the feedback.
     fn note_sent(&mut self, made: Time, frame: &Frame) {
-        match (frame.cob_id(), self.met) {
+        match (frame.cob_id(), self.pending_sync_due) {
             (Some(cob::SYNC), Some(due)) => self.timing.note_sync(self.clock.now().since(due)),
             (Some(0x201..=0x27F), None) => {
                 self.timing.set_point_delay.add_us(self.clock.now().since(made));
@@ -183,13 +183,13 @@ impl<'a, W: Witness> Live<'a, W> {
     }
 }
 
-impl<W: Witness> World for Live<'_, W> {
+impl<M: RunMonitor> RunIo for Live<'_, M> {
     fn machine(&mut self) -> &mut dyn Machine {
         self.session
     }
 
-    fn witness(&mut self) -> &mut dyn Witness {
-        &mut self.witness
+    fn monitor(&mut self) -> &mut dyn RunMonitor {
+        &mut self.monitor
     }
 
     fn now(&self) -> Time {
@@ -212,12 +212,12 @@ impl<W: Witness> World for Live<'_, W> {
     }
 
     fn record(&mut self, record: Record) {
-        self.witness.take(record, None);
+        self.monitor.take(record, None);
     }
 
     /// Takes the frames that wait on the bus: they came before what is due and before the tracker's events.
     fn take_arrived(&mut self) -> bool {
-        self.met = None;
+        self.pending_sync_due = None;
         let mut taken = 0;
         while taken < ARRIVED_MAX && self.take_frame(Duration::ZERO) {
             taken += 1;
@@ -225,17 +225,17 @@ impl<W: Witness> World for Live<'_, W> {
         taken > 0 && self.clock.now() < self.session.deadline()
     }
 
-    fn go_on(&mut self) {
+    fn wait_for_input(&mut self) {
         if self.clock.now() >= self.session.deadline() {
             self.give(Input::Tick);
-            self.witness.progress(self.session.progress());
-            carry_out(self);
-            self.met = None;
+            self.monitor.progress(self.session.progress());
+            flush_outputs(self);
+            self.pending_sync_due = None;
         }
         self.take_events();
-        carry_out(self);
-        self.met = None;
-        // Also if more events are queued: the kernel throttles a real-time thread that never sleeps.
+        flush_outputs(self);
+        self.pending_sync_due = None;
+        // Sleep even if more events are queued: the kernel throttles a real-time thread that never sleeps.
         let deadline = self.session.deadline();
         let wait = deadline.since(self.clock.now()).saturating_sub(self.spin).min(WAIT_MAX);
         match wait.is_zero() {
@@ -245,7 +245,7 @@ impl<W: Witness> World for Live<'_, W> {
     }
 }
 
-/// Names so many messages from the tracker in this time as the cause of a gap, if they are a flood.
+/// The cause of a gap in which the tracker sent this many messages in this time, if they are a flood.
 fn flood(messages: u64, time: Duration) -> Option<String> {
     let per_s = messages as f64 / time.max(READ_PERIOD).as_secs_f64();
     (per_s > FLOOD_PER_S)
@@ -272,7 +272,7 @@ pub fn run_live(
     let outcome = drive(&mut run);
     let figures = run.timing.report(run.session.stage_counters());
     let timing = TimingReport { frames_dropped: run.bus.dropped(), realtime, ..figures };
-    run.witness.finish(run.session, outcome, clock.now(), Some(timing))
+    run.monitor.finish(run.session, outcome, clock.now(), Some(timing))
 }
 
 #[cfg(test)]

@@ -94,7 +94,7 @@ fn lock_memory() -> Result<(), String> {
     mlockall(MlockAllFlags::MCL_CURRENT | MlockAllFlags::MCL_FUTURE).map_err(refused)
 }
 
-/// The refusal to lock memory, with the next step.
+/// The message that memory cannot be locked, with the next step.
 fn memory_refused(reason: Errno, limit_kb: u64) -> String {
     format!(
         "--realtime: memory cannot be locked: {reason}; {RIGHTS} memlock unlimited in \

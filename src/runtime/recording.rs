@@ -21,10 +21,10 @@ use std::time::Duration;
 
 /// Interval between two progress messages to the operator.
 const PROGRESS_PERIOD: Duration = Duration::from_secs(2);
-/// After this many intervals without progress the disk is taken for stalled, and the recording is given up.
+/// After this many intervals without progress the disk counts as stalled, and the recording is given up.
 const STALLED_PERIODS_MAX: u32 = 8;
 
-/// What the recording of a run needs beside the record.
+/// The data that the recording of a run needs besides the record.
 pub struct RecordedRun {
     /// The configuration of the run.
     pub run_config: RunConfig,
@@ -136,7 +136,7 @@ fn make_from_text_files(
                 log.text_until(time);
                 log.take(time, Entry { record, truth });
             }
-            // After a failed write the rest of the replay would take its time for nothing.
+            // After a failed write, the rest of the replay would be useless.
             log.failed.as_ref().map_or(Ok(()), |error| Err(error.to_string()))
         });
         difference = match replayed {
@@ -188,8 +188,8 @@ impl Log<'_> {
 
 type TimedRecord = (Time, Record);
 
-/// The records of a text file, in the order of the file. Where a line cannot be read there is instead the fault of a
-/// recording without it and those after it.
+/// The records of a text file, in the order of the file. A line that cannot be read gives an error: the fault of a
+/// recording that lacks this line and those after it.
 type TimedRecords = Peekable<Box<dyn Iterator<Item = Result<TimedRecord, String>>>>;
 
 /// The records in `lines` of `file`; `parse` gives none for a line without one.

@@ -1,6 +1,6 @@
 //! Passes a session's records on to the recorder, to the figures and to the operator's screen.
 
-use super::drive::Witness;
+use super::drive::RunMonitor;
 use super::interrupt::Interrupt;
 use super::timing::{DurationHistogram, TimingReport};
 use super::virtual_time::EmulationReport;
@@ -29,7 +29,7 @@ pub trait Operator {
     fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: &str);
     /// Takes each record as it is made.
     fn record(&mut self, _record: &Record) {}
-    /// Shows a trouble with the record; an event reports it too.
+    /// Shows a problem with the record; an event reports it too.
     fn record_trouble(&mut self, _text: &str) {}
     /// Takes the folder in which the run is recorded.
     fn recorded_to(&mut self, _folder: &Path) {}
@@ -42,11 +42,11 @@ pub trait Operator {
 /// How often an insertion was held, by cause.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
 pub struct Holds {
-    /// By the tracker: the tip was not seen, or the stream contradicted the model.
+    /// Holds by the tracker: the tip was not seen, or the stream contradicted the model.
     pub tracker: u32,
-    /// By the operator.
+    /// Holds by the operator.
     pub operator: u32,
-    /// After a single step.
+    /// Holds after a single step.
     pub step: u32,
 }
 
@@ -56,7 +56,7 @@ pub struct Sink<'a> {
     recorder: Result<Recorder, TelemetryError>,
     figures: RunFigures,
     holds: Holds,
-    /// What a warning says of the run, if it goes on when recording fails; `None` to stop it.
+    /// If the run goes on when recording fails, what the warning says about it; `None` if the run stops.
     goes_on: Option<&'static str>,
     /// How long it took to hand each record to the recorder, ns.
     record_times: DurationHistogram,
@@ -75,7 +75,7 @@ pub struct RunReport {
     pub stage_at_end: StageAtEnd,
     /// How often it was held.
     pub holds: Holds,
-    /// What the tracker's gates did with its samples.
+    /// The numbers of samples that the tracker's gates accepted and refused.
     pub gates: GateCounts,
     /// The session's time at the end.
     pub end: Time,
@@ -85,14 +85,14 @@ pub struct RunReport {
     pub run_dir: Option<PathBuf>,
     /// The manifest of the closed record. An error if the run was not recorded, or the record not closed.
     pub record: Result<Manifest, TelemetryError>,
-    /// What is known only in an emulated run; `None` in any other.
+    /// The facts that are known only in an emulated run; `None` in any other.
     pub emulated: Option<EmulationReport>,
 }
 
 impl<'a> Sink<'a> {
-    /// Passes records to `recorder` and news to `operator`; stops the run once `interrupt` is raised. If
-    /// recording fails, the run is stopped, unless `goes_on` says what goes on; lost records are then
-    /// reported and counted.
+    /// Passes records to `recorder` and events to `operator`, and stops the run once `interrupt` is raised. If
+    /// recording fails, the run is stopped, unless `goes_on` has the text of a warning about what goes on. Lost records
+    /// are then reported and counted.
     pub fn new(
         recorder: Result<Recorder, TelemetryError>,
         goes_on: Option<&'static str>,
@@ -127,7 +127,7 @@ impl<'a> Sink<'a> {
 
     /// Reports the recorder's news, and records them as far as possible. Returns the reason to stop the run if
     /// recording has failed, unless the run continues without a record or `is_ending` anyway.
-    fn look_after_record(&mut self, now: Time, is_ending: bool) -> Option<String> {
+    fn check_record(&mut self, now: Time, is_ending: bool) -> Option<String> {
         let mut reason = None;
         while let Some(news) = self.recorder.as_mut().ok().and_then(Recorder::news) {
             let trouble = match (news, self.goes_on) {
@@ -182,7 +182,7 @@ impl<'a> Sink<'a> {
     }
 }
 
-impl Witness for Sink<'_> {
+impl RunMonitor for Sink<'_> {
     fn take(&mut self, record: Record, truth: Option<Truth>) {
         self.operator.record(&record);
         match &record {
@@ -215,7 +215,7 @@ impl Witness for Sink<'_> {
 
     fn stop_reason(&mut self, now: Time, is_stopping: bool) -> Option<String> {
         let is_interrupted = self.interrupt.is_raised();
-        let record_reason = self.look_after_record(now, is_stopping || is_interrupted);
+        let record_reason = self.check_record(now, is_stopping || is_interrupted);
         if is_stopping {
             None
         } else if is_interrupted {

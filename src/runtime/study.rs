@@ -29,8 +29,8 @@ pub struct Study<'a> {
     pub goal: &'a (dyn Fn(u64) -> Result<DrawnGoal, String> + Sync),
 }
 
-/// A target with the path to it, `None` for an insertion in the plane, or the reason why the target cannot be
-/// reached.
+/// A target with the path to it; `None` for an insertion in the plane; an error with the reason if the target cannot
+/// be reached.
 pub(super) type DrawnGoal = Result<Option<Goal>, String>;
 
 /// Called after each trial, by several threads.
@@ -116,7 +116,7 @@ impl Study<'_> {
         (self.stage)(seed).map_err(|reason| refused_trial(seed, &reason))
     }
 
-    /// The times of the steps of all trials. They are those of a whole session with a needle that needs no
+    /// The times of the steps of all trials. They come from a whole session with a needle that needs no
     /// steering, on the stage of the trial with this seed.
     ///
     /// # Errors

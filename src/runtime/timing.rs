@@ -9,8 +9,8 @@ use serde::Serialize;
 use std::fmt;
 use std::time::{Duration, SystemTime};
 
-/// A monotonic clock whose origin is known in UTC. It also counts the time for which the machine is suspended: an
-/// [`Instant`](std::time::Instant) does not, and a run would go on as if nothing had been.
+/// A monotonic clock whose origin is known in UTC. It also counts the time for which the machine is suspended. An
+/// [`Instant`](std::time::Instant) does not, so a run would not notice that it was suspended.
 #[derive(Debug, Clone, Copy)]
 pub struct Clock {
     origin_since_boot: Duration,

@@ -1,7 +1,7 @@
 //! Runs a session against the virtual stage in one thread, in virtual time: without sockets, and without sleeps
 //! unless an operator practises at the pace of real time.
 
-use super::drive::{Witness, World, drive};
+use super::drive::{RunIo, RunMonitor, drive};
 use super::sink::{RunReport, Sink};
 use crate::canopen::Frame;
 use crate::canopen::cia402::DriveState;
@@ -16,7 +16,7 @@ use crate::units::Time;
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// Where a run in virtual time gets its tip positions from.
+/// The source of the tip positions of a run in virtual time.
 #[derive(Debug)]
 pub enum TipSource {
     /// The virtual stage's own tracker.
@@ -43,7 +43,7 @@ pub fn run_virtual(
     let mut run = VirtualRun { pace, ..VirtualRun::new(session, stage, tips, sink) };
     let outcome = drive(&mut run);
     run.emulated.update(&run.stage, run.now);
-    let report = run.witness.finish(run.session, outcome, run.now, None);
+    let report = run.monitor.finish(run.session, outcome, run.now, None);
     RunReport { emulated: Some(run.emulated), ..report }
 }
 
@@ -66,8 +66,8 @@ const UNCONFIRMED_SYNCS_MAX: usize = 2;
 /// The interface's name in messages.
 const INTERFACE: &str = "memory";
 
-/// A run in virtual time: the session, the virtual stage, and the witness that takes their records.
-struct VirtualRun<'a, W> {
+/// A run in virtual time: the session, the virtual stage, and the monitor that takes their records.
+struct VirtualRun<'a, M> {
     now: Time,
     session: &'a mut dyn Machine,
     stage: VirtualStage,
@@ -75,20 +75,20 @@ struct VirtualRun<'a, W> {
     pace: Option<Pace>,
     emulated: EmulationReport,
     unconfirmed: Unconfirmed,
-    witness: W,
+    monitor: M,
 }
 
-impl<'a, W: Witness> VirtualRun<'a, W> {
+impl<'a, M: RunMonitor> VirtualRun<'a, M> {
     fn new(
         session: &'a mut dyn Machine,
         stage: VirtualStage,
         tips: Option<TipSource>,
-        witness: W,
+        monitor: M,
     ) -> Self {
         let now = Time::ZERO;
         let emulated = EmulationReport::new(&stage, now);
         let unconfirmed = Unconfirmed::new(UNCONFIRMED_SYNCS_MAX);
-        VirtualRun { now, session, stage, tips, pace: None, emulated, unconfirmed, witness }
+        VirtualRun { now, session, stage, tips, pace: None, emulated, unconfirmed, monitor }
     }
 
     /// The error of an interface that does not accept `frame`; `None` if it does. In bus-off the interface
@@ -143,13 +143,13 @@ impl<'a, W: Witness> VirtualRun<'a, W> {
     }
 }
 
-impl<W: Witness> World for VirtualRun<'_, W> {
+impl<M: RunMonitor> RunIo for VirtualRun<'_, M> {
     fn machine(&mut self) -> &mut dyn Machine {
         self.session
     }
 
-    fn witness(&mut self) -> &mut dyn Witness {
-        &mut self.witness
+    fn monitor(&mut self) -> &mut dyn RunMonitor {
+        &mut self.monitor
     }
 
     fn now(&self) -> Time {
@@ -177,9 +177,9 @@ impl<W: Witness> World for VirtualRun<'_, W> {
         if let Record::State { state: State::Stopping, .. } = &record {
             self.emulated.stopping = Some(Moment::of(&self.stage, self.now));
         }
-        // A recording is of another needle than the emulated one.
+        // A recording comes from another needle than the emulated one, so its true pose is not known.
         let truth = self.replay().is_none().then(|| self.stage.truth(self.now));
-        self.witness.take(record, truth);
+        self.monitor.take(record, truth);
     }
 
     fn take_arrived(&mut self) -> bool {
@@ -198,8 +198,8 @@ impl<W: Witness> World for VirtualRun<'_, W> {
     }
 
     /// Goes to the earliest deadline of session, stage and tip source.
-    fn go_on(&mut self) {
-        self.witness.progress(self.session.progress());
+    fn wait_for_input(&mut self) {
+        self.monitor.progress(self.session.progress());
         self.emulated.update(&self.stage, self.now);
         let tip_due = self.replay().map_or(Time::NEVER, |replay| replay.deadline());
         let due = self.session.deadline().min(self.stage.deadline()).min(tip_due);
@@ -245,7 +245,7 @@ pub struct DriveOutcome {
     pub left_operation_enabled: Option<Moment>,
 }
 
-/// What is known only in an emulated run.
+/// The facts that are known only in an emulated run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EmulationReport {
     /// The scripted faults that began, in order.

@@ -12,16 +12,16 @@ use crate::tracker::{AcquisitionClock, Gate, TrackSettings};
 use nalgebra::Vector3;
 use std::time::Duration;
 
-/// Everything a run needs to know, in internal units.
+/// The configuration of an insertion, in mm, rad, s and per mm.
 #[derive(Debug, Clone)]
 pub struct SessionConfig {
     /// Pose `X_WP` of the plane in the bench frame.
     pub x_wp: Pose,
     /// How the needle is inserted.
     pub insertion: InsertionConfig,
-    /// The needle as the bench believes it to be.
+    /// The needle, as configured. The real or emulated one may differ.
     pub needle: Needle,
-    /// The torsion of its shaft as the bench believes it to be.
+    /// The torsion of its shaft, as configured.
     pub needle_torsion: Torsion,
     /// The observer that steers.
     pub observer: ObserverConfig,
@@ -44,7 +44,7 @@ impl SessionConfig {
     /// from there to the target, if there is one.
     ///
     /// # Errors
-    /// Why not, with its numbers.
+    /// The reason, with its numbers.
     pub fn check_reach(&self, tip_mm: &Vector3<f64>) -> Result<(), String> {
         self.goal.as_ref().map_or(Ok(()), |goal| goal.check_start(tip_mm))?;
         check_reach(self, tip_mm)
@@ -84,8 +84,8 @@ section! {
 }
 
 impl InsertionConfig {
-    /// How far the needle may go on after the step that stops it, mm: two SYNCs until it brakes, and the way of its
-    /// quick stop. Where that deceleration is not configured it is taken to be that of the insertion.
+    /// How far the needle may advance after the step that stops it, mm: its travel in two SYNC periods, and its
+    /// braking distance in a quick stop. If no quick-stop deceleration is configured, that of the insertion counts.
     pub fn stopping_mm(&self, stage: &StageConfig) -> f64 {
         let speed = self.speed_mm_per_s;
         let deceleration = stage.insertion.quick_stop_deceleration;

@@ -46,9 +46,9 @@ pub(crate) struct Estimation {
     /// Acquisition time of the last measurement that corrected the observers.
     corrected_at: Option<Time>,
     /// Acquisition time of the newest position, and its interval from the position before, s.
-    gathered_at: Option<Time>,
+    newest_at: Option<Time>,
     spacing_s: f64,
-    /// The instant to which the handedness watch has been carried.
+    /// The instant to which the handedness watch has been predicted.
     watched_to: Option<Time>,
     /// Positions that have not corrected the handedness watch yet.
     batch: Batch,
@@ -108,7 +108,7 @@ impl Estimation {
             predicted: None,
             corrections: None,
             corrected_at: None,
-            gathered_at: None,
+            newest_at: None,
             spacing_s: f64::INFINITY,
             watched_to: None,
             batch: Batch::default(),
@@ -129,7 +129,7 @@ impl Estimation {
         if self.observed_to.is_some_and(|at| at >= time) {
             return Ok(());
         }
-        self.carry_to(time, history)?;
+        self.predict_to(time, history)?;
         self.observed_to = Some(time);
         // The positions of a mean are as far apart as those of the stream.
         let since_s = self.corrected_at.map_or(f64::INFINITY, |last| time.seconds_after(last));
@@ -149,9 +149,9 @@ impl Estimation {
     }
 
     /// Adds an accepted position to the batch for the handedness watch.
-    pub(crate) fn gather(&mut self, measurement: &Measurement) {
+    pub(crate) fn add_to_batch(&mut self, measurement: &Measurement) {
         let time = measurement.acquisition_time;
-        if let Some(last) = self.gathered_at.replace(time).filter(|last| *last < time) {
+        if let Some(last) = self.newest_at.replace(time).filter(|last| *last < time) {
             self.spacing_s = time.seconds_after(last);
         }
         // The handedness watch cannot go back to a position that comes very late.
@@ -161,21 +161,21 @@ impl Estimation {
     }
 
     /// Corrects the handedness watch with the mean of the batch, once the first position of the batch
-    /// was acquired before `due`. Without any position the watch is carried along `history` to
+    /// was acquired before `due`. Without any position the watch is predicted along `history` to
     /// `oldest`, so that the history need not reach back further.
     ///
     /// # Errors
     /// If the stage's path is not known.
-    pub(crate) fn watch(
+    pub(crate) fn correct_watch(
         &mut self,
         due: Time,
         oldest: Time,
         history: &StageHistory,
     ) -> Result<(), String> {
         match self.batch.mean() {
-            None => self.carry_watch_to(oldest, history),
+            None => self.predict_watch_to(oldest, history),
             Some((time, tip_meas)) if self.batch.first.is_some_and(|first| first <= due) => {
-                self.carry_watch_to(time, history)?;
+                self.predict_watch_to(time, history)?;
                 self.watched_to.get_or_insert(time);
                 self.steering.correct_handedness(&tip_meas, self.batch.count, self.spacing_s);
                 self.batch = Batch::default();
@@ -185,7 +185,7 @@ impl Estimation {
         }
     }
 
-    fn carry_watch_to(&mut self, time: Time, history: &StageHistory) -> Result<(), String> {
+    fn predict_watch_to(&mut self, time: Time, history: &StageHistory) -> Result<(), String> {
         if self.steering.handedness().is_decided() {
             return Ok(());
         }
@@ -203,7 +203,7 @@ impl Estimation {
     ///
     /// # Errors
     /// If the stage's path to `time` is not known.
-    pub(crate) fn carry_to(&mut self, time: Time, history: &StageHistory) -> Result<(), String> {
+    pub(crate) fn predict_to(&mut self, time: Time, history: &StageHistory) -> Result<(), String> {
         if self.observed_to.is_some_and(|at| at < time) {
             let increments = self.increments(time, history)?;
             self.predicted = self.predicted.map(|tip| tip.after(&self.needle, &increments));

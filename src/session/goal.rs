@@ -1,4 +1,4 @@
-//! Steering to a target: the path is planned anew each step, and a control law follows it.
+//! Steering to a target: each step plans the path again, and a control law follows it.
 
 use super::config::SessionConfig;
 use super::target::TargetTool;
@@ -77,7 +77,8 @@ impl Goal {
         Replanner::new(world, problem, self.curvature_margin, Some(self.path.clone()))
     }
 
-    /// Checks that a path leads to the target from a tip that is seen at `tip_mm`, with the assumed heading.
+    /// Checks that a path leads to the target from a tip that is seen at `tip_mm`, plane frame, with the assumed
+    /// heading.
     ///
     /// # Errors
     /// The reason, in words.
@@ -119,7 +120,7 @@ impl Goal {
     }
 }
 
-/// The nearest point to a target without a path, and how far off it is.
+/// The nearest point to a target that no path reaches, and its distance from the target, in words.
 fn explain_nearest(at_mm: &Vector3<f64>, target_mm: &Vector3<f64>, status: Status) -> String {
     let what = match status {
         Status::Budget => "the nearest point that was reached",
@@ -133,7 +134,7 @@ fn shown(at_mm: &Vector3<f64>) -> String {
     format!("[{:.1}, {:.1}, {:.1}]", at_mm.x, at_mm.y, at_mm.z)
 }
 
-/// What is known of the target at a step.
+/// Distances to the target and the obstacles at a step, and the path to the target.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Approach {
     /// The target, plane frame, mm.
@@ -196,8 +197,8 @@ impl Pursuit {
         self.replanner.set_target(self.goal.problem.target_mm);
     }
 
-    /// Checks, before the first step, that the target is where a path may end, and that one leads there from a
-    /// tip that is seen at `tip_mm`.
+    /// Checks, before the first step, that a path may end at the target, and that a path leads there from a tip
+    /// that is seen at `tip_mm`, plane frame.
     ///
     /// # Errors
     /// The reason, in words.
@@ -245,13 +246,13 @@ impl Pursuit {
         Approach { target_mm, distance_mm, clearance_mm, error_mm, error_sd_mm, path: None }
     }
 
-    /// The approach at a step that stops the run: the needle may go on a little, straight ahead.
+    /// The approach at a step that stops the run. Its clearance covers the braking distance as well.
     pub(super) fn stopped(&mut self, estimate: &Estimate) -> Approach {
         let end = self.end(estimate);
         let ahead = Pose { translation: Vector3::z() * self.stopping_mm, ..Pose::identity() };
         let after = estimate.x_pb * ahead;
         let straight_mm = self.goal.world.distance_on_way_mm(&estimate.x_pb, &after);
-        // The needle bends, to whichever side.
+        // While it stops, the needle may bend to any side.
         let aside_mm = 0.5 * self.curvature_per_mm * self.stopping_mm * self.stopping_mm;
         Approach { clearance_mm: end.clearance_mm.min(straight_mm - aside_mm), ..end }
     }
@@ -259,7 +260,7 @@ impl Pursuit {
     /// Plans from `estimate` at `depth_mm` on. The command is `None` once the tip has arrived.
     ///
     /// # Errors
-    /// The command is the reason, in words, if the run must be stopped.
+    /// If the run must be stopped, the command is the reason, in words.
     pub fn step(
         &mut self,
         estimate: &Estimate,

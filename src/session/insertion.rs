@@ -25,8 +25,8 @@ enum StepPhase {
 }
 
 /// The state of an insertion. Depth and rotation count from where it started: measured ones from the
-/// position measured there, set-points from the target held there. The two differ by what the drive
-/// stays off its target at rest, and neither may jump when the insertion begins.
+/// position measured there, set-points from the target held there. The two origins differ by the drive's
+/// position error at rest, so that neither value jumps when the insertion begins.
 #[derive(Debug, Clone)]
 pub(crate) struct Insertion {
     config: InsertionConfig,
@@ -48,10 +48,10 @@ pub(crate) struct Insertion {
     newest: Option<Measurement>,
     /// The tip was seen since the insertion began.
     is_seen: bool,
-    /// Since when the set-points have been at their end while the measured depth is still short of it.
-    short_since: Option<Time>,
-    /// Since when the needle has been at their end without a break.
-    here_since: Option<Time>,
+    /// The time since which the set-points have stood at their end while the needle has not settled there.
+    unsettled_since: Option<Time>,
+    /// The time since which the needle has been within its tolerance of that end without a break.
+    in_tolerance_since: Option<Time>,
 }
 
 /// A step that is due, with the measurement that it uses.
@@ -79,8 +79,8 @@ impl Insertion {
             sampling: Duration::ZERO,
             newest: None,
             is_seen: false,
-            short_since: None,
-            here_since: None,
+            unsettled_since: None,
+            in_tolerance_since: None,
         }
     }
 
@@ -188,15 +188,15 @@ impl Insertion {
         (self.profile.position_mm() - insertion_meas_mm).abs()
     }
 
-    /// Checks that the needle arrives where its set-points end; otherwise the run would wait there for
-    /// ever. An error is the reason to stop the run.
+    /// Checks that the needle arrives where its set-points end; otherwise the run would wait there forever. An error
+    /// is the reason to stop the run.
     pub(crate) fn check_arrival(
         &mut self,
         time: Time,
         insertion_meas_mm: f64,
     ) -> Result<(), String> {
         let goal_mm = self.profile.goal_mm();
-        let (here_mm, settle) = match self.config.mode {
+        let (tolerance_mm, settle) = match self.config.mode {
             // Step 0 needs the axis only near to where the insertion began.
             InsertionMode::Continuous if self.next_step == 0 => {
                 (self.config.arrival_mm, Duration::ZERO)
@@ -205,16 +205,16 @@ impl Insertion {
             InsertionMode::Stepwise => (self.config.arrival_mm, self.config.settle),
         };
         let off_mm = (goal_mm - insertion_meas_mm).abs();
-        let is_here = off_mm <= here_mm;
-        self.here_since = is_here.then(|| self.here_since.unwrap_or(time));
+        let is_in_tolerance = off_mm <= tolerance_mm;
+        self.in_tolerance_since = is_in_tolerance.then(|| self.in_tolerance_since.unwrap_or(time));
         // An axis that hunts about its target crosses it again and again, and does not arrive.
-        let has_settled = self.here_since.is_some_and(|since| time.since(since) >= settle);
+        let has_settled = self.in_tolerance_since.is_some_and(|since| time.since(since) >= settle);
         if self.profile.position_mm() < goal_mm || has_settled {
-            self.short_since = None;
+            self.unsettled_since = None;
             return Ok(());
         }
-        let waited = time.since(*self.short_since.get_or_insert(time));
-        if is_here || waited < ARRIVAL_TIMEOUT + settle {
+        let waited = time.since(*self.unsettled_since.get_or_insert(time));
+        if is_in_tolerance || waited < ARRIVAL_TIMEOUT + settle {
             return Ok(());
         }
         Err(format!(
@@ -225,13 +225,13 @@ impl Insertion {
         ))
     }
 
-    /// The step that is due at the measured depth, if any. It is then no longer due.
+    /// Takes the step that is due at the measured depth, if one is due.
     pub(crate) fn take_due_step(&mut self, time: Time, insertion_meas_mm: f64) -> Option<DueStep> {
         let goal_mm = self.step_depth_mm(self.next_step);
         let measurement = match self.config.mode {
             InsertionMode::Continuous => {
                 let is_due = match self.next_step {
-                    // At rest, with the first measurement.
+                    // Step 0 is due at rest, once there is a measurement.
                     0 => self.is_seen && self.off_mm(insertion_meas_mm) <= self.config.arrival_mm,
                     // A depth beyond the set-point may be a wrong reading: it makes no step due.
                     _ => {
@@ -263,7 +263,7 @@ impl Insertion {
     /// their end: a real drive may hold its target a few counts off.
     fn has_nearly_arrived(&self, time: Time, insertion_meas_mm: f64) -> bool {
         (self.profile.goal_mm() - insertion_meas_mm).abs() <= self.config.arrival_mm
-            && self.short_since.is_some_and(|since| time.since(since) >= ARRIVAL_PATIENCE)
+            && self.unsettled_since.is_some_and(|since| time.since(since) >= ARRIVAL_PATIENCE)
     }
 
     /// The mean of the step's samples, once the needle has settled and the samples are complete.

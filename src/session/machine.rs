@@ -1,4 +1,4 @@
-//! The run machine.
+//! The session, which is the state machine of a run, and the interface that a run loop uses.
 
 use super::SessionConfig;
 use super::insert::InsertTask;
@@ -38,7 +38,7 @@ pub enum Input {
     Tick,
 }
 
-/// What the operator can ask of an insertion.
+/// A command of the operator to an insertion.
 #[derive(Debug, Clone, Copy, PartialEq, Display)]
 pub enum OperatorCommand {
     /// Brake the insertion to a standstill; both axes stay enabled.
@@ -98,7 +98,7 @@ pub struct Progress {
     pub tip_age_s: Option<f64>,
     /// SYNC periods skipped because the bench was late.
     pub syncs_skipped: u64,
-    /// The latest SYNC: how long after it was due.
+    /// The longest delay of a SYNC after it was due.
     pub sync_late_max: Duration,
 }
 
@@ -150,7 +150,7 @@ pub trait Machine {
         StageAtEnd::default()
     }
 
-    /// What the tracker's gates did with its samples.
+    /// The numbers of samples that the tracker's gates accepted and refused.
     fn gate_counts(&self) -> GateCounts {
         GateCounts::default()
     }
@@ -158,9 +158,8 @@ pub trait Machine {
 
 /// A run, from the first boot-up to the last frame; see [`Machine`] for how it is driven.
 ///
-/// It is the same shell for every task: bring-up, supervision, stop, power off. Nothing in it
-/// touches a clock, a socket, a file or a thread, so a live, an emulated and a replayed run are the
-/// same run.
+/// The same shell brings the stage up, supervises it, stops it and takes power off for every task. A session uses
+/// no clock, socket, file or thread, so live, emulated and replayed runs use the same code.
 ///
 /// Motion follows from feedback alone: a set-point is computed only when both drives have answered a
 /// SYNC, from that answer. Every fault stops both axes, and the session never starts them again.
@@ -196,7 +195,7 @@ impl Session {
     }
 
     /// Reports a warning of the CAN controller the 1st, 2nd, 4th, 8th … time: a bad contact gives thousands a
-    /// second. Numbers in it, such as error counters, make no other warning of it.
+    /// second. Warnings that differ only in their digits, such as error counters, count as one.
     fn report_bus_warning(&mut self, text: String) {
         let words: String = text.chars().filter(|c| !c.is_ascii_digit()).collect();
         let count = self.bus_warnings.entry(words).or_default();

@@ -1,4 +1,4 @@
-//! The run machine, sans-IO, and its record.
+//! The state machine of a run, sans-IO, and its record.
 //!
 //! Live, emulated and replayed runs are one [`Session`]: `handle(now, input)`, drain `poll()` to
 //! `None`, wait until `deadline()`, repeat. A session is a shell around a task: the shell brings the

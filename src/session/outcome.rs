@@ -3,13 +3,13 @@
 use crate::stage::{Axis, DriveReport, PerAxis, SetPoint};
 use serde::Serialize;
 
-/// Whether the run reached its depth.
+/// How a run ended, and why it was stopped.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[serde(tag = "outcome", content = "stop_reason", rename_all = "snake_case")]
 pub enum Outcome {
-    /// The configured depth was reached and the stage was stopped in order.
+    /// The task was completed, and both axes were stopped.
     Completed,
-    /// The run was stopped before, for the reason given.
+    /// The task was not completed, or the drives did not confirm the end of the stop, for this reason.
     Stopped(String),
 }
 
@@ -37,7 +37,8 @@ pub struct StageAtEnd {
 }
 
 impl StageAtEnd {
-    /// Where `axis` stands, mm or rad; `None` if that is not known. A drive that has restarted may count anew.
+    /// Where `axis` stands, mm or rad; `None` if that is not known: a drive that has restarted may count from another
+    /// zero.
     pub fn position_of(&self, axis: Axis) -> Option<f64> {
         let position = self.position.filter(|_| !self.drives[axis].restarted);
         position.map(|position| position.along(axis))

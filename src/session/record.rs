@@ -1,4 +1,4 @@
-//! What a session writes to its record. A session never reads its record.
+//! The records that a session writes. A session never reads them.
 
 use super::machine::Input;
 use super::state::State;
@@ -77,7 +77,7 @@ impl SampleRecord {
     }
 }
 
-/// One millimetre of the run, in the plane frame: a row of `steps.csv`.
+/// One step of an insertion, in the plane frame: a row of `steps.csv`.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct StepRecord {
     /// Number of the step, from 0 at the start of the insertion.

@@ -36,7 +36,7 @@ pub(crate) enum Power {
     /// The drives have been ready for power since this time.
     Awaited(Time),
     /// The drives are being enabled.
-    ComingOn,
+    Enabling,
     /// The drives have been enabled since this time.
     On(Time),
 }
@@ -192,7 +192,7 @@ impl Shell {
             self.report(Lane::Stage, severity, text);
         }
         match event {
-            StageEvent::Progress(Progress::Enabling) => self.power = Power::ComingOn,
+            StageEvent::Progress(Progress::Enabling) => self.power = Power::Enabling,
             StageEvent::Located(_) => self.power = Power::Awaited(self.now),
             StageEvent::Ready => {
                 self.power = Power::On(self.now);
@@ -256,7 +256,7 @@ impl Shell {
         self.enter(State::Stopping);
     }
 
-    /// The longest that a stop may take: the stage's own timeouts, plus a margin.
+    /// The longest time that a stop may take: the stage's own timeouts, plus a margin.
     fn stop_timeout(&self) -> Duration {
         self.config().power.stop_timeout * 2 + STOP_MARGIN
     }
@@ -298,7 +298,7 @@ impl Shell {
     fn had_power(&self) -> bool {
         let reports = self.stage.drive_reports();
         self.stopped_with_power
-            || matches!(self.power, Power::ComingOn | Power::On(_))
+            || matches!(self.power, Power::Enabling | Power::On(_))
             || Axis::BOTH.into_iter().any(|axis| reports[axis].says_power())
     }
 

@@ -42,14 +42,14 @@ pub struct Decision {
     pub rotation_cmd_rad_per_mm: Option<f64>,
     /// The law demanded more than its own limits allow.
     pub command_saturated: bool,
-    /// What is known of the target; `None` without a target or without an estimate.
+    /// The approach to the target; `None` without a target or without an estimate.
     pub approach: Option<Approach>,
     /// Why there is no command: the run must be stopped for this reason.
     pub refused: Option<String>,
 }
 
 impl Steering {
-    /// The observers and the law that `config` names.
+    /// Builds the observers and the law that `config` names.
     pub fn new(config: &SessionConfig) -> Self {
         let build =
             |observer: &ObserverConfig| observer.build(config.needle, config.needle_torsion);
@@ -99,7 +99,7 @@ impl Steering {
         };
         self.observers().for_each(|observer| observer.correct(tip_meas, independent));
         let innovation_mm = tip_meas.mm() - predicted_mm?;
-        // The watch expects the noise of one position; a mean of independent ones has √positions less.
+        // The watch expects the noise of one position. The mean of n independent positions has 1/√n of it.
         self.whiteness.take(innovation_mm * f64::from(positions).sqrt());
         Some(innovation_mm)
     }
@@ -182,7 +182,7 @@ impl Steering {
         self.observer.check().map_err(|error| format!("observer: {error}"))
     }
 
-    /// What is known of the target at this step, and the command; no command if the insertion ends here.
+    /// Returns the approach to the target at this step, and the command; no command if the insertion ends here.
     fn command(
         &mut self,
         estimate: &Estimate,

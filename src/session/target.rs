@@ -2,7 +2,7 @@
 
 use super::config::TrackerConfig;
 use super::record::SampleRecord;
-use super::tracking::Trouble;
+use super::tracking::HoldReason;
 use crate::geometry::Pose;
 use crate::tracker::gate::is_same_tool;
 use crate::tracker::refusal::short;
@@ -40,7 +40,7 @@ impl MovingMean {
         MovingMean { over, newest: VecDeque::new() }
     }
 
-    /// Adds a position, mm, unless it is the newest that was added.
+    /// Adds a position, mm, unless it was the last one added.
     pub fn take(&mut self, acquisition_time: Time, position_mm: Vector3<f64>) {
         if self.newest.back() == Some(&(acquisition_time, position_mm)) {
             return;
@@ -101,7 +101,7 @@ impl TargetTracking {
         is_same_tool(&sample.tool, &self.tool.gate.tool)
     }
 
-    /// A new connection may have another sender's clock.
+    /// Forgets the offset of the sender's clock: a new connection may be another sender's.
     pub(super) fn reconnected(&mut self) {
         self.clock.reconnected();
     }
@@ -118,7 +118,7 @@ impl TargetTracking {
                 self.last_refusal = None;
             }
             Err(refusal) => {
-                // Before the insertion the target may have been moved, so it is searched for anew.
+                // Before the insertion the target may have been moved, so it is searched for again.
                 if insertion_mm.is_none() && refusal.gate == GateName::Step {
                     self.mean = MovingMean::new(self.tool.average);
                 }
@@ -193,7 +193,7 @@ impl TargetTracking {
     }
 
     /// Why the needle cannot be steered to the target at `now`; `None` while it can.
-    pub(super) fn trouble(&self, now: Time) -> Option<Trouble> {
+    pub(super) fn hold_reason(&self, now: Time) -> Option<HoldReason> {
         let limit_s = self.hold_after.as_secs_f64();
         let what = match self.last_acquisition().map(|last| now.seconds_after(last)) {
             None => "the target has not been seen".to_owned(),
@@ -213,7 +213,7 @@ impl TargetTracking {
             Some(refusal) => refusal.to_string(),
             None => format!("is \"{}\" in view? See goal.tool", self.tool.gate.tool),
         };
-        Some(Trouble { of: "target", what, why })
+        Some(HoldReason { of: "target", what, why })
     }
 }
 

@@ -14,7 +14,7 @@ use std::time::Duration;
 /// power off. A task decides what to do between [`StageEvent::Ready`] and the stop. If a method returns an
 /// error, the run stops for that reason, unless the method says otherwise.
 pub(crate) trait Task {
-    /// The run begins.
+    /// Called once when the run begins.
     fn begin(&mut self, _shell: &mut Shell) {}
 
     /// Whether the axes may be given power now. The session asks after every input until they have power.
@@ -84,7 +84,7 @@ pub(crate) trait Task {
         Progress::default()
     }
 
-    /// What the tracker's gates did with its samples.
+    /// The numbers of samples that the tracker's gates accepted and refused.
     fn gate_counts(&self) -> GateCounts {
         GateCounts::default()
     }

@@ -30,12 +30,12 @@ const TOO_MANY_WAIT: &str = "too many positions wait for the stage's position at
 
 /// Why the needle cannot be steered for now.
 #[derive(Debug, Clone)]
-pub(super) struct Trouble {
-    /// What is not seen, or not believed: "tip" or "target".
+pub(super) struct HoldReason {
+    /// The tool that is not seen, or whose positions are refused: "tip" or "target".
     pub(super) of: &'static str,
-    /// What is wrong, with its numbers and limits.
+    /// The problem, with its numbers and limits.
     pub(super) what: String,
-    /// What led to it, or what the operator should check.
+    /// Its cause, or the advice to the operator.
     pub(super) why: String,
 }
 
@@ -66,7 +66,7 @@ pub(crate) struct Tracking {
     accepted_at: Option<Time>,
     /// How late the newest sample came by its stamp, beyond the configured latency; 0 if it was not dated.
     late: Duration,
-    /// What the gates did with the samples so far.
+    /// The numbers of samples that the gates have accepted and refused so far.
     pub(super) counts: GateCounts,
     census: Census,
     unpaired_age_max: Duration,
@@ -78,7 +78,7 @@ pub(crate) struct Tracking {
     last_refusal: Option<String>,
     /// The refusal by which the mean of the last positions contradicted the model, until a position is accepted.
     pub(super) jump: Option<Jump>,
-    link_trouble: Option<String>,
+    link_error: Option<String>,
     /// The error of the last malformed message, until a position is accepted.
     malformed: Option<String>,
     /// The last STATUS of the server was OK and came after the last accepted position.
@@ -118,7 +118,7 @@ impl Tracking {
             reported_state: TrackState::Waiting,
             last_refusal: None,
             jump: None,
-            link_trouble: None,
+            link_error: None,
             malformed: None,
             status_is_ok: false,
             dropped: 0,
@@ -133,11 +133,11 @@ impl Tracking {
         match event {
             Event::Connected { .. } => {
                 self.clock.reconnected();
-                self.link_trouble = None;
+                self.link_error = None;
                 self.status_is_ok = false;
             }
             Event::Unreachable { reason } | Event::Disconnected { reason } => {
-                self.link_trouble = Some(reason.clone());
+                self.link_error = Some(reason.clone());
             }
             Event::Status { status, .. } => self.status_is_ok = status.code == Status::OK,
             Event::Malformed(error) => self.malformed = Some(error.clone()),
@@ -260,7 +260,7 @@ impl Tracking {
     /// Checks that the stream as a whole does not contradict the insertion, now `insertion_mm` deep.
     ///
     /// # Errors
-    /// What contradicts it: the reason to stop the run.
+    /// The contradiction, which is the reason to stop the run.
     pub(super) fn check_stream(&self, insertion_mm: f64) -> Result<(), String> {
         if !self.config.judges_stream {
             return Ok(());
@@ -277,7 +277,7 @@ impl Tracking {
         }
     }
 
-    /// How many independent positions an accepted one is worth, by the configured noise.
+    /// The number of independent positions that carry as much information as an accepted one, by the configured noise.
     fn independent(&mut self, acquisition_time: Time) -> f64 {
         let last = self.accepted_at.replace(acquisition_time);
         let spacing_s = last.map_or(f64::INFINITY, |last| acquisition_time.seconds_after(last));
@@ -363,7 +363,7 @@ impl Tracking {
                 let refused = self.track.refused_in_a_row();
                 (Severity::Warning, format!("lost, {refused} refused in a row; the last: {last}"))
             }
-            // Before an insertion the tip is searched for anew, without a model.
+            // Before an insertion the tip is searched for again, without a model.
             (TrackState::Lost, TrackState::Waiting) => return,
             (TrackState::Lost, _) => {
                 (Severity::Info, "found again: it agrees with the model".to_owned())
@@ -413,7 +413,7 @@ impl Tracking {
     /// The state of the stream, for the operator.
     pub(crate) fn state(&self, now: Time) -> State {
         match self.track.state(now) {
-            _ if self.link_trouble.is_some() => State::Disconnected,
+            _ if self.link_error.is_some() => State::Disconnected,
             TrackState::Waiting => State::AwaitingTip,
             TrackState::Tracking => State::Tracking,
             TrackState::Coasting => State::Coasting,
@@ -443,8 +443,8 @@ impl Tracking {
 
     /// Why there is no tip to steer by, and what to do: for the operator.
     pub(crate) fn explain_silence(&self) -> String {
-        if let Some(trouble) = &self.link_trouble {
-            return trouble.clone();
+        if let Some(error) = &self.link_error {
+            return error.clone();
         }
         if self.late > self.config.hold.after / 2 {
             return format!(

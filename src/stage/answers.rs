@@ -2,9 +2,9 @@
 
 use crate::canopen::Frame;
 
-/// So many SYNCs more may stay unanswered than may be missed in a row.
+/// A drive may leave this many more SYNCs unanswered in all than it may miss in a row.
 const UNANSWERED_MAX: u32 = 2;
-/// One unanswered SYNC no longer counts after so many: a frame that is lost now and then is no fault.
+/// After this many SYNCs one unanswered SYNC is forgotten: a frame that is lost now and then is not a fault.
 const LEAK_SYNCS: u64 = 1000;
 
 /// The answers of one drive so far.
@@ -14,9 +14,10 @@ pub(super) struct Answers {
     pub(super) fresh: bool,
     /// SYNCs in a row without an answer.
     pub(super) missed_in_a_row: u32,
-    /// The length, bytes, of a TPDO1 that came since the last one that was taken.
+    /// The length, in bytes, of a TPDO1 of the wrong length that came since the last valid one.
     pub(super) wrong_length: Option<usize>,
-    /// SYNCs that were sent, less the TPDO1 that came: answers that were lost, or that are late by so many SYNCs.
+    /// SYNCs that were sent, less the TPDO1 that came: this many answers were lost, or answers are late by this many
+    /// SYNCs.
     unanswered: u32,
     payload: [u8; 6],
     /// A second TPDO1 after the last SYNC, with another payload.
@@ -26,14 +27,15 @@ pub(super) struct Answers {
 }
 
 impl Answers {
-    /// The SYNC of this number is sent.
+    /// Notes that the SYNC of this number is sent.
     pub(super) fn begin(&mut self, sync: u64) {
         self.fresh = false;
         self.unanswered += 1;
         self.unanswered -= u32::from(sync.is_multiple_of(LEAK_SYNCS));
     }
 
-    /// Takes a TPDO1 with this payload. False if the last SYNC has had its answer: the payload must not be used then.
+    /// Takes a TPDO1 with this payload. Returns false if the last SYNC was answered already: the payload must then not
+    /// be used.
     pub(super) fn take(&mut self, frame: &Frame, payload: [u8; 6]) -> bool {
         self.unanswered = self.unanswered.saturating_sub(1);
         if self.fresh {
@@ -44,8 +46,9 @@ impl Answers {
         true
     }
 
-    /// To be called once before each SYNC. Returns the fault of a drive that gives two answers to a SYNC.
-    /// `missed_max` may be missed in a row; all of them if the drive `may_be_silent`.
+    /// Counts the answers to the last SYNC. Call it once before each SYNC. Returns a fault if the drive has given two
+    /// different answers to each of more than `missed_max` SYNCs in a row. No answer counts as missing while the drive
+    /// `may_be_silent`.
     pub(super) fn judge(&mut self, missed_max: u32, may_be_silent: bool) -> Option<String> {
         let missed = self.missed_in_a_row.saturating_add(1);
         self.missed_in_a_row = if self.fresh || may_be_silent { 0 } else { missed };
@@ -61,7 +64,7 @@ impl Answers {
         })
     }
 
-    /// The fault of a drive whose positions may be too old.
+    /// Returns a fault if so many SYNCs are unanswered that the drive's positions may be too old.
     pub(super) fn fault_of_unanswered(&self, missed_max: u32) -> Option<String> {
         let (unanswered, unanswered_max) = (self.unanswered, missed_max + UNANSWERED_MAX);
         (unanswered > unanswered_max).then(|| {

@@ -27,7 +27,7 @@ impl Axis {
         ["mm", "deg"][self as usize]
     }
 
-    /// `value`, mm or rad, as an operator reads it: `1.500 mm`, `90.000 deg`.
+    /// `value`, mm or rad, as text for the operator: `1.500 mm`, `90.000 deg`.
     pub fn shown(self, value: f64) -> String {
         let (value, unit) = self.in_unit(value);
         format!("{value:.3} {unit}")
@@ -80,7 +80,7 @@ impl<T> IndexMut<Axis> for PerAxis<T> {
     }
 }
 
-/// What an axis is used for.
+/// The purpose for which an axis is used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum AxisUse {
     /// It steers a needle, or is put to a test: it must be homed, and stand within its soft limits.
@@ -91,7 +91,7 @@ pub enum AxisUse {
     Hold,
     /// It is homed. If it is homed already and stands away from home, only `again` homes it.
     Home {
-        /// Even then.
+        /// Home it even if it is homed already and stands away from home.
         again: bool,
     },
 }

@@ -65,14 +65,14 @@ pub(super) struct BringUp {
 /// How far a bring-up has come.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct BringUpState {
-    /// The part of the bring-up that is under way, as an operator reads it.
+    /// The part of the bring-up that is under way, as text for the operator.
     part: &'static str,
     /// The drive has answered.
     pub(super) found: bool,
     /// Its identity is that of the configuration.
     pub(super) identified: bool,
     /// Power is off, and the statusword was read: any fault from here on is a new one.
-    pub(super) disarmed: bool,
+    pub(super) is_power_off: bool,
     /// The drive may have been configured to monitor the bench's heartbeat; its power was taken off before.
     pub(super) may_be_supervised: bool,
     /// The last statusword that was read.

@@ -19,13 +19,13 @@ const REPEAT_PERIOD: Duration = Duration::from_millis(100);
 /// following-error window, or by this many counts: otherwise one of the two readings is wrong, or the axis moves.
 const STEADY_PART: f64 = 0.02;
 const STEADY_COUNTS: f64 = 2.0;
-/// A drive whose answer to the first SYNC does not come before the next is due may have begun late, or may answer
-/// late. It gets another SYNC when the answers to those before must have come.
+/// A drive that does not answer the first SYNC before the next is due may have started late, or may answer late. The
+/// stage sends it another SYNC after this time, when the answers to earlier SYNCs must have come.
 const DRAIN: Duration = Duration::from_millis(250);
-/// Least interval of the requests by SDO to a drive that sends no TPDO.
+/// Minimum interval between two SDO reads of a drive that sends no TPDO.
 const READ_PERIOD: Duration = Duration::from_millis(30);
 
-/// The last request by SDO to a drive that stops.
+/// The last SDO read of a drive that is being stopped.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Reading {
     pub(super) object: ObjectAddress,
@@ -120,8 +120,8 @@ impl Stage {
         SetPoint { insertion_mm: position(insertion), rotation_rad: position(rotation) }
     }
 
-    /// Counts SYNCs that were not answered by both drives, once both have answered one in time. Too many in a row
-    /// stop the stage, and so do too many in all.
+    /// Counts the SYNCs that were not answered by both drives, once both have answered one in time. Too many of them
+    /// stop the stage, whether in a row or in all.
     fn judge_feedback(&mut self, now: Time) {
         let is_located = !matches!(self.phase, Phase::Standby { located: false, .. });
         let missed_max = u32::from(self.config.bus.missed_feedback_max);
@@ -193,16 +193,17 @@ impl Stage {
         true
     }
 
-    /// Answers that are late by more than this leave so many SYNCs after the next one without an answer that it is a
-    /// fault.
+    /// How long the stage waits for late answers before it sends another SYNC. If answers are later than this, so many
+    /// SYNCs stay unanswered that it is a fault.
     fn drain_time(&self) -> Duration {
         let syncs = u32::from(self.config.bus.missed_feedback_max) + 2;
         let time = DRAIN.max(self.config.bus.sync_period() * syncs);
         time.min(self.config.power.enable_timeout / 2)
     }
 
-    /// Enabling has timed out: names a drive that is not in NMT Operational, else one that was not heard, else one
-    /// that answers late, else one that is not enabled, else one without a heartbeat.
+    /// Fails because enabling has timed out. The fault names the first of these that is found: a drive that is not in
+    /// NMT Operational, that was not heard, that answers late, that moves, that is not enabled, or that sends no
+    /// heartbeat.
     fn fail_enabling(&mut self, now: Time) {
         let timeout_ms = self.config.power.enable_timeout.as_millis();
         let first = |fails: &dyn Fn(Axis) -> bool| Axis::BOTH.into_iter().find(|axis| fails(*axis));
@@ -335,8 +336,8 @@ impl Stage {
         self.repeat_by_sdo(now, Drive::is_enabled);
     }
 
-    /// An orderly end has timed out: the first drive that is not `done` still has this `trouble`, the stop
-    /// timeout after the `last_step` of the end.
+    /// Fails because an orderly end has timed out: the stop timeout after its `last_step`, the first drive that is not
+    /// `done` still has this `trouble`.
     fn fail_orderly_end(
         &mut self,
         now: Time,
@@ -385,8 +386,8 @@ impl Stage {
         )
     }
 
-    /// In a quick stop: stops by SDO alone a drive that is enabled, since set-points that are late on the bus may
-    /// enable it again and again. In Pre-operational it takes no RPDO1.
+    /// In a quick stop, sends an enabled drive to Pre-operational, where it takes no RPDO1, and commands it by SDO
+    /// alone. Set-points that are late on the bus could otherwise enable it again and again.
     pub(super) fn stop_by_sdo_alone(&mut self, axis: Axis) {
         let drive = &mut self.drives[axis];
         drive.sent_to_pre_operational = true;
@@ -410,7 +411,7 @@ impl Stage {
         let answer_time = if is_answered { Duration::ZERO } else { self.config.bus.sdo_timeout() };
         let wait = answer_time.max(READ_PERIOD);
         let waited = now.since(sent);
-        // If it can be avoided, not at once after a controlword: an SDO server takes one request at a time.
+        // Leave the drive time for a controlword sent just before: an SDO server takes one request at a time.
         let is_commanded = self.repeat_due == now + REPEAT_PERIOD;
         if waited < wait || is_commanded && waited < 2 * wait {
             return;
@@ -445,14 +446,14 @@ impl Stage {
         }
     }
 
-    /// In a quick stop: commands the drives that `disobey` again, at intervals.
+    /// In a quick stop, commands the drives that `disobey` again, every [`REPEAT_PERIOD`].
     fn repeat_by_sdo(&mut self, now: Time, disobey: impl Fn(&Drive) -> bool) {
         if self.is_quick_stopping() && now >= self.repeat_due {
             self.send_controlwords(now, disobey);
         }
     }
 
-    /// Sends its controlword by SDO to each drive of `to`: one that has left Operational takes no PDOs.
+    /// Sends each drive that `to` selects its controlword by SDO: a drive that has left Operational takes no PDOs.
     fn send_controlwords(&mut self, now: Time, to: impl Fn(&Drive) -> bool) {
         self.repeat_due = now + REPEAT_PERIOD;
         for axis in Axis::BOTH {

@@ -43,7 +43,7 @@ pub trait Dialogue {
     fn is_over(&self) -> bool;
 }
 
-/// What a script uses to talk with its drive.
+/// A script's access to its drive.
 #[derive(Debug, Clone)]
 pub(super) struct Sdo(Rc<RefCell<Line>>);
 
@@ -56,7 +56,7 @@ struct Line {
     now: Time,
     /// When the script's pause ends.
     wake: Time,
-    /// What else the script sends or reports.
+    /// Frames and events of the script other than SDO requests.
     outputs: VecDeque<Output>,
 }
 
@@ -262,7 +262,7 @@ impl<T> ScriptRunner<T> {
         line.client.deadline().min(line.wake)
     }
 
-    /// Ends the transfer under way.
+    /// Cancels the transfer that is under way, and the script's pause.
     pub(super) fn cancel(&mut self) {
         let mut line = self.sdo.0.borrow_mut();
         line.client.cancel();

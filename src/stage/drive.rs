@@ -16,7 +16,8 @@ use crate::units::Time;
 
 /// Longest time from Fault Reset to the end of the fault.
 const RESET_TIMEOUT: Duration = Duration::from_millis(500);
-/// The first SYNC of a stop carries its controlword, and the TPDO1 after that may have been sampled before.
+/// A TPDO1 shows the effect of a stop after this many SYNCs: the drive takes the controlword at the first, and the
+/// TPDO1 after that may have been sampled before.
 const STOP_SYNCS: u64 = 2;
 /// A drive takes a command to stop within this time.
 const OBEYS_WITHIN: Duration = Duration::from_millis(20);
@@ -34,7 +35,7 @@ enum FaultReset {
     Sent(u32),
 }
 
-/// How often a bit of the statusword was set anew while the drive had to follow.
+/// Counts the rising edges of a bit of the statusword while the drive had to follow its targets.
 #[derive(Debug, Default)]
 pub(super) struct RisingEdges {
     was_set: bool,
@@ -42,7 +43,7 @@ pub(super) struct RisingEdges {
 }
 
 impl RisingEdges {
-    /// Takes the bit of the next statusword. Returns the count if it is set anew, for the 1st, 2nd, 4th, 8th … time.
+    /// Takes the bit of the next statusword. Returns the count at the 1st, 2nd, 4th, 8th … rising edge.
     pub(super) fn take(&mut self, is_set: bool) -> Option<u64> {
         let was_set = std::mem::replace(&mut self.was_set, is_set);
         let rises = is_set && !was_set;
@@ -69,7 +70,7 @@ pub(super) struct Drive {
     /// The SYNC after which the newest position came.
     position_sync: u64,
     pub(super) statusword: Option<Statusword>,
-    /// The SYNC after which it came. After one before `off_sync` it does not say that power is off.
+    /// The SYNC after which it came. A statusword from before `off_sync` does not show that power is off.
     statusword_sync: u64,
     off_sync: u64,
     /// The SYNC after which the last stop began.
@@ -147,7 +148,7 @@ impl Drive {
         matches!(self.purpose, AxisUse::Home { .. })
     }
 
-    /// Begins where the bring-up has found the axis.
+    /// Takes the position that the bring-up has read, and its `state`.
     pub(super) fn take_bring_up(&mut self, position: i32, state: BringUpState) {
         self.seed(position);
         self.home_counts = state.home_counts;
@@ -274,8 +275,8 @@ impl Drive {
         }
     }
 
-    /// To be called once a SYNC. Returns the statusword if the drive has stayed for longer than `timeout` in a
-    /// state on the way to Switched On that it is commanded to leave.
+    /// Returns the statusword if the drive has stayed for longer than `timeout` in a state on the way to Switched On
+    /// that it is commanded to leave. Call it once a SYNC.
     pub(super) fn count_transition(&mut self, timeout: Duration) -> Option<Statusword> {
         let is_commanded_on = matches!(
             (self.state(), self.controlword),
@@ -365,8 +366,8 @@ impl Drive {
         (!is_at_home(self.axis, here - home)).then_some((here, home))
     }
 
-    /// Begins anew at the drive's last reading after homing, which has changed the drive's zero. Returns the
-    /// position, mm or rad.
+    /// Restarts from the drive's last reading after homing, which has changed the drive's zero. Returns the position,
+    /// mm or rad.
     pub(super) fn take_home(&mut self) -> f64 {
         // The low 32 bits of the unwrapped position are the last reading.
         self.seed(self.position.counts() as i32);
@@ -447,8 +448,9 @@ impl Drive {
         DriveReport { state, error, restarted: self.restarted }
     }
 
-    /// Begins a stop after the SYNC of this number. In a quick stop the axis is not believed to stand before it can
-    /// have braked, nor a drive that was commanded to switch on to be off by what it said before the stop.
+    /// Begins a stop after the SYNC of this number. In a quick stop the axis does not count as standing before it can
+    /// have braked. If the drive was commanded to switch on, a statusword from before the stop does not show that it is
+    /// off.
     pub(super) fn begin_stop(&mut self, now: Time, sync: u64, quick: bool) {
         self.next_counts = None;
         self.stop_sync = sync;
@@ -484,7 +486,7 @@ impl Drive {
     }
 
     /// True if the drive is in Operation Enabled although it has had time to take the command to stop.
-    pub(super) fn disobeys_stop(&self) -> bool {
+    pub(super) fn ignores_stop(&self) -> bool {
         let syncs = OBEYS_WITHIN.div_duration_f64(self.sync_period) as u64;
         self.is_enabled() && self.statusword_sync >= self.stop_sync + syncs.max(STOP_SYNCS)
     }

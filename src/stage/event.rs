@@ -1,4 +1,4 @@
-//! What the stage gives to its caller: frames to send, and events.
+//! The outputs of the stage: frames to send, and events.
 
 use super::{Axis, Identity};
 use crate::canopen::cia402::{DriveState, Statusword};
@@ -33,7 +33,7 @@ pub struct DriveReport {
     pub state: Option<DriveState>,
     /// The last error that it reported, unless it has reported its end since.
     pub error: Option<EmcyCode>,
-    /// It has restarted since its bring-up, and may count its position anew.
+    /// It has restarted since its bring-up, and may count its position from another zero.
     pub restarted: bool,
 }
 
@@ -139,7 +139,7 @@ pub struct Counters {
     pub feedback_missed: u64,
     /// SYNC periods skipped because the bench was late.
     pub syncs_skipped: u64,
-    /// The latest SYNC: how long after it was due.
+    /// The longest delay of a SYNC after it was due.
     pub sync_late_max: Duration,
 }
 
@@ -167,8 +167,7 @@ pub enum StageEvent {
     /// A drive's emergency message: an error, or its end. A repeated message is reported the 1st, 2nd, 4th,
     /// 8th … time.
     Emergency(Axis, Emcy),
-    /// A limit inside the drive has become active (statusword bit 11): the axis goes no further, whatever its
-    /// target.
+    /// A limit inside the drive has become active (statusword bit 11): the axis does not follow its target beyond it.
     InternalLimit(Axis),
     /// A drive has not set this bit of its statusword when the stage became ready, so its loss cannot be
     /// noticed. Reported once for each bit.

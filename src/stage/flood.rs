@@ -7,7 +7,7 @@ use crate::units::Time;
 /// How long frames are counted before the count is checked.
 const WINDOW: Duration = Duration::from_millis(100);
 
-/// This many frames in a window are a flood: some 5% of a bus at 1 Mbit/s.
+/// This many frames in a window are a flood: about 5% of a bus at 1 Mbit/s.
 const FRAMES_MIN: u64 = 50;
 
 /// Counts the frames that are no part of the SYNC cycle or of the bring-up.
@@ -24,8 +24,7 @@ impl FloodWatch {
         FloodWatch { window_ends: now + WINDOW, frames: 0, flooded: false }
     }
 
-    /// At the end of the first window of a flood, the number of frames in it. To be called at least
-    /// once a window.
+    /// Returns the number of frames in the first window of a flood, at its end. Call it at least once a window.
     pub(super) fn check(&mut self, now: Time) -> Option<u64> {
         if now < self.window_ends {
             return None;

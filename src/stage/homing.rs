@@ -67,14 +67,14 @@ impl HomingConfig {
     }
 }
 
-/// After this time, if the axis stands, the bits of the statusword are taken for this homing's even if they
+/// After this time, if the axis stands, the homing bits of the statusword count as those of this homing even if they
 /// were never seen to clear: some methods take no time at all, and no drive takes this long to begin.
 const BEGUN_AFTER: Duration = Duration::from_secs(1);
 
 /// How far an axis may stand from its home, mm or rad, and still count as being there: a drive stops a little past the
 /// switch or index at which home is.
 const HOME_TOLERANCE: [f64; 2] = [1.0, 5.0 * PI / 180.0];
-/// A drive that says that it is home gives its position from there by this time.
+/// After "homing attained", a drive must report a position counted from its new zero within this time.
 const POSITION_DELAY: Duration = Duration::from_secs(1);
 
 /// A homing under way.

@@ -128,8 +128,8 @@ impl LimitCheck {
         Ok(counts)
     }
 
-    /// As [`check_position`](Self::check_position), but up to where the axis is held, at `held` counts, it may
-    /// be outside.
+    /// As [`check_position`](Self::check_position), but allows a target outside the limits that is no farther out than
+    /// `held`, in counts, where the axis is held.
     ///
     /// # Errors
     /// The position limit that `target` breaks.

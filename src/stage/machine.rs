@@ -22,7 +22,7 @@ use crate::canopen::sync::SyncProducer;
 use crate::canopen::{Frame, cob};
 use crate::units::Time;
 
-/// What the stage does now. It never goes back to an earlier phase, except from `Homing` to `Ready`.
+/// The phase of the stage. It never goes back to an earlier one, except from `Homing` to `Ready`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Phase {
     /// The stage sends nothing, and listens for another master.
@@ -73,7 +73,7 @@ pub struct Stage {
     pub(super) repeat_due: Time,
     /// A fault was reported.
     faulted: bool,
-    /// The bench is silent on purpose, see [`Stage::fall_silent`].
+    /// The bench has stopped its heartbeat on purpose, see [`Stage::fall_silent`].
     pub(super) silence_test: Option<SilenceTest>,
     /// The positions at the last SYNC before power, counts.
     pub(super) before_power_counts: PerAxis<i64>,
@@ -184,7 +184,7 @@ impl Stage {
             self.note_skipped(periods);
             self.cycle(now);
         }
-        // Only after the SYNC, which must not wait.
+        // This comes after the SYNC, which must not wait.
         if let Some(frames) = self.flood.check(now) {
             self.emit(StageEvent::Flood(frames));
         }

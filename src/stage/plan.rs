@@ -38,7 +38,7 @@ impl Script {
         self.identify().await?;
         // Two drives must not be configured as one.
         self.check_node_number()?;
-        self.disarm().await?;
+        self.take_power_off().await?;
         self.configure().await?;
         self.supervise().await?;
         self.map_pdos().await?;
@@ -146,11 +146,11 @@ impl Script {
 
     /// Takes power off first: a drive that an earlier run left enabled is not reconfigured under power. If
     /// the drive is in Fault, the cause is read; unless it may be reset, bring-up ends there.
-    async fn disarm(&self) -> Result<(), String> {
+    async fn take_power_off(&self) -> Result<(), String> {
         self.begin("taking power off, looking for faults");
         self.write_unchecked(drive::CONTROLWORD, Controlword::DISABLE_VOLTAGE.0.into()).await?;
         let statusword = self.wait_for_power_off().await?;
-        self.note(|state| state.disarmed = true);
+        self.note(|state| state.is_power_off = true);
         if !statusword.is_fault() {
             return Ok(());
         }
@@ -328,8 +328,8 @@ impl Script {
         ))
     }
 
-    /// Refuses to home an axis once more that stands elsewhere: homing where it stands would make a twisted cable
-    /// or an inserted needle its zero, and any other method would move it.
+    /// Refuses to home again an axis that stands away from its home. Homing in place would set its zero with the cable
+    /// twisted or the needle inserted, and any other method would move it.
     async fn check_not_homed_elsewhere(&self, position: i32) -> Result<(), String> {
         let (AxisUse::Home { again: false }, Some(homing)) = (self.purpose, self.drive().homing)
         else {

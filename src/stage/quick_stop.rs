@@ -83,7 +83,7 @@ impl AxisStop {
     async fn stop(mut self) -> Result<i32, String> {
         let stood = self.come_to_stand(Some(Controlword::QUICK_STOP)).await;
         let result = self.take_power_off(stood).await;
-        // Once more: the drive may have missed the first command.
+        // Send it again: the drive may have missed the first command.
         self.sdo.leave_operational();
         result
     }
@@ -99,7 +99,7 @@ impl AxisStop {
                 if let Some(word) = command.filter(|_| !obeys) {
                     self.command(word, self.give_up).await?;
                 }
-                trouble = self.disobedience().await;
+                trouble = self.why_not_stopped().await;
                 obeys = trouble.is_none();
             }
             let trouble = match trouble {
@@ -126,7 +126,7 @@ impl AxisStop {
     }
 
     /// Why the axis is not known to have left Operation Enabled; `None` if it has.
-    async fn disobedience(&mut self) -> Option<String> {
+    async fn why_not_stopped(&mut self) -> Option<String> {
         match self.statusword().await {
             Err(error) => Some(error),
             Ok(word) if word.state() == Some(DriveState::OperationEnabled) => {

@@ -4,7 +4,7 @@ use super::{Axis, PerAxis, Stage};
 use crate::units::Time;
 use std::time::Duration;
 
-/// A drive may report with this delay why it has stopped: the emergency message may come after the statusword.
+/// A drive may report this much later why it has stopped: its emergency message may come after the statusword.
 const EMCY_DELAY: Duration = Duration::from_millis(50);
 
 /// The test under way.
@@ -12,7 +12,7 @@ const EMCY_DELAY: Duration = Duration::from_millis(50);
 pub(super) struct SilenceTest {
     /// The drives that have sent emergency message 0x8130.
     noticed: PerAxis<bool>,
-    /// The first fault of a drive that has not sent 0x8130, and when that message must have come.
+    /// The first fault of a drive that has not sent 0x8130, and the deadline for that message.
     unexplained: PerAxis<Option<(Time, String)>>,
 }
 

@@ -20,7 +20,8 @@ pub(super) struct Standstill {
     anchor_counts: i64,
     positions: u32,
     stood: Duration,
-    /// How long the axis still brakes, by what it was commanded. Positions that do not change before are frozen.
+    /// How much longer the axis must still brake by its commanded speed. Positions that do not change until then are
+    /// frozen, and do not show a standstill.
     braking: Duration,
 }
 

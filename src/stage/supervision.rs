@@ -75,7 +75,7 @@ impl Stage {
             return;
         }
         if event == HeartbeatEvent::State(NmtState::Stopped) {
-            // A command that was sent to this drive by SDO was lost.
+            // In Stopped a node takes no SDO, so a command that was sent to this drive by SDO was lost.
             self.repeat_due = now;
         }
         // The heartbeat may have been sent before the drive took the start command.
@@ -111,9 +111,10 @@ impl Stage {
             self.emit(StageEvent::Emergency(axis, emcy));
         }
         // Errors from before bring-up took power off stop nothing: bring-up reads the statusword instead.
-        let is_watched = self.bring_ups[axis].as_ref().is_none_or(|drive| drive.state().disarmed)
-            && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped)
-            && !self.drives[axis].sent_to_pre_operational;
+        let is_watched =
+            self.bring_ups[axis].as_ref().is_none_or(|drive| drive.state().is_power_off)
+                && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped)
+                && !self.drives[axis].sent_to_pre_operational;
         let is_of_found_fault = self.drives[axis].is_of_found_fault(emcy.code);
         let is_expected = emcy.code == EmcyCode::NO_ERROR
             || emcy.code == EmcyCode::HEARTBEAT && self.note_silence_noticed(axis);
@@ -142,7 +143,7 @@ impl Stage {
         self.drives[axis].take_tpdo(payload, self.sync_count);
         self.check_statusword(now, axis, previous);
         let drive = &self.drives[axis];
-        if self.is_quick_stopping() && drive.disobeys_stop() && !drive.sent_to_pre_operational {
+        if self.is_quick_stopping() && drive.ignores_stop() && !drive.sent_to_pre_operational {
             self.stop_by_sdo_alone(axis);
         }
         if self.drives.all(|drive| drive.answers.fresh) {

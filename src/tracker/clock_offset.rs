@@ -93,7 +93,7 @@ struct Late {
 }
 
 impl ClockOffset {
-    /// What to add to `source_ns` to bring it to our time line: at most `receive − source`.
+    /// Returns the offset, ns, that converts `source_ns` to our time line: at most `receive − source`.
     ///
     /// # Errors
     /// [`Refusal`]; the stamp must not be used.
@@ -138,7 +138,7 @@ impl ClockOffset {
                     );
                     return Ok(self.learn(offset, source_ns, Some(news)));
                 }
-                // Stamps were only overtaken.
+                // A stamp was only overtaken by others: the clock was not set.
                 Ok(_) => (self.candidate, self.went_back) = (Settling::default(), false),
                 Err(samples) if is_ahead || behind_ns > DATED_BEHIND_MAX_NS => {
                     return Err(if back_ns > 0 {
@@ -174,7 +174,7 @@ impl ClockOffset {
         ns
     }
 
-    /// What to tell the operator about the sender's clock.
+    /// Takes the message to the operator about the sender's clock, if there is one.
     pub(super) fn news(&mut self) -> Option<String> {
         self.news.take()
     }
@@ -192,7 +192,7 @@ impl ClockOffset {
             late.samples = late.samples.saturating_add(1);
             late.least_ns = late.least_ns.min(late_ns);
             let lasts = late.samples >= LATE_SAMPLES && receive.since(late.since) >= time;
-            // A run over the first limit is over the second as well.
+            // A run that exceeds the first limit exceeds the second, too.
             if lasts && !late.is_reported && !is_reported {
                 self.news = Some(format!(
                     "by their stamps, positions come {:.3} s later than before: delayed, or the sender's \
@@ -265,7 +265,7 @@ struct Settling {
 }
 
 impl Settling {
-    /// By how much a stamp goes back from the one before; `None` for the first.
+    /// How far a stamp goes back from the one before, ns; `None` for the first stamp.
     fn back_ns(&self, source_ns: i64) -> Option<i64> {
         self.since.map(|_| self.last_source_ns.saturating_sub(source_ns))
     }

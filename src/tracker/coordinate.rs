@@ -7,7 +7,8 @@ use std::fmt;
 
 /// Positions that differ from one another are counted up to this number.
 const COUNTED_MAX: usize = 100;
-/// Where no coordinate ever changes by less than this, mm, the stream is rounded: one that is held may stay the same.
+/// If no coordinate ever changes by less than this, mm, the stream is rounded, and a coordinate of a tool at rest may
+/// stay the same.
 const ROUNDED_MM: f64 = 0.009;
 
 /// Watches the positions of a stream, in the tracker's frame, from the first on.
@@ -44,7 +45,7 @@ impl CoordinateWatch {
     pub const POSITIONS_AT_REST: usize = 10;
     /// The fewest that show it during an insertion.
     pub const POSITIONS_INSERTED: usize = COUNTED_MAX;
-    /// What the operator should look at.
+    /// Advice to the operator.
     pub const ADVICE: &str = "has it two dimensions, or its transform a row of zeros?";
 
     /// Takes the next position, mm, finite.

@@ -140,7 +140,7 @@ impl Columns {
         };
         let position_mm = Vector3::from_vec(numbers(&self.position)?) * mapping.position_unit_mm;
         let orientation = match is_blank(&self.quaternion_wxyz) {
-            // Also where the mapping has no such columns.
+            // This also applies if the mapping has no such columns.
             true => Orientation::Absent,
             false => match numbers(&self.quaternion_wxyz)?[..] {
                 [w, x, y, z] => Orientation::of_quaternion([w, x, y, z]),

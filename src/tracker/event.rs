@@ -17,7 +17,7 @@ pub enum Event {
     },
     /// No connection could be made; another attempt follows.
     Unreachable {
-        /// What happened and what to check.
+        /// The error, and what to check.
         reason: String,
     },
     /// Another client wanted to connect; the bench reads one at a time.
@@ -135,7 +135,7 @@ impl Census {
         if peer.is_empty() {
             return format!("tracker: not connected, so no position of {}", shown(tool));
         }
-        // Tools first, and without the type of their messages.
+        // Tools come first, without the type of their messages.
         let devices = devices.iter().filter(|(name, _)| !tools.contains(*name));
         let (more_tools, others): (Vec<_>, Vec<_>) =
             devices.partition(|(_, message_type)| has_positions(message_type));

@@ -17,9 +17,9 @@ const SHOWN_MAX: usize = 40;
 /// Senders send this when they have no measurement.
 const ZERO_POSE: &str = "the exact zero pose, which stands for a tool that was not seen";
 
-/// Passes samples that can be a measurement at all. It checks in this order: the tool, finite
-/// numbers, a rotation, not the exact zero or identity that stands for "nothing seen", valid by the
-/// tracker's own status, registered, inside the workspace.
+/// Accepts a sample only if it can be a measurement. It checks in this order: the tool, finite numbers, a rotation,
+/// not the exact zero or identity that stands for "not seen", valid by the tracker's own status, registered, inside
+/// the workspace.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Gate {
     /// The tool to steer by; samples of other tools are refused.
@@ -57,8 +57,8 @@ section! {
 }
 
 impl Gate {
-    /// Checks that a sample is a measurement by itself, of whatever tool and wherever the tracker stands: its
-    /// position is finite, and its content passes the [checks](Self::checks).
+    /// Checks the content of a sample, whatever its tool and the registration are: its position is finite, and it
+    /// passes the [checks](Self::checks).
     ///
     /// # Errors
     /// [`Refusal`], by the first check that fails.
@@ -77,7 +77,7 @@ impl Gate {
         self.admit_as("tip", sample)
     }
 
-    /// Like [`Gate::admit`]; what the tool marks is called `what` in a refusal.
+    /// As [`Gate::admit`]; a refusal calls the point that the tool marks `what`.
     ///
     /// # Errors
     /// [`Refusal`], by the first check that fails.

@@ -22,7 +22,7 @@ const UNIT_TOLERANCE: f64 = 1e-12;
 pub(super) enum Orientation {
     /// No orientation was sent.
     Absent,
-    /// What was sent is not a rotation.
+    /// The orientation that was sent is not a rotation.
     NotARotation,
     /// A rotation.
     Rotation(UnitQuaternion<f64>),

@@ -31,7 +31,7 @@ pub struct StageHistory {
 }
 
 impl StagePoint {
-    /// The straight line from `self` to `later`, at `time` between them.
+    /// The position at `time`, on the straight line from `self` to `later`.
     fn interpolate(&self, later: &StagePoint, time: Time) -> StagePoint {
         let fraction = time.seconds_after(self.time) / later.time.seconds_after(self.time);
         let moved = later.since(self);

@@ -38,7 +38,7 @@ pub enum GateName {
     Lost,
 }
 
-/// What a refusal does to the track.
+/// The effect of a refusal on the track.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Effect {
     /// None: a sample of another tool, sent twice, too old to pair, or received while the bench learns
@@ -56,7 +56,7 @@ pub enum Effect {
 pub struct Refusal {
     /// The gate that refused.
     pub gate: GateName,
-    /// What the refusal does to the track.
+    /// The effect on the track.
     pub effect: Effect,
     /// Why, with the numbers and the limit.
     pub why: String,
@@ -93,7 +93,7 @@ pub(crate) fn short(value: f64) -> String {
     if value.abs() < 1e6 { format!("{value:.1}") } else { format!("{value:.1e}") }
 }
 
-/// What the gates did with the samples so far.
+/// The numbers of samples that the gates have accepted and refused so far.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct GateCounts {
     /// Samples that passed.

@@ -8,11 +8,11 @@ use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 
 /// One position of a tool as the tracker sent it, in the tracker's frame T.
 ///
-/// Nothing of it has been checked: the position may be infinite, stale or somebody else's. The
+/// It has not been checked: the position may be infinite, stale, or that of another tool. The
 /// [gate](super::gate) decides.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
-    /// The tool's name. Cut to 20 bytes where the protocol cuts it.
+    /// The tool's name, truncated to 20 bytes if the protocol has no room for more.
     pub tool: String,
     /// When the sample was received, on the session's time line.
     pub receive_time: Time,

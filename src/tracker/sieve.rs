@@ -38,8 +38,8 @@ impl Sieve {
         }
     }
 
-    /// What to pass on for `event`, received at `now`; `None` for nothing. The first sample of another tool
-    /// becomes [`Event::SawTool`], unless its name was reported before.
+    /// Returns the event to pass on for `event`, received at `now`; `None` for nothing. The first sample of another
+    /// tool becomes [`Event::SawTool`], unless its name was reported before.
     pub fn pass(&mut self, now: Time, event: Event) -> Option<Event> {
         match event {
             Event::Connected { .. } => self.names.clear(),

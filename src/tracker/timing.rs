@@ -70,7 +70,7 @@ impl AcquisitionClock {
         self.offset = ClockOffset::default();
     }
 
-    /// What to tell the operator about the sender's clock since the last sample.
+    /// Takes the message to the operator about the sender's clock, if the last sample has caused one.
     pub fn news(&mut self) -> Option<String> {
         self.offset.news()
     }

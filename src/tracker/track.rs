@@ -71,7 +71,7 @@ pub struct Prediction {
     pub since_correction_mm: f64,
 }
 
-/// What the operator sees of the track.
+/// The state of a track, for the operator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TrackState {
     /// Too few positions have come yet that agree with one another.
@@ -114,7 +114,7 @@ const NO_MODEL: &str = "no observer has an estimate yet to find the tip again";
 /// The period is averaged over about this many positions.
 const PERIOD_MEMORY: f64 = 16.0;
 
-/// The track of a tip: believes positions that follow from the ones before and from the model.
+/// The track of a tip: accepts positions that follow from the ones before and from the model.
 ///
 /// Before an insertion the tip may be anywhere: it is found once some positions in a row are
 /// within a step of one another ([`Track::seek`]). During an insertion ([`Track::judge`]) a position must
@@ -149,7 +149,7 @@ pub struct Track {
 }
 
 impl Track {
-    /// A track of which nothing is known yet.
+    /// A track without positions.
     pub fn new(settings: TrackSettings) -> Self {
         Track {
             settings,
@@ -207,7 +207,7 @@ impl Track {
         }
     }
 
-    /// What the operator sees at `now`.
+    /// The state at `now`, for the operator.
     pub fn state(&self, now: Time) -> TrackState {
         match self.last_believed {
             _ if self.is_lost => TrackState::Lost,
@@ -388,7 +388,7 @@ impl Track {
             .last_believed
             .map(|last| fix.acquisition_time.seconds_after(last.acquisition_time));
         if let Some(interval_s) = interval_s.filter(|interval_s| *interval_s > 0.0) {
-            // Cut, so that a gap hardly changes the period; a stream that has become slower is still learnt.
+            // Limited, so that a gap hardly changes the period. The period of a slower stream is still learnt.
             let period_s = self.period_s.unwrap_or(interval_s);
             let interval_s = interval_s.min(self.settings.coast_after_periods * period_s);
             self.period_s = Some(period_s + (interval_s - period_s) / PERIOD_MEMORY);

@@ -22,15 +22,15 @@ const STRETCHES: [usize; 10] = [12, 16, 24, 32, 48, 64, 96, 128, 192, BINS_MAX];
 const BINS_MAX: usize = 256;
 /// A stretch with fewer positions is not checked.
 const POSITIONS_MIN: f64 = 6.0;
-/// A bin with more positions than this many times the usual number, because the needle was held there, counts as one
-/// with so many. Otherwise it would outweigh the others, and a stretch with it would not be checked.
-const CROWDED: f64 = 4.0;
+/// A bin counts for at most this many times the usual number of positions. A bin in which the needle was held would
+/// otherwise outweigh the others, and a stretch with it would not be checked.
+const BIN_WEIGHT_MAX: f64 = 4.0;
 /// At most this many positions per mm count as independent: real noise is correlated.
 const INDEPENDENT_PER_MM: f64 = 10.0;
 /// Standard deviations of the slope's length that are allowed for noise, besides the tolerance.
 const NOISE_SDS: f64 = 5.5;
-/// A tip that travels by this share of the depth is taken for one in metres, if the slope has a standard error, by its
-/// own scatter, of at most this share of the slope.
+/// Positions count as metres if the tip travels by a share of the depth in this range, and the standard error of the
+/// slope, from its own scatter, is at most [`METRES_SD`] times the slope.
 const METRES: std::ops::Range<f64> = 0.0008..0.00125;
 const METRES_SD: f64 = 0.2;
 /// The explanation of a refusal looks at this many bins: 8 mm.
@@ -48,11 +48,11 @@ const CURVATURE_MARGIN: f64 = 1.3;
 const RECORDED_STRETCH_MM: f64 = 10.0;
 /// A recorded insertion has at most this many stretches.
 const RECORDED_STRETCHES_MAX: f64 = 100.0;
-/// The travel of the tip, in mm per mm inserted, that a recorded stretch may have besides its noise. It is wide, since
-/// neither needle nor noise of a recording are known: over 20 mm an arc with a radius of 10 mm has 0.9.
+/// The range of the tip's travel over a recorded stretch, in mm per mm inserted, without noise. It is wide, since the
+/// needle and the noise of a recording are not known: over 20 mm an arc with a radius of 10 mm has 0.9.
 const RECORDED_TRAVEL: std::ops::Range<f64> = 0.5..1.5;
 
-/// What is tolerated besides noise.
+/// The deviation that is tolerated besides noise.
 struct Tolerance {
     /// A share of the travel.
     share: f64,
@@ -116,8 +116,8 @@ impl Sums {
         residual_mm2.max(0.0) / (3.0 * (self.count - 2.0))
     }
 
-    /// Whether the tip travels a thousandth of the depth, and scatters as little. The configured noise does not count:
-    /// that of such positions is a thousandth of it.
+    /// Whether the positions are in metres: the tip travels a thousandth of the depth, and its positions scatter as
+    /// little. The configured noise does not apply to them, since it is in mm.
     fn is_in_metres(&self) -> bool {
         let travel = self.slope().norm();
         let sd = (self.scatter_mm2() / self.depth_spread_mm2()).sqrt();
@@ -133,8 +133,8 @@ impl TravelCheck {
         TravelCheck { noise_sd_mm, curvature_per_mm, bins, newest_bin, error: None }
     }
 
-    /// Takes an accepted position, measured at this depth of the stage, mm. If the configured noise is correlated,
-    /// the position is worth only this part of an `independent` one.
+    /// Takes an accepted position, mm, measured at this depth of the stage, mm. It carries as much information as
+    /// `independent` positions with independent noise: at most 1, and less if the configured noise is correlated.
     pub fn take(&mut self, insertion_mm: f64, position_mm: &Vector3<f64>, independent: f64) {
         let bin = (insertion_mm / BIN_MM).floor() as i64;
         if self.bins.is_empty() || bin > self.newest_bin {
@@ -149,7 +149,7 @@ impl TravelCheck {
             }
             self.newest_bin = bin;
         }
-        // After an encoder's step back the position still counts to the newest bin.
+        // If the encoder has stepped back, the position still belongs to the newest bin.
         if let Some(newest) = self.bins.back_mut() {
             *newest += Sums::of(insertion_mm, position_mm, independent);
         }
@@ -164,7 +164,7 @@ impl TravelCheck {
     }
 
     /// The median number of positions in the bins that have any; 0 if there are none.
-    fn usual_count(&self) -> f64 {
+    fn median_count(&self) -> f64 {
         let counts = self.bins.iter().map(|bin| bin.count).filter(|count| *count > 0.0);
         let mut counts: Vec<f64> = counts.collect();
         counts.sort_by(f64::total_cmp);
@@ -174,16 +174,16 @@ impl TravelCheck {
     /// Checks every stretch that ends with the newest bin, the shortest first.
     fn check_stretches(&mut self) {
         let mut sums = Sums::default();
-        let error = (1..).zip(self.weighed_bins()).find_map(|(bins, bin)| {
+        let error = (1..).zip(self.weighted_bins()).find_map(|(bins, bin)| {
             sums += bin;
             STRETCHES.contains(&bins).then(|| self.contradiction(&sums, bins))?
         });
         self.error = self.error.take().or(error);
     }
 
-    /// The bins, the newest first, none with more weight than [`CROWDED`] allows.
-    fn weighed_bins(&self) -> impl Iterator<Item = Sums> {
-        let count_max = CROWDED * self.usual_count();
+    /// The bins, the newest first, none with more weight than [`BIN_WEIGHT_MAX`] allows.
+    fn weighted_bins(&self) -> impl Iterator<Item = Sums> {
+        let count_max = BIN_WEIGHT_MAX * self.median_count();
         let limited = move |bin: &Sums| *bin * (count_max / bin.count).min(1.0);
         self.bins.iter().rev().map(move |bin| if bin.count > 0.0 { limited(bin) } else { *bin })
     }
@@ -204,7 +204,7 @@ impl TravelCheck {
     /// Whether the last positions are in metres.
     fn is_in_metres(&self) -> bool {
         let mut sums = Sums::default();
-        self.weighed_bins().take(EXPLAINED_BINS).for_each(|bin| sums += bin);
+        self.weighted_bins().take(EXPLAINED_BINS).for_each(|bin| sums += bin);
         sums.is_in_metres()
     }
 
@@ -216,7 +216,7 @@ impl TravelCheck {
 
     /// The change to a scale in this range that fits the last `bins` bins, if any does.
     fn change_over(&self, bins: usize, tenths: Tenths) -> Option<ScaleChange> {
-        ScaleChange::fitted(self.weighed_bins().take(bins), tenths, self.noise_sd_mm.powi(2))
+        ScaleChange::fitted(self.weighted_bins().take(bins), tenths, self.noise_sd_mm.powi(2))
     }
 
     /// How the positions over the last `bins` bins, with these sums, contradict the insertion, if they do.

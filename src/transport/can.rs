@@ -81,8 +81,8 @@ pub trait CanBus: Send {
         None
     }
 
-    /// Puts an error frame on the bus, as if every controller on it had reported `error`. Real buses
-    /// carry no error frames.
+    /// Sends an error frame to every other endpoint of a virtual bus, as if its own controller had reported `error`.
+    /// Real buses carry no error frames.
     ///
     /// # Errors
     /// [`CanError::Io`] on a bus that cannot do so; otherwise as [`send`](Self::send).
@@ -140,9 +140,9 @@ pub enum CanError {
     NotConfirmed {
         /// The interface's name.
         interface: String,
-        /// How many wait.
+        /// The number of frames that wait.
         frames: usize,
-        /// Of how many SYNCs.
+        /// The number of SYNCs whose frames wait.
         syncs: usize,
     },
     /// Another error of the operating system.
@@ -150,7 +150,7 @@ pub enum CanError {
     Io {
         /// The interface's name.
         interface: String,
-        /// What was being done.
+        /// The action that failed.
         action: &'static str,
         /// The error of the operating system.
         reason: io::Error,
@@ -160,7 +160,7 @@ pub enum CanError {
 /// The emulated bus, which no command can bring up.
 const MEMORY: &str = "memory";
 
-/// What brings `interface` up: a command, for most interfaces.
+/// The next step to bring `interface` up: for most interfaces a command.
 fn bring_up_hint(interface: &str) -> String {
     if interface == MEMORY {
         "it is emulated, an [[emulator.fault]] took it down".to_owned()

@@ -215,7 +215,7 @@ impl Drop for Outlet {
 /// Streams that are not over TCP: from standard input or another reader, and from a recording.
 impl Link {
     /// Reads `input`, called `name` in messages, to its end, on a thread of its own, because reading a pipe may
-    /// block for ever. `clock` gives the receive times.
+    /// block forever. `clock` gives the receive times.
     pub fn read<R, C>(mut input: R, name: &str, settings: LinkSettings, clock: C) -> Self
     where
         R: Read + Send + 'static,

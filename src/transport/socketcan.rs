@@ -259,7 +259,7 @@ fn cannot_open(interface: &str, error: io::Error) -> CanError {
     }
 }
 
-/// Never `None` for a [`Frame`], whose identifier and length are in range.
+/// Converts a frame for the kernel. Never `None`, since identifier and length of a [`Frame`] are in range.
 fn to_socketcan(frame: &Frame) -> Option<CanFrame> {
     let id = match frame.id() {
         CanId::Base(id) => Id::Standard(StandardId::new(id)?),

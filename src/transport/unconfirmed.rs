@@ -39,7 +39,8 @@ impl Unconfirmed {
         }
     }
 
-    /// If so many SYNCs wait that no more frames may be sent: the numbers of waiting frames and SYNCs.
+    /// The numbers of waiting frames and SYNCs, if so many SYNCs wait that no more frames may be sent; otherwise
+    /// `None`.
     pub fn too_many(&self) -> Option<(usize, usize)> {
         let syncs = self.dropped_before.len();
         (syncs >= self.syncs_max).then_some((self.frames.len(), syncs))

@@ -34,7 +34,7 @@ pub enum DriveState {
 }
 
 impl DriveState {
-    /// True in a fault, stopping or stopped.
+    /// True in Fault and in Fault Reaction Active.
     pub fn is_fault(self) -> bool {
         matches!(self, DriveState::Fault | DriveState::FaultReactionActive)
     }
@@ -53,11 +53,11 @@ pub struct Statusword(pub u16);
 impl Statusword {
     /// Bit 4: the power stage has its supply.
     pub const VOLTAGE_ENABLED: u16 = 1 << 4;
-    /// Bit 7.
+    /// Bit 7: the drive warns.
     pub const WARNING: u16 = 1 << 7;
     /// Bit 9: the drive obeys the controlword.
     pub const REMOTE: u16 = 1 << 9;
-    /// Bit 10.
+    /// Bit 10: the target is reached; in homing, the axis stands.
     pub const TARGET_REACHED: u16 = 1 << 10;
     /// Bit 11: an internal limit is active.
     pub const INTERNAL_LIMIT: u16 = 1 << 11;
@@ -65,7 +65,7 @@ impl Statusword {
     pub const FOLLOWS_COMMAND: u16 = 1 << 12;
     /// Bit 12 in homing: the axis is homed.
     pub const HOMING_ATTAINED: u16 = 1 << 12;
-    /// Bit 13 in PP and CSP.
+    /// Bit 13 in PP and CSP: the position has left the following-error window.
     pub const FOLLOWING_ERROR: u16 = 1 << 13;
     /// Bit 13 in homing: homing error.
     pub const HOMING_ERROR: u16 = 1 << 13;
@@ -82,7 +82,7 @@ impl Statusword {
         (DriveState::QuickStopActive, 0x6f, 0x07),
     ];
 
-    /// True in a fault, stopping or stopped.
+    /// True in Fault and in Fault Reaction Active.
     pub fn is_fault(self) -> bool {
         self.state().is_some_and(DriveState::is_fault)
     }
@@ -133,7 +133,7 @@ impl Controlword {
     pub const HOMING_START_BIT: u16 = 1 << 4;
     /// Bit 7: a fault is reset on its rising edge.
     pub const FAULT_RESET_BIT: u16 = 1 << 7;
-    /// Bit 8.
+    /// Bit 8: halt.
     pub const HALT_BIT: u16 = 1 << 8;
 
     /// Power off at once, the axis coasts.

@@ -12,10 +12,11 @@ use crate::canopen::object::communication::{DEVICE_TYPE, ERROR_REGISTER};
 use crate::canopen::{Frame, NodeId, ObjectAddress, cob};
 use crate::units::Time;
 
-/// If an old answer may still come, the first of these objects that the next request does not name is read
-/// before that request. Every node has both.
+/// Fence objects. If an old answer may still come, the client first reads the first of these that the next request
+/// does not name. Every node has both.
 const FENCES: [ObjectAddress; 2] = [ERROR_REGISTER, DEVICE_TYPE];
-/// An answer is looked for among this many requests: a second drive may answer later than the first.
+/// Extra answers are recognized for this many of the last requests: a second drive with the same node number may
+/// answer later than the first.
 const ANSWERED_MAX: usize = 8;
 
 #[derive(Debug, Clone, Copy)]
@@ -155,8 +156,8 @@ impl SdoClient {
         if self.has_other_client { 0 } else { self.extra_answers }
     }
 
-    /// Whether `answer` repeats that to one of the last requests. While an answer from before a timeout may still
-    /// come, none does.
+    /// Whether `answer` repeats the answer to one of the last requests. False while an answer from before a timeout may
+    /// still come.
     fn is_extra(&self, answer: ServerFrame) -> bool {
         let is_due = self.transfer.is_some_and(|transfer| can_answer(answer, transfer.request));
         let was_given = self.answered.iter().any(|request| can_answer(answer, *request));

@@ -24,7 +24,7 @@ pub type SdoBytes = [u8; 8];
 /// The object address of an abort that names no object: 0000:00.
 pub(super) const NO_OBJECT: ObjectAddress = ObjectAddress::new(0, 0);
 
-/// What a client sends.
+/// A frame from a client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ClientFrame {
     /// Read or write an object.
@@ -38,7 +38,7 @@ pub enum ClientFrame {
     Unsupported(ObjectAddress),
 }
 
-/// What a server sends.
+/// A frame from a server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ServerFrame {
     /// The object was read or written.

@@ -96,7 +96,7 @@ impl SdoValue {
         &self.bytes[..usize::from(self.len)]
     }
 
-    /// As an unsigned number, if there are at least `len` bytes. There may be more than the object has: an
+    /// The value as an unsigned number, if there are at least `len` bytes. There may be more than the object has: an
     /// expedited answer need not say how many of its four bytes belong to the object (CiA 301, 7.2.4.3.6).
     pub fn at_least(self, len: u8) -> Option<u32> {
         (self.len >= len).then_some(self.to_u32())
@@ -107,7 +107,7 @@ impl SdoValue {
         self.is_sized.then_some(self.len.into())
     }
 
-    /// As an unsigned number.
+    /// The value as an unsigned number.
     pub const fn to_u32(self) -> u32 {
         u32::from_le_bytes(self.bytes)
     }

@@ -25,7 +25,7 @@ const REDUCED: [usize; 3] = [0, 4, 5];
 /// These components change the fibre, SE(2): y, z and the yaw.
 const FIBRE: [usize; 3] = [1, 2, 3];
 
-/// The paper's coupled observer (Fig. 2) without its local coordinates, with fading memory.
+/// The paper's coupled observer (Fig. 2) without local coordinates, with fading memory.
 ///
 /// The structure is the paper's: x alone corrects the reduced state, which does not depend on the
 /// fibre. The reduced estimate drives the fibre, which y and z correct. The paper's coordinates (Eq. 5) end
@@ -252,7 +252,8 @@ impl Observer for CoupledBank {
         });
         self.nis = likeliest.1;
         // The bank starts at the first position, and starts again if no copy can explain a position.
-        // A mean is better than one position. One position is as good as any, however correlated the next is.
+        // A mean is more accurate than one position. A single position has the configured standard deviation, however
+        // correlated its noise is with that of the next.
         let sd_mm = variance_mm2.sqrt().min(self.config.position_sd_mm);
         self.start_copies_if_due((tip_meas, sd_mm));
         mixture::reduce(&mut self.bank, WEIGHT_MIN);

@@ -10,9 +10,9 @@ use crate::observer::start;
 
 /// Number of rolls that the bank starts with if the roll is unknown.
 const ROLLS: u32 = 8;
-/// Relative standard deviation of a configured torsion in one half of the bank…
+/// Relative standard deviation of a configured torsion in one half of the bank.
 const TORSION_SD_TIGHT: f64 = 0.04;
-/// … and in the other half, which takes over if the first is wrong.
+/// The same in the other half, which takes over if the first half is wrong.
 const TORSION_SD_LOOSE: f64 = 0.22;
 /// If no torsion is configured, these growths of the band are tried, with these standard deviations, both as
 /// fractions of the search range. They are finer near 0, because a growth that was once mistaken for none is

@@ -17,10 +17,10 @@ use crate::needle::{Increment, Needle, TipPosition};
 use crate::observer::Slack;
 use nalgebra::{Matrix3, Vector3};
 
-/// A turn against the stroke starts a new stroke if it comes within a margin of the other edge: this angle,
-/// rad …
+/// A turn against the stroke starts a new stroke if it comes within a margin of the other edge: this angle, rad, plus
+/// [`REVERSAL_MARGIN_SD`] standard deviations.
 const REVERSAL_MARGIN_RAD: f64 = 0.05;
-/// … plus this many standard deviations of the distance to the edge.
+/// The part of that margin in standard deviations of the distance to the edge.
 const REVERSAL_MARGIN_SD: f64 = 5.0;
 
 /// Process noise, as variances per mm of insertion.

@@ -83,7 +83,8 @@ impl Invariant {
             return;
         }
         if self.bank.is_empty() {
-            // A mean is better than one position. One position is as good as any, however correlated the next is.
+            // A mean is more accurate than one position. A single position has the configured standard deviation,
+            // however correlated its noise is with that of the next.
             let position_sd_mm = variance_mm2.sqrt().min(self.config.position_sd_mm);
             let config = InvariantConfig { position_sd_mm, ..self.config };
             self.bank = config.bank(&self.needle, &self.torsion, tip_meas);

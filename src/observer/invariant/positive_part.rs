@@ -8,8 +8,7 @@ const SD_MIN: f64 = 1e-9;
 /// A variable farther from the kink than this many standard deviations counts as on one side of it.
 const SD_FAR: f64 = 8.0;
 
-/// `q = max(a, 0)` of a normal variable a. An edge of the play acts in this way on an uncertain
-/// lag.
+/// The positive part `q = max(a, 0)` of a normal variable a. An edge of the play acts on an uncertain lag in this way.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct PositivePart {
     /// E q.

@@ -117,7 +117,7 @@ fn the_lateness_of_a_sync_counts_from_when_the_sync_was_due() {
     let mut bus = StampedBus { frame: None, stamp: SystemTime::now() };
     let mut run = Live::new(&mut machine, &mut bus, None, clock, |_, _| {});
     run.give(Input::Tick);
-    carry_out(&mut run);
+    flush_outputs(&mut run);
     let timing = run.timing.report(Counters::default());
     assert!((5_000_000..9_000_000).contains(&timing.sync_late_us_max), "{timing:?}");
     assert!(timing.deadline_late_us_max >= 10_000_000, "{timing:?}");
@@ -400,13 +400,13 @@ fn run_ticking(
 ) -> RunReport {
     let mut run = Live::new(session, bus, None, clock, sink);
     let outcome = loop {
-        carry_out(&mut run);
+        flush_outputs(&mut run);
         match run.session.outcome().cloned() {
             Some(outcome) => break outcome,
             None => run.session.handle(run.session.deadline(), Input::Tick),
         }
     };
-    run.witness.finish(run.session, outcome, clock.now(), None)
+    run.monitor.finish(run.session, outcome, clock.now(), None)
 }
 
 /// Frames queued behind the refused one are stale and never sent; the frames of the stop are. The record holds

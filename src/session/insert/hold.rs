@@ -5,7 +5,7 @@ use super::InsertTask;
 use crate::session::config::Resume;
 use crate::session::insertion::Insertion;
 use crate::session::shell::Shell;
-use crate::session::tracking::Trouble;
+use crate::session::tracking::HoldReason;
 use crate::session::{Lane, Severity, State};
 use crate::text::clipped;
 use crate::units::Time;
@@ -13,9 +13,9 @@ use std::time::Duration;
 
 /// A message about a tip that is not seen has at most this many characters.
 pub(super) const MESSAGE_MAX: usize = 200;
-/// What the operator should check when the stream contradicts the model.
+/// Advice to the operator when the stream contradicts the model.
 const JUMP_ADVICE: &str = "check the tracker, needle.radius_mm, tip_offset_mm";
-/// What the operator should check when the tip does not move: the needle may be loose, or the axes exchanged.
+/// Advice to the operator when the tip does not move: the needle may be loose, or the axes exchanged.
 const FROZEN_ADVICE: &str = "check the tracker, the needle's clamp, and which drive is which";
 /// Why a command is refused before the insertion.
 pub(super) const NOT_BEGUN: &str = "the insertion has not begun";
@@ -32,26 +32,26 @@ pub(super) struct Hold {
     by: HeldBy,
 }
 
-/// A hold by the tracker that has ended by itself, together with those before it. The next hold has that much
-/// less time before it ends the run, but gets back the time for which the insertion went on in between. So
-/// the run ends when the stream causes holds for longer than it is believed.
+/// The last hold by the tracker that ended by itself. Its time, which includes that of the holds before it, counts
+/// towards `tracker.hold_timeout_s` of the next hold, less the time for which the insertion went on in between. So
+/// the run ends if the stream causes holds for longer than it is believed.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct EndedHold {
     at: Time,
     lasted: Duration,
 }
 
-/// What holds an insertion. A hold by the operator or by a step lasts until the operator ends it.
+/// The cause of a hold. A hold by the operator or by a step lasts until the operator ends it.
 #[derive(Debug, Clone)]
 enum HeldBy {
     Tracker {
         /// How long and how far the insertion went on blind, or how the stream contradicts the model; and why the
         /// tip was not seen, or what the operator should check.
-        trouble: Trouble,
+        reason: HoldReason,
         /// The hold interrupted a single step, which never goes on by itself.
         in_step: bool,
-        /// What the operator was told last: that the insertion may go on, or not.
-        is_told: bool,
+        /// The last message to the operator about this hold said that the insertion may go on.
+        may_go_on_reported: bool,
     },
     Operator,
     Step,
@@ -71,14 +71,14 @@ impl InsertTask {
         insertion_meas_mm: f64,
         insertion: &mut Insertion,
     ) -> Result<(), String> {
-        let found = self.trouble(now, insertion_meas_mm, insertion);
+        let found = self.hold_reason(now, insertion_meas_mm, insertion);
         let Some(hold) = &self.hold else {
-            if let Some(trouble) = found {
-                let text = format!("{}; insertion held; {}", trouble.what, trouble.why);
+            if let Some(reason) = found {
+                let text = format!("{}; insertion held; {}", reason.what, reason.why);
                 let text = clipped(&text, MESSAGE_MAX).into_owned();
                 insertion.profile.hold(self.config.tracker.hold.braking_mm_per_s2);
                 let in_step = insertion.profile.is_stepping();
-                let by = HeldBy::Tracker { trouble, in_step, is_told: false };
+                let by = HeldBy::Tracker { reason, in_step, may_go_on_reported: false };
                 let before = self.ended_hold.map_or(Duration::ZERO, |ended| {
                     ended.lasted.saturating_sub(now.since(ended.at))
                 });
@@ -90,14 +90,14 @@ impl InsertTask {
             }
             return Ok(());
         };
-        let HeldBy::Tracker { trouble: first, in_step, is_told } = &hold.by else {
+        let HeldBy::Tracker { reason: first, in_step, may_go_on_reported } = &hold.by else {
             return Ok(());
         };
         let lost = first.of;
         let tracker = &self.config.tracker;
         let is_standing = insertion.is_standing(insertion_meas_mm);
         let may_go_on = is_standing && found.is_none() && self.is_seen(now);
-        if tracker.hold.resume == Resume::Operator && may_go_on != *is_told {
+        if tracker.hold.resume == Resume::Operator && may_go_on != *may_go_on_reported {
             let held = now.since(hold.since) + hold.before;
             let left_s = tracker.hold.timeout.saturating_sub(held).as_secs_f64();
             let text = match may_go_on {
@@ -107,8 +107,10 @@ impl InsertTask {
                 false => format!("the {lost} is lost again; {left_s:.1} s are left"),
             };
             shell.report_at(now, Lane::Tracker, Severity::Info, text);
-            if let Some(Hold { by: HeldBy::Tracker { is_told, .. }, .. }) = &mut self.hold {
-                *is_told = may_go_on;
+            if let Some(Hold { by: HeldBy::Tracker { may_go_on_reported, .. }, .. }) =
+                &mut self.hold
+            {
+                *may_go_on_reported = may_go_on;
             }
             return Ok(());
         }
@@ -129,13 +131,13 @@ impl InsertTask {
             return Ok(());
         }
         let is_over = is_standing || insertion.must_stand(now.since(hold.since));
-        let (end, trouble) = if tracker.hold.resume == Resume::Stop && is_over {
+        let (end, reason) = if tracker.hold.resume == Resume::Stop && is_over {
             ("held and stopped".to_owned(), first)
         } else if now.since(hold.since) + hold.before >= tracker.hold.timeout {
             let in_a_row = if hold.before.is_zero() { "" } else { " in a row" };
             let timeout_s = tracker.hold.timeout.as_secs_f64();
             let end = format!("held for {timeout_s:.1} s{in_a_row} and stopped");
-            // The first trouble may be over and another may hold the insertion now.
+            // The first reason may no longer apply, and another may hold the insertion now.
             match (&found, insertion.explain_miss(insertion_meas_mm)) {
                 (None, Some(off)) if self.is_seen(now) => {
                     return Err(format!("tracker: the {lost} is seen again, but {off}; {end}"));
@@ -149,7 +151,7 @@ impl InsertTask {
         } else {
             return Ok(());
         };
-        let text = format!("tracker: {}; {end}; {}", trouble.what, trouble.why);
+        let text = format!("tracker: {}; {end}; {}", reason.what, reason.why);
         Err(clipped(&text, MESSAGE_MAX).into_owned())
     }
 
@@ -190,11 +192,8 @@ impl InsertTask {
         let hold = self.hold.as_ref().ok_or("the insertion is not held; hold it first")?;
         match (&hold.by, self.config.tracker.hold.resume) {
             (HeldBy::Tracker { .. }, Resume::Stop) => return Err(RUN_WILL_END.to_owned()),
-            (HeldBy::Tracker { trouble, .. }, Resume::Automatic) => {
-                return Err(format!(
-                    "the tracker holds it, until the {} is seen again",
-                    trouble.of
-                ));
+            (HeldBy::Tracker { reason, .. }, Resume::Automatic) => {
+                return Err(format!("the tracker holds it, until the {} is seen again", reason.of));
             }
             _ => {}
         }
@@ -225,7 +224,9 @@ impl InsertTask {
                 None => "the needle is still braking; try again once it stands".to_owned(),
             });
         }
-        if let Some(Trouble { what, why, .. }) = self.trouble(shell.now, insertion_mm, insertion) {
+        if let Some(HoldReason { what, why, .. }) =
+            self.hold_reason(shell.now, insertion_mm, insertion)
+        {
             return Err(clipped(&format!("{what}; {why}"), MESSAGE_MAX).into_owned());
         }
         let remaining_mm = insertion.remaining_mm();
@@ -243,16 +244,21 @@ impl InsertTask {
     }
 
     /// Why the insertion must be held; `None` if nothing calls for a hold.
-    fn trouble(&self, now: Time, insertion_meas_mm: f64, insertion: &Insertion) -> Option<Trouble> {
+    fn hold_reason(
+        &self,
+        now: Time,
+        insertion_meas_mm: f64,
+        insertion: &Insertion,
+    ) -> Option<HoldReason> {
         let of = "tip";
         if let Some(jump) = &self.tracking.jump {
             let why = if jump.is_frozen { FROZEN_ADVICE } else { JUMP_ADVICE };
-            return Some(Trouble { of, what: jump.what.clone(), why: why.to_owned() });
+            return Some(HoldReason { of, what: jump.what.clone(), why: why.to_owned() });
         }
         if let Some(what) = self.blindness(now, insertion_meas_mm, insertion) {
-            return Some(Trouble { of, what, why: self.tracking.explain_silence() });
+            return Some(HoldReason { of, what, why: self.tracking.explain_silence() });
         }
-        self.target.as_ref()?.trouble(now)
+        self.target.as_ref()?.hold_reason(now)
     }
 
     /// How long and how far the insertion has gone on blind, if it must be held for that: the tip is too old,

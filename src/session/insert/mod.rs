@@ -16,7 +16,7 @@ use super::state::State;
 use super::steering::Decision;
 use super::target::TargetTracking;
 use super::task::Task;
-use super::tracking::{Tracking, Trouble};
+use super::tracking::{HoldReason, Tracking};
 use super::{OperatorCommand, Progress, tracker_news};
 use crate::geometry::coordinates;
 use crate::observer::Estimate;
@@ -43,14 +43,14 @@ pub(super) struct InsertTask {
     /// Measured stage positions, with a depth that never decreases: the path that the needle has cut.
     history: StageHistory,
     estimation: Estimation,
-    /// `None` until the stage is brought up and the first tip position has come.
+    /// `None` until the axes have power and the tip is seen at an accepted start.
     insertion: Option<Insertion>,
     hold: Option<Hold>,
     /// The last hold by the tracker that ended by itself.
     ended_hold: Option<EndedHold>,
     /// Measurements that have not corrected the observers yet.
     pending: Vec<Measurement>,
-    /// The time of the feedback after which the observers still must be corrected.
+    /// The time of the feedback up to which the observers must still be corrected.
     catch_up_to: Option<Time>,
     progress: Progress,
 }
@@ -84,7 +84,7 @@ impl InsertTask {
         shell.enter(self.tracking.state(shell.now));
     }
 
-    /// Refuses an insertion from here that would run into a soft limit.
+    /// Refuses an insertion from `at` that would end beyond a soft limit.
     fn check_depth(&self, shell: &Shell, at: SetPoint) -> Result<(), String> {
         let depth_mm = self.config.insertion.depth_mm;
         let end = SetPoint { insertion_mm: at.insertion_mm + depth_mm, ..at };
@@ -96,10 +96,11 @@ impl InsertTask {
         })
     }
 
-    /// Both drives have answered a SYNC: pair, estimate, decide, command.
+    /// Handles the answers of both drives to a SYNC: pairs, estimates, decides and commands.
     fn take_feedback(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
         let cut_mm = self.history.newest().map_or(f64::NEG_INFINITY, |point| point.insertion_mm);
-        // A wrong reading must not count as cut until the needle is there. In a stop the axis passes its last target.
+        // A reading deeper than the set-point is wrong and must not count as cut. In a stop the axis may pass its
+        // last target, so there this limit does not apply.
         let inserting = self.insertion.as_ref().filter(|_| shell.is_running());
         let deepest_mm = inserting
             .map_or(f64::INFINITY, |insertion| insertion.deepest_stage_mm(feedback.commanded));
@@ -122,7 +123,7 @@ impl InsertTask {
         let mut inserted = Ok(());
         if shell.is_running() {
             measurements.into_iter().for_each(|measurement| {
-                self.estimation.gather(&measurement);
+                self.estimation.add_to_batch(&measurement);
                 self.pending.extend(insertion.take_measurement(measurement));
             });
             inserted = self.insert(shell, feedback, at, &mut insertion);
@@ -161,11 +162,11 @@ impl InsertTask {
                 self.estimation.take(newest, &self.history)?;
             }
         }
-        self.estimation.carry_to(time - self.config.tracker.hold.after, &self.history)
+        self.estimation.predict_to(time - self.config.tracker.hold.after, &self.history)
     }
 
-    /// One SYNC of the insertion: checks, the step that is due, the next set-point. An error is
-    /// the reason to stop the run.
+    /// Handles one SYNC of the insertion: makes the checks, takes the step that is due, and sends the next set-point.
+    /// An error is the reason to stop the run.
     fn insert(
         &mut self,
         shell: &mut Shell,
@@ -209,7 +210,7 @@ impl InsertTask {
         let Decision { estimate, rotation_cmd_rad_per_mm, command_saturated, .. } = decision;
         let refused = decision.refused.clone();
         let path = decision.approach.as_ref().and_then(|approach| approach.path.as_ref());
-        // The path begins at the estimate, which was carried along the history.
+        // The path begins at the estimate, which was predicted along the history.
         let estimated_mm = history.newest().map(|point| insertion.depth_mm(point.insertion_mm));
         let end_mm = estimated_mm.zip(path).map(|(from_mm, path)| from_mm + path.length_mm());
         let observer = match &estimate {
@@ -255,7 +256,8 @@ impl InsertTask {
 
     /// True while the tip is seen, and the target if that is a tool of its own.
     fn is_seen(&self, now: Time) -> bool {
-        let sees_target = self.target.as_ref().is_none_or(|target| target.trouble(now).is_none());
+        let sees_target =
+            self.target.as_ref().is_none_or(|target| target.hold_reason(now).is_none());
         self.tracking.is_seen(now) && sees_target
     }
 
@@ -267,7 +269,7 @@ impl InsertTask {
         let target = self.target.as_ref().map_or(tip, TargetTracking::last_acquisition);
         let last_seen = tip.min(target).unwrap_or(self.begun).max(self.begun);
         let waiting_since = match power {
-            Power::Off | Power::ComingOn => last_seen,
+            Power::Off | Power::Enabling => last_seen,
             // The start is accepted; power comes on, or the insertion begins, at the next SYNC.
             Power::Awaited(_) | Power::On(_) if matches!(self.start, Start::Accepted(_)) => {
                 last_seen
@@ -281,8 +283,8 @@ impl InsertTask {
     fn explain_no_tip(&self, now: Time) -> String {
         let limit_s = self.config.tracker.timeout.as_secs_f64();
         let target = self.target.as_ref().filter(|_| self.tracking.is_seen(now));
-        let text = match target.and_then(|target| target.trouble(now)) {
-            Some(Trouble { what, why, .. }) => {
+        let text = match target.and_then(|target| target.hold_reason(now)) {
+            Some(HoldReason { what, why, .. }) => {
                 format!("tracker: no target within {limit_s:.1} s; {what}; {why}")
             }
             None => {
@@ -320,7 +322,7 @@ impl Task for InsertTask {
         let Some(time) = self.catch_up_to.take() else { return Ok(()) };
         self.correct(time)?;
         let after = self.config.tracker.hold.after;
-        self.estimation.watch(time - after / 2, time - after, &self.history)
+        self.estimation.correct_watch(time - after / 2, time - after, &self.history)
     }
 
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
@@ -373,7 +375,7 @@ impl Task for InsertTask {
     fn deadline(&self, shell: &Shell) -> Time {
         match self.insertion {
             None => self.tip_due(shell.power()),
-            // At once. The SYNC up to which it catches up may be long past, without that the bench is late.
+            // Now, not at `catch_up_to`: that SYNC may be long past although the bench is not late.
             Some(_) => self.catch_up_to.map_or(Time::NEVER, |_| shell.now),
         }
     }

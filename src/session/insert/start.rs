@@ -13,7 +13,7 @@ use std::time::Duration;
 /// A start is refused only by the mean of the positions over this time, because of their noise.
 const AVERAGE: Duration = Duration::from_millis(500);
 /// Two positions are the same place if they are no farther apart than this many standard deviations of the noise
-/// of a coordinate. Uniform noise puts them no farther apart.
+/// of a coordinate. Uniform noise cannot put two positions of the same place farther apart.
 const SAME_PLACE_SDS: f64 = 6.0;
 
 /// Where the tip and the target are seen, plane frame, mm.
@@ -40,7 +40,7 @@ pub(super) enum Start {
     Unknown,
     /// In doubt since this time, with the mean of the positions since then.
     InDoubt(Time, MovingMean),
-    /// Good, with tip and target there.
+    /// Good, with tip and target at these positions.
     Accepted(Seen),
 }
 
@@ -102,7 +102,7 @@ impl InsertTask {
         steering.check_start(&seen.tip_mm).map_err(|why| format!("goal: {why}"))?;
         let Err(why) = check_reach(&self.config, &seen.tip_mm) else { return Ok(()) };
         match self.config.insertion.plane_out_of_reach {
-            // It was said when the start was accepted first.
+            // The operator was warned when the start was first accepted.
             PlaneOutOfReach::Insert if matches!(self.start, Start::Accepted(_)) => Ok(()),
             PlaneOutOfReach::Insert => {
                 shell.report(Lane::Session, Severity::Warning, why);

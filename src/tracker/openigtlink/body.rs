@@ -22,13 +22,13 @@ pub struct Tool<const N: usize> {
     /// The tool's name, at most 20 bytes. At most 19 are sent, and a zero, since the reference library
     /// reads a name without a zero as empty.
     pub name: String,
-    /// What its pose contains: a [`tool_kind`].
+    /// The kind of its pose: a [`tool_kind`].
     pub kind: u8,
     /// Its pose.
     pub pose: [f32; N],
 }
 
-/// What a tool's pose contains; other codes are kept.
+/// The kinds of a tool's pose. Other codes are kept.
 pub mod tool_kind {
     /// The tracker itself.
     pub const TRACKER: u8 = 1;

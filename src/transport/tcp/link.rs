@@ -141,7 +141,7 @@ impl<C: Fn() -> Time> LinkTask<C> {
         }
         let retry = self.settings.retry_first;
         let mut next_client = pin!(accept(listener, retry));
-        let mut is_told = false;
+        let mut is_reported = false;
         loop {
             tokio::select! {
                 read = peer.read() => {
@@ -156,8 +156,8 @@ impl<C: Fn() -> Time> LinkTask<C> {
                         *next = Some((stream, newcomer));
                         return reason;
                     }
-                    // Told once: a client may try again many times a second.
-                    if !std::mem::replace(&mut is_told, true) {
+                    // Reported once: a client may try again many times a second.
+                    if !std::mem::replace(&mut is_reported, true) {
                         let reason = format!(
                             "tracker: {newcomer} turned away: {} is connected, and one tracker at a time is read",
                             peer.name

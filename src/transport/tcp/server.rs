@@ -99,7 +99,7 @@ async fn accept_clients(listener: TcpListener, messages: broadcast::Sender<Arc<[
 
 /// Serves a client until it disconnects or falls behind, and returns the reason.
 async fn serve(mut stream: TcpStream, mut messages: broadcast::Receiver<Arc<[u8]>>) -> String {
-    // Send each message at once.
+    // Without Nagle's algorithm each message leaves at once.
     if let Err(error) = stream.set_nodelay(true) {
         return error.to_string();
     }
