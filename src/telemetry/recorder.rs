@@ -14,7 +14,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime};
 
-/// Entries the queue holds: about half a minute of a run at 10 ms SYNC, 3 s at 1 ms.
+/// Capacity of the queue, entries: about half a minute of a run at 10 ms SYNC, 3 s at 1 ms.
 const QUEUE_ENTRIES: usize = 32_768;
 /// At the end of a run the writer is given up after this long without progress.
 const CLOSING_LIMIT: Duration = Duration::from_secs(15);
@@ -38,11 +38,11 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Creates a new folder in `parent` for the run that `manifest` describes, with `config_toml`, the
-    /// configuration as used, and starts the writer.
+    /// Creates a new folder in `parent` for the run that `manifest` describes, writes `config_toml`, the
+    /// configuration as used, and starts the writer and the keeper.
     ///
     /// # Errors
-    /// The folder or one of its files cannot be created. No folder remains then.
+    /// The folder or one of its files cannot be created, or a thread cannot be started. No folder remains then.
     pub fn create(
         parent: &Path,
         manifest: Manifest,
@@ -82,7 +82,7 @@ impl Recorder {
         discard(&self.run_dir);
     }
 
-    /// Records `entry`. This takes some microseconds, most of them to wake the writer; with
+    /// Records `entry`. This takes some microseconds, mostly to wake the writer. With
     /// [`Backpressure::DropAndCount`] it never waits for a disk or a viewer.
     pub fn record(&mut self, entry: Entry) {
         if let Some(live) = &mut self.live {
@@ -94,8 +94,8 @@ impl Recorder {
     }
 
     /// The next change in the state of the recording. Call this at least twenty times a second, each time until
-    /// it returns `None`: then a full or stalled disk or a lost folder is reported within a second. At most
-    /// 50 ms of the time between two calls count as silence of a thread.
+    /// it returns `None`: then a full or stalled disk or a lost folder is reported within a second. Of the time
+    /// between two calls, at most 50 ms count as silence of a thread.
     pub fn news(&mut self) -> Option<RecordNews> {
         let now = Instant::now();
         let news = self.text.news(now).or_else(|| self.keeper.news(now));

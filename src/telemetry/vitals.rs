@@ -1,4 +1,4 @@
-//! Signs of life of the recording threads, and what is reported when they stop.
+//! Heartbeats of the recording threads, and the watchdog that reports a thread that stalls, fails or loses items.
 
 use super::TelemetryError;
 use std::mem;
@@ -6,39 +6,39 @@ use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// A thread that is silent for this long is reported to the operator.
+/// After this long without a heartbeat, a stalled thread is reported to the operator.
 const WARN_AFTER: Duration = Duration::from_millis(700);
-/// A thread that is silent for this long is given up.
+/// After this long without a heartbeat, a thread is given up.
 pub(super) const SILENCE_LIMIT: Duration = Duration::from_secs(5);
 /// Minimum interval between two warnings of dropped records.
 const DROP_WARNING_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Whether a recording thread works, shared without a lock.
+/// The state of a recording thread, shared without a lock.
 #[derive(Debug, Default)]
 pub(super) struct Vitals {
-    /// Signs of life so far.
+    /// Number of heartbeats so far.
     pub(super) beats: AtomicU64,
-    /// The first reason why it has failed.
+    /// The reason of the first failure.
     pub(super) fault: OnceLock<String>,
 }
 
 impl Vitals {
-    /// A sign of life: at every tick, and now and then while the files are completed.
+    /// A heartbeat: sent at every tick, and while the files are completed.
     pub(super) fn beat(&self) {
         self.beats.fetch_add(1, Ordering::Relaxed);
     }
 }
 
-/// At most this much of the time between two looks counts as silence, since the watcher itself may have been
-/// descheduled or stopped by a debugger.
+/// At most this much of the time between two looks counts as time without a heartbeat, since the watcher itself may
+/// have been descheduled or stopped by a debugger.
 const LOOK_MAX: Duration = Duration::from_millis(50);
 
-/// How long a thread has shown no sign of life.
+/// Measures the time since a thread's last heartbeat, without the watcher's own stalls.
 #[derive(Debug)]
 pub(super) struct Silence {
     beats: u64,
     last_look: Instant,
-    /// The time without a sign of life up to the last look.
+    /// The time without a heartbeat, up to the last look.
     lasted: Duration,
 }
 
@@ -48,7 +48,7 @@ impl Silence {
         Silence { beats: 0, last_look: now, lasted: Duration::ZERO }
     }
 
-    /// Looks at the thread at `now`. Returns how long it has shown no sign of life.
+    /// Looks at the thread at `now`. Returns the time since its last heartbeat.
     pub(super) fn look(&mut self, vitals: &Vitals, now: Instant) -> Duration {
         let elapsed = now.saturating_duration_since(mem::replace(&mut self.last_look, now));
         let beats = vitals.beats.load(Ordering::Relaxed);
@@ -118,7 +118,7 @@ impl Watch {
         Some(if is_failed { RecordNews::Failed(text) } else { RecordNews::Warning(text) })
     }
 
-    /// What is new at `now`, if `dropped` items were lost so far because the queue was full.
+    /// The report at `now` of newly lost items, if any; `dropped` items were lost so far because the queue was full.
     pub(super) fn drop_news(&mut self, dropped: u64, now: Instant) -> Option<RecordNews> {
         let (before, is_recent) = self.reported_drops.map_or((0, false), |(drops, time)| {
             (drops, now.saturating_duration_since(time) < DROP_WARNING_INTERVAL)

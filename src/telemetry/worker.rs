@@ -23,14 +23,14 @@ pub enum Backpressure {
 
 /// Retry interval while the queue is full.
 const RETRY: Duration = Duration::from_millis(1);
-/// If completing the files takes longer than this, the operator is told.
+/// The operator is told if the writer, while it completes its files, makes no progress for this long.
 const WARN_AFTER: Duration = Duration::from_secs(3);
 
-/// The work of the thread.
+/// What the thread does with the items.
 pub(super) trait Sink: Send + 'static {
-    /// The items that it takes.
+    /// The items that the sink takes.
     type Item: Send + 'static;
-    /// Those items in messages.
+    /// The word for those items in messages.
     const ITEMS: &'static str = "records";
     /// Interval of [`Sink::tick`].
     const TICK: Duration;
@@ -65,8 +65,8 @@ enum Message<T> {
     Close(Box<Manifest>),
 }
 
-/// The session thread's handle to a writer thread. A preempted writer never makes the session wait
-/// (docs/decisions/0018-tracker-queue.md).
+/// The session thread's handle to a writer thread. The queue is lock-free, so a preempted writer never makes the
+/// session wait (docs/decisions/0018-tracker-queue.md).
 pub(super) struct Worker<T> {
     queue: Producer<Message<T>>,
     /// Dropped after the queue: its last wake-up shows the writer that the run was abandoned.
@@ -168,8 +168,8 @@ impl<T: Send + 'static> Worker<T> {
         self.vitals.fault.get().is_none()
     }
 
-    /// Tells the thread how the run ended, and waits for it at most `limit`, even if items are still queued.
-    /// If the queue is full, returns at once without telling it.
+    /// Tells the thread how the run ended, and waits at most `limit` for it to finish. If the queue is full, returns
+    /// at once without telling it.
     pub(super) fn close_within(&mut self, manifest: &Manifest, limit: Duration) {
         if self.push(Message::Close(Box::new(manifest.clone()))).is_ok() {
             let _ = self.done.recv_timeout(limit);
