@@ -6,8 +6,8 @@ use super::reader::{Reader, contradictions};
 use crate::session::PROFILE_PEAK;
 use crate::stage::{Axis, AxisConfig, Reference};
 
-/// Objects that `optional_objects` may not name, each with the reason. Of the objects that the bring-up writes,
-/// a drive may lack:
+/// Objects that `optional_objects` may not name, each with the reason. A drive may lack these of the objects that the
+/// bring-up writes:
 ///
 /// - 605A: by CiA 402 the drive then brakes on its quick-stop ramp, as with option 2
 /// - 6065 and 6066: the bench compares target and position itself
@@ -16,7 +16,7 @@ use crate::stage::{Axis, AxisConfig, Reference};
 /// - 6502: the bench reads back the mode (6061)
 /// - 1029: by CiA 301 the drive then goes to Pre-operational, as with option 0
 ///
-/// The bring-up never insists on 1005, 1018:3, 1018:4, 605E, and PDOs beyond the first.
+/// The bring-up never requires 1005, 1018:3, 1018:4, 605E, or PDOs beyond the first.
 const NEEDED: [(&[u16], &str); 7] = [
     (&[0x1000, 0x1018], "it tells which drive this is"),
     (
@@ -39,7 +39,7 @@ const NEEDED: [(&[u16], &str); 7] = [
 const SOFTWARE_LIMITS: u16 = 0x607D;
 
 /// Settings that make a real drive brake on quick stop, on its own faults and when the bench dies: key, allowed
-/// values, and these in words.
+/// values, and the allowed values in words.
 const STOPPING: [(&str, &[i16], &str); 4] = [
     (
         "abort_connection_option",
@@ -65,8 +65,8 @@ const STOPPING: [(&str, &[i16], &str); 4] = [
     ),
 ];
 
-/// Objects that the bench writes if a key of the axis is given. If not, a raw SDO may write them, in the
-/// drive's own unit.
+/// Objects that the bench writes if a key of the axis is given. If it is not given, a raw SDO may write them, in
+/// the drive's own unit.
 const SET_BY: [((u16, u8), &str); 5] = [
     ((0x607C, 0), "homing.offset_UNIT"),
     ((0x6098, 0), "homing.method"),
@@ -112,7 +112,7 @@ impl Checks<'_> {
         let unit = self.which.unit();
         let homed = axis.reference == Reference::Homing;
         // The limits of a real axis protect its screw, its needle or the sensor's cable. Limits that count from
-        // the start of each command do not: three jogs can go three times as far.
+        // the start of each command do not protect them: three jogs can go three times as far.
         let has_moving_limits = self.config.stage.hardware && axis.zero.is_none() && !axis.wraps;
         contradictions! { reader;
             [&reference, &homing] if homed && axis.homing.is_none() =>
@@ -126,7 +126,7 @@ impl Checks<'_> {
         }
     }
 
-    /// Home, where the drive's zero is the home offset (607C) away from it, is within the limits. An insertion
+    /// Checks that home is within the limits; the drive's zero is at home plus the home offset (607C). An insertion
     /// axis that homes on an end switch moves between that switch and the other end: the limits must be on that
     /// side of home.
     fn home(&self, reader: &mut Reader) {
@@ -154,8 +154,9 @@ impl Checks<'_> {
             return;
         };
         let method = homing.method;
-        // The direction in which each method seeks its switch, and the method that seeks it in the other one. 3 to 6
-        // and 19 to 22 move as the switch says; 33 and 34 move by at most one turn of the motor, 35 and 37 do not.
+        // The direction in which each method seeks its switch, and the method that seeks it in the opposite direction.
+        // The direction of 3 to 6 and 19 to 22 depends on the switch's state; 33 and 34 move by at most one turn of
+        // the motor, 35 and 37 not at all.
         let (direction, other_method) = match method {
             1 | 17 => (-sign, method + 1),
             2 | 18 => (sign, method - 1),
@@ -176,7 +177,8 @@ impl Checks<'_> {
         }
     }
 
-    /// Stopping options that leave the axis moving, objects that are not optional, and the following-error timeout.
+    /// Refuses stopping options that leave the axis moving, optional objects that the bench needs, and a
+    /// following-error timeout that is too long.
     fn drive(&self, reader: &mut Reader) {
         for (name, stopping, allowed) in STOPPING {
             let key = &*self.key(name);
@@ -232,8 +234,8 @@ impl Checks<'_> {
     }
 }
 
-/// Why a raw SDO may not write an object: it moves the axis, or the bench writes it, from the key named here.
-/// `None` if a raw SDO may write it.
+/// The reason why a raw SDO may not write the object `index`: the object moves the axis, or the bench writes it,
+/// from the key named here. `None` if a raw SDO may write it.
 fn reserved(index: u16) -> Option<&'static str> {
     Some(match index {
         0x1014 | 0x1015 => {
@@ -256,7 +258,7 @@ fn reserved(index: u16) -> Option<&'static str> {
     })
 }
 
-/// The configured accelerations are within the limits of their axis: otherwise a run would be certain to stop.
+/// Checks that the configured accelerations are within the limits of their axis: beyond them every run would stop.
 fn accelerations(config: &Config, reader: &mut Reader) {
     let along = "stage.insertion.acceleration_max_mm_per_s2";
     for (key, max_key) in [

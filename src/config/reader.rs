@@ -64,13 +64,13 @@ impl Reader {
         }
     }
 
-    /// Reads the configuration. A wrong value is reported; in the result it has a placeholder, such as NaN or 0.
+    /// Reads the configuration. A wrong value is reported; in the result a placeholder such as NaN or 0 replaces it.
     pub(super) fn read(&mut self) -> Config {
         Config::of(self.table(&Kind::Table(Config::KEYS), &[], "", true))
     }
 
-    /// Reads the table at `path`; `narrowed` has narrower rules for some keys. If it `has_defaults`, keys that
-    /// are not given get theirs.
+    /// Reads the table at `path`; `narrowed` has narrower rules for some keys. If it `has_defaults`, keys that are not
+    /// given get their defaults.
     fn table(
         &mut self,
         kind: &Kind,
@@ -131,7 +131,7 @@ impl Reader {
 
     /// Adds the default of `key`, which is at `path`, where nothing is given.
     fn add_default(&mut self, key: &Key, path: &str) {
-        // The defaults fill a given table, unless it is replaced as a whole.
+        // Defaults complete a given table, unless the table is replaced as a whole.
         let is_merged = !tables(&key.kind).is_empty() && !key.is_whole;
         let is_complete = self.tree.contains_key(path) && !is_merged;
         let holds = match key.default_holds {
@@ -191,8 +191,8 @@ impl Reader {
         self.tree.contains_key(path) || self.tree.keys().any(|key| is_inside(key, path))
     }
 
-    /// Reports `message` at the one of `keys` from the source of highest precedence. Reports nothing if one of
-    /// them [is wrong](Self::is_wrong) by itself: its value is not known.
+    /// Reports `message` at the place of that one of `keys` whose source has the highest precedence. Reports nothing if
+    /// one of them [is wrong](Self::is_wrong) by itself, because its value is unknown.
     pub(super) fn refuse(&mut self, keys: &[&str], message: String) {
         if keys.iter().any(|&key| self.is_wrong(key)) {
             return;
@@ -209,15 +209,15 @@ impl Reader {
         self.problems.push((keys[0].to_owned(), problem));
     }
 
-    /// True if `key`, a key inside it or a table around it was found wrong or missing.
+    /// True if `key`, a key inside it or a table around it is wrong or missing.
     pub(super) fn is_wrong(&self, key: &str) -> bool {
         outward(key).any(|outer| self.failed.contains(outer))
             || self.failed.iter().any(|failed| is_inside(failed, key))
     }
 
-    /// Checks a table at `table_path` that may have only some of the keys in `all`, depending on its kind. `what` is
-    /// its kind in words, and `known` are its keys. Reports given keys that are not among these; if there are
-    /// none, reports what else is `wrong` with the table: the key and the message.
+    /// Checks the table at `table_path`, whose kind allows only the keys `known` of the keys in `all`; `what` is the
+    /// kind in words. Reports given keys that the kind does not allow. If there are none, reports what else is `wrong`
+    /// with the table: the key and the message.
     pub(super) fn check_own_keys(
         &mut self,
         table_path: &str,
@@ -246,7 +246,7 @@ impl Reader {
         }
     }
 
-    /// Checks that no problem was found with these `keys`, or with the tables around them.
+    /// Checks that these `keys` and the tables around them have no problem.
     ///
     /// # Errors
     /// The problems, in the order found.
@@ -259,7 +259,7 @@ impl Reader {
     /// Reports unknown keys, and returns the tree with all defaults.
     ///
     /// # Errors
-    /// Everything found wrong, files first, by line.
+    /// Every problem found: those in files first, by line.
     pub(super) fn finish(mut self) -> Result<Tree, ConfigError> {
         self.refuse_unknown();
         self.problems.sort_by_key(|(_, problem)| match problem.origin {
@@ -310,7 +310,7 @@ impl Reader {
         self.failed.extend(keys.into_iter().map(str::to_owned));
     }
 
-    /// Reports that `key` is wrong, at the place of the key `given`, or else of the nearest table around it.
+    /// Reports that `key` is wrong, at the place of the key `given` or of the nearest table around it.
     pub(super) fn fail(&mut self, key: &str, given: &str, message: String) {
         let entry = outward(given).find_map(|key| self.given(key));
         let problem = Problem::at(entry.map(|entry| entry.origin.clone()), message);
@@ -386,7 +386,7 @@ pub(super) fn is_inside(key: &str, outer: &str) -> bool {
     key.strip_prefix(outer).is_some_and(|rest| rest.starts_with(['.', '[']))
 }
 
-/// `key` and the keys around it, nearest first: of `a.b[0].c`: itself, `a.b[0]`, `a.b`, `a`.
+/// `key` and the keys around it, innermost first: `a.b[0].c`, `a.b[0]`, `a.b`, `a`.
 fn outward(key: &str) -> impl Iterator<Item = &str> {
     std::iter::successors(Some(key), |key| key.get(..key.rfind(['.', '['])?))
 }

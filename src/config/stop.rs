@@ -17,8 +17,8 @@ const USED: [&str; 5] = [
     "stage.insertion.counts_per_mm",
     "stage.rotation.counts_per_turn",
 ];
-/// Coarse scales for axes whose scale is unknown. With them an axis that still moves never counts as standing;
-/// a fine axis is only watched a little longer than necessary.
+/// Coarse scales for axes whose scale is unknown. With them, a moving axis never counts as stopped; a fine axis is
+/// only watched a little longer than necessary.
 const COARSE: [(&str, &str); 2] = [
     (USED[3], "stage.insertion.counts_per_mm={ counts = 100, mm = 1 }"),
     (USED[4], "stage.rotation.counts_per_turn={ counts = 500, turns = 1 }"),
@@ -37,11 +37,12 @@ pub struct StopConfig {
 impl StopConfig {
     /// Reads what a stop needs from `source`, if there is one, overridden by `sets` (`key=value`). A wrong or
     /// missing time gets its default, a wrong or missing scale a coarse one. On a virtual bus the nodes have
-    /// defaults as well; on any other bus they must be given.
+    /// defaults as well; on any other bus they must be given. If `source` is not valid TOML, its readable lines are
+    /// used.
     ///
     /// # Errors
-    /// The interface or a node is wrong or missing. Of a source that is not TOML the lines that can be read
-    /// count; its syntax errors are reported only together with such an error.
+    /// The interface or a node is wrong or missing. Syntax errors of `source` are reported only together with such
+    /// an error.
     pub fn from_source(source: Option<Source<'_>>, sets: &[String]) -> Result<Self, ConfigError> {
         let mut entries = Vec::new();
         let mut problems = Vec::new();
@@ -54,7 +55,7 @@ impl StopConfig {
         for (set, layer) in sets.iter().zip(2..) {
             match value::parse_set(set, layer) {
                 Ok(more) => entries.extend(more),
-                // It was meant to set the interface or a node.
+                // The operator meant to set the interface or a node.
                 Err(error) if names_what_a_stop_needs(set) => return Err(error),
                 Err(_) => {}
             }
@@ -95,7 +96,7 @@ impl StopConfig {
         let mut stage = Reader::new(tree).read().stage;
         stage.insertion.node = config.stage.insertion.node;
         stage.rotation.node = config.stage.rotation.node;
-        // The coarser the scale, the longer it takes to see that an axis stands.
+        // The coarser the scale, the longer it takes to detect that an axis has stopped.
         let windows = stage::Axis::BOTH.map(|axis| 2 * stage.standstill_window(axis));
         stage.power.stop_timeout = stage.power.stop_timeout.max(windows[0]).max(windows[1]);
         Ok(StopConfig { interface: config.can.interface, stage })
@@ -108,8 +109,8 @@ fn names_what_a_stop_needs(set: &str) -> bool {
     NEEDED.iter().any(|needed| *needed == key || is_inside(needed, key))
 }
 
-/// The lines of `text` that are TOML by themselves, for a text that as a whole is not, such as a file that is
-/// being edited: bus and nodes can still be read. Keys below a broken header go to a table that is not used.
+/// The lines of `text` that are valid TOML by themselves. So bus and nodes can still be read from a file that as a
+/// whole is not valid, for example while it is being edited. Keys below a broken header go into an unused table.
 fn salvaged(text: &str) -> String {
     let lines = text.split(['\n', '\r']).map(|line| match value::parse_file("", line, 1) {
         Ok(_) => line,
