@@ -128,8 +128,8 @@ fn turn_by_angles(rotation: &Rotation3<f64>) -> Matrix3<f64> {
     Matrix3::from_columns(&[yaw, about_z * Vector3::y(), Vector3::z()])
 }
 
-/// How the end of `Exp(ξ)` moves, in its own frame, if ξ changes by `change`: the right Jacobian of
-/// SE(3) times `change`.
+/// The motion of the end of `Exp(ξ)`, in its own frame, per change of ξ by `change`: the right Jacobian of SE(3) times
+/// `change`, by a finite difference.
 fn sensitivity(xi: &Twist, change: &Twist) -> Vector6<f64> {
     let nudged = Twist { v: xi.v + change.v * NUDGE, w: xi.w + change.w * NUDGE };
     (Pose::exp(xi).inverse() * Pose::exp(&nudged)).log().to_vector() / NUDGE
@@ -139,8 +139,8 @@ fn sensitivity(xi: &Twist, change: &Twist) -> Vector6<f64> {
 #[derive(Debug, Clone)]
 struct TorsionSensitivity {
     nominal: (Torsion, Play),
-    /// The torsions with half-width, growth and offset changed, with the change; `None` if neither
-    /// direction is allowed.
+    /// The torsions with half-width, growth or offset changed, each with its change; `None` if a change is allowed in
+    /// neither direction.
     nudged: [Option<(Torsion, Play, f64)>; 3],
     last: [f64; 3],
 }
@@ -166,7 +166,7 @@ impl TorsionSensitivity {
         }
     }
 
-    /// How much the lag's derivative with respect to each parameter changes over `base`.
+    /// The change, over `base`, of the lag's derivative with respect to each parameter.
     fn advance(&mut self, base: Increment) -> [f64; 3] {
         let follow = |torsion: &Torsion, play: &mut Play| {
             play.advance(torsion, base).for_each(drop);

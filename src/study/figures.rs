@@ -96,7 +96,7 @@ pub struct RunFigures {
     /// Estimated x, mm, at steps with an estimate.
     estimated: ByDepth<f64>,
     saturated: usize,
-    /// The figures that are updated at once; [`report`](Self::report) adds those that need all steps.
+    /// The figures that are updated at every record; [`report`](Self::report) adds those that need all steps.
     so_far: FigureReport,
     /// Acquisition time of the newest accepted position.
     tip_seen: Option<Time>,
@@ -111,7 +111,7 @@ fn raise(greatest: &mut Option<f64>, value: f64) {
     }
 }
 
-/// The figures of a run as its manifest holds them; unknown ones are null.
+/// The figures of a run as written into its manifest; unknown ones are null.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct FigureReport {
@@ -141,7 +141,7 @@ pub struct FigureReport {
     pub tip_lag_mm_max: Option<f64>,
     /// The largest age of the newest accepted position at a SYNC, s, including holds and the stop.
     pub blind_s_max: Option<f64>,
-    /// The largest depth inserted since that position was acquired, mm.
+    /// The largest depth inserted since the newest accepted position was acquired, mm.
     pub blind_mm_max: Option<f64>,
     /// True distance of the tip from the target at the last step, mm; if the truth is known.
     pub target_error_mm: Option<f64>,
@@ -256,9 +256,8 @@ impl RunFigures {
         }
     }
 
-    /// By how much the plane was missed, mm: the RMS distance from the plane over the last third of
-    /// the depth. The distance is the estimated one, since a live run has no truth. `None` if it is
-    /// at most 1 mm, without an estimate, or with a target.
+    /// The estimated RMS distance from the plane over the last third of the depth, mm, if it is over 1 mm. `None` if it
+    /// is not, without an estimate, or with a target.
     pub fn plane_missed_by_mm(&self) -> Option<f64> {
         if self.so_far.target_error_est_mm.is_some() {
             return None;

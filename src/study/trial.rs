@@ -1,4 +1,4 @@
-//! One emulated insertion without drives, bytes or time. A study makes thousands of them.
+//! One emulated insertion without drives, bus or clock. A study makes thousands of them.
 
 use super::base_path::BasePath;
 use super::timetable::{SampleDue, Timetable};
@@ -77,7 +77,7 @@ pub fn insert(
         };
         take(&record, &needle.truth(due.insertion_mm));
         if let Some(error) = refused {
-            // The needle goes on until it stands: that may be nearer to an obstacle.
+            // The needle goes on while it brakes, possibly nearer to an obstacle.
             if session.goal.is_some() {
                 let stopped_mm = due.insertion_mm + session.insertion.stopping_mm(&session.stage);
                 needle.insert_to(stopped_mm);
@@ -137,8 +137,8 @@ impl<'a> EmulatedNeedle<'a> {
         Truth { x_pb: *self.tissue.tip_true(), target_mm }
     }
 
-    /// Tracks the target at the times of the tip's samples, and before the insertion for as long as its mean
-    /// takes.
+    /// Tracks the target at the times of the tip's samples; before the insertion, for as long as its position is
+    /// averaged.
     fn see_target(&mut self, tool: &TargetTool, samples: &[SampleDue]) {
         let (Some(target), Some(first)) = (self.stage.target, samples.first()) else { return };
         let model = TargetModel::tracker_model(self.stage.tracker);
