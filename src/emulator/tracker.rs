@@ -8,7 +8,7 @@ use nalgebra::{Rotation3, Vector2, Vector3};
 use std::collections::VecDeque;
 use std::time::Duration;
 
-/// What the emulated tracker does to positions.
+/// The settings of an emulated tracker.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackerModel {
     /// Noise of each position, independent of that of all others.

@@ -40,19 +40,19 @@ pub(super) struct Axis {
     pub(super) behind_since: Option<Time>,
     /// The encoder position that is 0 on the bus.
     pub(super) zero: i64,
-    /// The last target was outside the software limits and was cut to them.
+    /// True if the last target was outside the software limits and was clamped to them.
     pub(super) target_limited: bool,
     /// The state to enter when the axis stands.
     after_stop: Option<DriveState>,
     last_controlword: Controlword,
     pub(super) has_voltage: bool,
-    /// Something blocks the axis.
+    /// True while something blocks the axis.
     pub(super) is_stalled: bool,
-    /// A supervised node is lost: a fault reset and Operation Enabled are refused.
+    /// True while a supervised node is lost: a fault reset and Operation Enabled are refused.
     partner_lost: bool,
     updated: Time,
     pub(super) homing: Homing,
-    /// The last homing since power-on succeeded.
+    /// True if the last homing since power-on succeeded.
     pub(super) referenced: bool,
 }
 

@@ -10,11 +10,11 @@ use crate::units::Time;
 /// A fault on a line.
 #[derive(Debug, Clone)]
 struct FrameFault {
-    /// The fault; its count is of the frames still to be affected.
+    /// The fault; its count is the number of frames still to be affected.
     fault: Fault,
     /// The identifier of the frames it acts on; `None` for all frames.
     id: Option<CanId>,
-    /// It acts before this time.
+    /// The fault acts before this time.
     until: Time,
 }
 
