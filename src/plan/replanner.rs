@@ -287,10 +287,10 @@ impl Replanner {
     }
 
     /// True if a path to the target is left after `turn_mm` straight ahead, the distance that the needle goes while
-    /// the base turns once around. The new path must end about as near to the target as the path of the last step
-    /// ([`TURN_LOSS_MAX_MM`]), keep the same distance from obstacles, and leave the curvature margin unused even if
-    /// the last path does not, because it must make up for the turn. If the path of the last step ends before the
-    /// turn does, the way straight ahead need only be clear.
+    /// the base turns once around. The new path must end about as near to the target as the path of the last step,
+    /// keep the same distance from obstacles, and leave the curvature margin unused even if the last path does not,
+    /// because it must make up for the turn. If the path of the last step ends before the turn does, the way straight
+    /// ahead need only be clear.
     pub fn may_turn(&mut self, estimate: &TipEstimate, turn_mm: f64) -> bool {
         let Some(path) = self.path.as_ref() else { return true };
         let (start, remaining_mm) = (path.start, path.length_mm());
