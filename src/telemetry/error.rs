@@ -65,7 +65,7 @@ impl TelemetryError {
     }
 
     /// `writer` makes no progress, most likely because of a stalled disk or network share.
-    pub(super) fn writer_silent(writer: &str, silent: Duration, limit: Duration) -> Self {
+    pub(super) fn writer_stalled(writer: &str, silent: Duration, limit: Duration) -> Self {
         let (silent_s, limit_s) = (silent.as_secs_f64(), limit.as_secs_f64());
         TelemetryError::Recording(format!(
             "{writer}: no sign of life for {silent_s:.1} s (given up after {limit_s:.1}); is the disk \

@@ -215,7 +215,7 @@ mod tests {
         create_files(&scratch.0);
         let (mut keeper, _) = keep(&scratch.0).unwrap();
         while keeper.dropped == 0 {
-            keeper.give(Manifest::default());
+            keeper.send(Manifest::default());
         }
         let news = std::iter::from_fn(|| keeper.news(Instant::now()));
         let said: Vec<String> = news.map(|news| format!("{news:?}")).collect();
@@ -246,8 +246,8 @@ mod tests {
         assert!(next().contains("steps.csv: No such file"));
         fs::rename(&dir, scratch.0.join("moved")).unwrap();
         assert!(next().contains("run: No such file"));
-        let beats = keeper.vitals.beats.load(Relaxed);
-        while keeper.vitals.beats.load(Relaxed) < beats + 3 {
+        let beats = keeper.status.beats.load(Relaxed);
+        while keeper.status.beats.load(Relaxed) < beats + 3 {
             thread::yield_now();
         }
         assert!(problems.is_empty());

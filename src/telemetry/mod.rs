@@ -25,7 +25,7 @@ mod recording;
 mod repair;
 mod run_folder;
 mod text;
-mod vitals;
+mod watchdog;
 mod worker;
 
 pub use error::TelemetryError;
@@ -34,7 +34,7 @@ pub use recorder::Recorder;
 pub use recording::Recording;
 pub use repair::{Repaired, note_recording, repair};
 pub use run_folder::{RunFolder, open_regular};
-pub use vitals::RecordNews;
+pub use watchdog::RecordNews;
 pub use worker::Backpressure;
 
 use crate::archive::rfc3339;

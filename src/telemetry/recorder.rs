@@ -3,7 +3,7 @@
 use super::keeper::keep;
 use super::recording::live;
 use super::text::{TextFiles, WRITER};
-use super::vitals::RecordNews;
+use super::watchdog::RecordNews;
 use super::worker::{Backpressure, Worker};
 use super::{Entry, Scene, TelemetryError, folder, utc_text};
 use crate::archive::{DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex};
@@ -86,10 +86,10 @@ impl Recorder {
     /// [`Backpressure::DropAndCount`] it never waits for a disk or a viewer.
     pub fn record(&mut self, entry: Entry) {
         if let Some(live) = &mut self.live {
-            live.give(entry.clone());
+            live.send(entry.clone());
         }
         if TextFiles::wants(&entry.record) {
-            self.text.give(entry);
+            self.text.send(entry);
         }
     }
 
@@ -109,7 +109,7 @@ impl Recorder {
     /// Puts a drive found on the bus into the manifest, without waiting for it to be written.
     pub fn identify_drive(&mut self, drive: DriveIdentity) {
         self.manifest.drives.push(drive);
-        self.keeper.give(self.manifest.clone());
+        self.keeper.send(self.manifest.clone());
     }
 
     /// Completes the text files, seals them and writes the final manifest, to which `sum_up` adds the
@@ -130,7 +130,7 @@ impl Recorder {
         sum_up(&mut manifest);
         manifest.ended_utc = Some(utc_text(SystemTime::now()));
         if let Some(live) = &mut self.live {
-            live.close_within(&manifest, live::FAREWELL_MAX);
+            live.close_within(&manifest, live::CLOSE_TIMEOUT);
         }
         let mut dropped = Dropped {
             text_files: self.text.dropped,
@@ -140,7 +140,7 @@ impl Recorder {
         match &closed {
             Ok((written, _)) => {
                 // An entry that is not in the files is lost, for whatever reason.
-                dropped.text_files = self.text.given.saturating_sub(written.entries);
+                dropped.text_files = self.text.sent.saturating_sub(written.entries);
                 manifest.counts = Some(written.counts);
                 manifest.files.clone_from(&written.files);
                 let config = FileSeal::of(self.config_toml.as_bytes());

@@ -72,7 +72,7 @@ pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
     }
     let (mut lines, mut cuts, mut missing) = (BTreeMap::new(), Vec::new(), Vec::new());
     for name in file::TEXT_FILES {
-        let cut = cut_last_line(dir, name).map_err(TelemetryError::file(&dir.join(name)));
+        let cut = move_partial_line(dir, name).map_err(TelemetryError::file(&dir.join(name)));
         match cut? {
             None => missing.push(name),
             Some((whole, cut)) => {
@@ -123,7 +123,7 @@ fn cut_name(name: &str) -> String {
 /// Moves what follows the last newline of the file `name` to its `.cut` file. Returns the number of whole lines and
 /// the number of bytes in the `.cut` file, which an earlier, interrupted repair may have moved; `None` if the file
 /// is missing.
-fn cut_last_line(dir: &Path, name: &str) -> io::Result<Option<(u64, u64)>> {
+fn move_partial_line(dir: &Path, name: &str) -> io::Result<Option<(u64, u64)>> {
     let (path, cut_path) = (dir.join(name), dir.join(cut_name(name)));
     if !is_regular(&path)? {
         return Ok(None);
@@ -244,7 +244,7 @@ mod tests {
     #[test]
     fn an_interrupted_repair_can_be_repeated() {
         let scratch = open_record("repair-again");
-        cut_last_line(&scratch.0, file::STEPS).unwrap();
+        move_partial_line(&scratch.0, file::STEPS).unwrap();
         let repaired = repair(&scratch.0).unwrap();
         assert_eq!(repaired.cuts, [("steps.csv".to_owned(), 9)]);
         let run = RunFolder::open(&scratch.0).unwrap();

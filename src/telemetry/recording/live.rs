@@ -17,9 +17,9 @@ const QUEUE_ENTRIES: usize = 32_768;
 /// and counted.
 const HISTORY_BYTES: u64 = 64 << 20;
 /// Viewers are given this long to take the end of the run.
-const FAREWELL: Duration = Duration::from_millis(300);
+const DRAIN_TIME: Duration = Duration::from_millis(300);
 /// A frozen viewer delays the end of the run at most this long.
-pub(in crate::telemetry) const FAREWELL_MAX: Duration = Duration::from_secs(2);
+pub(in crate::telemetry) const CLOSE_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Serves the run of `manifest` to viewers at `address`, from a thread of its own. Viewers see it under the same
 /// identity as `run.rrd`.
@@ -60,8 +60,8 @@ impl Sink for Content {
     /// Gives viewers time to take the end of the run before the stream is dropped. The drop waits for frozen viewers.
     fn close(&mut self, manifest: &Manifest, _: &dyn Fn()) -> Result<(), String> {
         let ended = log_manifest(&self.stream, manifest);
-        let _ = self.stream.flush_with_timeout(FAREWELL);
-        thread::sleep(FAREWELL);
+        let _ = self.stream.flush_with_timeout(DRAIN_TIME);
+        thread::sleep(DRAIN_TIME);
         ended.map_err(|error| error.to_string())
     }
 }
