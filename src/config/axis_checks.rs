@@ -17,7 +17,7 @@ use crate::stage::{Axis, AxisConfig, Reference};
 /// - 1029: by CiA 301 the drive then goes to Pre-operational, as with option 0
 ///
 /// The bring-up never requires 1005, 1018:3, 1018:4, 605E, or PDOs beyond the first.
-const NEEDED: [(&[u16], &str); 7] = [
+const NOT_OPTIONAL: [(&[u16], &str); 7] = [
     (&[0x1000, 0x1018], "it tells which drive this is"),
     (
         &[0x1016, 0x1017, 0x6007],
@@ -138,7 +138,7 @@ impl Checks<'_> {
         let unit = self.which.unit();
         let (scale, units) =
             [("counts_per_mm", 1.0), ("counts_per_turn", 360.0)][self.which as usize];
-        let is_unknown = reader.is_wrong(&self.key(scale));
+        let is_unknown = reader.is_invalid(&self.key(scale));
         let counts_per_unit = if is_unknown { f64::NAN } else { self.axis.ratio.to_f64() / units };
         let zero_counts = self.axis.zero.map_or(f64::NAN, f64::from);
         // Not -offset, which would print as -0.000.
@@ -190,7 +190,7 @@ impl Checks<'_> {
             }
         }
         for (n, index) in self.axis.optional_objects.iter().enumerate() {
-            let needed = NEEDED.iter().find(|(indexes, _)| indexes.contains(index));
+            let needed = NOT_OPTIONAL.iter().find(|(indexes, _)| indexes.contains(index));
             let Some((_, why)) = needed else { continue };
             let key = &*self.key(&format!("optional_objects[{n}]"));
             contradictions! { reader;

@@ -92,16 +92,16 @@ pub(super) fn remove_outdated_fits(tree: &mut Tree) {
 impl CalibrationFile {
     /// The content of the file, in the layer that names it; nothing if a higher layer replaces it.
     fn content(&self, entries: &Entries, read: ReadFile<'_>) -> Result<Entries, ConfigError> {
-        let Some(naming) = topmost(entries, self.key) else { return Ok(Vec::new()) };
+        let Some(naming) = highest_entry(entries, self.key) else { return Ok(Vec::new()) };
         let Some(path) = naming.value.as_str() else { return Ok(Vec::new()) };
         let refusal = |message: String| ConfigError::at(Some(naming.origin.clone()), message);
-        let mut others = self.instead_of.iter().filter_map(|key| topmost(entries, key));
-        if others.any(|other| other.layer > naming.layer && !other.is_beside(naming)) {
+        let mut others = self.instead_of.iter().filter_map(|key| highest_entry(entries, key));
+        if others.any(|other| other.layer > naming.layer && !other.is_same_source(naming)) {
             return Ok(Vec::new());
         }
         // All `--set` together are one source. But for a key that the file merely contains, the later `--set` wins.
         let is_twice = |(key, entry): &&(String, Entry)| {
-            is_among(key, self.instead_of) && entry.is_beside(naming)
+            is_among(key, self.instead_of) && entry.is_same_source(naming)
                 || is_among(key, self.holds) && entry.layer == naming.layer
         };
         if let Some((key, _)) = entries.iter().find(is_twice) {
@@ -145,7 +145,7 @@ fn is_among(key: &str, keys: &[&str]) -> bool {
 }
 
 /// The value of `key` in the highest layer that has it.
-pub(super) fn topmost<'a>(entries: &'a Entries, key: &str) -> Option<&'a Entry> {
+pub(super) fn highest_entry<'a>(entries: &'a Entries, key: &str) -> Option<&'a Entry> {
     let named = entries.iter().filter(|(name, _)| name == key);
     named.map(|(_, entry)| entry).max_by_key(|entry| entry.layer)
 }

@@ -273,7 +273,7 @@ fn entries(sources: &[Source<'_>], sets: &[String]) -> Result<Entries, ConfigErr
         }
     }
     ConfigError::unless_empty(problems)?;
-    let named = include::topmost(&entries, "emulator.tracker").map(|entry| &entry.value);
+    let named = include::highest_entry(&entries, "emulator.tracker").map(|entry| &entry.value);
     let preset = TrackerPreset::take(named);
     entries.extend(value::parse_file(&preset.to_string(), preset.toml(), PRESET)?);
     Ok(entries)

@@ -100,13 +100,13 @@ impl Reader {
             let has_default = has_defaults || key.default_holds == DefaultHolds::Everywhere;
             let given = self.tree.get(&key_path);
             if let Some((other, other_entry)) = alternative {
-                let is_beside = given.is_some_and(|entry| entry.is_beside(other_entry));
+                let is_same_source = given.is_some_and(|entry| entry.is_same_source(other_entry));
                 // The source of higher precedence counts.
-                if !is_beside && given.is_some_and(|entry| entry.layer < other_entry.layer) {
+                if !is_same_source && given.is_some_and(|entry| entry.layer < other_entry.layer) {
                     self.tree.remove(&key_path);
                 }
                 contradictions! { self;
-                    [&other, &key_path] if is_beside && key.instead_of.is_some() =>
+                    [&other, &key_path] if is_same_source && key.instead_of.is_some() =>
                         "{key_path} is given along with {other}: give one of the two";
                 }
             } else if has_default {
@@ -159,7 +159,7 @@ impl Reader {
             return Some(self.table(kind, key.narrowed, path, has_defaults));
         }
         let Some(entry) = self.tree.get(path) else {
-            if !key.is_optional && !outward(path).any(|key| self.failed.contains(key)) {
+            if !key.is_optional && !enclosing_keys(path).any(|key| self.failed.contains(key)) {
                 let expected = words.expected;
                 let message =
                     format!("{path} is missing and has no default here, expected {expected}");
@@ -192,9 +192,9 @@ impl Reader {
     }
 
     /// Reports `message` at the place of that one of `keys` whose source has the highest precedence. Reports nothing if
-    /// one of them [is wrong](Self::is_wrong) by itself, because its value is unknown.
+    /// one of them [is invalid](Self::is_invalid) by itself, because its value is unknown.
     pub(super) fn refuse(&mut self, keys: &[&str], message: String) {
-        if keys.iter().any(|&key| self.is_wrong(key)) {
+        if keys.iter().any(|&key| self.is_invalid(key)) {
             return;
         }
         let entries = keys.iter().filter_map(|&key| Some((key, self.tree.get(key)?)));
@@ -209,9 +209,9 @@ impl Reader {
         self.problems.push((keys[0].to_owned(), problem));
     }
 
-    /// True if `key`, a key inside it or a table around it is wrong or missing.
-    pub(super) fn is_wrong(&self, key: &str) -> bool {
-        outward(key).any(|outer| self.failed.contains(outer))
+    /// True if `key`, a key inside it or a table around it is invalid or missing.
+    pub(super) fn is_invalid(&self, key: &str) -> bool {
+        enclosing_keys(key).any(|outer| self.failed.contains(outer))
             || self.failed.iter().any(|failed| is_inside(failed, key))
     }
 
@@ -226,7 +226,7 @@ impl Reader {
         known: &[&str],
         wrong: Option<(&str, String)>,
     ) {
-        if self.is_wrong(table_path) {
+        if self.is_invalid(table_path) {
             return;
         }
         // A recorded configuration has all defaults in every table.
@@ -241,7 +241,7 @@ impl Reader {
                 self.fail(&key_path, &key_path, message);
             }
         }
-        if let (false, Some((key, message))) = (self.is_wrong(table_path), wrong) {
+        if let (false, Some((key, message))) = (self.is_invalid(table_path), wrong) {
             self.fail(table_path, &join(table_path, key), format!("{table_path}: {message}"));
         }
     }
@@ -279,10 +279,10 @@ impl Reader {
             let is_reported = |outer: &str| {
                 self.failed.contains(outer) || self.tree.contains_key(outer) && !is_known(outer)
             };
-            if is_known(key) || outward(key).skip(1).any(is_reported) {
+            if is_known(key) || enclosing_keys(key).skip(1).any(is_reported) {
                 continue;
             }
-            let hint = match outward(key).find_map(|outer| self.known.get_key_value(outer)) {
+            let hint = match enclosing_keys(key).find_map(|outer| self.known.get_key_value(outer)) {
                 Some((value, Some(allowed))) => {
                     format!("{value} has no keys below it; allowed as its value: {allowed}")
                 }
@@ -312,7 +312,7 @@ impl Reader {
 
     /// Reports that `key` is wrong, at the place of the key `given` or of the nearest table around it.
     pub(super) fn fail(&mut self, key: &str, given: &str, message: String) {
-        let entry = outward(given).find_map(|key| self.given(key));
+        let entry = enclosing_keys(given).find_map(|key| self.given(key));
         let problem = Problem::at(entry.map(|entry| entry.origin.clone()), message);
         self.failed.insert(key.to_owned());
         self.problems.push((key.to_owned(), problem));
@@ -372,7 +372,7 @@ pub(super) fn merge(mut entries: Entries) -> Tree {
         if let Some(replaced) = replaced {
             tree.retain(|other, below: &mut Entry| {
                 // Two alternatives in one source are both kept, so that the reader refuses them.
-                let is_alternative = !is_inside(other, &key) && below.is_beside(&entry);
+                let is_alternative = !is_inside(other, &key) && below.is_same_source(&entry);
                 below.layer >= entry.layer || is_alternative || !is_inside(other, replaced)
             });
         }
@@ -387,6 +387,6 @@ pub(super) fn is_inside(key: &str, outer: &str) -> bool {
 }
 
 /// `key` and the keys around it, innermost first: `a.b[0].c`, `a.b[0]`, `a.b`, `a`.
-fn outward(key: &str) -> impl Iterator<Item = &str> {
+fn enclosing_keys(key: &str) -> impl Iterator<Item = &str> {
     std::iter::successors(Some(key), |key| key.get(..key.rfind(['.', '['])?))
 }

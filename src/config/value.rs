@@ -40,7 +40,7 @@ pub(super) struct Entry {
 
 impl Entry {
     /// True if both entries come from one source: from one file, or from the command line.
-    pub(super) fn is_beside(&self, other: &Entry) -> bool {
+    pub(super) fn is_same_source(&self, other: &Entry) -> bool {
         let is_set = |entry: &Entry| entry.layer > 0 && entry.origin == Origin::Set;
         self.layer == other.layer || is_set(self) && is_set(other)
     }
