@@ -31,7 +31,7 @@ const ON_PATH_MM: f64 = 0.1;
 /// A tip has arrived if the target is no farther ahead than this, mm.
 const ARRIVED_MM: f64 = 0.02;
 /// Without a path the needle is bent toward the target for this depth, mm, since a later estimate may give a path.
-const PATIENCE_MM: f64 = 5.0;
+const WITHOUT_PATH_MAX_MM: f64 = 5.0;
 /// After a whole turn of the base, the path may end farther from the target by this much, mm.
 const TURN_LOSS_MAX_MM: f64 = 0.05;
 /// On a path that does not surely lead to the target, this much of the way ahead must be clear of obstacles, mm; and
@@ -219,7 +219,7 @@ impl Replanner {
         let is_ahead = ahead_mm > ARRIVED_MM;
         let clear_mm = next_mm.max(CLEAR_AHEAD_MM);
         let path = path
-            .or_else(|| self.last_path_blindly(last?, heading_sd_rad, clear_mm))
+            .or_else(|| self.last_path_within_uncertainty(last?, heading_sd_rad, clear_mm))
             .or_else(|| self.nearest_path(estimate))
             .or_else(|| self.toward_target(heading_sd_rad, clear_mm).filter(|_| is_ahead));
         let Some(path) = path else {
@@ -320,9 +320,9 @@ impl Replanner {
     /// A path whose distance from obstacles suits the uncertainty of the estimate. The searches share one budget; each
     /// may spend half of what remains.
     fn find(&mut self, estimate: &TipEstimate, next_mm: f64, last: Option<&Path>) -> Option<Path> {
-        let doubt_mm = SDS * estimate.position_sd_mm;
+        let uncertainty_mm = SDS * estimate.position_sd_mm;
         let (clearance_mm, margin) = (self.problem.clearance_mm, self.curvature_margin);
-        let (cautious_mm, tip) = (clearance_mm + doubt_mm, self.problem.start);
+        let (cautious_mm, tip) = (clearance_mm + uncertainty_mm, self.problem.start);
         self.expansions_left = self.problem.expansions_max;
         let set_limits = |this: &mut Self, clearance_mm, margin| {
             this.field.clearance_mm = clearance_mm;
@@ -343,7 +343,7 @@ impl Replanner {
         });
         searched.or_else(|| {
             // A path leads through no obstacle, however uncertain the estimate is.
-            let least_mm = (clearance_mm - doubt_mm).max(CLEARANCE_MIN_MM.min(clearance_mm));
+            let least_mm = (clearance_mm - uncertainty_mm).max(CLEARANCE_MIN_MM.min(clearance_mm));
             set_limits(self, least_mm, 0.0);
             self.remembered_from(tip, estimate, next_mm).or_else(|| self.known(last))
         })
@@ -373,11 +373,13 @@ impl Replanner {
         (self.miss_mm(&path) <= tolerance_mm).then_some(path)
     }
 
-    /// The sharpest arc toward the target, if a path was found recently ([`PATIENCE_MM`]) and the arc's next `clear_mm`
-    /// are clear; or if the whole arc is clear and, given the uncertainty of the heading, may end within the tolerance.
+    /// The sharpest arc toward the target, if a path was found recently ([`WITHOUT_PATH_MAX_MM`]) and the arc's next
+    /// `clear_mm` are clear; or if the whole arc is clear and, given the uncertainty of the heading, may end within the
+    /// tolerance.
     fn toward_target(&mut self, heading_sd_rad: f64, clear_mm: f64) -> Option<Path> {
         let path = self.sharpest();
-        let was_lately = self.without_path_mm < PATIENCE_MM && self.begins_clear(&path, clear_mm);
+        let was_lately =
+            self.without_path_mm < WITHOUT_PATH_MAX_MM && self.begins_clear(&path, clear_mm);
         let may_end_near = self.may_end_near(&path, heading_sd_rad)
             && self.field.is_clear(&path.start, &path.arcs[0]);
         (was_lately || may_end_near).then_some(path)
@@ -385,7 +387,7 @@ impl Replanner {
 
     /// The `last` path unchanged, if its next `clear_mm` are clear and, given the uncertainty of the heading, it may
     /// end within the tolerance.
-    fn last_path_blindly(
+    fn last_path_within_uncertainty(
         &mut self,
         last: Path,
         heading_sd_rad: f64,

@@ -105,7 +105,7 @@ pub struct RunFigures {
 }
 
 /// Updates `greatest`, the largest magnitude so far, with `value`.
-fn raise(greatest: &mut Option<f64>, value: f64) {
+fn update_max(greatest: &mut Option<f64>, value: f64) {
     if value.is_finite() {
         *greatest = Some(greatest.unwrap_or(0.0).max(value.abs()));
     }
@@ -192,7 +192,7 @@ impl RunFigures {
         self.take_scored(step.insertion_meas_mm, x_mm, error);
         self.saturated += usize::from(step.decision.command_saturated);
         if let Some(age_s) = step.tip_meas_age_s {
-            raise(&mut self.so_far.tip_age_s_max, age_s);
+            update_max(&mut self.so_far.tip_age_s_max, age_s);
         }
         if let Some(approach) = &step.decision.approach {
             let true_mm = |truth: &Truth| {
@@ -206,7 +206,7 @@ impl RunFigures {
             self.so_far.clearance_mm_min = Some(least_mm).filter(|mm| mm.is_finite());
         }
         if let Some(at_mm) = step.tip_meas_insertion_mm {
-            raise(&mut self.so_far.tip_lag_mm_max, step.insertion_meas_mm - at_mm);
+            update_max(&mut self.so_far.tip_lag_mm_max, step.insertion_meas_mm - at_mm);
         }
     }
 
@@ -231,14 +231,14 @@ impl RunFigures {
             while self.path.get(1).is_some_and(|(time, _)| *time <= seen) {
                 self.path.pop_front();
             }
-            raise(&mut figures.blind_s_max, stage.time.seconds_after(seen).max(0.0));
+            update_max(&mut figures.blind_s_max, stage.time.seconds_after(seen).max(0.0));
             let seen_at_mm = self.path.front().map_or(f64::NAN, |(_, depth_mm)| *depth_mm);
-            raise(&mut figures.blind_mm_max, stage.measured.insertion_mm - seen_at_mm);
+            update_max(&mut figures.blind_mm_max, stage.measured.insertion_mm - seen_at_mm);
         }
         let behind_mm = stage.commanded.insertion_mm - stage.measured.insertion_mm;
-        raise(&mut figures.following_error_mm_max, behind_mm);
+        update_max(&mut figures.following_error_mm_max, behind_mm);
         let behind_rad = stage.commanded.rotation_rad - stage.measured.rotation_rad;
-        raise(&mut figures.following_error_deg_max, behind_rad.to_degrees());
+        update_max(&mut figures.following_error_deg_max, behind_rad.to_degrees());
     }
 
     /// All figures so far.

@@ -58,9 +58,9 @@ pub fn insert(
             steering.correct_handedness(&tip_meas, mean.positions(), interval_s);
         }
         if let Some(tool) = target_tool {
-            needle.see_target(tool, &due.samples);
+            needle.track_target(tool, &due.samples);
         }
-        needle.seen_target_mm().into_iter().for_each(|target_mm| steering.set_target(target_mm));
+        needle.tracked_target_mm().into_iter().for_each(|target_mm| steering.set_target(target_mm));
         let is_last = step + 1 == timetable.steps.len();
         let ahead = needle.base.between(observed_mm, due.insertion_mm);
         let decision = steering.decide(&ahead, is_last);
@@ -139,7 +139,7 @@ impl<'a> EmulatedNeedle<'a> {
 
     /// Tracks the target at the times of the tip's samples; before the insertion, for as long as its position is
     /// averaged.
-    fn see_target(&mut self, tool: &TargetTool, samples: &[SampleDue]) {
+    fn track_target(&mut self, tool: &TargetTool, samples: &[SampleDue]) {
         let (Some(target), Some(first)) = (self.stage.target, samples.first()) else { return };
         let model = TargetModel::tracker_model(self.stage.tracker);
         let interval_s = model.interval().as_secs_f64();
@@ -161,7 +161,7 @@ impl<'a> EmulatedNeedle<'a> {
         }
     }
 
-    fn seen_target_mm(&self) -> Option<Vector3<f64>> {
+    fn tracked_target_mm(&self) -> Option<Vector3<f64>> {
         self.target.as_ref()?.mean_mm()
     }
 

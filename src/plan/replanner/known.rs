@@ -20,7 +20,7 @@ impl Replanner {
     /// A path that is found without a search.
     pub(super) fn known(&mut self, last: Option<&Path>) -> Option<Path> {
         // If one arc is too long, several may be short enough.
-        let known = self.direct().or_else(|| self.mended(last?));
+        let known = self.direct().or_else(|| self.redirected(last?));
         let known = known.or_else(|| self.nearly_direct());
         known.or_else(|| self.continued(last?)).or_else(|| self.rejoined())
     }
@@ -94,7 +94,7 @@ impl Replanner {
     }
 
     /// The `last` path up to some point, then directly to the target; the shortest of these paths.
-    fn mended(&mut self, last: &Path) -> Option<Path> {
+    fn redirected(&mut self, last: &Path) -> Option<Path> {
         let mut best: Option<Path> = None;
         let mut arcs = Vec::new();
         for (start, arc) in last.pieces() {
