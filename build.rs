@@ -1,11 +1,11 @@
-//! Tells the bench which commit it was built from, where there is a repository to ask.
+//! Passes the git commit to the build, if there is a git repository.
 
 use std::path::Path;
 use std::process::Command;
 
 fn main() {
     println!("cargo:rerun-if-changed=src");
-    // HEAD names the branch, its log changes with every commit; in a worktree they are elsewhere.
+    // HEAD names the branch; its log changes with every commit. In a worktree, git keeps both elsewhere.
     for name in ["HEAD", "logs/HEAD"] {
         if let Some(path) = git(&["rev-parse", "--git-path", name])
             && Path::new(&path).exists()
@@ -18,7 +18,7 @@ fn main() {
     }
 }
 
-/// What git says to `arguments`; none without git or a repository.
+/// The output of git with these `arguments`, trimmed; `None` if git fails or is missing.
 fn git(arguments: &[&str]) -> Option<String> {
     let output = Command::new("git").args(arguments).output().ok()?;
     let said = String::from_utf8(output.stdout).ok()?;

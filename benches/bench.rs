@@ -1,7 +1,7 @@
 //! Times the work of the bench at each millimetre, frame and message, and a whole run.
 //!
-//! `cargo bench --profile dev` prints criterion's figures, and before them the quantiles of single
-//! steps. (Without the profile, all dependencies are built anew as for a release.)
+//! `cargo bench --profile dev` prints the quantiles of single steps, then criterion's figures. (Without the profile,
+//! cargo builds all dependencies again, as for a release.)
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use nalgebra::Vector3;

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The study's insertion in numpy, vectorised over trials: what `needle-bench study` is measured by.
+"""The study's insertion in numpy, vectorised over trials: the baseline for `needle-bench study`.
 
     usage: numpy_study.py [TRIALS] [DEPTH_MM]
 

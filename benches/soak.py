@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""One long insertion of 300 mm with faults strewn in that a run tolerates, and what it costs in memory.
+"""One long insertion of 300 mm with scattered faults that a run tolerates, and its memory use.
 
     usage: benches/soak.py [--hours 24]           virtual stage, virtual time
            benches/soak.py --udp [--hours 0.333]  vcan-stage over UDP, real time

@@ -1,11 +1,11 @@
-//! CSV tables with a header line, read by the names of their columns. An error names the line, what it holds and what
-//! was expected.
+//! CSV tables with a header line, read by column name. An error names the line, what it contains and what was
+//! expected.
 
 use crate::text::clipped;
 use csv::{ReaderBuilder, StringRecord, Trim};
 use nalgebra::{Quaternion, Rotation3, UnitQuaternion};
 
-/// The columns of an orientation: a table has all four or none.
+/// The columns of an orientation, a quaternion: a table has all four or none.
 const QUATERNION: [&str; 4] = ["qw", "qx", "qy", "qz"];
 /// An error shows at most this many characters of the file.
 const SHOWN_MAX: usize = 80;
@@ -43,7 +43,7 @@ impl Table {
             .from_reader(csv.as_bytes());
         // No error is possible: text in memory is UTF-8, and rows may be of any length.
         let records = reader.records().map_while(Result::ok);
-        // The csv crate takes the blank lines before a record as part of it.
+        // The csv crate counts the blank lines before a record as part of that record.
         let (mut line, mut counted) = (1, 0);
         let mut rows = records.map(|fields| {
             let from = fields.position().map_or(0, |position| position.byte() as usize);
@@ -92,10 +92,10 @@ impl Table {
         &self.rows
     }
 
-    /// Checks that each row is as long as the header.
+    /// Checks that each row has as many fields as the header.
     ///
     /// # Errors
-    /// The first row that is not.
+    /// The first row that has not.
     pub fn check_row_lengths(&self) -> Result<(), String> {
         let columns = self.header.len();
         match self.rows.iter().find(|row| row.fields.len() != columns) {
@@ -109,7 +109,7 @@ impl Table {
     /// The finite numbers of the columns `names` in every row, in the order of `names`.
     ///
     /// # Errors
-    /// A column that is missing, a row that is not as long as the header, or a field that is not a finite number.
+    /// A column is missing, a row has not as many fields as the header, or a field is not a finite number.
     pub fn numbers<const N: usize>(&self, names: [&str; N]) -> Result<Vec<[f64; N]>, String> {
         self.check_row_lengths()?;
         let columns = self.columns_of(names)?;
@@ -124,8 +124,8 @@ impl Table {
     /// them, or if they are empty in every row.
     ///
     /// # Errors
-    /// Some of the columns or rows without the others, a field that is not a finite number, or a quaternion that
-    /// cannot be normalised.
+    /// The table has only some of the columns, only some rows have an orientation, a field is not a finite number, or
+    /// a quaternion cannot be normalised.
     pub fn rotations(&self) -> Result<Vec<Option<Rotation3<f64>>>, String> {
         if !self.header.iter().any(|name| QUATERNION.contains(&name)) {
             return Ok(vec![None; self.rows.len()]);
@@ -159,7 +159,7 @@ impl Table {
 }
 
 impl Row {
-    /// The text in `column`; empty where the row is too short.
+    /// The text in `column`; empty if the row is too short.
     pub fn text(&self, column: &Column) -> &str {
         self.fields.get(column.index).unwrap_or_default()
     }
@@ -181,7 +181,7 @@ impl Row {
         Ok(numbers)
     }
 
-    /// The error for a field in `column` that does not hold what was `expected`.
+    /// The error for a field in `column` that does not contain what was `expected`.
     pub fn error(&self, column: &Column, expected: &str) -> String {
         let (line, name) = (self.line, &column.name);
         let field = clipped(self.text(column), SHOWN_MAX);

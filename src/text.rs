@@ -1,5 +1,5 @@
-//! Text from outside, such as a tool's name: made safe to show on a terminal, and short. Screens from
-//! templates and tables.
+//! Makes text from outside, such as a tool's name, safe to show on a terminal, and short. Renders screens from
+//! templates, and tables.
 
 use minijinja::syntax::SyntaxConfig;
 use minijinja::value::Serde;
@@ -8,9 +8,9 @@ use serde::Serialize;
 use std::borrow::Cow;
 use std::fmt::Display;
 
-/// True for a character that a terminal acts upon or that hides what follows it: control characters
-/// (C0, DEL and C1), line and paragraph separators, and the marks, embeddings, overrides and isolates
-/// of bidirectional text.
+/// True for a character that a terminal acts upon, or that changes how the text after it is shown: control
+/// characters (C0, DEL and C1), line and paragraph separators, and the marks, embeddings, overrides and
+/// isolates of bidirectional text.
 pub fn is_unprintable(c: char) -> bool {
     c.is_control()
         || matches!(c, '\u{061C}' | '\u{200E}' | '\u{200F}')
@@ -33,7 +33,7 @@ pub fn escaped(text: &str) -> Cow<'_, str> {
     Cow::Owned(shown)
 }
 
-/// `word`, such as a path, as a shell takes it.
+/// `word`, such as a path, quoted for a shell if necessary.
 pub fn shell_word(word: impl Display) -> String {
     let word = word.to_string();
     let is_bare = |c: char| c.is_ascii_alphanumeric() || "_-./=:,+%".contains(c);
@@ -43,7 +43,7 @@ pub fn shell_word(word: impl Display) -> String {
     }
 }
 
-/// The first `max` characters of `text`, the last of them `…` where there are more.
+/// `text` truncated to `max` characters; the last of them is `…` if anything was cut.
 pub fn clipped(text: &str, max: usize) -> Cow<'_, str> {
     if text.chars().nth(max).is_none() {
         return Cow::Borrowed(text);
@@ -51,9 +51,9 @@ pub fn clipped(text: &str, max: usize) -> Cow<'_, str> {
     Cow::Owned(text.chars().take(max.saturating_sub(1)).chain(['…']).collect())
 }
 
-/// A line that an operator reads has at most this many characters.
+/// Longest line of an operator's message, characters.
 const LINE_MAX: usize = 199;
-/// Before the continuation of a broken line.
+/// Indentation of the continuation of a broken line.
 const INDENT: &str = "       ";
 
 /// `text` with its longer lines broken in their second half: after the last semicolon there, otherwise at
@@ -98,13 +98,13 @@ pub fn screen(template: &str, object: &impl Serialize, more: Value) -> Result<St
     Ok(screen.trim_end_matches('\n').to_owned())
 }
 
-/// ` (1 of 2)` if a figure is of some of all recordings; empty if it is of all or of none.
+/// ` (1 of 2)` if a figure comes from some of the recordings; empty if it comes from all or none of them.
 fn part_of(count: u64, total: u64) -> String {
     if (1..total).contains(&count) { format!(" ({count} of {total})") } else { String::new() }
 }
 
-/// `value` with `decimals`; `never` for infinity, a depth or time that is never reached; a dash for `None`.
-/// A zero has no sign.
+/// `value` with this many `decimals`. Infinity, a depth or time that is never reached, is `never`; `None` is a
+/// dash. A zero has no sign.
 pub fn fixed(value: Option<f64>, decimals: usize) -> String {
     match value {
         None => "-".to_owned(),

@@ -8,7 +8,7 @@ use std::fmt;
 use std::ops::{Add, Sub};
 use std::time::Duration;
 
-/// The likely cause of positions whose distances are a thousandth of what they must be.
+/// The hint for positions whose distances are a thousandth of the expected ones.
 pub(crate) const IN_METRES: &str = "the positions look like metres; OpenIGTLink is in mm";
 
 /// A point on the session's own time line, in nanoseconds since the run's origin.

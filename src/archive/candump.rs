@@ -21,7 +21,7 @@ pub struct CandumpLine<'a> {
     pub frame: Frame,
 }
 
-/// UTC of `time` in a run that began at `started_unix_us`, µs since 1970, rounded down.
+/// UTC of `time`, µs since 1970, rounded down. The run began at `started_unix_us`, in the same unit.
 pub fn unix_us(started_unix_us: i64, time: Time) -> i64 {
     started_unix_us.saturating_add(time.as_nanos().div_euclid(1000))
 }
@@ -38,7 +38,7 @@ impl fmt::Display for CandumpLine<'_> {
 }
 
 impl<'a> CandumpLine<'a> {
-    /// When the frame was sent or received, on the time line of a run that began at `started_unix_us`.
+    /// The time of the frame on the time line of a run that began at `started_unix_us`, UTC in µs since 1970.
     pub fn time(&self, started_unix_us: i64) -> Time {
         Time::from_nanos(self.unix_us.saturating_sub(started_unix_us).saturating_mul(1000))
     }

@@ -22,7 +22,7 @@ pub enum EventKind {
 /// tracker.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EventLine<'a> {
-    /// When, whole milliseconds.
+    /// The time of the record, rounded down to the millisecond.
     pub time: Time,
     /// The part of the bench.
     pub lane: Lane,
@@ -60,7 +60,7 @@ impl<'a> EventLine<'a> {
     }
 }
 
-/// The result of a `stage prove`: the text of the last such line in `events`.
+/// The result of a `stage prove`: the text of the last line of `events`, an `events.log`, that states one.
 pub fn proof(events: &str) -> Option<String> {
     let lines = events.lines().rev().filter_map(EventLine::parse);
     lines.map(|line| line.text).find(|text| text.starts_with(PROVED)).map(Cow::into_owned)

@@ -1,9 +1,9 @@
 //! `inputs.log`: the inputs of the session, in order, each with its time.
 //!
-//! These determine everything that the session does. The first line has the format and the time at which
-//! the session was created. Each further line is one input: its time, in ns on the run's own time line, its
-//! kind and its values. Frames and samples are not written a second time: `frame` is the next received frame
-//! of `can.log`, `sample` the next line of `tracker.ndjson`. Text is quoted as in JSON.
+//! Together with the configuration, they determine everything that the session does. The first line has the
+//! format and the time at which the session was created. Each further line is one input: its time, in ns on the
+//! run's own time line, its kind and its values. Frames and samples are not written a second time: `frame` is the
+//! next received frame of `can.log`, `sample` the next line of `tracker.ndjson`. Text is quoted as in JSON.
 //!
 //! ```text
 //! needle-bench inputs 1, begun 0
@@ -23,7 +23,7 @@ use crate::units::Time;
 use serde_json::{Value, json};
 use std::io;
 
-/// Raised when a line changes its meaning.
+/// Version of the format; raised when the meaning of a line changes.
 const FORMAT: u32 = 1;
 const TITLE: &str = "needle-bench inputs ";
 
@@ -91,7 +91,7 @@ pub enum RecordedInput {
 pub struct Inputs {
     /// The time at which the session was created.
     pub begun: Time,
-    /// The time of the last input that was read.
+    /// The time of the last input read.
     last_time: Time,
     /// Lines read so far.
     pub line: usize,

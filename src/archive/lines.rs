@@ -2,8 +2,8 @@
 
 use std::io::{self, BufRead};
 
-/// The lines of a text file, read one by one. A partial last line, as a killed bench leaves it, is left
-/// out; bytes that are not UTF-8 are replaced. The first read error is the last item.
+/// The lines of a text file, read one by one. A partial last line, which a killed bench leaves behind, is
+/// omitted; bytes that are not UTF-8 are replaced. A read error is the last item.
 pub struct Lines(Option<Box<dyn BufRead>>);
 
 impl Lines {

@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 
 /// Format of the manifest that this version of the bench writes and reads.
 const FORMAT: u32 = 2;
-/// The key of the seal.
+/// The key of the seal: the SHA-256 of all other keys.
 const SEAL: &str = "seal_sha256";
 
 /// The identity that a drive reports (CiA 301 object 1018h), and the axis that it moves.
@@ -45,7 +45,7 @@ pub struct Counts {
 }
 
 impl Counts {
-    /// The counts of text files; `lines` gives the number of lines of the file of a name.
+    /// The counts of text files; `lines` returns the number of lines of the file with that name.
     pub fn of_lines(lines: impl Fn(&str) -> u64) -> Self {
         Counts {
             can_frames: lines(file::CAN),
@@ -57,7 +57,7 @@ impl Counts {
     }
 }
 
-/// Numbers of records that were lost, for whatever reason: a full queue, a full disk, a failed writer.
+/// Numbers of lost records, for whatever reason: a full queue, a full disk, a failed writer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Dropped {
     /// Not in the text files.
@@ -74,9 +74,9 @@ pub struct Dropped {
 #[display(rename_all = "snake_case")]
 #[serde(rename_all = "snake_case")]
 pub enum RunOutcome {
-    /// The run or operation went to its end.
+    /// The run or operation reached its end.
     Completed,
-    /// It was stopped before.
+    /// It was stopped before its end.
     Stopped,
 }
 
@@ -105,14 +105,14 @@ impl FileSeal {
     }
 }
 
-/// An operator's judgement of a run.
+/// The operator's judgement of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display, Serialize, Deserialize)]
 #[display(rename_all = "snake_case")]
 #[serde(rename_all = "snake_case")]
 pub enum VerdictKind {
-    /// It counts.
+    /// The run counts.
     Valid,
-    /// It does not count: it is left out of a campaign's figures.
+    /// The run does not count: a campaign's figures leave it out.
     Invalid,
 }
 
@@ -121,9 +121,9 @@ pub enum VerdictKind {
 pub struct Verdict {
     /// The judgement.
     pub verdict: VerdictKind,
-    /// Why.
+    /// The operator's reason.
     pub reason: String,
-    /// When it was given, RFC 3339.
+    /// When the operator gave it, RFC 3339.
     pub given_utc: String,
 }
 
@@ -143,7 +143,7 @@ pub struct Manifest {
     /// The bus of the rig that was rehearsed; `None` if this was no rehearsal.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rehearsal: Option<String>,
-    /// Who ran it.
+    /// The operator's name.
     pub operator: Option<String>,
     /// The phantom that the needle was inserted into.
     pub phantom: Option<String>,
@@ -169,7 +169,7 @@ pub struct Manifest {
     pub started_utc: String,
     /// When the record was closed, RFC 3339.
     pub ended_utc: Option<String>,
-    /// Length of the run on its own time line, s. In virtual time this is not the time that passed.
+    /// Length of the run on its own time line, s. In virtual time this differs from the elapsed time.
     pub duration_s: Option<f64>,
     /// How the run ended.
     pub outcome: Option<RunOutcome>,
@@ -217,7 +217,7 @@ impl Manifest {
     /// not a signature.
     ///
     /// # Errors
-    /// The manifest cannot be written as JSON. This does not happen to a manifest of this program.
+    /// The manifest cannot be written as JSON, which does not happen for a manifest of this program.
     pub fn to_text(&self) -> Result<String, serde_json::Error> {
         let mut value = serde_json::to_value(self)?;
         let seal = seal_of(&value);
@@ -230,7 +230,7 @@ impl Manifest {
     /// Reads what [`Manifest::to_text`] wrote.
     ///
     /// # Errors
-    /// Not a manifest, of another format, or edited, with the next step.
+    /// The text is no manifest, has another format, or was edited. The message says what to do next.
     pub fn from_text(text: &str) -> Result<Self, String> {
         let foreign = |error| format!("not a run's manifest: {error} (restore it from a copy)");
         let mut value: Value = serde_json::from_str(text).map_err(foreign)?;

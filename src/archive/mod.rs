@@ -1,7 +1,7 @@
-//! The formats of a run folder, written and read: pure text and types.
+//! The file formats of a run folder: pure text and types.
 //!
-//! `telemetry` fills a folder and opens one; replay and review read it through the types here.
-//! Each format has one source file here, which writes and reads it.
+//! Each format has one source file here, which writes and reads it. `telemetry` fills and opens run folders;
+//! `replay` and `review` read them through the types here.
 
 mod candump;
 mod events;

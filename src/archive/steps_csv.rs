@@ -10,7 +10,7 @@ use std::fmt;
 
 /// A row of `steps.csv`.
 ///
-/// Its text has no newline. Numbers are printed with the fewest digits that read back to the same `f64`.
+/// Its text has no newline. Numbers are printed with the fewest digits that read back as the same `f64`.
 /// Unknown values are empty. NaN and infinity, which should not occur, are printed as `NaN`, `inf`, `-inf`.
 pub struct StepRow<'a> {
     step: &'a StepRecord,
@@ -22,7 +22,7 @@ pub struct StepRow<'a> {
 }
 
 impl<'a> StepRow<'a> {
-    /// The row of `step`; in an emulated run with the truth.
+    /// The row of `step`, with the truth in an emulated run.
     pub fn new(step: &'a StepRecord, truth: Option<&Truth>) -> Self {
         StepRow {
             step,
@@ -45,7 +45,7 @@ const COUNTS: [&str; 2] = ["step", "tip_positions"];
 /// A column that is added here appears in `run.rrd` too, with angles in degrees.
 pub const STEP_COLUMNS: [StepColumn; 38] = [
     ("step", |c| Some(c.step.step.into())),
-    // A quotient, unlike a product with 1e-9, is the f64 nearest to the decimal number.
+    // The quotient is the f64 nearest to the decimal number; a product with 1e-9 may not be.
     ("time_s", |c| Some(c.step.time.as_nanos() as f64 / 1e9)),
     ("insertion_mm", |c| Some(c.step.insertion_meas_mm)),
     ("rotation_rad", |c| Some(c.step.rotation_meas_rad)),
@@ -85,7 +85,7 @@ pub const STEP_COLUMNS: [StepColumn; 38] = [
     ("target_error_pred_sd_mm", |c| c.approach?.error_sd_mm),
 ];
 
-/// The first line of `steps.csv`, without its end.
+/// The first line of `steps.csv`, without its newline.
 pub fn steps_csv_header() -> String {
     STEP_COLUMNS.map(|(name, _)| name).join(",")
 }
@@ -115,7 +115,7 @@ impl RecordedColumns {
         RecordedColumns(header.split(',').map(str::to_owned).collect())
     }
 
-    /// The value of `column` in `row`; `None` if it is missing or not a number.
+    /// The value of `column` in `row`; `None` if there is none or it is not a number.
     pub fn value(&self, row: &str, column: &str) -> Option<f64> {
         let position = self.0.iter().position(|name| name == column)?;
         row.split(',').nth(position)?.parse().ok()

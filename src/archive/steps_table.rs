@@ -1,4 +1,4 @@
-//! `steps.csv` as numbers, by the names of its columns.
+//! `steps.csv` as columns of numbers, by name.
 
 use super::lines::without_partial_line;
 use crate::table::Table;
@@ -12,10 +12,10 @@ pub struct StepsTable {
 }
 
 impl StepsTable {
-    /// Reads `text`. A partial last line, as a killed bench leaves it, is left out. Empty fields are unknown.
+    /// Reads `text`. A partial last line, which a killed bench leaves behind, is omitted. Empty fields are unknown.
     ///
     /// # Errors
-    /// A row that is not as long as the header, or a field that is not a number.
+    /// A row has not as many fields as the header, or a field is not a number.
     pub fn parse(text: &str) -> Result<Self, String> {
         let table = Table::parse(without_partial_line(text));
         table.check_row_lengths()?;
@@ -37,7 +37,8 @@ impl StepsTable {
         self.columns.get(name).cloned().unwrap_or_else(|| vec![None; self.rows])
     }
 
-    /// Where `step` does not count up by one, in words. It is no error: a writer that cannot keep up leaves out rows.
+    /// The first place where `step` does not count up by one, in words. This is no error: a writer that cannot keep
+    /// up drops rows.
     pub fn miscount(&self) -> Option<String> {
         let steps: Vec<f64> = self.column("step").into_iter().flatten().collect();
         let [before, next] = *steps.windows(2).find(|pair| pair[1] != pair[0] + 1.0)? else {

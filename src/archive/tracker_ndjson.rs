@@ -6,7 +6,7 @@ use crate::units::Time;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize, Serializer};
 
-/// A sample as a line of `tracker.ndjson`, without its end.
+/// A sample as a line of `tracker.ndjson`, without its newline.
 ///
 /// Times are whole nanoseconds. JSON has no NaN and no infinity, but a stream may send them: they are
 /// written as the strings `"NaN"`, `"inf"`, `"-inf"`, which Rust's `f64::from_str` and Python's `float`
@@ -40,14 +40,14 @@ struct Line<'a> {
     refused: Option<String>,
 }
 
-/// Of which tool a sample of `tracker.ndjson` is, when it was received, and whether it was accepted.
+/// The tool and the times of a sample of `tracker.ndjson`, and whether it was accepted.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 pub struct TrackerTimes {
     /// The tool, as it was sent.
     pub tool: String,
     /// When the bench received it, ns on the run's time line.
     pub receive_time_ns: i64,
-    /// When the tip was at this position, if the sample was accepted.
+    /// When the tip was at this position, ns on the run's time line, if the sample was accepted.
     pub acquisition_time_ns: Option<i64>,
     /// Why it was refused; `None` if it was accepted.
     pub refused: Option<String>,
@@ -59,7 +59,7 @@ impl TrackerTimes {
         serde_json::from_str(line).ok()
     }
 
-    /// True if the sample is of `tool`, whose name may have been cut on the way.
+    /// True if the sample is of `tool`, whose name a sender may have truncated.
     pub fn is_of(&self, tool: &str) -> bool {
         is_same_tool(&self.tool, tool)
     }

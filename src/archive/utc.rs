@@ -2,12 +2,12 @@
 
 use jiff::Timestamp;
 
-/// `20260301T143000Z`: sorts by time and is a file name everywhere.
+/// UTC of `unix_us`, µs since 1970, as `20260301T143000Z`: sorts by time and is valid in file names everywhere.
 pub fn compact(unix_us: i64) -> String {
     formatted(unix_us, "%Y%m%dT%H%M%SZ")
 }
 
-/// `2026-03-01T14:30:00.123456Z` (RFC 3339).
+/// UTC of `unix_us`, µs since 1970, as `2026-03-01T14:30:00.123456Z` (RFC 3339).
 pub fn rfc3339(unix_us: i64) -> String {
     formatted(unix_us, "%Y-%m-%dT%H:%M:%S.%6fZ")
 }

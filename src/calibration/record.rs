@@ -1,5 +1,5 @@
-//! Where calibrated values in a configuration came from, and how good they are. The preflight judges their
-//! age and the registration's RMS. The fiducials say how well the tip is known; nothing else is used.
+//! Origin and quality of the calibrated values in a configuration. The preflight judges their age and the
+//! registration's RMS. The fiducials determine how well the tip is known. Nothing else is used.
 
 use super::FiducialPair;
 use crate::keys::{Rule, section, within};

@@ -87,13 +87,13 @@ const FLAT: &str = "the points lie in a plane, and so cannot show a mirrored axi
 const SCATTERED: &str =
     "measure that one again, and check that both frames have the points in the same order";
 
-/// Another order of the points is looked for up to this many; more are hardly symmetric by chance.
+/// With more points than this, no other order is searched for: so many are hardly symmetric by chance.
 const ORDER_POINTS_MAX: usize = 12;
 /// No more partial orders are tried than this. Points that all lie close together have billions.
 const ORDER_TRIES_MAX: usize = 100_000;
-/// In another order two points may be farther apart or closer than in the given one by this, mm.
+/// In another order, the distance of two points on the bench may differ from the tracker's by this, mm.
 const ORDER_DISTANCE_MM: f64 = 3.0;
-/// A frame that another order turns by less than this is the same one, with two close points exchanged.
+/// An order that turns the frame by less than this is the same one, with two close points exchanged.
 const TURNED_MIN_RAD: f64 = 2.0 * PI / 180.0;
 
 /// The orders of the bench's points in which they are as far apart as in the tracker's frame, by backtracking: the

@@ -25,7 +25,7 @@ const RADIUS_IN_METRES_MIN_MM: f64 = 1e-4;
 /// The least length of the mean of unit vectors that should all be equal: 0.9 is a spread of 26°,
 /// which leaves room for the shaft's torsion.
 const COHERENCE_MIN: f64 = 0.9;
-/// A sensor whose roll is not seen is taken to point along the needle; it may not point farther away from it.
+/// Without the sensor's roll, its z axis is assumed along the needle; it may be off by at most this, deg.
 const TILT_MAX_DEG: f64 = 30.0;
 
 /// One position while the base turns.
@@ -261,7 +261,7 @@ impl SensorMount {
     }
 }
 
-/// Gauss-Newton steps: from the algebraic fit a few are enough, the others cost nothing.
+/// Gauss-Newton steps: a few suffice after the algebraic fit, and more cost nothing.
 const STEPS: usize = 20;
 
 /// A circle in space.

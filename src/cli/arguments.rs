@@ -97,7 +97,7 @@ pub(super) fn text_of(path: &Path) -> Result<String> {
     read_text(path).map_err(|error| Failure::bad_input(path, error))
 }
 
-/// A file that the arguments name has at most so many bytes; an hour of a tracker at 250 Hz has about as many.
+/// Largest file that the arguments may name, bytes: about an hour of a tracker at 250 Hz.
 const TEXT_MAX: u64 = 300_000_000;
 
 /// The text of the file `path`, or why it cannot be read.

@@ -226,7 +226,7 @@ fn is_in_fault(drive: &DriveReport) -> bool {
     drive.state.is_some_and(DriveState::is_fault)
 }
 
-/// What the drives were last known to do.
+/// The last known state of the drives.
 fn drives(stage: &StageAtEnd) -> String {
     let known = match stage.had_power {
         true => "both axes stand, power is off",

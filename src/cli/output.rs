@@ -12,7 +12,7 @@ use std::os::fd::AsFd;
 use std::path::Path;
 
 /// Writes `text`, made [`plain`], and a line end to stdout. A closed pipe (`run --json | true`) is no
-/// failure: the reader has read all that it wanted. Nor is a closed terminal: nobody is there to read.
+/// failure: the reader has read all that it wanted. Nor is a closed terminal, which has no reader.
 pub(super) fn print_stdout(text: impl Display) -> Result<()> {
     let mut stdout = io::stdout().lock();
     match writeln!(stdout, "{}", plain(text, "\n\t")).and_then(|()| stdout.flush()) {
@@ -43,8 +43,8 @@ pub(super) fn print_result(
     }
 }
 
-/// As [`print_result`], after a step that may have failed: the result is printed all the same, the failure with it
-/// and on stderr.
+/// Like [`print_result`], after a step that may have failed: prints the result in any case, and the failure in it and
+/// on stderr.
 pub(super) fn print_result_despite(
     failed: Result<()>,
     json: bool,

@@ -114,7 +114,7 @@ impl Job<'_> {
             terminal.finish();
             performed
         };
-        // Last: until here the runtime listens for signals.
+        // Last, because the runtime listens for signals until here.
         runtime.shutdown_background();
         performed
     }
@@ -126,7 +126,7 @@ impl Job<'_> {
         interrupt: &Interrupt,
     ) -> Result<Performed> {
         let config = self.config;
-        // A needle in tissue comes out, whatever happens to the record.
+        // A withdrawal from tissue goes on, whatever happens to its record.
         let goes_on = match config.record.on_failure {
             _ if self.is_withdrawal() => Some("the withdrawal goes on"),
             OnFailure::GoOn => Some("the run goes on (record.on_failure)"),
@@ -159,7 +159,7 @@ impl Job<'_> {
             let mut tracker = self.open_tracker(runtime, clock)?;
             let (recorder, realtime) = self.start_recording(clock.origin_utc())?;
             let sink = Sink::new(recorder, goes_on, operator, interrupt);
-            // Last: the session's deadlines start to run here.
+            // Last, because the session's deadlines start to run here.
             session = self.run_config.clone().begin(clock.now());
             run_live(&mut session, bus.as_mut(), tracker.as_mut(), clock, realtime, sink)
         };
@@ -306,7 +306,8 @@ impl Job<'_> {
     }
 }
 
-/// What the viewer shows for a run of `config` besides its records. A motion must not wait for a mask.
+/// The scene that viewers show with the records of a run of `config`. For a motion of the stage, a goal that cannot be
+/// read is no error.
 pub(super) fn scene(config: &Config, is_motion: bool) -> Result<Scene, ConfigError> {
     Ok(Scene {
         x_wp: config.plane,
@@ -341,7 +342,7 @@ pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>> {
         )));
     }
     let mut bus = SocketCan::open(name)?;
-    // As many as may go unanswered, plus the current one.
+    // As many SYNCs as may go unanswered, plus the current one.
     let syncs_max = usize::from(config.can.bus.missed_feedback_max) + 1;
     bus.confirm_sending(syncs_max)?;
     if config.can.listen == Listen::Stage {

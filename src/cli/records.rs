@@ -34,7 +34,7 @@ const RECORDINGS_TOML: (&str, &str) =
 /// all used.
 const ROWS_APART_MM: f64 = 0.04;
 
-/// The runs in `dir`, the newest first. A folder's name does not count: it may be a copy, or renamed.
+/// The runs in `dir`, the newest first by their manifests: a folder may be a copy, or renamed.
 pub(super) fn newest_first(dir: &Path) -> impl Iterator<Item = RunFolder> + use<> {
     let folders = folders_in(dir).unwrap_or_default().into_iter();
     let mut runs: Vec<RunFolder> = folders.filter_map(|it| RunFolder::open(&it).ok()).collect();
@@ -104,7 +104,7 @@ pub(super) fn describe(config: Config) -> Describe {
     })
 }
 
-/// What the run of `manifest` was to do, from its configuration and arguments.
+/// The settings of the run of `manifest`, from its configuration and arguments.
 pub(super) fn recorded_run_config(manifest: &Manifest, config: &Config) -> Result<RunConfig> {
     let Some(name) = &manifest.operation else {
         let session = config.session_reading(&mask_reader(None, no_warning))?;
@@ -304,7 +304,7 @@ fn rows(
         let start_mm = *start_mm.get_or_insert(measured.insertion_mm);
         let before_mm = rows.last().map_or(start_mm, |row| row.insertion_meas_mm);
         if rows.len() < 2 && measured.insertion_mm < start_mm + ROWS_APART_MM {
-            // While the bench waits the tip may move: the insertion begins where it was last.
+            // The tip may move while the bench waits: the insertion begins at its last position before the motion.
             rows.clear();
         } else if measured.insertion_mm < before_mm + ROWS_APART_MM {
             continue;

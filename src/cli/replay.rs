@@ -128,7 +128,7 @@ fn what_if(text: &str, sets: &[String]) -> Result<Option<ObserverConfig>> {
     }
     let source = Source { name: file::CONFIG, text };
     let unread = |_: &Path| Err("a replay reads no other file".to_owned());
-    // The shadows of the run do not make another observer's keys count here.
+    // Without the run's shadows, a key of an observer that is not chosen gives a warning.
     let sets = [&["observer.shadows=[]".to_owned()], sets].concat();
     let (config, warnings) = Config::with_warnings(&[source], &sets, &unread)?;
     for warning in warnings {

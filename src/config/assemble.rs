@@ -16,7 +16,7 @@ const EMULATED_VENDOR_ID: u32 = 0;
 const EMULATED_PRODUCT_CODE: u32 = 0x402;
 
 impl Config {
-    /// The bus of a run; that of a rehearsal is memory.
+    /// The bus of a run; a rehearsal uses `memory`.
     pub fn bus(&self) -> &CanInterface {
         if self.emulator.rehearse { &CanInterface::Memory } else { &self.can.interface }
     }
@@ -26,12 +26,12 @@ impl Config {
         *self.bus() == CanInterface::Memory
     }
 
-    /// True if the true tip is known: the positions are those of the needle that is emulated in this process.
+    /// True if the true pose of the tip is known: the needle and its tracker are emulated in this process.
     pub fn knows_truth(&self) -> bool {
         self.is_emulated() && self.tip_source() == TrackerSource::Emulated
     }
 
-    /// The source of a run's tip positions; that of a rehearsal is the emulated tracker.
+    /// The source of a run's tip positions; a rehearsal uses the emulated tracker.
     pub fn tip_source(&self) -> TrackerSource {
         if self.emulator.rehearse { TrackerSource::Emulated } else { self.tracker.source }
     }
@@ -47,7 +47,7 @@ impl Config {
     /// Like [`Config::session`], but reads masks with `read_mask`.
     ///
     /// # Errors
-    /// No registration; values that the needle, the stage or the observers refuse; a target that cannot be
+    /// There is no registration; the needle, the stage or the observers refuse a value; or the target cannot be
     /// reached.
     pub fn session_reading(&self, read_mask: ReadMask<'_>) -> Result<SessionConfig, ConfigError> {
         let goal = self.to_goal(read_mask)??;
@@ -57,7 +57,7 @@ impl Config {
     /// The settings of a session that steers into the plane, whatever the goal.
     ///
     /// # Errors
-    /// No registration; values that the needle, the stage or the observers refuse.
+    /// There is no registration, or the needle, the stage or the observers refuse a value.
     pub fn session_without_goal(&self) -> Result<SessionConfig, ConfigError> {
         let invariant = self.observer.invariant;
         let (needle, needle_torsion) = self.believed_needle()?;
@@ -67,7 +67,7 @@ impl Config {
             needle,
             needle_torsion,
             handedness: InvariantConfig {
-                // Only one of the two places may have the real noise.
+                // The noise may be configured in only one of the two places.
                 position_sd_mm: invariant.position_sd_mm.max(self.tracker.to_track().noise_sd_mm),
                 ..invariant
             },
@@ -99,7 +99,7 @@ impl Config {
         let mut stage = self.stage.clone();
         if self.emulator.rehearse {
             for axis in [&mut stage.insertion, &mut stage.rotation] {
-                // The raw value has the real drive's unit. The emulated drive takes the key's.
+                // A raw SDO has the real drive's unit, which the emulated drive does not know. It uses the key.
                 let is_told = axis.quick_stop_deceleration.is_some();
                 axis.sdo.retain(|raw| !(is_told && raw.is_quick_stop()));
             }
@@ -110,7 +110,7 @@ impl Config {
     /// The settings of the virtual stage: the drives that the bench expects, and the emulator's needle.
     ///
     /// # Errors
-    /// No registration; a needle or a torsion that cannot exist.
+    /// There is no registration, or the needle or its torsion is impossible.
     pub fn virtual_stage(&self) -> Result<VirtualStageConfig, ConfigError> {
         let emulator = &self.emulator;
         let turns_per_s = self.number("stage.rotation.speed_max_deg_per_s") / 360.0;
@@ -143,8 +143,8 @@ impl Config {
         })
     }
 
-    /// The drive of `axis`, which reaches `units_per_s` mm or turns per second, and its counts per mm or turn,
-    /// negative if it counts in the opposite direction.
+    /// The emulated drive of `axis`, whose speed limit is `units_per_s` mm or turns per second, and its counts per mm
+    /// or turn, negative if it counts in the opposite direction.
     fn emulated_drive(&self, axis: &AxisConfig, units_per_s: f64) -> (DriveConfig, f64) {
         let counts_per_unit = axis.ratio.to_f64();
         let vendor = axis.vendor_id.unwrap_or(EMULATED_VENDOR_ID);

@@ -7,7 +7,7 @@ use crate::session::PROFILE_PEAK;
 use crate::stage::{Axis, AxisConfig, Reference, SOFTWARE_LIMITS, why_needed};
 
 /// Settings that make a real drive brake on quick stop, on its own faults and when the bench dies: key, allowed
-/// values, and these in words.
+/// values, and the allowed values in words.
 const STOPPING: [(&str, &[i16], &str); 4] = [
     (
         "abort_connection_option",
@@ -33,8 +33,8 @@ const STOPPING: [(&str, &[i16], &str); 4] = [
     ),
 ];
 
-/// Objects that the bench writes if a key of the axis is given. If not, a raw SDO may write them, in the
-/// drive's own unit.
+/// Objects that the bench writes if a key of the axis is given. If it is not given, a raw SDO may write them, in
+/// the drive's own unit.
 const SET_BY: [((u16, u8), &str); 5] = [
     ((0x607C, 0), "homing.offset_UNIT"),
     ((0x6098, 0), "homing.method"),
@@ -80,7 +80,7 @@ impl Checks<'_> {
         let unit = self.which.unit();
         let homed = axis.reference == Reference::Homing;
         // The limits of a real axis protect its screw, its needle or the sensor's cable. Limits that count from
-        // the start of each command do not: three jogs can go three times as far.
+        // the start of each command do not protect them: three jogs can go three times as far.
         let has_moving_limits = self.config.stage.hardware && axis.zero.is_none() && !axis.wraps;
         contradictions! { reader;
             [&reference, &homing] if homed && axis.homing.is_none() =>
@@ -94,7 +94,7 @@ impl Checks<'_> {
         }
     }
 
-    /// Home, where the drive's zero is the home offset (607C) away from it, is within the limits. An insertion
+    /// Checks that home is within the limits; the drive's zero is at home plus the home offset (607C). An insertion
     /// axis that homes on an end switch moves between that switch and the other end: the limits must be on that
     /// side of home.
     fn home(&self, reader: &mut Reader) {
@@ -106,7 +106,7 @@ impl Checks<'_> {
         let unit = self.which.unit();
         let (scale, units) =
             [("counts_per_mm", 1.0), ("counts_per_turn", 360.0)][self.which as usize];
-        let is_unknown = reader.is_wrong(&self.key(scale));
+        let is_unknown = reader.is_invalid(&self.key(scale));
         let counts_per_unit = if is_unknown { f64::NAN } else { self.axis.ratio.to_f64() / units };
         let zero_counts = self.axis.zero.map_or(f64::NAN, f64::from);
         // Not -offset, which would print as -0.000.
@@ -122,8 +122,9 @@ impl Checks<'_> {
             return;
         };
         let method = homing.method;
-        // The direction in which each method seeks its switch, and the method that seeks it in the other one. 3 to 6
-        // and 19 to 22 move as the switch says; 33 and 34 move by at most one turn of the motor, 35 and 37 do not.
+        // The direction in which each method seeks its switch, and the method that seeks it in the opposite direction.
+        // The direction of 3 to 6 and 19 to 22 depends on the switch's state; 33 and 34 move by at most one turn of
+        // the motor, 35 and 37 not at all.
         let (direction, other_method) = match method {
             1 | 17 => (-sign, method + 1),
             2 | 18 => (sign, method - 1),
@@ -144,7 +145,8 @@ impl Checks<'_> {
         }
     }
 
-    /// Stopping options that leave the axis moving, objects that are not optional, and the following-error timeout.
+    /// Refuses stopping options that leave the axis moving, optional objects that the bench needs, and a
+    /// following-error timeout that is too long.
     fn drive(&self, reader: &mut Reader) {
         for (name, stopping, allowed) in STOPPING {
             let key = &*self.key(name);
@@ -199,8 +201,8 @@ impl Checks<'_> {
     }
 }
 
-/// Why a raw SDO may not write an object: it moves the axis, or the bench writes it, from the key named here.
-/// `None` if a raw SDO may write it.
+/// The reason why a raw SDO may not write the object `index`: the object moves the axis, or the bench writes it,
+/// from the key named here. `None` if a raw SDO may write it.
 fn reserved(index: u16) -> Option<&'static str> {
     Some(match index {
         0x1010 | 0x1011 => {
@@ -226,7 +228,7 @@ fn reserved(index: u16) -> Option<&'static str> {
     })
 }
 
-/// The configured accelerations are within the limits of their axis: otherwise a run would be certain to stop.
+/// Checks that the configured accelerations are within the limits of their axis: beyond them every run would stop.
 fn accelerations(config: &Config, reader: &mut Reader) {
     let along = "stage.insertion.acceleration_max_mm_per_s2";
     for (key, max_key) in [

@@ -61,8 +61,8 @@ impl CanInterface {
         matches!(self, CanInterface::Memory | CanInterface::Udp(_))
     }
 
-    /// True for a bus without a wire, on which the drives are emulated: `memory`, `udp`, and network
-    /// interfaces whose names begin with `vcan` or `vxcan`, as Linux names its virtual ones.
+    /// True for a bus without a wire, on which the drives are emulated: `memory`, `udp`, and Linux's virtual
+    /// CAN interfaces, whose names begin with `vcan` or `vxcan`.
     pub fn is_virtual(&self) -> bool {
         let is_virtual = |name: &str| name.starts_with("vcan") || name.starts_with("vxcan");
         self.is_for_tests() || matches!(self, CanInterface::Socket(name) if is_virtual(name))

@@ -28,8 +28,8 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     check_faults(config, reader);
 }
 
-/// Numbers that limit other numbers. The declarations say which key is the upper limit of which; the other
-/// limits are here.
+/// Checks numbers that other keys limit. The upper limits come from the declarations of the keys; the other limits
+/// are here.
 fn check_limits(config: &Config, reader: &mut Reader) {
     let limited = std::mem::take(&mut reader.limited);
     let mut limit = |key: &str, allowed: &str, other: &str, is_wrong: fn(f64, f64) -> bool| {
@@ -50,7 +50,7 @@ fn check_limits(config: &Config, reader: &mut Reader) {
     limit(timeout, "at least twice", period, |timeout, period| timeout < 2.0 * period);
 }
 
-/// At most one step is taken per SYNC period.
+/// Checks that the needle moves at most one step per SYNC period.
 fn check_step(config: &Config, reader: &mut Reader) {
     let (step, speed) = (config.insertion.step_mm, config.insertion.speed_mm_per_s);
     let sync_ms = config.can.bus.sync_ms;
@@ -62,7 +62,7 @@ fn check_step(config: &Config, reader: &mut Reader) {
     }
 }
 
-/// A real drive may leave SYNCs without an answer for no longer than it may leave out its heartbeat.
+/// Checks that a real drive may leave SYNCs unanswered for no longer than the heartbeat timeout.
 fn check_missed_feedback(config: &Config, reader: &mut Reader) {
     let [missed, period, timeout] =
         ["can.missed_feedback_max", "can.sync_ms", "can.heartbeat_timeout_ms"];
@@ -77,7 +77,7 @@ fn check_missed_feedback(config: &Config, reader: &mut Reader) {
     }
 }
 
-/// The axis can follow the fastest rotation that the control law may command, and its reversal.
+/// Checks that the axis can follow the fastest rotation that the control law may command, and its reversal.
 fn check_rotation(config: &Config, reader: &mut Reader) {
     let section = section_name(&config.control.kind.to_string());
     let key = &*format!("control.{section}.rotation_max_deg_per_mm");
@@ -99,7 +99,7 @@ fn check_rotation(config: &Config, reader: &mut Reader) {
     }
 }
 
-/// Rounded down to this many decimals, so that a value that a message suggests is allowed.
+/// `value` rounded down to this many `digits` after the point, so that a value that a message suggests is allowed.
 pub(super) fn rounded_down(value: f64, digits: i32) -> f64 {
     let per_one = 10f64.powi(digits);
     (value * per_one).floor() / per_one
@@ -114,7 +114,8 @@ fn check_torsion(section: &str, torsion: TorsionConfig, reader: &mut Reader) {
     }
 }
 
-/// Each range has its lower end first, and no trial draws a torsion offset outside its torsion band.
+/// Checks that each range has its lower end first, that drawn keys have an effect, that a target does not move faster
+/// than the needle, and that no trial draws a torsion offset outside its torsion band.
 fn check_study(config: &Config, reader: &mut Reader) {
     for key in StudyConfig::KEYS {
         let Some([low, high]) = config.range(key.name) else { continue };
@@ -161,8 +162,8 @@ fn check_study(config: &Config, reader: &mut Reader) {
     }
 }
 
-/// Correlated noise needs both its standard deviation and its correlation time. If the correlation time is
-/// longer than the run, the noise is a constant offset, which no observer can distinguish from the tip.
+/// Checks that correlated noise has both its standard deviation and its correlation time. If the correlation time
+/// is longer than the run, the noise acts as a constant offset, which no observer can distinguish from the tip.
 fn check_noise(config: &Config, reader: &mut Reader) {
     let time_s = config.tracker.noise.map_or(0.0, |noise| noise.correlation_time.as_secs_f64());
     let run_s = config.insertion.depth_mm / config.insertion.speed_mm_per_s;
@@ -182,7 +183,7 @@ fn check_noise(config: &Config, reader: &mut Reader) {
     }
 }
 
-/// No two of the nodes at these `keys` have the same number.
+/// Checks that no two of the nodes at these `keys` have the same number.
 pub(super) fn check_nodes(keys: &[&str], config: &Config, reader: &mut Reader) {
     for (n, second) in keys.iter().enumerate() {
         for first in &keys[..n] {
@@ -212,7 +213,7 @@ fn check_bus(config: &Config, reader: &mut Reader) {
     }
 }
 
-/// The source of tip positions, the keys that only some sources allow, and the registration.
+/// Checks the source of tip positions, the keys that only some sources allow, and the registration.
 fn check_tracker(config: &Config, reader: &mut Reader) {
     if let Err(error) = config.registration_sd_mm() {
         reader.refuse(&[FIDUCIALS, REGISTRATION], error.to_string());
@@ -269,11 +270,12 @@ fn check_tracker(config: &Config, reader: &mut Reader) {
     }
 }
 
-/// A position comes soon enough to steer by, and to stop before `tracker.hold_after_mm` without one.
+/// Checks that positions arrive soon enough to steer by, and that without one the needle can stop before
+/// `tracker.hold_after_mm`.
 fn check_delays(config: &Config, reader: &mut Reader) {
     let latency_ms = config.number("tracker.latency_ms");
     let after_s = config.number("tracker.hold_after_s");
-    // The longest way without a position: latency, tracker period, two SYNCs until the hold begins, braking.
+    // The longest travel without a position: latency, tracker period, two SYNCs until the hold begins, braking.
     let (speed, hold) = (config.insertion.speed_mm_per_s, config.tracker.hold);
     let (hold_mm, braking) = (hold.after_mm, hold.braking_mm_per_s2);
     let is_seen_here = config.tip_source() == TrackerSource::Emulated;
@@ -292,7 +294,7 @@ fn check_delays(config: &Config, reader: &mut Reader) {
     }
 }
 
-/// Each kind of fault allows only some keys, and needs some of them.
+/// Checks that each fault has the keys that its kind needs, and no others.
 fn check_faults(config: &Config, reader: &mut Reader) {
     for (i, fault) in config.emulator.fault.iter().enumerate() {
         let table = format!("emulator.fault[{i}]");

@@ -1,4 +1,4 @@
-//! `[emulator]`: the emulated needle and tracker, apart from what the bench believes of them.
+//! `[emulator]`: the emulated drives, needle and tracker, separate from the bench's model of them.
 
 use std::time::Duration;
 
@@ -116,7 +116,7 @@ choice! {
 }
 
 impl TrackerPreset {
-    /// The keys that it sets.
+    /// The keys that the preset sets, as TOML.
     pub(super) fn toml(self) -> &'static str {
         match self {
             TrackerPreset::Plain => "",

@@ -8,12 +8,12 @@ use super::value::Origin;
 /// At most this many problems are printed.
 const SHOWN_MAX: usize = 10;
 
-/// One thing wrong with a configuration: where, which key, which value, what is allowed.
+/// One error in a configuration: its place, the key, the value, and what is allowed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Problem {
     /// Where the offending value was given; `None` for a key that is not given.
     pub origin: Option<Origin>,
-    /// The whole line, with the place in front.
+    /// The whole message, which begins with the place.
     pub message: String,
 }
 
@@ -25,7 +25,7 @@ impl Problem {
     }
 }
 
-/// A configuration that cannot be used: everything found wrong with it, in the order found.
+/// All errors of a configuration that cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub struct ConfigError {
     /// At least one.
@@ -62,10 +62,10 @@ impl fmt::Display for ConfigError {
     }
 }
 
-/// A known key is suggested from this similarity on.
+/// Lowest similarity, from 0 to 1, at which a known key is suggested.
 const SIMILARITY_MIN: f64 = 0.55;
 
-/// Length of a list of keys, characters.
+/// Longest list of keys in a message, characters.
 const LISTED_MAX: usize = 110;
 
 /// A hint for the unknown `key`: the nearest of the known `keys`, or the keys and sections of its section.
@@ -90,7 +90,7 @@ pub fn nearest_key<'a>(key: &str, keys: impl Iterator<Item = &'a str> + Clone) -
     }
 }
 
-/// As many of `names` as a line has room for, and the number of the others.
+/// As many of `names` as fit into [`LISTED_MAX`], and the number of the others.
 fn listed(names: &[&str]) -> String {
     let mut length = 0;
     let fitting = names.iter().take_while(|name| {

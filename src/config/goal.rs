@@ -127,10 +127,10 @@ impl ObstacleShape {
 pub type ReadMask<'a> = &'a dyn Fn(&str, Option<u32>, &Pose) -> Result<Obstacle, String>;
 
 impl ObstacleConfig {
-    /// Builds the obstacle, which has all keys that its shape needs.
+    /// Builds the obstacle; it must have all keys that its shape needs.
     ///
     /// # Errors
-    /// A mask that cannot be read.
+    /// The mask cannot be read.
     fn to_obstacle(&self, read_mask: ReadMask<'_>) -> Result<Obstacle, String> {
         let [centre_mm, from_mm, to_mm, min_mm, max_mm] =
             [self.centre_mm, self.from_mm, self.to_mm, self.min_mm, self.max_mm]
@@ -185,10 +185,10 @@ impl Config {
         Ok(goal.map(|goal| Some(Goal { tool, ..goal })))
     }
 
-    /// Refuses a target so near to a wall of the workspace that a run which is stopped there could go beyond it.
+    /// Checks that the target is further from a wall of the workspace than the needle's stopping distance.
     ///
     /// # Errors
-    /// Both distances, in words.
+    /// The target is nearer; the text gives both distances.
     pub fn check_wall(&self, world: &World, problem: &Problem) -> Result<(), String> {
         let wall_mm = world.workspace.depth_mm(&problem.target_mm);
         let stopping_mm = self.insertion.stopping_mm(&self.stage);
@@ -205,16 +205,16 @@ impl Config {
     fn target_tool(&self, expected_mm: Vector3<f64>) -> Result<Option<TargetTool>, ConfigError> {
         let Some(tool) = self.goal.tool.clone() else { return Ok(None) };
         let gate = self.tracker.to_gate()?;
-        // The offset of the tip belongs to the needle's sensor, not to this one.
+        // The tip offset belongs to the needle's sensor, not to the target's.
         let registration = Registration::new(*gate.registration.x_wt());
         let GoalConfig { tool_range_mm: range_mm, tool_average: average, .. } = self.goal;
         let gate = Gate { tool, registration, ..gate };
         Ok(Some(TargetTool { gate, expected_mm, range_mm, average }))
     }
 
-    /// The configuration as a run records it: with the curvature margin, and for each mask with its CRC-32 (if
-    /// `crc32` can compute it) and with its path, which is relative to the folder of the configuration `file`,
-    /// completed.
+    /// The configuration as a run records it: with the curvature margin and, for each mask, the CRC-32, if `crc32`
+    /// can compute it. The path of a mask, which is relative to the folder of the configuration `file`, gets that
+    /// folder in front.
     pub fn recorded_beside(&self, file: &Path, crc32: impl Fn(&Path) -> Option<u32>) -> Config {
         let mut toml = self.toml.clone();
         if let (GoalKind::Target, Some(goal)) = (self.goal.kind, toml["goal"].as_table_mut()) {
@@ -238,7 +238,7 @@ impl Config {
     /// at x = 0 and without pitch.
     ///
     /// # Errors
-    /// No target; a mask that cannot be read.
+    /// There is no target, or a mask cannot be read.
     pub fn to_plan(&self, read_mask: ReadMask<'_>) -> Result<(World, Problem), ConfigError> {
         let goal = &self.goal;
         let target_mm = goal.position_mm.filter(|_| goal.kind == GoalKind::Target);

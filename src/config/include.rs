@@ -1,4 +1,4 @@
-//! The layers that a configuration names: calibration files, and presets of the emulated tracker.
+//! The calibration files that a configuration names.
 
 use std::path::Path;
 
@@ -16,10 +16,10 @@ struct CalibrationFile {
     made_by: &'static str,
     /// The keys in such a file; it has all of them and no others.
     holds: &'static [&'static str],
-    /// If a source of higher precedence gives one of these keys, the file does not count. One source may not give
-    /// `key` together with one of these, or with a key that the file holds.
+    /// If a source of higher precedence gives one of these keys, the file is ignored. One source may not give `key`
+    /// together with one of these, or with a key that the file contains.
     instead_of: &'static [&'static str],
-    /// The key in `holds` that says when and from what the values were computed, for the preflight.
+    /// The key in `holds` that says when and from which data the values were computed; the preflight checks it.
     fit: &'static str,
 }
 
@@ -57,7 +57,7 @@ const CALIBRATION_FILES: [CalibrationFile; 3] = [
 /// Keys of calibration files that are not measured values: overriding one keeps the `fit`.
 const NOT_MEASURED: [&str; 2] = ["tracker.registration.sd_mm", "evaluation"];
 
-/// Calibration files that cannot be used: for each the keys whose values are therefore unknown, and why.
+/// Calibration files that cannot be used: for each, the keys whose values are therefore unknown, and the error.
 pub(super) type Unusable = Vec<(Vec<&'static str>, ConfigError)>;
 
 /// Adds the content of the named calibration files to the layers that name them, as if it were written
@@ -69,13 +69,13 @@ pub(super) fn add_calibrations(entries: &mut Entries, read: ReadFile<'_>) -> Unu
             Ok(content) => entries.extend(content),
             Err(error) => unusable.push(([file.holds, file.instead_of].concat(), error)),
         }
-        // From here on the layers hold the file's content, or a higher layer replaces it.
+        // Now the layers contain the file's content, or a higher layer replaces it.
         entries.retain(|(key, entry)| key != file.key || !entry.value.is_str());
     }
     unusable
 }
 
-/// Removes the `fit` of each calibration of which a higher layer overrides a measured value.
+/// Removes the `fit` of each calibration if a higher layer overrides one of its measured values.
 pub(super) fn remove_outdated_fits(tree: &mut Tree) {
     for file in &CALIBRATION_FILES {
         let Some(layer) = tree.get(file.fit).map(|fit| fit.layer) else { continue };
@@ -92,16 +92,16 @@ pub(super) fn remove_outdated_fits(tree: &mut Tree) {
 impl CalibrationFile {
     /// The content of the file, in the layer that names it; nothing if a higher layer replaces it.
     fn content(&self, entries: &Entries, read: ReadFile<'_>) -> Result<Entries, ConfigError> {
-        let Some(naming) = topmost(entries, self.key) else { return Ok(Vec::new()) };
+        let Some(naming) = highest_entry(entries, self.key) else { return Ok(Vec::new()) };
         let Some(path) = naming.value.as_str() else { return Ok(Vec::new()) };
         let refusal = |message: String| ConfigError::at(Some(naming.origin.clone()), message);
-        let mut others = self.instead_of.iter().filter_map(|key| topmost(entries, key));
-        if others.any(|other| other.layer > naming.layer && !other.is_beside(naming)) {
+        let mut others = self.instead_of.iter().filter_map(|key| highest_entry(entries, key));
+        if others.any(|other| other.layer > naming.layer && !other.is_same_source(naming)) {
             return Ok(Vec::new());
         }
-        // Several `--set` are one source. But of a key that the file merely holds, the later `--set` counts.
+        // All `--set` together are one source. But for a key that the file merely contains, the later `--set` wins.
         let is_twice = |(key, entry): &&(String, Entry)| {
-            is_among(key, self.instead_of) && entry.is_beside(naming)
+            is_among(key, self.instead_of) && entry.is_same_source(naming)
                 || is_among(key, self.holds) && entry.layer == naming.layer
         };
         if let Some((key, _)) = entries.iter().find(is_twice) {
@@ -145,7 +145,7 @@ fn is_among(key: &str, keys: &[&str]) -> bool {
 }
 
 /// The value of `key` in the highest layer that has it.
-pub(super) fn topmost<'a>(entries: &'a Entries, key: &str) -> Option<&'a Entry> {
+pub(super) fn highest_entry<'a>(entries: &'a Entries, key: &str) -> Option<&'a Entry> {
     let named = entries.iter().filter(|(name, _)| name == key);
     named.map(|(_, entry)| entry).max_by_key(|entry| entry.layer)
 }

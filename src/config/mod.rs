@@ -13,8 +13,8 @@
 //!
 //! `tracker.registration_file`, `tracker.tip_file` and `needle.needle_file` name files with calibrated values.
 //! Their content counts as if it were written in place of that key; the configuration of a run folder has
-//! the content and not the key. If a higher layer overrides a calibrated value, the origin of the
-//! calibration (`fit`) is left out.
+//! the content and not the key. If a higher layer overrides a calibrated value, the record of the
+//! calibration (`fit`) is dropped.
 //!
 //! Three things are not overridden key by key:
 //! - of two alternatives (a radius and a curvature, `uniform_mm` and `sd_mm` of `emulator.noise`, `at_mm` and
@@ -25,8 +25,8 @@
 //!   nodes, identities, scales, signs and limits have no defaults, and with any `tracker.source` but
 //!   `"emulated"` there is no registration unless one is given.
 //!
-//! Units are in the keys and are those of the file, degrees among them; methods convert to mm and
-//! rad. This module reads no files: the caller hands it their text.
+//! The name of a key ends with the unit of its value, which may be degrees or ms. A field that is declared `as`
+//! another key is converted to mm, rad or s. This module reads no files: the caller passes their text.
 
 mod assemble;
 mod axis_checks;
@@ -80,7 +80,7 @@ pub(crate) const DEFAULT_TOML: &str = include_str!("../../bench-config/virtual.t
 /// No displacement and no rotation, as a default.
 const IDENTITY: &str =
     "{ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }";
-/// The number of the layer below the files.
+/// The layer of presets and of a rehearsal's derived values: above the defaults, below the files.
 const PRESET: usize = 1;
 
 const HEAD: &str = "\
@@ -148,8 +148,8 @@ impl Config {
     /// The defaults, overridden by `sources` in order, and then by `sets` (`key=value`).
     ///
     /// # Errors
-    /// Everything that is wrong: invalid TOML; or unknown keys, wrong types, values out of range and
-    /// contradictions. A key that names a calibration file is refused too, since no file is read.
+    /// Every error found: invalid TOML; or unknown keys, wrong types, values out of range and contradictions. A
+    /// key that names a calibration file is an error too, since no file is read.
     pub fn from_sources(sources: &[Source<'_>], sets: &[String]) -> Result<Self, ConfigError> {
         let read = |path: &Path| Err(format!("{} cannot be read here", path.display()));
         Self::with_warnings(sources, sets, &read).map(|(config, _)| config)
@@ -160,7 +160,7 @@ impl Config {
     /// section that has no effect because its control law or observer is not chosen.
     ///
     /// # Errors
-    /// Those of [`Config::from_sources`]; a calibration file that cannot be read or has other content.
+    /// Those of [`Config::from_sources`], or a calibration file cannot be read or has other content.
     pub fn with_warnings(
         sources: &[Source<'_>],
         sets: &[String],
@@ -231,7 +231,7 @@ impl Config {
         }
     }
 
-    /// The reference of all keys, which is a configuration as well: that of the defaults.
+    /// The reference of all keys, which is also a valid configuration: the defaults.
     pub fn reference() -> String {
         format!("{HEAD}{}", keys::toml_reference(Config::KEYS))
     }
@@ -245,7 +245,7 @@ impl Config {
     /// a rehearsal derives are left out, so that it can still derive them.
     ///
     /// # Errors
-    /// Not for a configuration that was read.
+    /// None for a configuration that was read.
     pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
         let mut toml = self.toml.clone();
         if !self.is_emulated()
@@ -273,13 +273,13 @@ fn entries(sources: &[Source<'_>], sets: &[String]) -> Result<Entries, ConfigErr
         }
     }
     ConfigError::unless_empty(problems)?;
-    let named = include::topmost(&entries, "emulator.tracker").map(|entry| &entry.value);
+    let named = include::highest_entry(&entries, "emulator.tracker").map(|entry| &entry.value);
     let preset = TrackerPreset::take(named);
     entries.extend(value::parse_file(&preset.to_string(), preset.toml(), PRESET)?);
     Ok(entries)
 }
 
-/// True if `name` can be part of a folder's name.
+/// True if `name` is valid as part of a folder's name.
 fn is_run_name(name: &str) -> bool {
     (1..=64).contains(&name.len())
         && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"._-".contains(&byte))

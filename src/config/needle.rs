@@ -44,7 +44,8 @@ impl Arc {
         self.curvature_per_mm.unwrap_or_else(of_radius)
     }
 
-    /// A needle that cuts this arc, with its tip `tip_ahead_mm` ahead. An error names the `section`.
+    /// A needle that cuts this arc, with its tip `tip_ahead_mm` ahead of the bicycle model's point. An error names
+    /// the `section`.
     pub(super) fn to_needle(self, tip_ahead_mm: f64, section: &str) -> Result<Needle, String> {
         Needle::new(self.curvature_per_mm())
             .and_then(|needle| needle.with_tip_ahead(tip_ahead_mm))
@@ -67,7 +68,7 @@ impl Config {
         Ok((arc.to_needle(tip_ahead_mm, "needle")?, torsion(config, "needle")?))
     }
 
-    /// The disturbance of a path by tracker and tissue, from the settings of the invariant observer.
+    /// The noise of a path due to tracker and tissue, from the settings of the invariant observer.
     pub fn path_noise(&self) -> PathNoise {
         let observer = &self.observer.invariant;
         PathNoise {

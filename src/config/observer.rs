@@ -43,7 +43,7 @@ choice! {
 }
 
 impl ObserverSection {
-    /// The observer that steers, then its shadows: each once, in the order given.
+    /// The observer that steers, then its shadows: each kind once, in the given order.
     pub(super) fn kinds(&self) -> Vec<ObserverKind> {
         let mut kinds = vec![self.kind];
         for shadow in &self.shadows {

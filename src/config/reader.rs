@@ -64,13 +64,13 @@ impl Reader {
         }
     }
 
-    /// Reads the configuration. A wrong value is reported; in the result it has a placeholder, such as NaN or 0.
+    /// Reads the configuration. A wrong value is reported; in the result a placeholder such as NaN or 0 replaces it.
     pub(super) fn read(&mut self) -> Config {
         Config::of(self.table(&Kind::Table(Config::KEYS), &[], "", true))
     }
 
-    /// Reads the table at `path`; `narrowed` has narrower rules for some keys. If it `has_defaults`, keys that
-    /// are not given get theirs.
+    /// Reads the table at `path`; `narrowed` has narrower rules for some keys. If it `has_defaults`, keys that are not
+    /// given get their defaults.
     fn table(
         &mut self,
         kind: &Kind,
@@ -100,13 +100,13 @@ impl Reader {
             let has_default = has_defaults || key.default_holds == DefaultHolds::Everywhere;
             let given = self.tree.get(&key_path);
             if let Some((other, other_entry)) = alternative {
-                let is_beside = given.is_some_and(|entry| entry.is_beside(other_entry));
+                let is_same_source = given.is_some_and(|entry| entry.is_same_source(other_entry));
                 // The source of higher precedence counts.
-                if !is_beside && given.is_some_and(|entry| entry.layer < other_entry.layer) {
+                if !is_same_source && given.is_some_and(|entry| entry.layer < other_entry.layer) {
                     self.tree.remove(&key_path);
                 }
                 contradictions! { self;
-                    [&other, &key_path] if is_beside && key.instead_of.is_some() =>
+                    [&other, &key_path] if is_same_source && key.instead_of.is_some() =>
                         "{key_path} is given along with {other}: give one of the two";
                 }
             } else if has_default {
@@ -131,7 +131,7 @@ impl Reader {
 
     /// Adds the default of `key`, which is at `path`, where nothing is given.
     fn add_default(&mut self, key: &Key, path: &str) {
-        // The defaults fill a given table, unless it is replaced as a whole.
+        // Defaults complete a given table, unless the table is replaced as a whole.
         let is_merged = !tables(&key.kind).is_empty() && !key.is_whole;
         let is_complete = self.tree.contains_key(path) && !is_merged;
         let holds = match key.default_holds {
@@ -159,7 +159,7 @@ impl Reader {
             return Some(self.table(kind, key.narrowed, path, has_defaults));
         }
         let Some(entry) = self.tree.get(path) else {
-            if !key.is_optional && !outward(path).any(|key| self.failed.contains(key)) {
+            if !key.is_optional && !enclosing_keys(path).any(|key| self.failed.contains(key)) {
                 let expected = words.expected;
                 let message =
                     format!("{path} is missing and has no default here, expected {expected}");
@@ -191,10 +191,10 @@ impl Reader {
         self.tree.contains_key(path) || self.tree.keys().any(|key| is_inside(key, path))
     }
 
-    /// Reports `message` at the one of `keys` from the source of highest precedence. Reports nothing if one of
-    /// them [is wrong](Self::is_wrong) by itself: its value is not known.
+    /// Reports `message` at the place of that one of `keys` whose source has the highest precedence. Reports nothing if
+    /// one of them [is invalid](Self::is_invalid) by itself, because its value is unknown.
     pub(super) fn refuse(&mut self, keys: &[&str], message: String) {
-        if keys.iter().any(|&key| self.is_wrong(key)) {
+        if keys.iter().any(|&key| self.is_invalid(key)) {
             return;
         }
         let entries = keys.iter().filter_map(|&key| Some((key, self.tree.get(key)?)));
@@ -209,15 +209,15 @@ impl Reader {
         self.problems.push((keys[0].to_owned(), problem));
     }
 
-    /// True if `key`, a key inside it or a table around it was found wrong or missing.
-    pub(super) fn is_wrong(&self, key: &str) -> bool {
-        outward(key).any(|outer| self.failed.contains(outer))
+    /// True if `key`, a key inside it or a table around it is invalid or missing.
+    pub(super) fn is_invalid(&self, key: &str) -> bool {
+        enclosing_keys(key).any(|outer| self.failed.contains(outer))
             || self.failed.iter().any(|failed| is_inside(failed, key))
     }
 
-    /// Checks a table at `table_path` that may have only some of the keys in `all`, depending on its kind. `what` is
-    /// its kind in words, and `known` are its keys. Reports given keys that are not among these; if there are
-    /// none, reports what else is `wrong` with the table: the key and the message.
+    /// Checks the table at `table_path`, whose kind allows only the keys `known` of the keys in `all`; `what` is the
+    /// kind in words. Reports given keys that the kind does not allow. If there are none, reports what else is `wrong`
+    /// with the table: the key and the message.
     pub(super) fn check_own_keys(
         &mut self,
         table_path: &str,
@@ -226,7 +226,7 @@ impl Reader {
         known: &[&str],
         wrong: Option<(&str, String)>,
     ) {
-        if self.is_wrong(table_path) {
+        if self.is_invalid(table_path) {
             return;
         }
         // A recorded configuration has all defaults in every table.
@@ -241,12 +241,12 @@ impl Reader {
                 self.fail(&key_path, &key_path, message);
             }
         }
-        if let (false, Some((key, message))) = (self.is_wrong(table_path), wrong) {
+        if let (false, Some((key, message))) = (self.is_invalid(table_path), wrong) {
             self.fail(table_path, &join(table_path, key), format!("{table_path}: {message}"));
         }
     }
 
-    /// Checks that no problem was found with these `keys`, or with the tables around them.
+    /// Checks that these `keys` and the tables around them have no problem.
     ///
     /// # Errors
     /// The problems, in the order found.
@@ -259,7 +259,7 @@ impl Reader {
     /// Reports unknown keys, and returns the tree with all defaults.
     ///
     /// # Errors
-    /// Everything found wrong, files first, by line.
+    /// Every problem found: those in files first, by line.
     pub(super) fn finish(mut self) -> Result<Tree, ConfigError> {
         self.refuse_unknown();
         self.problems.sort_by_key(|(_, problem)| match problem.origin {
@@ -279,10 +279,10 @@ impl Reader {
             let is_reported = |outer: &str| {
                 self.failed.contains(outer) || self.tree.contains_key(outer) && !is_known(outer)
             };
-            if is_known(key) || outward(key).skip(1).any(is_reported) {
+            if is_known(key) || enclosing_keys(key).skip(1).any(is_reported) {
                 continue;
             }
-            let hint = match outward(key).find_map(|outer| self.known.get_key_value(outer)) {
+            let hint = match enclosing_keys(key).find_map(|outer| self.known.get_key_value(outer)) {
                 Some((value, Some(allowed))) => {
                     format!("{value} has no keys below it; allowed as its value: {allowed}")
                 }
@@ -310,9 +310,9 @@ impl Reader {
         self.failed.extend(keys.into_iter().map(str::to_owned));
     }
 
-    /// Reports that `key` is wrong, at the place of the key `given`, or else of the nearest table around it.
+    /// Reports that `key` is wrong, at the place of the key `given` or of the nearest table around it.
     pub(super) fn fail(&mut self, key: &str, given: &str, message: String) {
-        let entry = outward(given).find_map(|key| self.given(key));
+        let entry = enclosing_keys(given).find_map(|key| self.given(key));
         let problem = Problem::at(entry.map(|entry| entry.origin.clone()), message);
         self.failed.insert(key.to_owned());
         self.problems.push((key.to_owned(), problem));
@@ -372,7 +372,7 @@ pub(super) fn merge(mut entries: Entries) -> Tree {
         if let Some(replaced) = replaced {
             tree.retain(|other, below: &mut Entry| {
                 // Two alternatives in one source are both kept, so that the reader refuses them.
-                let is_alternative = !is_inside(other, &key) && below.is_beside(&entry);
+                let is_alternative = !is_inside(other, &key) && below.is_same_source(&entry);
                 below.layer >= entry.layer || is_alternative || !is_inside(other, replaced)
             });
         }
@@ -386,7 +386,7 @@ pub(super) fn is_inside(key: &str, outer: &str) -> bool {
     key.strip_prefix(outer).is_some_and(|rest| rest.starts_with(['.', '[']))
 }
 
-/// `key` and the keys around it, nearest first: of `a.b[0].c`: itself, `a.b[0]`, `a.b`, `a`.
-fn outward(key: &str) -> impl Iterator<Item = &str> {
+/// `key` and the keys around it, innermost first: `a.b[0].c`, `a.b[0]`, `a.b`, `a`.
+fn enclosing_keys(key: &str) -> impl Iterator<Item = &str> {
     std::iter::successors(Some(key), |key| key.get(..key.rfind(['.', '['])?))
 }

@@ -60,7 +60,7 @@ impl Config {
     /// The settings of an evaluation of recordings.
     ///
     /// # Errors
-    /// The two axes are parallel.
+    /// The two axes of `[evaluation]` determine no orientation.
     pub fn scoring(&self) -> Result<Scoring, ConfigError> {
         let EvaluationConfig { axis, bend_axis, score_after_mm } = self.evaluation;
         let r_sb = mount(axis.into(), bend_axis.into())

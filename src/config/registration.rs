@@ -49,7 +49,7 @@ impl Field for RegistrationConfig {
 }
 
 impl GivenRegistration {
-    /// The registration of the fiducials that its file keeps; `None` without them.
+    /// The registration of the fiducials that the calibration recorded; `None` without them.
     pub fn of_fiducials(&self) -> Option<RegistrationFit> {
         RegistrationFit::of(&self.fit.as_ref()?.fiducials, f64::INFINITY).ok()
     }
@@ -67,7 +67,7 @@ impl Fiducials {
     /// The registration that the fiducials determine.
     ///
     /// # Errors
-    /// They determine no registration.
+    /// The fiducials determine no registration.
     pub fn fit(&self) -> Result<RegistrationFit, String> {
         RegistrationFit::of(&self.fiducials, self.rms_max_mm)
             .map_err(|error| format!("tracker.registration.fiducials: {error}"))
@@ -76,12 +76,12 @@ impl Fiducials {
 
 impl Config {
     /// Standard deviation in the worst direction, mm, of a tip on the planned path, due to the error of the
-    /// registration: as configured, or computed from the fiducials at either end of the path, whichever is
-    /// larger; in between it is never larger. Zero if it is unknown. The configured one alone would not do: it is
-    /// of the depth and the plane for which it was calibrated.
+    /// registration: as configured, or computed from the fiducials at both ends of the path, whichever is largest;
+    /// between the ends it is never larger. Zero if it is unknown. The configured value alone does not suffice: it
+    /// holds for the depth and the plane of its calibration.
     ///
     /// # Errors
-    /// Fiducials that determine no registration.
+    /// The fiducials determine no registration.
     pub fn registration_sd_mm(&self) -> Result<f64, ConfigError> {
         match &self.tracker.registration {
             None => Ok(0.0),
@@ -95,7 +95,7 @@ impl Config {
         }
     }
 
-    /// That standard deviation, mm, for the registration `fit`.
+    /// The standard deviation of [`Config::registration_sd_mm`], mm, for the registration `fit`.
     pub fn registration_sd_of_mm(&self, fit: &RegistrationFit) -> f64 {
         let ends = [0.0, self.insertion.depth_mm].map(|depth_mm| Vector3::z() * depth_mm);
         let [start, end] = ends.map(|p_p_mm| fit.target_sd_mm(&self.plane.transform(&p_p_mm)));

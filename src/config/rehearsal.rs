@@ -1,4 +1,4 @@
-//! A rehearsal: the emulator's settings when the configuration is that of a real rig.
+//! A rehearsal: the emulator's settings when the configuration is for a real rig.
 //!
 //! The drives get the make, the objects, the switches and the start position that the rig's configuration
 //! implies. The needle is the bench's own model of it, and the tracker has the noise that the gates expect.
@@ -11,9 +11,9 @@ use crate::stage::AxisConfig;
 use crate::tracker::TrackerKind;
 use serde_json::{Value, json};
 
-/// maxon motor; a drive of this vendor is emulated as an EPOS4.
+/// Vendor ID of maxon motor, whose drives are emulated as an EPOS4.
 const MAXON_VENDOR_ID: u32 = 0xFB;
-/// The start is off the plane by this part of depth² · curvature; half of the depth suffices to correct that.
+/// The start is off the plane by this fraction of depth² · curvature, which half of the depth suffices to correct.
 const START_PART: f64 = 1.0 / 16.0;
 /// The start is at most this far off the plane, mm.
 const START_MAX_MM: f64 = 5.0;
@@ -27,7 +27,7 @@ pub(super) fn derives(key: &str, config: &Config) -> bool {
 /// The keys of `[emulator]` that a rehearsal derives from the rest of `config`, as TOML.
 ///
 /// # Errors
-/// Never for a configuration that was read.
+/// None for a configuration that was read.
 pub(super) fn layer(config: &Config) -> Result<String, toml::ser::Error> {
     toml::to_string(&json!({ "emulator": derived(config) }))
 }
@@ -66,7 +66,7 @@ fn derived(config: &Config) -> Value {
 /// homing seeks, placed so that homing changes no position.
 pub(super) fn switches(given: Switches, axis: &AxisConfig, counts_per_unit: f64) -> Switches {
     let Some(homing) = axis.homing else { return given };
-    // The drive's zero is at home plus the offset; the drive reads 0 now.
+    // The drive's zero is at home plus the offset; the drive now reads 0.
     let home = -(homing.offset.unwrap_or(0.0) * counts_per_unit).round() as i64;
     let mut switches = given;
     match homing.method {

@@ -8,20 +8,20 @@ use crate::stage;
 
 const INTERFACE: &str = "can.interface";
 const NODES: [&str; 2] = ["stage.insertion.node", "stage.rotation.node"];
-const NEEDED: [&str; 3] = [INTERFACE, NODES[0], NODES[1]];
+const REQUIRED: [&str; 3] = [INTERFACE, NODES[0], NODES[1]];
 /// Other keys that a stop uses, if they are valid.
-const USED: [&str; 5] = [
+const OPTIONAL: [&str; 5] = [
     "can.sdo_timeout_ms",
     "can.sdo_attempts",
     "stage.stop_timeout_s",
     "stage.insertion.counts_per_mm",
     "stage.rotation.counts_per_turn",
 ];
-/// Coarse scales for axes whose scale is unknown. With them an axis that still moves never counts as standing;
-/// a fine axis is only watched a little longer than necessary.
-const COARSE: [(&str, &str); 2] = [
-    (USED[3], "stage.insertion.counts_per_mm={ counts = 100, mm = 1 }"),
-    (USED[4], "stage.rotation.counts_per_turn={ counts = 500, turns = 1 }"),
+/// Coarse scales for axes whose scale is unknown. With them, a moving axis never counts as stopped; a fine axis is
+/// only watched a little longer than necessary.
+const COARSE_SCALES: [(&str, &str); 2] = [
+    (OPTIONAL[3], "stage.insertion.counts_per_mm={ counts = 100, mm = 1 }"),
+    (OPTIONAL[4], "stage.rotation.counts_per_turn={ counts = 500, turns = 1 }"),
 ];
 
 /// Where a stop is sent, and how long the drives are given.
@@ -37,25 +37,26 @@ pub struct StopConfig {
 impl StopConfig {
     /// Reads what a stop needs from `source`, if there is one, overridden by `sets` (`key=value`). A wrong or
     /// missing time gets its default, a wrong or missing scale a coarse one. On a virtual bus the nodes have
-    /// defaults as well; on any other bus they must be given.
+    /// defaults as well; on any other bus they must be given. If `source` is not valid TOML, its readable lines are
+    /// used.
     ///
     /// # Errors
-    /// The interface or a node is wrong or missing. Of a source that is not TOML the lines that can be read
-    /// count; its syntax errors are reported only together with such an error.
+    /// The interface or a node is wrong or missing. Syntax errors of `source` are reported only together with such
+    /// an error.
     pub fn from_source(source: Option<Source<'_>>, sets: &[String]) -> Result<Self, ConfigError> {
         let mut entries = Vec::new();
         let mut problems = Vec::new();
         if let Some(Source { name, text }) = source {
             entries = value::parse_file(name, text, 1).unwrap_or_else(|error| {
                 problems = error.problems;
-                value::recover_file("salvaged", &salvaged(text), 1).0
+                value::recover_file("salvaged", &readable_lines(text), 1).0
             });
         }
         for (set, layer) in sets.iter().zip(2..) {
             match value::parse_set(set, layer) {
                 Ok(more) => entries.extend(more),
-                // It was meant to set the interface or a node.
-                Err(error) if names_what_a_stop_needs(set) => return Err(error),
+                // The operator meant to set the interface or a node.
+                Err(error) if sets_required_key(set) => return Err(error),
                 Err(_) => {}
             }
         }
@@ -71,7 +72,7 @@ impl StopConfig {
         let config = reader.read();
         let is_named = reader.given(INTERFACE).is_some();
         let is_optional = |key| key != INTERFACE && is_named && config.can.interface.is_virtual();
-        for key in NEEDED {
+        for key in REQUIRED {
             contradictions! { reader;
                 [key] if !is_optional(key) && reader.given(key).is_none() =>
                     "{key} is not given, and a stop needs it";
@@ -82,12 +83,12 @@ impl StopConfig {
                 "{INTERFACE} is \"memory\", where there is no drive to stop";
         }
         checks::check_nodes(&NODES, &config, &mut reader);
-        reader.check_found_no_problem_with(&NEEDED)?;
+        reader.check_found_no_problem_with(&REQUIRED)?;
         tree.retain(|key, _| {
-            let used = USED.iter().find(|used| key == *used || is_inside(key, used));
-            used.is_some_and(|used| !reader.is_wrong(used))
+            let used = OPTIONAL.iter().find(|used| key == *used || is_inside(key, used));
+            used.is_some_and(|used| !reader.is_invalid(used))
         });
-        for (key, coarse) in COARSE {
+        for (key, coarse) in COARSE_SCALES {
             if !tree.keys().any(|given| given == key || is_inside(given, key)) {
                 tree.extend(value::parse_set(coarse, 1)?);
             }
@@ -95,7 +96,7 @@ impl StopConfig {
         let mut stage = Reader::new(tree).read().stage;
         stage.insertion.node = config.stage.insertion.node;
         stage.rotation.node = config.stage.rotation.node;
-        // The coarser the scale, the longer it takes to see that an axis stands.
+        // The coarser the scale, the longer it takes to detect that an axis has stopped.
         let windows = stage::Axis::BOTH.map(|axis| 2 * stage.standstill_window(axis));
         stage.power.stop_timeout = stage.power.stop_timeout.max(windows[0]).max(windows[1]);
         Ok(StopConfig { interface: config.can.interface, stage })
@@ -103,14 +104,14 @@ impl StopConfig {
 }
 
 /// True if `key=value` sets a key that a stop needs, or a table around one.
-fn names_what_a_stop_needs(set: &str) -> bool {
+fn sets_required_key(set: &str) -> bool {
     let key = set.split('=').next().unwrap_or(set).trim();
-    NEEDED.iter().any(|needed| *needed == key || is_inside(needed, key))
+    REQUIRED.iter().any(|needed| *needed == key || is_inside(needed, key))
 }
 
-/// The lines of `text` that are TOML by themselves, for a text that as a whole is not, such as a file that is
-/// being edited: bus and nodes can still be read. Keys below a broken header go to a table that is not used.
-fn salvaged(text: &str) -> String {
+/// The lines of `text` that are valid TOML by themselves. So bus and nodes can still be read from a file that as a
+/// whole is not valid, for example while it is being edited. Keys below a broken header go into an unused table.
+fn readable_lines(text: &str) -> String {
     let lines = text.split(['\n', '\r']).map(|line| match value::parse_file("", line, 1) {
         Ok(_) => line,
         Err(_) if line.trim_start().starts_with('[') => "[unreadable]",

@@ -13,13 +13,13 @@ use nalgebra::{Vector3, Vector4};
 use std::f64::consts::TAU;
 use toml::{Table, Value};
 
-/// The numbers of the random draws of a trial start here, away from those of its noise.
+/// First counter of the random draws of a trial, away from the counters of its noise.
 const DRAWS: u64 = 0x5354_5544_5900_0000;
-/// The numbers of the draws of targets and obstacles start here; an obstacle is drawn until it has room.
+/// First counter of the draws of targets and obstacles; an obstacle is drawn until it has room.
 const GOAL_DRAWS: u64 = DRAWS + 0x1000_0000;
-/// The numbers of the draws of a target's motion start here.
+/// First counter of the draws of a target's motion.
 const DRIFT_DRAWS: u64 = DRAWS + 0x2000_0000;
-/// The number of the draw of the growth of a shaft's creep.
+/// Counter of the draw of the growth of a shaft's creep.
 const GROWTH_DRAW: u64 = DRAWS + 0x3000_0000;
 /// An obstacle is drawn at most this often.
 const TRIES_MAX: u32 = 1000;
@@ -69,9 +69,9 @@ section! {
     }
 }
 
-/// The centres of drawn obstacles are at most this far from the straight line to the target, mm, along x and y.
+/// Largest distance of the centres of drawn obstacles from the straight line to the target, mm, along x and y each.
 const ASIDE_MM: f64 = 30.0;
-/// Distance of start and target from drawn obstacles, in addition to the clearance, mm.
+/// Least distance of start and target from drawn obstacles, in addition to the clearance, mm.
 const ROOM_MM: f64 = 1.0;
 
 /// A point as a value of the configuration.
@@ -79,7 +79,7 @@ fn toml_point(point: &Vector3<f64>) -> Value {
     Value::from(point.iter().copied().collect::<Vec<_>>())
 }
 
-/// A number from 0 up to 1, drawn for the trial with this seed.
+/// A uniform random number in [0, 1) for the trial with this `seed`; `number` is the counter of the draw.
 fn fraction(seed: u64, number: u64) -> f64 {
     (split_mix64(seed, number) >> 11) as f64 / (1u64 << 53) as f64
 }
@@ -95,7 +95,7 @@ impl Config {
         self.check_relative_errors()?;
         let mut toml = self.toml.clone();
         let emulator = &mut toml["emulator"];
-        // Each range has its own number, so adding a range at the end does not change the draws of the others.
+        // Each range has its own counter, so adding a range at the end does not change the draws of the others.
         for (number, key) in (DRAWS..).zip(StudyConfig::KEYS) {
             if key.name.starts_with("target") || key.name.starts_with("obstacle") {
                 continue;
@@ -142,8 +142,8 @@ impl Config {
     }
 
     /// Checks that no relative error takes a value out of the range of its key: the record of such a run could
-    /// not be read. This is not checked as the configuration is read, since a drawn one has both the error and
-    /// what it was drawn to.
+    /// not be read. The reader of configurations does not check this, since the configuration of a trial contains
+    /// both the error and the value drawn with it.
     fn check_relative_errors(&self) -> Result<(), String> {
         let torsion = self.emulator.torsion;
         for (error, name, emulated) in [
@@ -166,7 +166,8 @@ impl Config {
         Ok(())
     }
 
-    /// Draws target and obstacles of the trial with this seed, which begins at `start`; returns the target, mm.
+    /// Draws target and obstacles of the trial with this seed, which begins at `start`. Returns the target in the
+    /// plane frame, mm.
     fn draw_goal(&self, seed: u64, start: &Pose, goal: &mut Value) -> Result<Vector3<f64>, String> {
         let study = &self.study;
         let mut number = GOAL_DRAWS;
@@ -199,7 +200,7 @@ impl Config {
         }
         let [low, high] = study.obstacle_radius_mm.unwrap_or_default();
         let obstacles = study.obstacles.unwrap_or_default();
-        // The path begins in the plane.
+        // With `in_plane` the path begins in the plane.
         let mut start_mm = start.translation;
         if self.goal.in_plane {
             start_mm.x = 0.0;

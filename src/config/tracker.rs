@@ -148,7 +148,7 @@ impl TrackerSection {
         self.tip_fit.is_some() || self.tip_offset_mm != [0.0; 3]
     }
 
-    /// True if it is known how the sensor is turned on the needle.
+    /// True if the sensor's orientation on the needle is known.
     pub fn has_tilt(&self) -> bool {
         self.tip_fit.is_some() || self.tip_tilt != FixedAngles::default()
     }
@@ -170,7 +170,7 @@ impl TrackerSection {
         })
     }
 
-    /// That gate without a registration and a workspace: positions stay in the tracker's frame.
+    /// The same gate without a registration and a workspace: positions stay in the tracker's frame.
     pub fn to_unregistered_gate(&self) -> Gate {
         Gate {
             tool: self.tool.clone(),

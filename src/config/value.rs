@@ -29,7 +29,7 @@ pub enum Origin {
 /// entries of their own.
 #[derive(Debug, Clone)]
 pub(super) struct Entry {
-    /// A table is empty here. An array has the right number of elements, but not their values.
+    /// Empty for a table. An array has the right number of elements, but not their values.
     pub(super) value: Value,
     /// The value as the user wrote it, on one line.
     pub(super) source_text: String,
@@ -40,13 +40,13 @@ pub(super) struct Entry {
 
 impl Entry {
     /// True if both entries come from one source: from one file, or from the command line.
-    pub(super) fn is_beside(&self, other: &Entry) -> bool {
+    pub(super) fn is_same_source(&self, other: &Entry) -> bool {
         let is_set = |entry: &Entry| entry.layer > 0 && entry.origin == Origin::Set;
         self.layer == other.layer || is_set(self) && is_set(other)
     }
 }
 
-/// Entries of one or more sources, as (dotted key, entry). Those of one source are in the order of its text.
+/// Entries of one or more sources, as (dotted key, entry). The entries of one source are in the order of its text.
 pub(super) type Entries = Vec<(String, Entry)>;
 
 /// Reads a TOML file.
@@ -230,7 +230,7 @@ impl Flattener<'_> {
         }
     }
 
-    /// The value as the user wrote it, on one line and shortened to 60 characters and `…`.
+    /// The value as the user wrote it, on one line, truncated to 60 characters and `…`.
     fn source_text(&self, value: &Value, spanned: &Spanned<DeValue<'_>>) -> String {
         if value.is_table() {
             return "a table".to_owned();

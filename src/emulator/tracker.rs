@@ -8,7 +8,7 @@ use nalgebra::{Rotation3, Vector2, Vector3};
 use std::collections::VecDeque;
 use std::time::Duration;
 
-/// What the emulated tracker does to positions.
+/// The settings of an emulated tracker.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackerModel {
     /// Noise of each position, independent of that of all others.
@@ -102,7 +102,7 @@ pub(crate) struct EmulatedTracker {
     /// The last measurement, and how many repeats of it remain.
     last: Option<(Pose, u32)>,
     /// Samples on their way, with their time of arrival and the truth at acquisition.
-    under_way: VecDeque<(Time, TrackedTip, Truth)>,
+    in_flight: VecDeque<(Time, TrackedTip, Truth)>,
 }
 
 impl EmulatedTracker {
@@ -114,7 +114,7 @@ impl EmulatedTracker {
             next: start,
             measured: 0,
             last: None,
-            under_way: VecDeque::new(),
+            in_flight: VecDeque::new(),
         }
     }
 
@@ -133,7 +133,7 @@ impl EmulatedTracker {
         self.last = Some((x_ts, repeats));
         let sample = TrackedTip { acquisition_time, x_ts };
         let arrival = acquisition_time + self.model.latency;
-        self.under_way.push_back((arrival, sample, Truth { x_pb: *tip_true, target_mm: None }));
+        self.in_flight.push_back((arrival, sample, Truth { x_pb: *tip_true, target_mm: None }));
         self.next = acquisition_time + self.model.period;
     }
 
@@ -149,13 +149,13 @@ impl EmulatedTracker {
 
     /// The next sample that has arrived by `now`, with the truth of its acquisition.
     pub(crate) fn deliver(&mut self, now: Time) -> Option<(TrackedTip, Truth)> {
-        let (_, sample, truth) = self.under_way.pop_front_if(|(arrival, ..)| *arrival <= now)?;
+        let (_, sample, truth) = self.in_flight.pop_front_if(|(arrival, ..)| *arrival <= now)?;
         Some((sample, truth))
     }
 
     /// When the next sample is taken or arrives.
     pub(crate) fn deadline(&self) -> Time {
-        self.under_way.front().map_or(self.next, |&(arrival, ..)| arrival.min(self.next))
+        self.in_flight.front().map_or(self.next, |&(arrival, ..)| arrival.min(self.next))
     }
 }
 

@@ -7,9 +7,9 @@ use toml::Value;
 
 /// A type that a key may have.
 pub(crate) trait Field: Sized {
-    /// How it is written in TOML.
+    /// The kind of value in TOML.
     const KIND: Kind;
-    /// True if it may be absent.
+    /// True if the key may be absent.
     const IS_OPTIONAL: bool = false;
     /// Converts a value that was checked; a wrong or missing value gives a placeholder such as NaN or 0.
     fn take(value: Option<&Value>) -> Self;
@@ -22,7 +22,7 @@ impl Field for f64 {
     }
 }
 
-/// In seconds.
+/// A duration in seconds.
 impl Field for Duration {
     const KIND: Kind = Kind::Number;
     fn take(value: Option<&Value>) -> Self {

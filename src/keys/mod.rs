@@ -25,18 +25,18 @@ pub(crate) struct Key {
     pub(crate) text: &'static str,
     pub(crate) kind: Kind,
     pub(crate) rule: Rule,
-    /// True if the key may be left out although it has no default.
+    /// True if the key may be omitted although it has no default.
     pub(crate) is_optional: bool,
     /// The default, in TOML.
     pub(crate) default: Option<&'static str>,
     pub(crate) default_holds: DefaultHolds,
-    /// The file has the value in the unit of the key's name; the program has it in mm, rad or s.
+    /// True if the value is converted from the unit in the key's name to mm, rad or s.
     pub(crate) is_converted: bool,
     /// A table whose keys are written in the enclosing table.
     pub(crate) is_flat: bool,
     /// A table that is replaced as a whole when it is given.
     pub(crate) is_whole: bool,
-    /// The key of the same table that this one can replace.
+    /// The key of the same table to which this one is an alternative.
     pub(crate) instead_of: Option<&'static str>,
     /// The dotted key whose value is the upper limit of this one.
     pub(crate) at_most: Option<&'static str>,
@@ -47,7 +47,8 @@ pub(crate) struct Key {
 /// When a default holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum DefaultHolds {
-    /// Always. Nobody has decided whether hardware must give the key; for a key of a drive this does not compile.
+    /// Always. The declaration does not say whether hardware must give the key; for a key of a drive this does not
+    /// compile.
     Undecided,
     /// With an emulated tracker only.
     ForEmulatedTracker,
@@ -55,7 +56,7 @@ pub(crate) enum DefaultHolds {
     ForEmulatedStage,
     /// For hardware as well.
     ForHardware,
-    /// Even inside a table that is given as a whole.
+    /// Always, even inside a table that is replaced as a whole.
     Everywhere,
 }
 
@@ -232,10 +233,10 @@ impl Key {
     }
 }
 
-/// The name of a key that this axis does not have.
+/// Stands for the name of a key that this axis does not have.
 pub(crate) const NO_KEY: &str = "";
 
-/// True if each of `keys` says whether hardware must give it.
+/// True if the declaration of each of `keys` says whether hardware must give it.
 pub(crate) const fn hardware_is_decided(keys: &[Key]) -> bool {
     match keys {
         [] => true,

@@ -1,4 +1,4 @@
-//! The units that names of keys end in.
+//! The units with which the names of keys end.
 
 use toml::Value;
 
@@ -20,7 +20,7 @@ static UNITS: [(&str, &str, Conversion); 11] = [
     ("_hz", "Hz", |hz| hz),
 ];
 
-/// The unit that the key `name` has in the file.
+/// The unit of the key `name` in the file, in words; `None` if the name ends with none.
 pub(crate) fn unit_of(name: &str) -> Option<&'static str> {
     UNITS.iter().find(|(suffix, ..)| name.ends_with(suffix)).map(|&(_, words, _)| words)
 }

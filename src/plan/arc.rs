@@ -7,7 +7,7 @@ use std::f64::consts::{PI, TAU};
 /// Distance from the tip's axis under which a point counts as straight ahead, mm.
 const STRAIGHT_MM: f64 = 1e-9;
 
-/// Position and heading of the needle's tip. The roll can be chosen freely, so it is not part of a plan.
+/// Position and heading of the needle's tip. The base can turn the tip to any roll, so a plan does not contain it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tip {
     /// Position, plane frame, mm.
@@ -34,7 +34,7 @@ impl Arc {
     }
 }
 
-/// The end of a bent arc relative to its start: distances ahead and aside, mm; sine and cosine of its turn.
+/// The end of a bent arc relative to its start: distances ahead and aside, mm, and the sine and cosine of the turn.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Chord {
     ahead_mm: f64,
@@ -179,7 +179,7 @@ impl RelativePoint {
             ahead_mm * radius_mm - from_axis_mm * straight_mm,
             from_axis_mm * radius_mm + ahead_mm * straight_mm,
         );
-        // Rounding must not turn "straight ahead" into a full turn.
+        // Rounding must not change "straight ahead" into a full turn.
         let turn_rad = if turn_rad < -1e-9 { turn_rad + TAU } else { turn_rad.max(0.0) };
         Some((turn_rad, straight_mm))
     }
@@ -188,10 +188,10 @@ impl RelativePoint {
     /// inside the turning circle by more than that. The shortest way to such a point is two arcs: the needle turns
     /// away from the point and then around it the other way (Cockayne and Hall, SIAM J. Control 13, 1975).
     ///
-    /// The centres A and B of the two circles and the point P make a triangle of sides AB = 2 r, AP = q and BP. The
-    /// first arc turns by ψ + γ, with γ the angle at A and ψ that of P at the start; the second by 2 π − ε, with ε
-    /// the angle at B, less the part within the tolerance. BP differs from r by at most the tolerance, which bounds
-    /// γ; over these γ the bound takes the largest ε. It is at a right angle at P, or at an end.
+    /// The centres A and B of the two circles and the point P form a triangle with sides AB = 2 r, AP = q and BP. The
+    /// first arc turns by ψ + γ, with γ the angle at A and ψ that of P at the start. The second turns by 2 π − ε, with
+    /// ε the angle at B, minus the part within the tolerance. BP differs from r by at most the tolerance, which bounds
+    /// γ. The bound uses the largest ε over these γ: at a right angle at P, or at an end of the range of γ.
     fn away_then_toward_mm(&self, radius_mm: f64, tolerance_mm: f64) -> f64 {
         let (ahead_mm, off_a_mm) = (self.ahead_mm, self.off_axis_mm + radius_mm);
         let psi_rad = math::atan2(ahead_mm, off_a_mm);

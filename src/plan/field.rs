@@ -6,9 +6,9 @@ use super::obstacle::World;
 use nalgebra::Vector3;
 use std::borrow::Cow;
 
-/// The shortest step along an arc when it is tested against the obstacles, mm. Between two tests a path may come
-/// nearer to an obstacle than a clearance of 1 mm by 0.0013 mm, and than one of 0.1 mm, the least that is
-/// allowed with obstacles, by 0.0134 mm. With less than half a step it could lead through a thin obstacle.
+/// The shortest step along an arc when it is tested against the obstacles, mm. Between two tests a path may violate
+/// a clearance of 1 mm by 0.0013 mm, and one of 0.1 mm, the least that is allowed with obstacles, by 0.0134 mm. With
+/// a clearance under half a step a path could lead through a thin obstacle.
 const TEST_STEP_MM: f64 = 0.1;
 /// The least clearance from obstacles, mm.
 pub const CLEARANCE_MIN_MM: f64 = 0.1;
@@ -96,12 +96,12 @@ pub(super) struct Field<'a> {
     pub(super) in_plane: bool,
     /// Distance of each node to the nearest obstacle, mm; NaN until it is computed.
     distances_mm: Vec<f32>,
-    /// The memory of the last search.
+    /// The visited cells of the last search, whose memory the next one reuses.
     pub(super) visited: Visited,
 }
 
 impl<'a> Field<'a> {
-    /// The field around the obstacles of `world`. With `in_plane` it only judges points of the plane x = 0.
+    /// The field around the obstacles of `world`. With `in_plane` all points must be in the plane x = 0.
     pub(super) fn new(world: Cow<'a, World>, clearance_mm: f64, in_plane: bool) -> Self {
         let grid = Grid::new(&world, in_plane);
         let distances_mm = vec![f32::NAN; grid.nodes()];
@@ -117,8 +117,8 @@ impl<'a> Field<'a> {
         f64::from(self.distances_mm[node]) - self.clearance_mm
     }
 
-    /// How far the tip may go from `point_mm` in any direction, mm; if that is far, a lower bound of it. Negative
-    /// if the tip must not be at `point_mm`.
+    /// The slack at `point_mm`, mm: how far the tip may go from there in any direction; a lower bound if that is far.
+    /// Negative if the tip must not be at `point_mm`.
     pub(super) fn slack_mm(&mut self, point_mm: &Vector3<f64>) -> f64 {
         let depth_mm = self.world.workspace.depth_mm(point_mm);
         if depth_mm < 0.0 {
@@ -155,7 +155,7 @@ impl<'a> Field<'a> {
             && self.is_clear_between(tip, arc, slacks_mm)
     }
 
-    /// The first part of `arc` from `tip` that is clear; of length 0 if the tip must not be where it is.
+    /// The first part of `arc` from `tip` that is clear; its length is 0 if the tip must not be where it is.
     pub(super) fn clear_part(&mut self, tip: &Tip, arc: Arc) -> Arc {
         let mut along_mm = 0.0;
         let mut clear_mm = 0.0;
@@ -173,7 +173,7 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// As [`Field::is_clear`], if the slacks of both ends are known and not negative, mm.
+    /// Like [`Field::is_clear`], with the slacks of both ends given, mm; neither is negative.
     pub(super) fn is_clear_between(
         &mut self,
         tip: &Tip,

@@ -27,12 +27,12 @@ pub struct Resolution {
     pub heading_rad: f64,
 }
 
-/// From each tip, arcs of one length lead on: a straight and arcs of one curvature. The places that they reach are
-/// sorted into cells of position and heading.
+/// From each tip, arcs of one length lead on: a straight one, and bent ones of one curvature. The places that they
+/// reach are sorted into cells of position and heading.
 #[derive(Debug)]
 pub(super) struct Lattice {
     pub(super) resolution: Resolution,
-    /// The cells are larger than they should be, to fit into the memory.
+    /// True if the cells are larger than intended, to fit into [`BITS_MAX`].
     pub(super) is_coarse: bool,
     pub(super) in_plane: bool,
     curvature_per_mm: f64,
@@ -45,7 +45,7 @@ pub(super) struct Lattice {
     pub(super) visited: Visited,
 }
 
-/// A set of cells. Its memory is reused from search to search.
+/// A set of cells. Searches reuse its memory.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Visited {
     words: Vec<u64>,
@@ -98,7 +98,8 @@ pub(super) struct Place {
 }
 
 impl Lattice {
-    /// In the plane there is only one resolution; in space, `level` 0 is the coarsest.
+    /// The lattice of a search for `problem`. In the plane there is only one resolution; in space, `level` 0 is the
+    /// coarsest.
     pub(super) fn new(
         workspace: &Workspace,
         problem: &Problem,

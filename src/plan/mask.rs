@@ -19,14 +19,14 @@ pub struct Mask {
 impl Mask {
     /// The most voxels that a mask may have: 256 in each direction.
     pub const VOXELS_MAX: usize = 1 << 24;
-    /// A smaller voxel is not in mm.
+    /// Allowed spacing of the voxels. A header with a smaller one is not in mm.
     const SPACING_MM: RangeInclusive<f32> = 0.01..=100.0;
 
-    /// The mask of `size` voxels, `spacing_mm` apart. `occupied` tells which voxels are occupied, with the first
-    /// coordinate running fastest. `x_pg` is the pose of the grid in the plane frame.
+    /// The mask of `size` voxels, `spacing_mm` apart. `occupied` says which voxels are occupied, with the first
+    /// coordinate running fastest. `x_pg` is `X_PG`, the pose of the grid in the plane frame.
     ///
     /// # Errors
-    /// As [`Mask::voxel_count`]; if `occupied` does not have one value for each voxel.
+    /// Those of [`Mask::voxel_count`], or `occupied` does not have one value for each voxel.
     pub fn new(
         size: [usize; 3],
         spacing_mm: Vector3<f64>,
@@ -58,7 +58,7 @@ impl Mask {
     /// Checks the `size` and the spacing of a mask, and returns its number of voxels.
     ///
     /// # Errors
-    /// If there are too many voxels or none, or the spacing is not between 0.01 and 100 mm.
+    /// There are too many voxels or none, or the spacing is not between 0.01 and 100 mm.
     pub fn voxel_count(size: [usize; 3], spacing_mm: &Vector3<f64>) -> Result<usize, String> {
         let voxels = size.iter().try_fold(1usize, |product, count| product.checked_mul(*count));
         let voxels = voxels.unwrap_or(usize::MAX);
@@ -97,9 +97,8 @@ impl Mask {
         })
     }
 
-    /// A lower bound of the distance of `point_mm`, plane frame, to the occupied voxels, mm, from the
-    /// nearest voxel's centre; it is too small by one and a half diagonals of a voxel at most. Negative
-    /// inside.
+    /// A lower bound of the distance of `point_mm`, plane frame, to the occupied voxels, mm, computed from the
+    /// nearest voxel's centre. It is too small by at most one and a half diagonals of a voxel. Negative inside.
     pub fn distance_mm(&self, point_mm: &Vector3<f64>) -> f64 {
         let at = self.x_gp.transform(point_mm).component_div(&self.spacing_mm);
         let last = Vector3::from(self.size.map(|count| (count - 1) as f64));
@@ -112,7 +111,7 @@ impl Mask {
         let voxel = (z * self.size[1] + y) * self.size[0] + x;
         let bound_mm = f64::from(self.distances_mm[voxel]) - away_mm;
         let bound_mm = match beyond_mm > 0.0 {
-            // For a point outside, the angle between the way to `inside` and any centre is 90° or more.
+            // For a point outside the grid, the angle at `inside` between that point and any centre is 90° or more.
             true => (beyond_mm.powi(2) + bound_mm.max(0.0).powi(2)).sqrt(),
             false => bound_mm,
         };
@@ -123,8 +122,8 @@ impl Mask {
 /// Farther than any voxel, mm².
 const FAR_MM2: f32 = 1e12;
 
-/// Distance from each voxel's centre to the nearest voxel that `is_in`, mm (Felzenszwalb and
-/// Huttenlocher, Distance transforms of sampled functions, 2012: one pass a coordinate).
+/// Distance from each voxel's centre to the centre of the nearest voxel that `is_in`, mm (Felzenszwalb and
+/// Huttenlocher, Distance transforms of sampled functions, 2012: one pass per coordinate).
 fn distances_mm(size: [usize; 3], spacing_mm: [f64; 3], is_in: impl Fn(usize) -> bool) -> Vec<f32> {
     let voxels = size.iter().product();
     let mut squared_mm2: Vec<f32> =

@@ -1,6 +1,6 @@
 //! Planning a path of the needle to a target, around obstacles: geometry, distances, search.
 //!
-//! Everything is in the plane frame, in mm, and depends only on its arguments: the budget of a search is a
+//! Everything is in the plane frame, in mm. Results depend only on the arguments: the budget of a search is a
 //! number of expansions, never a time, so a plan is the same on every machine.
 
 mod arc;

@@ -19,8 +19,8 @@ const DISTANCE_SHARE: f64 = 0.1;
 const GAIN_MIN_MM: f64 = 0.05;
 /// Maximum number of changes of a path.
 const CHANGES_MAX: u32 = 10;
-/// All of them together may take this many tries of an arc for each node that the problem allows; in space a search
-/// tries about as many at a node.
+/// All changes together may try this many arcs for each node that the problem allows to expand; in space a search tries
+/// about as many arcs per node.
 const TRIES_PER_NODE: u32 = 10;
 /// Distance between the points at which an arc may leave a path or end, mm.
 const LEAVE_MM: f64 = 2.0;
@@ -39,8 +39,8 @@ struct Node {
     from: Option<(usize, Arc)>,
 }
 
-/// How near an arc from `tip` can come to the target without obstacles, mm: the needle cannot enter its turning
-/// circle.
+/// How near an arc from `tip` can come to the target, without obstacles, mm: 0 outside the turning circle, which the
+/// needle cannot enter.
 fn miss_mm(tip: &Tip, problem: &Problem) -> f64 {
     let RelativePoint { off_axis_mm, ahead_mm, .. } = tip.relative(&problem.target_mm);
     let radius_mm = problem.curvature_per_mm.recip();
@@ -79,7 +79,7 @@ pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path 
         let Some((_, from)) = queue.pop() else { break };
         let Node { place, previous_heading, length_mm, .. } = nodes[from];
         let is_hopeless = miss_mm(&place.tip, problem) > best.0 - GAIN_MIN_MM;
-        // The first node that comes to a cell, which is the best, keeps it.
+        // The first node that comes to a cell is the best one; later ones are dropped.
         if is_hopeless || !lattice.visited.insert(lattice.cell(&place)) {
             continue;
         }
@@ -116,7 +116,7 @@ pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path 
     improved(field, problem, Path { start: problem.start, arcs }.joined())
 }
 
-/// The path after changes that bring its end nearer to the target. Each time the best change is made.
+/// Improves the path by changes that bring its end nearer to the target, each time by the best change.
 fn improved(field: &mut Field<'_>, problem: &Problem, mut path: Path) -> Path {
     let mut tries_left = problem.expansions_max.saturating_mul(TRIES_PER_NODE);
     for _ in 0..CHANGES_MAX {
@@ -127,9 +127,9 @@ fn improved(field: &mut Field<'_>, problem: &Problem, mut path: Path) -> Path {
     path
 }
 
-/// The change of `path` that brings its end nearest to the target: leave it somewhere on one arc, then go on by
-/// the sharpest arc toward the target. Returns where to leave it, mm, and the two arcs; `None` if the gain is too
-/// small. Each arc that is tried uses up one of `tries_left`.
+/// The change of `path` that brings its end nearest to the target: leave the path on one arc, then continue on the
+/// sharpest arc toward the target. Returns the length along the path at which to leave it, mm, and the two arcs; `None`
+/// if the gain is too small. Each arc that is tried uses up one of `tries_left`.
 fn best_change(
     field: &mut Field<'_>,
     problem: &Problem,

@@ -5,9 +5,9 @@ use crate::geometry::{POSITION, Pose, Twist};
 use crate::keys::section;
 use nalgebra::Vector3;
 
-/// A way between two poses is judged at points at most this far apart, mm …
+/// The distance to obstacles on a way between two poses is computed at points at most this far apart, mm …
 const WAY_SPACING_MM: f64 = 0.25;
-/// … and at no more points than this.
+/// … but at no more points than this.
 const WAY_POINTS_MAX: f64 = 1000.0;
 
 /// Something that the needle must not come near. Lengths in mm, plane frame.
@@ -48,12 +48,12 @@ impl Obstacle {
             Obstacle::Sphere { centre_mm, radius_mm } => (point_mm - centre_mm).norm() - radius_mm,
             Obstacle::Cylinder { from_mm, to_mm, radius_mm } => {
                 let length_mm = (to_mm - from_mm).norm();
-                // Without a length it has no axis, and counts as a ball.
+                // A cylinder of zero length has no axis and acts as a sphere.
                 let axis = (to_mm - from_mm).try_normalize(0.0).unwrap_or_default();
                 let to_point = point_mm - from_mm;
                 let along_mm = to_point.dot(&axis);
                 let off_axis_mm = (to_point - axis * along_mm).norm();
-                // In the half plane of axis and point the cylinder is a rectangle.
+                // In the half plane through its axis and the point, the cylinder is a rectangle.
                 signed_distance([
                     off_axis_mm - radius_mm,
                     (along_mm - 0.5 * length_mm).abs() - 0.5 * length_mm,
@@ -176,8 +176,8 @@ impl World {
         distances.fold(f64::INFINITY, f64::min)
     }
 
-    /// The least distance of the tip to an obstacle, mm, on its way `from` one pose `to` another with a constant
-    /// twist, as a needle moves whose base turns evenly.
+    /// The least distance of the tip to an obstacle, mm, on its way `from` one pose `to` another with a constant twist,
+    /// which is the motion of a needle whose base turns at a constant rate per mm.
     pub fn distance_on_way_mm(&self, from: &Pose, to: &Pose) -> f64 {
         let twist = (from.inverse() * *to).log();
         let points = (twist.v.norm() / WAY_SPACING_MM).ceil().clamp(1.0, WAY_POINTS_MAX) as u32;
@@ -190,7 +190,7 @@ impl World {
     }
 
     /// How far the tip may go from `point_mm` in any direction, mm, before it leaves the workspace or
-    /// comes nearer than `clearance_mm` to an obstacle; negative where it must not be.
+    /// comes nearer than `clearance_mm` to an obstacle; negative where the tip must not be.
     pub fn slack_mm(&self, point_mm: &Vector3<f64>, clearance_mm: f64) -> f64 {
         (self.distance_mm(point_mm) - clearance_mm).min(self.workspace.depth_mm(point_mm))
     }

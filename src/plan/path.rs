@@ -35,8 +35,7 @@ impl Path {
         })
     }
 
-    /// The tip `along_mm` from the start, and the arc it is on. Beyond the end of the path it is the end, on no
-    /// arc.
+    /// The tip `along_mm` from the start, and the arc that it is on; beyond the end of the path, the end and no arc.
     pub fn at(&self, along_mm: f64) -> (Tip, Option<Arc>) {
         let mut left_mm = along_mm.max(0.0);
         for (tip, arc) in self.pieces() {
@@ -48,7 +47,7 @@ impl Path {
         (self.end(), None)
     }
 
-    /// The arcs of its first `length_mm`.
+    /// The arcs of the first `length_mm` of the path.
     pub(super) fn first(&self, length_mm: f64) -> Vec<Arc> {
         let mut left_mm = length_mm;
         let cut = self.arcs.iter().map(|arc| {
@@ -83,7 +82,7 @@ impl Path {
         least_mm.min(world.distance_mm(&self.end().position_mm))
     }
 
-    /// The path without arcs of zero length, with arcs joined that continue one another.
+    /// The path without arcs of zero length; arcs that continue the one before are joined with it.
     pub(super) fn joined(mut self) -> Self {
         const SAME: f64 = 1e-6;
         let mut joined: Vec<(Tip, Arc)> = Vec::new();

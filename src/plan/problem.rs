@@ -1,4 +1,4 @@
-//! What a planner is asked for.
+//! The planning problem.
 
 use super::arc::Tip;
 use crate::math;
@@ -34,7 +34,7 @@ impl Problem {
     /// The corners of a box that no path leaves, plane frame, mm.
     pub(super) fn reach_mm(&self) -> [Vector3<f64>; 2] {
         let Problem { start, curvature_per_mm, length_max_mm, .. } = self;
-        // Farthest along an axis comes the path that first turns toward it, and then goes straight.
+        // The path that gets farthest along an axis first turns toward that axis, then goes straight.
         let farthest_mm = |along: f64| {
             let away_rad = math::acos(along.clamp(-1.0, 1.0));
             let turn_rad = away_rad.min(curvature_per_mm * length_max_mm);

@@ -37,12 +37,12 @@ pub fn reach_around(world: &World, problem: &Problem, tip: &Tip) -> Vec<(Vector3
     let points = around
         .filter(|(i, j)| i * i + j * j <= count * count)
         .map(|(i, j)| target_mm + (first * f64::from(i) + second * f64::from(j)) * spacing_mm);
-    // In space: the estimated tip may be off the plane.
+    // A field in space, because the estimated tip may be off the plane.
     let mut field = Field::new(Cow::Borrowed(world), problem.clearance_mm, false);
     let mut reach = |point_mm: &Vector3<f64>| {
         let arc = tip.arc_to(point_mm);
         let can_reach = |arc: &Arc| {
-            // As a path, the arc may end within the tolerance.
+            // Like a path, the arc may end within the tolerance.
             arc.curvature_per_mm <= problem.curvature_per_mm
                 && arc.length_mm <= problem.length_max_mm + problem.tolerance_mm
         };

@@ -26,12 +26,12 @@ const NEXT_STEP_SDS: f64 = 1.0;
 const REMEMBER_SD_MAX_MM: f64 = 0.3;
 /// If the heading's standard deviation is over this, rad, the tip may still be on the remembered path, …
 const HEADING_UNKNOWN_SD_RAD: f64 = 0.01;
-/// … even if it is farther off than the position's deviation by this much, mm: whole turns shake the path.
+/// … even if it is farther off than the position's deviation by this much, mm: whole turns of the base disturb it.
 const ON_PATH_MM: f64 = 0.1;
 /// A tip has arrived if the target is no farther ahead than this, mm.
 const ARRIVED_MM: f64 = 0.02;
 /// Without a path the needle is bent toward the target for this depth, mm, since a later estimate may give a path.
-const PATIENCE_MM: f64 = 5.0;
+const WITHOUT_PATH_MAX_MM: f64 = 5.0;
 /// After a whole turn of the base, the path may end farther from the target by this much, mm.
 const TURN_LOSS_MAX_MM: f64 = 0.05;
 /// On a path that does not surely lead to the target, this much of the way ahead must be clear of obstacles, mm; and
@@ -49,15 +49,15 @@ const AHEAD_SPACING_MM: f64 = 0.25;
 pub struct Replanner {
     field: Field<'static>,
     route: Route,
-    /// Its start is the tip at the last step, and its `length_max_mm` what a path may have from there.
+    /// Its start is the tip at the last step; its `length_max_mm` is the longest path from there.
     problem: Problem,
     /// The depth that may still be inserted, mm.
     depth_left_mm: f64,
-    /// How long a path may be, by the last one that was found, mm.
+    /// How long a path may be, given the length of the last one found, mm.
     longest_mm: f64,
     /// How far the needle may go on after a stop, mm.
     stopping_mm: f64,
-    /// A step was made.
+    /// True once a step was made.
     has_begun: bool,
     /// The path of the last step, from where the tip was then.
     path: Option<Path>,
@@ -126,11 +126,11 @@ impl Replanner {
         &self.field.world
     }
 
-    /// Checks, before the first step, that a path that is not too long leads from `start` to the target, with at
-    /// most `curvature_per_mm`: the known path, or one that a search finds. The tip is seen at `tip_mm`.
+    /// Checks, before the first step, that a path of allowed length and of at most `curvature_per_mm` leads from
+    /// `start` to the target: the known path, or one that a search finds. The tip was measured at `tip_mm`.
     ///
     /// # Errors
-    /// Why no path is found, and the point nearest to the target.
+    /// No path was found; the error has the reason, and the reachable point nearest to the target.
     pub fn check_start(
         &mut self,
         start: Tip,
@@ -190,7 +190,7 @@ impl Replanner {
             return Step::Arrived { error_mm };
         }
         self.depth_left_mm = (self.depth_left_mm - inserted_mm).max(0.0);
-        // If the next step stops the needle, it goes on until it stands, but no farther than a target that is ahead.
+        // If the next step stops the needle, the needle goes on while it brakes, but no farther than a target ahead.
         let next_mm = step_mm + self.stopping_mm;
         let to_target_mm = if ahead_mm > 0.0 { ahead_mm } else { f64::INFINITY };
         let ways_mm = [step_mm, next_mm].map(|mm| mm.min(to_target_mm));
@@ -219,7 +219,7 @@ impl Replanner {
         let is_ahead = ahead_mm > ARRIVED_MM;
         let clear_mm = next_mm.max(CLEAR_AHEAD_MM);
         let path = path
-            .or_else(|| self.last_path_blindly(last?, heading_sd_rad, clear_mm))
+            .or_else(|| self.last_path_within_uncertainty(last?, heading_sd_rad, clear_mm))
             .or_else(|| self.nearest_path(estimate))
             .or_else(|| self.toward_target(heading_sd_rad, clear_mm).filter(|_| is_ahead));
         let Some(path) = path else {
@@ -245,9 +245,9 @@ impl Replanner {
         self.field.world.to_mut().workspace.begin_at(*tip_mm, start.position_mm);
     }
 
-    /// Why the tip must not go on: the estimated tip, or the same `tip` moved into the plane, is where it must not
-    /// be, or would be straight ahead, after `step_mm` or after `stopped_mm`: a step, and the stop that may follow it.
-    /// The needle may go straight ahead while its base turns, and off the plane, although the path is in the plane.
+    /// The reason why the tip must not go on, if there is one. Checks the estimated tip, the same `tip` moved into the
+    /// plane, and the points straight ahead, up to `step_mm` (a step) and up to `stopped_mm` (a step and the stop that
+    /// may follow it). While its base turns, the needle may go straight ahead, and off a plane that its path stays in.
     fn stop_reason(
         &self,
         estimate: &TipEstimate,
@@ -273,9 +273,9 @@ impl Replanner {
             let points = (way_mm / AHEAD_SPACING_MM).ceil().max(1.0) as u32;
             (1..=points).find_map(|point| {
                 let ahead_mm = way_mm * f64::from(point) / f64::from(points);
-                // A tip that is too near already must come away from there.
+                // A tip that is already too near must be able to leave.
                 let limit_mm = if point == points { limit_mm } else { limit_mm.min(here_mm) };
-                // The needle bends, to whichever side.
+                // The needle may bend to any side.
                 let aside_mm = 0.5 * estimate.curvature_per_mm * ahead_mm * ahead_mm;
                 let at = position_mm + heading * ahead_mm;
                 let reasons = [StopReason::WallAhead, StopReason::ObstacleAhead];
@@ -287,10 +287,10 @@ impl Replanner {
     }
 
     /// True if a path to the target is left after `turn_mm` straight ahead, the distance that the needle goes while
-    /// the base turns once around. That path must end as near to the target as the path of the last step, keeps
-    /// the same distance from obstacles, and leaves the curvature margin unused even if that path does not: what
-    /// the turn costs must be made up for. If the path of the last step ends sooner, the way straight ahead need
-    /// only be clear.
+    /// the base turns once around. The new path must end about as near to the target as the path of the last step,
+    /// keep the same distance from obstacles, and leave the curvature margin unused even if the last path does not,
+    /// because it must make up for the turn. If the path of the last step ends before the turn does, the way straight
+    /// ahead need only be clear.
     pub fn may_turn(&mut self, estimate: &TipEstimate, turn_mm: f64) -> bool {
         let Some(path) = self.path.as_ref() else { return true };
         let (start, remaining_mm) = (path.start, path.length_mm());
@@ -317,12 +317,12 @@ impl Replanner {
         self.problem.to_target_mm(&path.end().position_mm)
     }
 
-    /// A path that suits the uncertainty of the estimate. The searches share one budget; each may spend half of
-    /// what remains of it.
+    /// A path whose distance from obstacles suits the uncertainty of the estimate. The searches share one budget; each
+    /// may spend half of what remains.
     fn find(&mut self, estimate: &TipEstimate, next_mm: f64, last: Option<&Path>) -> Option<Path> {
-        let doubt_mm = SDS * estimate.position_sd_mm;
+        let uncertainty_mm = SDS * estimate.position_sd_mm;
         let (clearance_mm, margin) = (self.problem.clearance_mm, self.curvature_margin);
-        let (cautious_mm, tip) = (clearance_mm + doubt_mm, self.problem.start);
+        let (cautious_mm, tip) = (clearance_mm + uncertainty_mm, self.problem.start);
         self.expansions_left = self.problem.expansions_max;
         let set_limits = |this: &mut Self, clearance_mm, margin| {
             this.field.clearance_mm = clearance_mm;
@@ -343,7 +343,7 @@ impl Replanner {
         });
         searched.or_else(|| {
             // A path leads through no obstacle, however uncertain the estimate is.
-            let least_mm = (clearance_mm - doubt_mm).max(CLEARANCE_MIN_MM.min(clearance_mm));
+            let least_mm = (clearance_mm - uncertainty_mm).max(CLEARANCE_MIN_MM.min(clearance_mm));
             set_limits(self, least_mm, 0.0);
             self.remembered_from(tip, estimate, next_mm).or_else(|| self.known(last))
         })
@@ -373,19 +373,21 @@ impl Replanner {
         (self.miss_mm(&path) <= tolerance_mm).then_some(path)
     }
 
-    /// The sharpest arc toward the target, if there was a path lately and the arc's next millimetres are clear; or
-    /// if the whole arc is clear and, given the uncertainty of the heading, may end within the tolerance.
+    /// The sharpest arc toward the target, if a path was found recently ([`WITHOUT_PATH_MAX_MM`]) and the arc's next
+    /// `clear_mm` are clear; or if the whole arc is clear and, given the uncertainty of the heading, may end within the
+    /// tolerance.
     fn toward_target(&mut self, heading_sd_rad: f64, clear_mm: f64) -> Option<Path> {
         let path = self.sharpest();
-        let was_lately = self.without_path_mm < PATIENCE_MM && self.begins_clear(&path, clear_mm);
+        let was_lately =
+            self.without_path_mm < WITHOUT_PATH_MAX_MM && self.begins_clear(&path, clear_mm);
         let may_end_near = self.may_end_near(&path, heading_sd_rad)
             && self.field.is_clear(&path.start, &path.arcs[0]);
         (was_lately || may_end_near).then_some(path)
     }
 
-    /// The last path as it is from here, if its next millimetres are clear and, given the uncertainty of the
-    /// heading, it may end within the tolerance.
-    fn last_path_blindly(
+    /// The `last` path unchanged, if its next `clear_mm` are clear and, given the uncertainty of the heading, it may
+    /// end within the tolerance.
+    fn last_path_within_uncertainty(
         &mut self,
         last: Path,
         heading_sd_rad: f64,
@@ -426,7 +428,7 @@ impl Replanner {
     }
 }
 
-/// How long the next path may be after `path` was found, mm.
+/// How long the next path may be once `path` was found, mm.
 fn longest_after_mm(path: &Path) -> f64 {
     path.length_mm() * (1.0 + LONGER_MAX_SHARE) + LONGER_MAX_MM
 }

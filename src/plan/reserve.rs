@@ -5,8 +5,8 @@ use super::path::Path;
 use super::problem::Problem;
 use super::search::{Answer, Status, plan};
 
-/// The extra distance from obstacles, mm, wherever a path exists with it. The shortest path passes obstacles
-/// as near as it may, and noise would push the needle past the last point from which it can pass them.
+/// The extra distance from obstacles, mm, if a path exists with it. The shortest path passes obstacles as near as it
+/// may; noise would then push the needle to where it can no longer pass them.
 pub(super) const RESERVE_MM: f64 = 2.0;
 
 /// The parts of the reserve that are tried, the largest first.
@@ -22,11 +22,11 @@ pub struct RoomyPath {
 }
 
 /// Plans the path with which a run begins, with as much of the reserve as possible, but no less than `least_mm`.
-/// `shortest` is the answer to `problem`; without a path in it, none is looked for. Each try may spend
+/// `shortest` is the answer to `problem`; if it has no path, no other is searched for. Each try may spend
 /// `problem.expansions_max`.
 ///
 /// # Errors
-/// Why a run has no path to begin with, in words.
+/// There is no such path; the text says why.
 pub fn plan_with_reserve(
     world: &World,
     problem: &Problem,

@@ -1,4 +1,4 @@
-//! Lengths of the ways to the target around the obstacles, for a tip that could turn on the spot.
+//! Lengths of the shortest ways to the target around the obstacles, for a tip that could turn on the spot.
 
 use super::field::{Field, Grid};
 use nalgebra::Vector3;

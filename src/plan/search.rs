@@ -49,14 +49,15 @@ pub struct Answer {
     pub resolution: Resolution,
     /// Why there is no path.
     pub reason: Option<String>,
-    /// There is no path, but a needle that bends more may have one.
+    /// True if there is no path, but a needle that bends more may have one.
     pub may_bend_too_little: bool,
     /// The reachable point nearest to the target, mm. With a path it is only the nearest of those that the search
     /// visited. `None` if even the start is not allowed.
     pub nearest_mm: Option<Vector3<f64>>,
 }
 
-/// Plans the path to the target, or within the tolerance of it, whose length plus distance left at the end is least.
+/// Plans the path to the target, or to a point within its tolerance, with the least sum of length and distance from the
+/// target at the end.
 ///
 /// The search is best-first over arcs of full curvature and straights, all of one length, in cells of position
 /// and heading that are visited once. Nodes are ordered by the length so far plus a lower bound of the
@@ -69,7 +70,7 @@ pub fn plan(world: &World, problem: &Problem) -> Answer {
     plan_thoroughly(&mut field, problem, &route)
 }
 
-/// As [`plan`], with the `route` to the target already known.
+/// Like [`plan`], with the `route` to the target already known.
 pub(super) fn plan_thoroughly(field: &mut Field<'_>, problem: &Problem, route: &Route) -> Answer {
     // No path leaves the workspace, or comes nearer to an obstacle than the clearance.
     let slack_mm = field.world.slack_upper_bound_mm(&problem.target_mm, problem.clearance_mm);
@@ -79,8 +80,8 @@ pub(super) fn plan_thoroughly(field: &mut Field<'_>, problem: &Problem, route: &
     if is_out_of_bounds {
         answer.status = Status::None;
     }
-    // The search does not follow ways from which the target is out of reach, but those may come nearer to it.
-    // This is done only after an exhausted search: one whose budget was spent does not know what can be reached.
+    // The search drops nodes from which the target is out of reach, but these may lead nearer to it. Look for them only
+    // after an exhausted search: one whose budget was spent does not know what can be reached.
     if let (Status::None, Some(nearest_mm)) = (answer.status, answer.nearest_mm) {
         let path = path_to_nearest(field, problem);
         let end_mm = path.end().position_mm;
@@ -133,7 +134,7 @@ struct Node {
     length_mm: f32,
     changes: u16,
     arc_number: u8,
-    /// No obstacle is known to be in the way to the target.
+    /// False if an obstacle is known to be in the way to the target.
     may_be_free: bool,
     parent: u32,
 }
@@ -245,8 +246,8 @@ impl Search<'_, '_> {
         let route_mm = self.route.length_mm(&tip.position_mm) - self.moved_mm;
         match route_mm.is_finite() {
             true => (unobstructed_mm.max(route_mm), unobstructed_mm > route_mm - DETOUR_MM),
-            // The search goes on, to find the point nearest to the target. The route does not know the ways to a
-            // target that has moved to where none of its ways begins.
+            // The search goes on, to find the point nearest to the target. If the target has moved to where none of the
+            // route's ways begins, the route knows no way to it.
             false => (unobstructed_mm, self.moved_mm.is_infinite()),
         }
     }
@@ -337,13 +338,13 @@ impl Search<'_, '_> {
         let distance_mm = self.problem.to_target_mm(&tip.position_mm);
         let ends_near = distance_mm <= *tolerance_mm + self.lattice.resolution.step_mm;
         let near = if ends_near { self.nearest_on_arcs(node) } else { None };
-        // The grid of the route is too coarse to judge a target that is near.
+        // The route's grid is too coarse to judge a target that is near.
         let tip_aims = Some(tip).filter(|_| may_be_free || ends_near);
         let turning =
             tip_aims.and_then(|tip| tip.arc_then_straight_to(target_mm, *curvature_per_mm));
         let bent = tip_aims.and_then(|tip| tip.arc_to(target_mm));
         let bent = bent.filter(|arc| arc.curvature_per_mm <= *curvature_per_mm);
-        // If two cost the same, the first wins: the direct ways end at the target.
+        // Of equal costs the first wins: the direct ways, which end at the target.
         let ways = [turning.map(|arcs| (0.0, arcs)), bent.map(|arc| (0.0, [arc, NO_ARC])), near];
         for (left_mm, rest) in ways.into_iter().flatten() {
             let whole_mm = length_mm + rest.iter().map(|arc| arc.length_mm).sum::<f64>();
@@ -457,7 +458,7 @@ impl Search<'_, '_> {
     }
 }
 
-/// Describes the distance of a point from an obstacle. That from a mask is a lower bound.
+/// Describes the distance of a point from an obstacle; the distance from a mask is a lower bound.
 fn describe_distance(world: &World, distance_mm: f64) -> String {
     let has_mask = world.obstacles.iter().any(|it| matches!(it, Obstacle::Mask(_)));
     match distance_mm < 0.0 {

@@ -12,13 +12,13 @@ const DAY_US: f64 = 86_400e6;
 /// A date may be ahead of this machine's clock by an hour; a later one is wrong.
 const AHEAD_MAX_DAYS: f64 = 1.0 / 24.0;
 
-/// The pose that the fiducials give may be off by this, mm and rad: the rounding of its numbers.
+/// Largest difference between the configured pose and that of its fiducials, mm and rad: the rounding of its numbers.
 const SAME_POSE: f64 = 1e-6;
 
-/// The largest standard error of a calibrated curvature, as a part of it.
+/// The largest standard error of a calibrated curvature, relative to the curvature.
 const CURVATURE_PART_MAX: f64 = 0.2;
 
-/// The tip's offset may differ from that with which the fiducials were touched by this, mm.
+/// Largest difference between the present tip offset and the one with which the fiducials were touched, mm.
 const TIP_MOVED_MAX_MM: f64 = 0.05;
 
 /// The largest error of the registration at the tip, mm, one standard deviation.
@@ -94,7 +94,7 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
         Some(RegistrationConfig::Given(given)) => {
             let of_fiducials = given.of_fiducials();
             let off = of_fiducials.map(|fit| (fit.x_wt.inverse() * given.x_wt).log().to_vector());
-            // A pose that was changed by hand has no origin.
+            // A pose that was changed by hand has no known origin.
             let fit = given.fit.as_ref().filter(|_| off.is_none_or(|off| off.amax() < SAME_POSE));
             let found = fit.map(|fit| fits(fit.rms_mm)).unwrap_or_default();
             let provenance = fit.map(|fit| &fit.provenance);
@@ -155,11 +155,11 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
     vec![registration, tip, needle]
 }
 
-/// This check of a registration, unless its fiducials were touched with another offset of the tip than the present
-/// one. The difference went into the pose.
+/// The `check` of a registration, with a worse verdict if its fiducials were touched with another tip offset than the
+/// present one, since the difference went into the pose.
 fn collected_with_tip(check: Check, fit: &RegistrationRecord, tracker: &TrackerSection) -> Check {
     let now_mm = tracker.tip_offset_mm;
-    // A probe of its own has its own tip.
+    // A separate probe has a tip of its own.
     if fit.tool.as_ref().is_some_and(|tool| *tool != tracker.tool) {
         return check;
     }
@@ -169,7 +169,7 @@ fn collected_with_tip(check: Check, fit: &RegistrationRecord, tracker: &TrackerS
         return check.unless(now_mm == [0.0; 3], Warn, next);
     };
     let moved_mm = (Vector3::from(now_mm) - Vector3::from(then_mm)).norm();
-    // A needle that is replaced has another offset, and the registration stays right.
+    // After a change of needle the offset differs, although the registration is right.
     let (verdict, why) = match then_mm == [0.0; 3] {
         true => (Fail, "the tip's offset would count twice; collect the fiducials again"),
         false => (Warn, "if the needle is the same, collect the fiducials again"),
@@ -178,8 +178,8 @@ fn collected_with_tip(check: Check, fit: &RegistrationRecord, tracker: &TrackerS
     check.unless(moved_mm <= TIP_MOVED_MAX_MM, verdict, next)
 }
 
-/// Checks that the roll at the start is known. Only against it does a run notice a registration that is turned
-/// about the needle. `None` for an emulated rig.
+/// Checks that the roll at the start is known. Only by comparison with it can a run detect a registration that is
+/// turned about the needle. `None` for an emulated rig.
 pub fn start_roll(config: &Config) -> Option<Check> {
     let sd_deg = config.observer.invariant.start_sd.roll.to_degrees();
     let limit = format!("up to {:.0} deg", ROLL_JUDGED_SD_MAX_RAD.to_degrees());
@@ -190,8 +190,8 @@ pub fn start_roll(config: &Config) -> Option<Check> {
     config.stage.hardware.then(|| check.unless(is_known, Warn, next))
 }
 
-/// Judges the `last` completed `stage prove` on this bus, or the last one of `--handedness`: its age, and the keys that
-/// it concerns and that changed since.
+/// Judges the `last` completed `stage prove` on this bus, or `stage prove --handedness`: its age, and the keys that
+/// affect it and have changed since.
 pub fn proof(
     config: &Config,
     is_of_handedness: bool,

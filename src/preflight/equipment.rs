@@ -16,7 +16,7 @@ use std::f64::consts::TAU;
 const CYCLE_BITS: f64 = 600.0;
 /// Largest load of a bus that does not delay set-points.
 const LOAD_MAX: f64 = 0.5;
-/// A rotation should begin at least so far from its limits, rad, or a quarter of its range: it turns by itself.
+/// A rotation should begin at least this far from its limits, rad, or a quarter of its range: the control law turns it.
 const ROTATION_ROOM_RAD: f64 = TAU;
 /// Error counter at which a node reports "error warning" (ISO 11898-1).
 const ERRORS_WARN: u16 = 96;
@@ -40,11 +40,11 @@ const POSITIONS_PER_HOLD: f64 = 2.0;
 /// What the operating system reports about a CAN interface; `None` for what it does not report.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct BusFacts {
-    /// The interface is up.
+    /// True if the interface is up.
     pub is_up: bool,
     /// State of the controller, in words.
     pub state: Option<String>,
-    /// The controller may send: it is neither bus-off nor error passive.
+    /// True if the controller may send: it is neither bus-off nor error passive.
     pub may_send: bool,
     /// Bit rate, bit/s.
     pub bit_rate: Option<u32>,
@@ -265,7 +265,7 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     let noise_mm = report.noise_sd_mm;
     let gate_mm = config.tracker.to_track().noise_sd_mm;
     let [noise_min_mm, noise_max_mm] = [NOISE_MIN, NOISE_MAX].map(|ratio| ratio * gate_mm);
-    // A short rest shows little of a correlated noise.
+    // A short rest shows little of the correlated noise.
     let noise_min_mm = if config.tracker.noise.is_some() { 0.0 } else { noise_min_mm };
     let found = noise_mm.map_or_else(|| "not measured".to_owned(), |mm| format!("{mm:.3} mm"));
     let limit = format!(
@@ -337,9 +337,9 @@ fn workspace(config: &Config, report: &TrackerReport) -> Check {
     check.unless(is_inside, Fail, next)
 }
 
-/// Checks that the tip heads as the configuration says (`observer.start`), and can reach the plane or the target from
-/// its last position on the bench. `None` without a registration, and for a target among masks, which only the run
-/// reads.
+/// Checks that the tip's heading is as configured (`observer.start`), and that the tip can reach the plane or the
+/// target from its last position on the bench. `None` without a registration, and for a target among masks, which
+/// only a run reads.
 pub fn plane(config: &Config, report: &TrackerReport) -> Option<Check> {
     let session = config.session().ok()?;
     let x_pw = session.x_wp.inverse();
@@ -360,7 +360,7 @@ pub fn plane(config: &Config, report: &TrackerReport) -> Option<Check> {
         found += &format!(", heading {turned_deg:.1} deg from observer.start");
         limit += &format!(", heading up to {warn_deg:.0} deg");
     }
-    // Without an offset a run does not use orientations. A typed offset may go with a sensor whose tilt is not given.
+    // Without an offset a run does not use orientations. An offset that was typed in may lack the sensor's tilt.
     let is_known = config.tracker.tip_offset_mm != [0.0; 3] && config.tracker.has_tilt();
     let verdict = match turned_deg {
         Some(turned_deg) if is_known && turned_deg > fail_deg => Fail,

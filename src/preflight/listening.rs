@@ -34,9 +34,9 @@ pub struct TrackerReport {
     pub stamp_skew_s: Option<f64>,
     /// Seconds by which the stamps advance in a second; `None` if the positions span less than half a second.
     pub stamp_pace: Option<f64>,
-    /// The last position is outside the workspace, and would be inside if it were in metres.
+    /// True if the last position is outside the workspace, and would be inside if it were in metres.
     pub is_in_metres: bool,
-    /// Positions jump back and forth, as they do if two tools have the same name.
+    /// True if positions jump back and forth, as they do if two tools have the same name.
     pub has_two_tools: bool,
     /// The coordinate of the tracker that never changes, and what to look at.
     pub constant_coordinate: Option<String>,

@@ -10,7 +10,8 @@ use crate::canopen::Frame;
 use crate::session::{Direction, Input, Outcome, SampleRecord, StepRecord};
 use crate::units::Time;
 
-/// Compares frames, samples and steps in the order of the session's output, and keeps the first difference.
+/// Compares frames, samples and steps in the order in which the session outputs them, and keeps the first
+/// difference.
 pub(super) struct Comparison<'a> {
     recorded: &'a Recorded<'a>,
     started_unix_us: i64,
@@ -56,7 +57,7 @@ impl<'a> Comparison<'a> {
         })
     }
 
-    /// True for a truncated record: output of the replay after its end is no difference.
+    /// True for a truncated record: what the replay outputs after its end is no difference.
     pub(super) fn is_truncated(&self) -> bool {
         self.outcome.is_none()
     }
@@ -107,10 +108,10 @@ impl<'a> Comparison<'a> {
         Ok(())
     }
 
-    /// True if a frame that the session made at `time` in answer to `input` need not be in `can.log`. The log
-    /// lacks frames that the bus refused and frames that were discarded because the bench was held up; the
-    /// session is told of either before anything else is sent. Any frame in answer to a fault of the bus may
-    /// be refused too.
+    /// True if a frame that the session output at `time` in answer to `input` may be missing from `can.log`. The
+    /// log lacks frames that the bus refused, and frames that the bench discarded because its control loop had
+    /// stalled. In both cases the session gets an input that says so before it sends anything else. The bus may
+    /// also refuse a frame that answers a fault of the bus.
     fn may_be_unsent(&self, time: Time, input: Option<&Input>) -> bool {
         let sent_us = unix_us(self.started_unix_us, time);
         let next_us = self.sent.peek().map_or(i64::MAX, |logged| logged.unix_us);
@@ -156,7 +157,7 @@ impl<'a> Comparison<'a> {
         Ok(Some(recorded))
     }
 
-    /// The first value in which two rows differ, in words.
+    /// The first value in which two rows differ, in words; the truth is not compared.
     fn differing_value(&self, line: usize, recorded: &str, replayed: &str) -> Option<String> {
         let step = recorded.split(',').next().unwrap_or_default();
         let values = recorded.split(',').zip(replayed.split(','));
@@ -174,8 +175,8 @@ impl<'a> Comparison<'a> {
         Some(format!("{place}: recorded {recorded}, replayed {replayed}{more}"))
     }
 
-    /// Compares the end: the session was given all inputs and ended as `outcome`. Further recorded entries
-    /// are a difference.
+    /// Compares the end, after the session was given all inputs and ended with `outcome`. Recorded entries that
+    /// remain are a difference.
     pub(super) fn close(&mut self, outcome: Option<&Outcome>) -> Result<(), String> {
         let Some(recorded) = self.outcome.take() else { return Ok(()) };
         for (file, line, text) in [

@@ -79,7 +79,7 @@ impl RecordedInputs {
         Ok(Input::Tracker(Event::Sample(sample)))
     }
 
-    /// The error for files that do not belong together; `what` says how the last input does not fit.
+    /// The error for files that do not belong together; `what` says how the last input contradicts the others.
     pub(super) fn mismatch(&self, what: &str) -> String {
         format!("the files are not of one run: {} line {} {what}", file::INPUTS, self.inputs.line)
     }
@@ -90,8 +90,8 @@ impl RecordedInputs {
     }
 }
 
-/// The times at which frames of the session may have remained unsent, UTC µs: the bus failed, or the bench
-/// was held up.
+/// The times at which frames of the session may have remained unsent, UTC in µs since 1970: the bus failed, or the
+/// control loop stalled.
 pub(super) fn unsent_unix_us(recorded: &Recorded<'_>) -> Result<Vec<i64>, String> {
     let started_unix_us = recorded.started_unix_us()?;
     let mut unsent = Vec::new();

@@ -12,9 +12,9 @@ use crate::session::{
 use crate::study::{FigureReport, RunFigures};
 use crate::units::Time;
 
-/// The files of a truncated record end at different times: within 0.2 s if the bench was killed, within
-/// 1.25 s more if the machine lost power, since they are synced in turn. A file that ends earlier than this
-/// lost its end in another way.
+/// The files of a truncated record end within this long of each other, s: 0.2 s if the bench was killed, and
+/// 1.25 s more if the machine lost power, since they are synced in turn. A file that ends earlier was truncated
+/// by something else.
 const APART_MAX_S: f64 = 1.5;
 
 /// Where a truncated record ends.
@@ -99,11 +99,12 @@ pub fn replay(
     }
 }
 
-/// Takes a record of the replayed session; that of a step comes with the recorded truth. An error ends the replay.
+/// Takes a record of the replayed session; the record of a step comes with the recorded truth. An error ends the
+/// replay.
 type TakeRecord<'a> = &'a mut dyn FnMut(Record, Option<Truth>) -> Result<(), String>;
 
 /// Like [`replay`], but accepts dropped records, and passes every record of the session to `take`, up to the
-/// first difference. After a dropped record the replay equals the run only up to there.
+/// first difference. The replay equals the run only up to the first dropped record.
 ///
 /// # Errors
 /// The session refuses its configuration, the files do not belong together, or `take` fails.
@@ -219,7 +220,7 @@ impl Replay<'_> {
         Ok(truth)
     }
 
-    /// Closes the replay of inputs from `begun` to `end`.
+    /// Completes the replay of the inputs from `begun` to `end`.
     fn finish(
         mut self,
         recorded: &Recorded<'_>,
@@ -257,7 +258,7 @@ impl Replay<'_> {
     }
 }
 
-/// The row `replayed` with the truth copied as text from `recorded`: a replay does not compute it.
+/// The row `replayed` with the truth copied as text from `recorded`, since a replay does not compute it.
 fn with_recorded_truth(replayed: &str, recorded: &str) -> String {
     let mut recorded = recorded.split(',');
     let values =

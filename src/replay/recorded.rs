@@ -15,7 +15,7 @@ use std::io;
 pub struct Recorded<'a> {
     /// Its manifest.
     pub manifest: &'a Manifest,
-    /// What the run was to do.
+    /// The settings of the run: an insertion or an operation.
     pub run_config: RunConfig,
     /// Opens the text file of this name.
     pub open: &'a dyn Fn(&str) -> io::Result<Lines>,
@@ -102,7 +102,7 @@ pub(super) struct LoggedFrame {
     pub(super) frame: Frame,
 }
 
-/// The entries of a file in order, with a look at the next one.
+/// The entries of a file in order; the next one can be peeked at.
 pub(super) struct Entries<T> {
     entries: Box<dyn Iterator<Item = Result<T, String>>>,
     next: Option<T>,

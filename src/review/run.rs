@@ -77,7 +77,7 @@ impl Run {
         let steps: Course = times.into_iter().zip(depths).filter_map(|(s, mm)| s.zip(mm)).collect();
         let recorded = &self.motion.measured.insertion;
         let last_s = |course: &Course| course.last().map(|(time_s, _)| *time_s);
-        // Positions that end before the last step were cut off.
+        // Positions that end before the last step were truncated.
         let course = if last_s(recorded) >= last_s(&steps) { recorded } else { &steps }.clone();
         let start = steps.first().and_then(|(time_s, depth_mm)| {
             Some((*time_s, position_mm(&course, *time_s)? - depth_mm))

@@ -304,7 +304,7 @@ impl Script {
 /// - 6502: the bench reads back the mode (6061)
 /// - 1029: by CiA 301 the drive then goes to Pre-operational, as with option 0
 ///
-/// The bring-up never insists on 1005, 1018:3, 1018:4, 605E, 607B, and PDOs beyond the first. A drive whose position
+/// The bring-up never requires 1005, 1018:3, 1018:4, 605E, 607B, or PDOs beyond the first. A drive whose position
 /// wraps needs no limits of its own (607D).
 const NEEDED: [(&[u16], &str); 8] = [
     (&[0x1000, 0x1018], "it tells which drive this is"),

@@ -6,7 +6,7 @@ use crate::observer::standard_deviations;
 use nalgebra::{Matrix3, Matrix4, Matrix6, Matrix6x4, Rotation3, Vector3, Vector4, Vector6};
 
 /// Step of the numerical derivative with respect to a parameter, rad or rad/mm.
-const NUDGE: f64 = 1e-6;
+const DERIVATIVE_STEP: f64 = 1e-6;
 
 /// The prior before an insertion, as variances.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -128,45 +128,46 @@ fn turn_by_angles(rotation: &Rotation3<f64>) -> Matrix3<f64> {
     Matrix3::from_columns(&[yaw, about_z * Vector3::y(), Vector3::z()])
 }
 
-/// How the end of `Exp(ξ)` moves, in its own frame, if ξ changes by `change`: the right Jacobian of
-/// SE(3) times `change`.
+/// The motion of the end of `Exp(ξ)`, in its own frame, per change of ξ by `change`: the right Jacobian of SE(3) times
+/// `change`, by a finite difference.
 fn sensitivity(xi: &Twist, change: &Twist) -> Vector6<f64> {
-    let nudged = Twist { v: xi.v + change.v * NUDGE, w: xi.w + change.w * NUDGE };
-    (Pose::exp(xi).inverse() * Pose::exp(&nudged)).log().to_vector() / NUDGE
+    let perturbed =
+        Twist { v: xi.v + change.v * DERIVATIVE_STEP, w: xi.w + change.w * DERIVATIVE_STEP };
+    (Pose::exp(xi).inverse() * Pose::exp(&perturbed)).log().to_vector() / DERIVATIVE_STEP
 }
 
 /// How the lag of a play depends on its parameters, along one path of the base.
 #[derive(Debug, Clone)]
 struct TorsionSensitivity {
     nominal: (Torsion, Play),
-    /// The torsions with half-width, growth and offset changed, with the change; `None` if neither
-    /// direction is allowed.
-    nudged: [Option<(Torsion, Play, f64)>; 3],
+    /// The torsions with half-width, growth or offset changed, each with its change; `None` if a change is allowed in
+    /// neither direction.
+    perturbed: [Option<(Torsion, Play, f64)>; 3],
     last: [f64; 3],
 }
 
 impl TorsionSensitivity {
     fn new(torsion: Torsion) -> Self {
         let config = torsion.config();
-        let nudged = |change: fn(&mut TorsionConfig, f64)| {
-            [NUDGE, -NUDGE].into_iter().find_map(|nudge| {
+        let perturbed = |change: fn(&mut TorsionConfig, f64)| {
+            [DERIVATIVE_STEP, -DERIVATIVE_STEP].into_iter().find_map(|step| {
                 let mut moved = config;
-                change(&mut moved, nudge);
-                Some((Torsion::new(moved).ok()?, Play::default(), nudge))
+                change(&mut moved, step);
+                Some((Torsion::new(moved).ok()?, Play::default(), step))
             })
         };
         TorsionSensitivity {
             nominal: (torsion, Play::default()),
-            nudged: [
-                nudged(|config, nudge| config.half_width_rad += nudge),
-                nudged(|config, nudge| config.half_width_rad_per_mm += nudge),
-                nudged(|config, nudge| config.offset_rad += nudge),
+            perturbed: [
+                perturbed(|config, step| config.half_width_rad += step),
+                perturbed(|config, step| config.half_width_rad_per_mm += step),
+                perturbed(|config, step| config.offset_rad += step),
             ],
             last: [0.0; 3],
         }
     }
 
-    /// How much the lag's derivative with respect to each parameter changes over `base`.
+    /// The change, over `base`, of the lag's derivative with respect to each parameter.
     fn advance(&mut self, base: Increment) -> [f64; 3] {
         let follow = |torsion: &Torsion, play: &mut Play| {
             play.advance(torsion, base).for_each(drop);
@@ -175,10 +176,11 @@ impl TorsionSensitivity {
         let (torsion, play) = &mut self.nominal;
         let lag_rad = follow(torsion, play);
         let mut changes = [0.0; 3];
-        for ((nudged, last), change) in self.nudged.iter_mut().zip(&mut self.last).zip(&mut changes)
+        for ((perturbed, last), change) in
+            self.perturbed.iter_mut().zip(&mut self.last).zip(&mut changes)
         {
-            if let Some((torsion, play, nudge)) = nudged {
-                let derivative = (follow(torsion, play) - lag_rad) / *nudge;
+            if let Some((torsion, play, step)) = perturbed {
+                let derivative = (follow(torsion, play) - lag_rad) / *step;
                 *change = derivative - *last;
                 *last = derivative;
             }

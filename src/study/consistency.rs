@@ -1,4 +1,4 @@
-//! Consistency of an observer: its errors against its own covariance.
+//! Consistency of an observer: its errors relative to its own covariance.
 
 use super::statistics::{mean, rms};
 use crate::geometry::Pose;
@@ -13,7 +13,7 @@ const POSITION_FREEDOM: f64 = 3.0;
 const SPREAD_MAX: f64 = 10.0;
 /// 95 % of a normal distribution lie within this many standard deviations.
 const WITHIN_95: f64 = 1.96;
-/// The same of Student's t with 1, 2 … degrees of freedom.
+/// The same for Student's t with 1, 2 … degrees of freedom.
 const STUDENT_T_95: [f64; 9] = [12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262];
 
 /// The normalised estimation error squared, `εᵀ P⁻¹ ε`, with the left-invariant error `ε =
@@ -36,22 +36,22 @@ pub struct TrialNees {
 }
 
 impl TrialNees {
-    /// From the values at the steps of a trial's last third.
+    /// The figures of a trial from the values at the steps of its last third; `None` without values.
     pub(super) fn of(steps: impl Iterator<Item = f64>) -> Option<Self> {
         let steps: Vec<f64> = steps.collect();
         Some(TrialNees { end: *steps.last()?, mean: mean(steps)? })
     }
 }
 
-/// Whether an observer's errors are as large as its covariance says.
+/// The verdict on an observer: its errors compared with its covariance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Verdict {
-    /// They are as large.
+    /// The errors are as large as the covariance says.
     Consistent,
-    /// They are larger than it says, or not finite.
+    /// The errors are larger than the covariance says, or not finite.
     OverConfident,
-    /// They are smaller than it says.
+    /// The errors are smaller than the covariance says.
     UnderConfident,
 }
 
@@ -64,13 +64,13 @@ pub struct Consistency {
     pub lo95: f64,
     /// Upper bound.
     pub hi95: f64,
-    /// The verdict; `None` for a single trial, which says too little.
+    /// The verdict; `None` for a single trial, or if the trials differ too much.
     pub verdict: Option<Verdict>,
 }
 
 impl Consistency {
-    /// From independent values, one for each trial, that have a χ² distribution with 6 degrees of
-    /// freedom. The bounds of the mean follow Wilson and Hilferty.
+    /// Judges independent values, one per trial. For a consistent observer they have a χ² distribution with 6 degrees
+    /// of freedom. The bounds of the mean follow Wilson and Hilferty.
     fn of_independent(values: &[f64]) -> Option<Self> {
         let freedom = FREEDOM * values.len() as f64;
         let part = 2.0 / (9.0 * freedom);
@@ -78,14 +78,14 @@ impl Consistency {
         Self::judge(values, bound(-WITHIN_95), bound(WITHIN_95))
     }
 
-    /// The normalised innovation squared, averaged over the last third of each trial: 3 for a
-    /// consistent observer of positions.
+    /// Judges the normalised innovation squared, averaged over the last third of each trial; its mean is 3 for a
+    /// consistent observer.
     pub(super) fn of_innovations(values: &[f64]) -> Option<Self> {
         Self::of_means(values, POSITION_FREEDOM)
     }
 
-    /// From means over correlated steps: the bounds follow from the spread of the trials, by Student's t.
-    /// Means of χ² are skewed: of consistent observers 7 % are outside the bounds of 3 to 20 trials.
+    /// Judges means over correlated steps: the bounds follow from the spread of the trials, by Student's t. Means of χ²
+    /// are skewed: with 3 to 20 trials, 7 % of consistent observers are outside the bounds.
     fn of_means(values: &[f64], freedom: f64) -> Option<Self> {
         let mean = mean(values.iter().copied())?;
         let spread = rms(values.iter().map(|value| value - mean))?;
@@ -134,8 +134,8 @@ impl Nees {
     }
 }
 
-/// 95 % of Student's t with `freedom` degrees of freedom lie within this; from 10 on by its expansion for
-/// many (Abramowitz and Stegun 26.7.5), right to 0.2 %.
+/// 95 % of Student's t with `freedom` degrees of freedom lie within plus or minus this. From 10 degrees on it is the
+/// asymptotic expansion (Abramowitz and Stegun 26.7.5), accurate to 0.2 %.
 pub fn student_95(freedom: usize) -> f64 {
     let few = freedom.checked_sub(1).and_then(|at| STUDENT_T_95.get(at));
     let part = 1.0 / freedom as f64;

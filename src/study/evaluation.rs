@@ -93,10 +93,10 @@ impl Evaluation {
     }
 }
 
-/// How recordings are evaluated.
+/// The settings with which recordings are evaluated.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Scoring {
-    /// How the tip frame B sits in the sensor frame S.
+    /// `R_SB`, the orientation of the tip frame B in the sensor frame S.
     pub r_sb: Rotation3<f64>,
     /// Depth between two steps, mm.
     pub step_mm: f64,
@@ -122,7 +122,7 @@ struct Step {
 /// The rows of `recording` in the plane frame P, which is the tip frame at the first row.
 ///
 /// # Errors
-/// If a row has a number far beyond any needle; the text names its line.
+/// A row has a number far beyond any needle; the text names its line.
 fn steps(recording: &Recording, r_sb: &Rotation3<f64>) -> Result<Vec<Step>, String> {
     let first = &recording.rows[0];
     let has_roll = recording.roll() == Some(RecordedRoll::Turns);
@@ -162,17 +162,16 @@ fn prediction_error_mm(observer: &dyn Observer, steps: &[Step], at: usize) -> Op
     Some((predicted.x_pb.translation - ahead[there].tip_meas.mm()).norm())
 }
 
-/// Runs `observer` over `recording`: it predicts with the measured increments of every row and
-/// corrects it, at every row or once a step ([`Scoring::samples`]). Once a step is scored, if it is deep
-/// enough: the position before the correction, which uses the recorded position, and the roll after it.
+/// Runs `observer` over `recording`: it predicts with the measured increment of every row, and corrects at every row
+/// or once per step ([`Scoring::samples`]). Each step that is deep enough is scored: the position before the
+/// correction by the recorded position, and the roll after it.
 ///
 /// The observer's plane frame P is the tip frame at the first row, so a start with all angles zero
 /// is correct. The observer gets depth, base rotation and position, never the recorded orientation.
 /// The roll error is the rotation about the tip's axis between estimate and record.
 ///
 /// # Errors
-/// In words, if a row's increment or position is far beyond any needle, or if the recording ends before
-/// errors count.
+/// A row's increment or position is far beyond any needle, or the recording ends before errors count.
 pub fn evaluate(
     observer: &mut dyn Observer,
     recording: &Recording,

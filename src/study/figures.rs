@@ -96,7 +96,7 @@ pub struct RunFigures {
     /// Estimated x, mm, at steps with an estimate.
     estimated: ByDepth<f64>,
     saturated: usize,
-    /// The figures that are updated at once; [`report`](Self::report) adds those that need all steps.
+    /// The figures that are updated at every record; [`report`](Self::report) adds those that need all steps.
     so_far: FigureReport,
     /// Acquisition time of the newest accepted position.
     tip_seen: Option<Time>,
@@ -105,13 +105,13 @@ pub struct RunFigures {
 }
 
 /// Updates `greatest`, the largest magnitude so far, with `value`.
-fn raise(greatest: &mut Option<f64>, value: f64) {
+fn update_max(greatest: &mut Option<f64>, value: f64) {
     if value.is_finite() {
         *greatest = Some(greatest.unwrap_or(0.0).max(value.abs()));
     }
 }
 
-/// The figures of a run as its manifest holds them; unknown ones are null.
+/// The figures of a run as written into its manifest; unknown ones are null.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct FigureReport {
@@ -141,7 +141,7 @@ pub struct FigureReport {
     pub tip_lag_mm_max: Option<f64>,
     /// The largest age of the newest accepted position at a SYNC, s, including holds and the stop.
     pub blind_s_max: Option<f64>,
-    /// The largest depth inserted since that position was acquired, mm.
+    /// The largest depth inserted since the newest accepted position was acquired, mm.
     pub blind_mm_max: Option<f64>,
     /// True distance of the tip from the target at the last step, mm; if the truth is known.
     pub target_error_mm: Option<f64>,
@@ -192,7 +192,7 @@ impl RunFigures {
         self.take_scored(step.insertion_meas_mm, x_mm, error);
         self.saturated += usize::from(step.decision.command_saturated);
         if let Some(age_s) = step.tip_meas_age_s {
-            raise(&mut self.so_far.tip_age_s_max, age_s);
+            update_max(&mut self.so_far.tip_age_s_max, age_s);
         }
         if let Some(approach) = &step.decision.approach {
             let true_mm = |truth: &Truth| {
@@ -206,7 +206,7 @@ impl RunFigures {
             self.so_far.clearance_mm_min = Some(least_mm).filter(|mm| mm.is_finite());
         }
         if let Some(at_mm) = step.tip_meas_insertion_mm {
-            raise(&mut self.so_far.tip_lag_mm_max, step.insertion_meas_mm - at_mm);
+            update_max(&mut self.so_far.tip_lag_mm_max, step.insertion_meas_mm - at_mm);
         }
     }
 
@@ -231,14 +231,14 @@ impl RunFigures {
             while self.path.get(1).is_some_and(|(time, _)| *time <= seen) {
                 self.path.pop_front();
             }
-            raise(&mut figures.blind_s_max, stage.time.seconds_after(seen).max(0.0));
+            update_max(&mut figures.blind_s_max, stage.time.seconds_after(seen).max(0.0));
             let seen_at_mm = self.path.front().map_or(f64::NAN, |(_, depth_mm)| *depth_mm);
-            raise(&mut figures.blind_mm_max, stage.measured.insertion_mm - seen_at_mm);
+            update_max(&mut figures.blind_mm_max, stage.measured.insertion_mm - seen_at_mm);
         }
         let behind_mm = stage.commanded.insertion_mm - stage.measured.insertion_mm;
-        raise(&mut figures.following_error_mm_max, behind_mm);
+        update_max(&mut figures.following_error_mm_max, behind_mm);
         let behind_rad = stage.commanded.rotation_rad - stage.measured.rotation_rad;
-        raise(&mut figures.following_error_deg_max, behind_rad.to_degrees());
+        update_max(&mut figures.following_error_deg_max, behind_rad.to_degrees());
     }
 
     /// All figures so far.
@@ -256,9 +256,8 @@ impl RunFigures {
         }
     }
 
-    /// By how much the plane was missed, mm: the RMS distance from the plane over the last third of
-    /// the depth. The distance is the estimated one, since a live run has no truth. `None` if it is
-    /// at most 1 mm, without an estimate, or with a target.
+    /// The estimated RMS distance from the plane over the last third of the depth, mm, if it is over 1 mm. `None` if it
+    /// is not, without an estimate, or with a target.
     pub fn plane_missed_by_mm(&self) -> Option<f64> {
         if self.so_far.target_error_est_mm.is_some() {
             return None;

@@ -1,13 +1,13 @@
-//! How the tracker's sensor sits on the needle of a recording.
+//! The orientation of the tracker's sensor on the needle of a recording.
 
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
-/// `R_SB`, how the tip frame B sits in the sensor frame S, from two vectors of any length in the sensor
+/// `R_SB`, the orientation of the tip frame B in the sensor frame S, from two vectors of any length in the sensor
 /// frame: the shaft's axis, about which the tip rolls (the z axis of B), and the axis about which the path
 /// bends while the base does not turn (the x axis of B, made orthogonal to the shaft's axis).
 ///
 /// # Errors
-/// Why the two vectors do not span a plane.
+/// The two vectors do not span a plane; the text says why.
 pub fn mount(axis: Vector3<f64>, bend_axis: Vector3<f64>) -> Result<Rotation3<f64>, &'static str> {
     let no_axis = "the shaft's axis in the sensor frame is zero";
     let z = axis.try_normalize(1e-9).ok_or(no_axis)?;

@@ -9,10 +9,10 @@ use nalgebra::{Rotation3, Vector3};
 /// The columns that a recording must have, in any order.
 const REQUIRED: [&str; 5] = ["insertion_mm", "rotation_rad", "x_mm", "y_mm", "z_mm"];
 
-/// Two orientations that differ by less are the same, rad.
+/// Two orientations that differ by less than this count as the same, rad.
 const SAME_MAX_RAD: f64 = 1e-3;
 /// Once the base has turned by this much, rad, the orientations show whether they turn with it: no needle bends by
-/// half of this, and no shaft holds back half of it.
+/// half of this angle, and no shaft twists by half of it.
 const TURNED_RAD: f64 = 2.5;
 /// Orientations turn with the base if they do so by at least this share of it, ...
 const FOLLOWED_SHARE: f64 = 0.3;
@@ -22,8 +22,8 @@ const FOLLOWED_MAX: f64 = 1.8;
 /// roll of 5 deg.
 const FOLLOWED_MIN_RAD: f64 = 0.12;
 
-/// Largest change of the depth, mm, and of the base's rotation, rad, from one row to the next: over the largest
-/// `insertion.step_mm`, and less than a turn, so that an angle that starts again is noticed.
+/// Largest change of the depth, mm, and of the base's rotation, rad, from one row to the next: more than the largest
+/// `insertion.step_mm`, and less than a turn, so that an angle that wraps around is detected.
 const STEP_MAX_MM: f64 = 12.0;
 const TURN_MAX_RAD: f64 = 6.0;
 
@@ -42,7 +42,7 @@ pub struct RecordedRow {
     pub sensor_orientation: Option<Rotation3<f64>>,
 }
 
-/// Whether the orientations of a recording turn with the base about the needle's axis.
+/// The relation of a recording's orientations to the base's rotation about the needle's axis.
 #[derive(Debug, Clone, Copy, PartialEq, Display)]
 pub enum RecordedRoll {
     /// They do: they contain the roll.
@@ -77,11 +77,11 @@ pub struct Recording {
     pub rows: Vec<RecordedRow>,
 }
 
-/// Refuses a row whose depth or rotation is far from that of the row before: one such value would change the
-/// rows after it as well.
+/// Checks that the depth and rotation of each row are near those of the row before: one wrong value would also change
+/// the rows after it.
 ///
 /// # Errors
-/// The first such row, by its line.
+/// The first row that is not; the text names its line.
 fn check_steps(rows: &[RecordedRow]) -> Result<(), String> {
     for (last, row) in rows.iter().zip(&rows[1..]) {
         for (name, step, max, hint) in [
@@ -118,7 +118,7 @@ impl Recording {
     /// and, all four or none, `qw,qx,qy,qz`, in any order.
     ///
     /// # Errors
-    /// Those of [`Table`], a row far from the one before, both with the line, and a file without rows.
+    /// Those of [`Table`], a row that is far from the one before, both with the line, or a file without rows.
     pub fn parse(csv: &str) -> Result<Self, String> {
         let table = Table::parse(csv);
         let numbers = table.numbers(REQUIRED)?;
@@ -153,7 +153,7 @@ impl Recording {
         for (last, row) in self.rows.iter().zip(&self.rows[1..]) {
             let (before, now) = (last.sensor_orientation?, row.sensor_orientation?);
             is_fixed &= first_orientation.angle_to(&now) < SAME_MAX_RAD;
-            // A change of heading is no roll, however large the needle's bend makes it.
+            // A change of heading is not a roll, however much the needle bends.
             roll_rad += so3::log(&(before.inverse() * now)).dot(&axis);
             rolls_rad.push(roll_rad);
             turn_rad += wrap_angle(row.rotation_meas_rad - last.rotation_meas_rad);

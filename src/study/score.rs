@@ -36,11 +36,11 @@ pub struct TrialResult {
 /// The result of a trial with a target.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TargetScore {
-    /// There was no path with which a run may begin.
+    /// True if there was no path with which a run may begin.
     pub is_refused: bool,
     /// True distance of the tip from the target at the end, mm; `None` if the trial was stopped.
     pub error_mm: Option<f64>,
-    /// The trial ended within the tolerance.
+    /// True if the trial ended within the tolerance.
     pub is_reached: bool,
     /// The least distance of the true tip from an obstacle, mm; infinite without obstacles.
     pub clearance_mm: f64,

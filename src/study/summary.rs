@@ -8,8 +8,8 @@ use crate::emulator::split_mix64;
 use crate::session::Outcome;
 use serde::Serialize;
 
-/// The seed of trial `trial` in the study with this `seed`. It does not depend on the thread, and has
-/// 53 bits, so that every JSON reader reads it exactly.
+/// The seed of trial `trial` in the study with this `seed`. It does not depend on the thread that runs the trial. It
+/// has 53 bits, so that every JSON reader represents it exactly.
 pub fn trial_seed(seed: u64, trial: u64) -> u64 {
     split_mix64(seed, trial) >> 11
 }
@@ -66,7 +66,7 @@ pub struct FailedTrial {
     pub off_plane_rms_mm: Option<f64>,
     /// Why it was stopped; `None` if it reached its depth.
     pub stop_reason: Option<String>,
-    /// The trial was not begun, since there was no path to its target.
+    /// True if the trial did not begin, because there was no path to its target.
     pub refused: bool,
 }
 

@@ -17,7 +17,7 @@ pub(super) struct SampleDue {
 }
 
 impl SampleDue {
-    /// How many positions it is the mean of.
+    /// The number of positions that are averaged.
     pub(super) fn positions(&self) -> u32 {
         u32::try_from(self.numbers.end() - self.numbers.start() + 1).unwrap_or(u32::MAX)
     }
@@ -43,7 +43,7 @@ pub struct Timetable {
     tracker: TrackerModel,
     /// Positions averaged at a step.
     averaged: u32,
-    /// Every position corrects the observers individually.
+    /// True if every position corrects the observers individually.
     takes_all: bool,
     is_inserting: bool,
     /// The assumed acquisition time and the receive time of each position accepted since the step before.
@@ -128,7 +128,7 @@ impl Timetable {
 
     /// The position received at `received`, or the mean of it and those before it.
     fn sample_due(&self, received: Time, insertion_meas_mm: f64) -> SampleDue {
-        // The true latency, which may differ from the one that the session assumes.
+        // The tracker's true latency; the session may assume another one.
         let sent_s = (received - self.tracker.latency).as_secs_f64();
         let sent = (sent_s / self.tracker.period.as_secs_f64()).round() as u64;
         // A repeated position was measured when it was first sent.

@@ -1,4 +1,4 @@
-//! One emulated insertion without drives, bytes or time. A study makes thousands of them.
+//! One emulated insertion without drives, bus or clock. A study makes thousands of them.
 
 use super::base_path::BasePath;
 use super::timetable::{SampleDue, Timetable};
@@ -58,9 +58,9 @@ pub fn insert(
             steering.correct_handedness(&tip_meas, mean.positions(), interval_s);
         }
         if let Some(tool) = target_tool {
-            needle.see_target(tool, &due.samples);
+            needle.track_target(tool, &due.samples);
         }
-        needle.seen_target_mm().into_iter().for_each(|target_mm| steering.set_target(target_mm));
+        needle.tracked_target_mm().into_iter().for_each(|target_mm| steering.set_target(target_mm));
         let is_last = step + 1 == timetable.steps.len();
         let ahead = needle.base.between(observed_mm, due.insertion_mm);
         let decision = steering.decide(&ahead, is_last);
@@ -77,7 +77,7 @@ pub fn insert(
         };
         take(&record, &needle.truth(due.insertion_mm));
         if let Some(error) = refused {
-            // The needle goes on until it stands: that may be nearer to an obstacle.
+            // The needle goes on while it brakes, possibly nearer to an obstacle.
             if session.goal.is_some() {
                 let stopped_mm = due.insertion_mm + session.insertion.stopping_mm(&session.stage);
                 needle.insert_to(stopped_mm);
@@ -137,9 +137,9 @@ impl<'a> EmulatedNeedle<'a> {
         Truth { x_pb: *self.tissue.tip_true(), target_mm }
     }
 
-    /// Tracks the target at the times of the tip's samples, and before the insertion for as long as its mean
-    /// takes.
-    fn see_target(&mut self, tool: &TargetTool, samples: &[SampleDue]) {
+    /// Tracks the target at the times of the tip's samples; before the insertion, for as long as its position is
+    /// averaged.
+    fn track_target(&mut self, tool: &TargetTool, samples: &[SampleDue]) {
         let (Some(target), Some(first)) = (self.stage.target, samples.first()) else { return };
         let model = TargetModel::tracker_model(self.stage.tracker);
         let interval_s = model.interval().as_secs_f64();
@@ -161,7 +161,7 @@ impl<'a> EmulatedNeedle<'a> {
         }
     }
 
-    fn seen_target_mm(&self) -> Option<Vector3<f64>> {
+    fn tracked_target_mm(&self) -> Option<Vector3<f64>> {
         self.target.as_ref()?.mean_mm()
     }
 

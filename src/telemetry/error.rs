@@ -44,7 +44,7 @@ impl TelemetryError {
         move |source| TelemetryError::File { path: path.to_path_buf(), source }
     }
 
-    /// The system's error with the folder at `path`, in which run folders are made.
+    /// The system's error with the folder at `path`, which is or contains the run folder.
     pub(super) fn folder(path: &Path) -> impl FnOnce(io::Error) -> Self {
         move |error| {
             let path = path.display();
@@ -64,8 +64,8 @@ impl TelemetryError {
         TelemetryError::Recording(format!("{writer}: {reason}; what follows is not recorded"))
     }
 
-    /// `writer` makes no progress: a stalled disk or network share.
-    pub(super) fn writer_silent(writer: &str, silent: Duration, limit: Duration) -> Self {
+    /// `writer` makes no progress, most likely because of a stalled disk or network share.
+    pub(super) fn writer_stalled(writer: &str, silent: Duration, limit: Duration) -> Self {
         let (silent_s, limit_s) = (silent.as_secs_f64(), limit.as_secs_f64());
         TelemetryError::Recording(format!(
             "{writer}: no sign of life for {silent_s:.1} s (given up after {limit_s:.1}); is the disk \

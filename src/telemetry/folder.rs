@@ -11,11 +11,11 @@ use std::io::ErrorKind::{AlreadyExists, InvalidInput, Unsupported};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
-/// Runs of one name in one second are distinguished by a number, up to this.
+/// The largest number that distinguishes runs with the same name and second.
 const COLLISIONS_MAX: u32 = 1000;
 
-/// Creates a new folder for the run of `manifest` in `parent`, and `parent` itself if it does not exist. The run's
-/// name must be valid as a key of the configuration.
+/// Creates a new folder for the run of `manifest` in `parent`, and `parent` itself if it does not exist. The
+/// configuration has checked that the run's name is valid in a folder's name.
 ///
 /// `create_dir` fails on an existing folder, so two processes never get the same one.
 ///
@@ -52,7 +52,7 @@ pub fn write_manifest(dir: &Path, manifest: &Manifest) -> Result<(), TelemetryEr
     let write = || -> io::Result<()> {
         let text = manifest.to_text()?;
         let new = dir.join(file::NEW_MANIFEST);
-        // Writes into the reserved space.
+        // Overwrites the reserved space, so that a full disk does not matter.
         let mut file = OpenOptions::new().write(true).create(true).truncate(false).open(&new)?;
         file.write_all(text.as_bytes())?;
         file.set_len(text.len() as u64)?;
@@ -70,17 +70,16 @@ pub fn write_manifest(dir: &Path, manifest: &Manifest) -> Result<(), TelemetryEr
     write().map_err(TelemetryError::file(&path))
 }
 
-/// A write lock on a whole file. It belongs to the file as it was opened (F_OFD_SETLK), and unlike that of
-/// `File::try_lock` it can be looked for without being taken.
+/// A write lock on a whole file, for an open-file-description lock (F_OFD_SETLK). Unlike with `File::try_lock`, a
+/// process can query the lock without taking it (F_OFD_GETLK).
 const WRITE_LOCK: flock =
     flock { l_type: F_WRLCK as i16, l_whence: SEEK_SET as i16, l_start: 0, l_len: 0, l_pid: 0 };
 
-/// Marks the run folder `dir` as being written while the returned file is open, by a lock on its
-/// configuration. `None` if another process holds the lock. On a file system without locks nothing is
-/// marked.
+/// Marks the run folder `dir` as being written, by a lock on its configuration file that lasts while the returned
+/// file is open. Returns `None` if another process holds the lock. A file system without locks gets no mark.
 ///
 /// # Errors
-/// [`TelemetryError::File`] where there is no configuration that can be opened.
+/// [`TelemetryError::File`] if the configuration file cannot be opened.
 pub fn lock(dir: &Path) -> Result<Option<File>, TelemetryError> {
     let path = dir.join(file::CONFIG);
     let opened = OpenOptions::new().read(true).write(true).open(&path);
@@ -91,8 +90,8 @@ pub fn lock(dir: &Path) -> Result<Option<File>, TelemetryError> {
     })
 }
 
-/// True if another process holds the lock of the run folder `dir`. Nothing is locked to find that out: a run
-/// that begins would not get its lock.
+/// True if another process holds the lock of the run folder `dir`. The query takes no lock, which could prevent a
+/// starting run from taking its own.
 pub fn is_being_written(dir: &Path) -> bool {
     let Ok(config) = File::open(dir.join(file::CONFIG)) else { return false };
     let mut found = WRITE_LOCK;
@@ -100,7 +99,7 @@ pub fn is_being_written(dir: &Path) -> bool {
     looked.is_ok() && i32::from(found.l_type) != F_UNLCK
 }
 
-/// A disk with less free space than this counts as full: it is enough for some seconds of a run.
+/// A disk with less free space than this counts as full, kB (1000 bytes). It is enough for some seconds of a run.
 const FULL_KB: u64 = 256;
 
 /// Creates the folder `dir` if it does not exist, and checks that its file system has `free_mb_min` MB
@@ -122,7 +121,7 @@ pub fn check_room(dir: &Path, free_mb_min: u32) -> Result<(), TelemetryError> {
     }
 }
 
-/// Checks that there is space for what a run writes until the next check.
+/// Checks that the disk of `dir` has space for what a run writes until the next check.
 ///
 /// # Errors
 /// The disk is full, or the check fails.

@@ -1,9 +1,9 @@
 //! The keeper of a run folder: it writes the manifest, syncs the text files to the disk, and checks that
 //! the folder is still there and its disk is not full.
 //!
-//! Written lines survive the end of the bench, but stay in the operating system's memory until they are on the
-//! disk. So only a sync detects a stalled disk. The keeper syncs four times a second, on a thread of its own,
-//! which may block.
+//! Written lines survive a crash of the bench, but stay in the operating system's page cache until they are on the
+//! disk. So only a sync detects a stalled disk. The keeper syncs four times a second, on its own thread, which may
+//! block.
 
 use super::TelemetryError;
 use super::folder::{self, check_not_full};
@@ -19,18 +19,18 @@ use std::time::Duration;
 
 /// The keeper's name in messages.
 pub(super) const KEEPER: &str = "run folder";
-/// Manifests that wait to be written; there is one for each drive that is found.
+/// Capacity of the queue of manifests; a run writes one for each drive that it finds.
 const QUEUE_MANIFESTS: usize = 8;
 const QUEUE_PROBLEMS: usize = 64;
 
 /// A path, and the file or folder that was opened there.
 type OpenPath = (PathBuf, File);
 
-/// Starts the thread that checks the run folder `dir`, its text files and its configuration, and that writes
-/// each manifest that it is given. The consumer gets each problem with the folder once.
+/// Starts the thread that checks the run folder `dir`, its text files and its configuration, and writes the
+/// manifests from its queue. The consumer gets each problem with the folder once.
 ///
 /// # Errors
-/// The folder or a file cannot be opened, or no thread can be started.
+/// The folder or a file cannot be opened, or the thread cannot be started.
 pub(super) fn keep(dir: &Path) -> Result<(Worker<Manifest>, Consumer<String>), TelemetryError> {
     let (reports, problems) = RingBuffer::new(QUEUE_PROBLEMS);
     let folder = Folder::open(dir, reports)?;
@@ -88,7 +88,7 @@ impl Folder {
         }
     }
 
-    /// Writes `manifest`, unless another folder has taken this one's place.
+    /// Writes `manifest`, unless the folder was removed or replaced by another one.
     fn write_manifest(&self, manifest: &Manifest) -> Result<(), TelemetryError> {
         check_in_place(&self.dir)?;
         folder::write_manifest(&self.dir.0, manifest)
@@ -121,7 +121,7 @@ fn check_in_place((path, file): &OpenPath) -> Result<(), TelemetryError> {
 impl Sink for Folder {
     type Item = Manifest;
     const ITEMS: &'static str = "manifests";
-    /// Each check syncs one of the five text files, so a loss of power costs 1.25 s.
+    /// Each tick syncs one of the five text files, so a loss of power costs up to 1.25 s.
     const TICK: Duration = Duration::from_millis(250);
 
     fn take(&mut self, manifest: Manifest) -> Result<(), String> {
@@ -215,7 +215,7 @@ mod tests {
         create_files(&scratch.0);
         let (mut keeper, _) = keep(&scratch.0).unwrap();
         while keeper.dropped == 0 {
-            keeper.give(Manifest::default());
+            keeper.send(Manifest::default());
         }
         let news = std::iter::from_fn(|| keeper.news(Instant::now()));
         let said: Vec<String> = news.map(|news| format!("{news:?}")).collect();
@@ -246,8 +246,8 @@ mod tests {
         assert!(next().contains("steps.csv: No such file"));
         fs::rename(&dir, scratch.0.join("moved")).unwrap();
         assert!(next().contains("run: No such file"));
-        let beats = keeper.vitals.beats.load(Relaxed);
-        while keeper.vitals.beats.load(Relaxed) < beats + 3 {
+        let beats = keeper.status.beats.load(Relaxed);
+        while keeper.status.beats.load(Relaxed) < beats + 3 {
             thread::yield_now();
         }
         assert!(problems.is_empty());

@@ -1,11 +1,11 @@
 //! The run folder and the recording of a run.
 //!
-//! A [`Recorder`] takes [`Entry`]s from the session's thread through a bounded queue. One thread appends to
-//! the text files (`steps.csv`, `can.log`, `tracker.ndjson`, `inputs.log`, `events.log`). A second thread
-//! keeps the folder: it syncs the text files, which can take longer than the lines that a kill may cost (200 ms),
-//! writes the manifest, and checks that the folder is still there. Entries that do not fit into a full queue
-//! are dropped, counted and reported. A thread that fails or stalls is reported to the runtime
-//! ([`Recorder::news`]). The live view is a lossy tap with a queue of its own.
+//! A [`Recorder`] passes [`Entry`]s from the session's thread through a bounded queue to a writer thread, which
+//! appends to the text files (`steps.csv`, `can.log`, `tracker.ndjson`, `inputs.log`, `events.log`). A second
+//! thread, the keeper, syncs the text files, writes the manifest, and checks that the folder is still there. The
+//! writer does not sync, because a sync may take longer than the 200 ms of lines that a kill may cost. If the
+//! queue is full, entries are dropped, counted and reported. The recorder reports a thread that fails or stalls to
+//! the runtime ([`Recorder::news`]). The live view is a lossy tap with a queue of its own.
 //!
 //! `run.rrd` is made from the text files when they are closed ([`Recording`]): it can be made again at
 //! any time.
@@ -25,7 +25,7 @@ mod recording;
 mod repair;
 mod run_folder;
 mod text;
-mod vitals;
+mod watchdog;
 mod worker;
 
 pub use error::TelemetryError;
@@ -34,7 +34,7 @@ pub use recorder::Recorder;
 pub use recording::Recording;
 pub use repair::{Repaired, note_recording, repair};
 pub use run_folder::{RunFolder, open_regular};
-pub use vitals::RecordNews;
+pub use watchdog::RecordNews;
 pub use worker::Backpressure;
 
 use crate::archive::rfc3339;
@@ -56,13 +56,13 @@ pub struct Entry {
 }
 
 impl From<Record> for Entry {
-    /// A record without a truth: of a live run, or not a step.
+    /// An entry without the truth: in a live run, or for a record that is not a step.
     fn from(record: Record) -> Self {
         Entry { record, truth: None }
     }
 }
 
-/// `time` as the files of a run have it: `2026-03-01T14:30:00.123456Z`.
+/// `time` in the format of a run's files, RFC 3339: `2026-03-01T14:30:00.123456Z`.
 pub fn utc_text(time: SystemTime) -> String {
     rfc3339(Timestamp::try_from(time).unwrap_or_default().as_microsecond())
 }
@@ -78,13 +78,13 @@ pub struct Scene {
     pub curvature_per_mm: f64,
     /// The obstacles, and the target with its tolerance.
     pub goal: Option<(World, Problem)>,
-    /// Whether the steps have the truth.
+    /// True if the steps come with the truth.
     pub truth: bool,
     /// Observers that run alongside, by name.
     pub shadows: Vec<String>,
-    /// The fastest turning that the control law asks for, rad/mm.
+    /// Upper bound of the control law's rotation command, rad/mm.
     pub rotation_max_rad_per_mm: f64,
-    /// Age of the newest accepted tip position from which on the insertion is held, s.
+    /// The insertion is held when the newest accepted tip position is older than this, s.
     pub tip_meas_age_max_s: f64,
     /// The drives, with scales and limits.
     pub stage: StageConfig,

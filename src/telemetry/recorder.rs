@@ -3,7 +3,7 @@
 use super::keeper::keep;
 use super::recording::live;
 use super::text::{TextFiles, WRITER};
-use super::vitals::RecordNews;
+use super::watchdog::RecordNews;
 use super::worker::{Backpressure, Worker};
 use super::{Entry, Scene, TelemetryError, folder, utc_text};
 use crate::archive::{DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex};
@@ -14,7 +14,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime};
 
-/// Entries the queue holds: about half a minute of a run at 10 ms SYNC, 3 s at 1 ms.
+/// Capacity of the queue, entries: about half a minute of a run at 10 ms SYNC, 3 s at 1 ms.
 const QUEUE_ENTRIES: usize = 32_768;
 /// At the end of a run the writer is given up after this long without progress.
 const CLOSING_LIMIT: Duration = Duration::from_secs(15);
@@ -38,11 +38,11 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Creates a new folder in `parent` for the run that `manifest` describes, with `config_toml`, the
-    /// configuration as used, and starts the writer.
+    /// Creates a new folder in `parent` for the run that `manifest` describes, writes `config_toml`, the
+    /// configuration as used, and starts the writer and the keeper.
     ///
     /// # Errors
-    /// The folder or one of its files cannot be created. No folder remains then.
+    /// The folder or one of its files cannot be created, or a thread cannot be started. No folder remains then.
     pub fn create(
         parent: &Path,
         manifest: Manifest,
@@ -82,20 +82,20 @@ impl Recorder {
         discard(&self.run_dir);
     }
 
-    /// Records `entry`. This takes some microseconds, most of them to wake the writer; with
+    /// Records `entry`. This takes some microseconds, mostly to wake the writer. With
     /// [`Backpressure::DropAndCount`] it never waits for a disk or a viewer.
     pub fn record(&mut self, entry: Entry) {
         if let Some(live) = &mut self.live {
-            live.give(entry.clone());
+            live.send(entry.clone());
         }
         if TextFiles::wants(&entry.record) {
-            self.text.give(entry);
+            self.text.send(entry);
         }
     }
 
     /// The next change in the state of the recording. Call this at least twenty times a second, each time until
-    /// it returns `None`: then a full or stalled disk or a lost folder is reported within a second. At most
-    /// 50 ms of the time between two calls count as silence of a thread.
+    /// it returns `None`: then a full or stalled disk or a lost folder is reported within a second. Of the time
+    /// between two calls, at most 50 ms count as silence of a thread.
     pub fn news(&mut self) -> Option<RecordNews> {
         let now = Instant::now();
         let news = self.text.news(now).or_else(|| self.keeper.news(now));
@@ -109,7 +109,7 @@ impl Recorder {
     /// Puts a drive found on the bus into the manifest, without waiting for it to be written.
     pub fn identify_drive(&mut self, drive: DriveIdentity) {
         self.manifest.drives.push(drive);
-        self.keeper.give(self.manifest.clone());
+        self.keeper.send(self.manifest.clone());
     }
 
     /// Completes the text files, seals them and writes the final manifest, to which `sum_up` adds the
@@ -130,7 +130,7 @@ impl Recorder {
         sum_up(&mut manifest);
         manifest.ended_utc = Some(utc_text(SystemTime::now()));
         if let Some(live) = &mut self.live {
-            live.close_within(&manifest, live::FAREWELL_MAX);
+            live.close_within(&manifest, live::CLOSE_TIMEOUT);
         }
         let mut dropped = Dropped {
             text_files: self.text.dropped,
@@ -140,7 +140,7 @@ impl Recorder {
         match &closed {
             Ok((written, _)) => {
                 // An entry that is not in the files is lost, for whatever reason.
-                dropped.text_files = self.text.given.saturating_sub(written.entries);
+                dropped.text_files = self.text.sent.saturating_sub(written.entries);
                 manifest.counts = Some(written.counts);
                 manifest.files.clone_from(&written.files);
                 let config = FileSeal::of(self.config_toml.as_bytes());

@@ -48,17 +48,16 @@ fn cut_text(name: &str, bytes: u64) -> String {
     format!("{name} ended in the middle of a line; that part ({bytes} bytes) is now in {name}.cut")
 }
 
-/// Closes the record in `dir`, whose bench ended without doing so.
+/// Closes the record in `dir`, whose bench ended without closing it.
 ///
-/// It moves the partial last line of each text file to a `.cut` file, counts the lines, seals the files,
-/// and writes a manifest that says that the run was stopped, and at which step. Nothing recorded is
-/// lost. A repair that was interrupted can be repeated. The caller makes `run.rrd` afterwards, from the
-/// closed record.
+/// Moves the partial last line of each text file to a `.cut` file, counts the lines, seals the files, and writes
+/// a manifest that says that the run was stopped, and at which step. Nothing recorded is lost. An interrupted
+/// repair can be repeated. The caller makes `run.rrd` afterwards, from the closed record.
 ///
 /// # Errors
 /// [`TelemetryError`]; the record then stays open.
 pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
-    // Without a run folder there is nothing to lock, and the error must say so.
+    // If `dir` is no run folder, the error must say so, not that there is nothing to lock.
     RunFolder::open(dir)?;
     let Some(_lock) = folder::lock(dir)? else {
         let reason = "a bench is still writing this record, or another repair has it; wait for it, or end it with Ctrl-C";
@@ -73,7 +72,7 @@ pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
     }
     let (mut lines, mut cuts, mut missing) = (BTreeMap::new(), Vec::new(), Vec::new());
     for name in file::TEXT_FILES {
-        let cut = cut_last_line(dir, name).map_err(TelemetryError::file(&dir.join(name)));
+        let cut = move_partial_line(dir, name).map_err(TelemetryError::file(&dir.join(name)));
         match cut? {
             None => missing.push(name),
             Some((whole, cut)) => {
@@ -121,10 +120,10 @@ fn cut_name(name: &str) -> String {
     format!("{name}.cut")
 }
 
-/// Moves what follows the last newline of the file `name` to its `.cut` file. Returns the number of whole
-/// lines, and of bytes in the `.cut` file, which an earlier, interrupted repair may have moved; `None` for a
-/// missing file.
-fn cut_last_line(dir: &Path, name: &str) -> io::Result<Option<(u64, u64)>> {
+/// Moves what follows the last newline of the file `name` to its `.cut` file. Returns the number of whole lines and
+/// the number of bytes in the `.cut` file, which an earlier, interrupted repair may have moved; `None` if the file
+/// is missing.
+fn move_partial_line(dir: &Path, name: &str) -> io::Result<Option<(u64, u64)>> {
     let (path, cut_path) = (dir.join(name), dir.join(cut_name(name)));
     if !is_regular(&path)? {
         return Ok(None);
@@ -153,7 +152,7 @@ fn cut_last_line(dir: &Path, name: &str) -> io::Result<Option<(u64, u64)>> {
     Ok(Some((lines, partial_line.len() as u64)))
 }
 
-/// True for a regular file, false if there is nothing. A link is refused, since it may lead out of the record.
+/// True for a regular file, false if `path` does not exist. A link is refused, since it may lead out of the record.
 fn is_regular(path: &Path) -> io::Result<bool> {
     match fs::symlink_metadata(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
@@ -245,7 +244,7 @@ mod tests {
     #[test]
     fn an_interrupted_repair_can_be_repeated() {
         let scratch = open_record("repair-again");
-        cut_last_line(&scratch.0, file::STEPS).unwrap();
+        move_partial_line(&scratch.0, file::STEPS).unwrap();
         let repaired = repair(&scratch.0).unwrap();
         assert_eq!(repaired.cuts, [("steps.csv".to_owned(), 9)]);
         let run = RunFolder::open(&scratch.0).unwrap();

@@ -7,7 +7,7 @@ use std::fs::{self, File};
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
 
-/// The folder of a run that was recorded, opened for reading. Nothing here writes.
+/// The folder of a recorded run, opened for reading. Nothing here writes.
 #[derive(Debug, Clone)]
 pub struct RunFolder {
     /// The folder's path.
@@ -20,7 +20,7 @@ impl RunFolder {
     /// Opens `dir` and reads only its manifest.
     ///
     /// # Errors
-    /// [`TelemetryError::NotARun`], and [`TelemetryError::Unusable`] if its manifest cannot be used.
+    /// [`TelemetryError::NotARun`], or [`TelemetryError::Unusable`] if its manifest cannot be used.
     pub fn open(dir: &Path) -> Result<Self, TelemetryError> {
         let not_a_run =
             |reason: String| TelemetryError::NotARun { path: dir.to_path_buf(), reason };
@@ -46,7 +46,7 @@ impl RunFolder {
     /// (see [`Self::change`]): it follows from the other files, and nothing is read from it.
     ///
     /// # Errors
-    /// [`TelemetryError::Unusable`] with every file that differs, and [`TelemetryError::File`].
+    /// [`TelemetryError::Unusable`] with every file that differs, or [`TelemetryError::File`].
     pub fn verify(&self) -> Result<(), TelemetryError> {
         let files = &self.manifest.files;
         let sealed = files.keys().map(String::as_str).filter(|name| *name != file::RECORDING);
@@ -68,8 +68,8 @@ impl RunFolder {
         Err(TelemetryError::unusable(&self.dir, reason))
     }
 
-    /// How the file `name` differs from its seal in the manifest; `None` if it is unchanged. Of the configuration
-    /// without a seal only the hash is known.
+    /// How the file `name` differs from its seal in the manifest; `None` if it is unchanged. A configuration without a
+    /// seal is compared by its hash alone.
     ///
     /// # Errors
     /// [`TelemetryError::File`].
@@ -95,7 +95,7 @@ impl RunFolder {
     /// The lines of the file `name`, read one by one.
     ///
     /// # Errors
-    /// It cannot be opened.
+    /// The file cannot be opened.
     pub fn lines(&self, name: &str) -> io::Result<Lines> {
         open_regular(&self.dir.join(name)).map(|file| Lines::new(BufReader::new(file)))
     }
@@ -110,10 +110,10 @@ impl RunFolder {
     }
 }
 
-/// Opens the file `path`.
+/// Opens the regular file `path`.
 ///
 /// # Errors
-/// It cannot be opened, or it is a pipe or a device: reading it may never end.
+/// The file cannot be opened, or is a pipe or a device, which might never end.
 pub fn open_regular(path: &Path) -> io::Result<File> {
     if !fs::metadata(path)?.is_file() {
         return Err(io::Error::other("not a regular file"));

@@ -19,7 +19,8 @@ pub(super) const WRITER: &str = "text files";
 
 /// Collects lines, passes them to the system at every tick, and syncs them to the disk at the end.
 pub(super) struct TextFiles {
-    /// In the order of [`file::TEXT_FILES`]: if the bench is killed between two files, every input has its frame.
+    /// In the order of [`file::TEXT_FILES`], so that every recorded input has its frame and sample even if the bench
+    /// is killed between the writes of two files.
     files: Vec<TextFile>,
     interface: String,
     started_unix_us: i64,
@@ -134,8 +135,8 @@ impl TextFile {
         self.pending.push('\n');
     }
 
-    /// Writes all pending lines to the operating system: from then on they survive the end of this process. A
-    /// partial line is truncated if possible.
+    /// Writes all pending lines to the operating system: then they survive the end of this process. If the write
+    /// fails, a partial line is truncated where possible.
     ///
     /// # Errors
     /// The system's error, with the file's path. Lines that were not written are lost.

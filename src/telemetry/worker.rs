@@ -2,7 +2,7 @@
 //! viewers.
 
 use super::TelemetryError;
-use super::vitals::{RecordNews, SILENCE_LIMIT, Silence, Vitals, Watch};
+use super::watchdog::{RecordNews, STALL_TIMEOUT, StallTimer, ThreadStatus, Watchdog};
 use crate::archive::{Counts, FileSeal, Manifest};
 use rtrb::{Consumer, Producer, PushError, RingBuffer};
 use std::collections::BTreeMap;
@@ -23,14 +23,14 @@ pub enum Backpressure {
 
 /// Retry interval while the queue is full.
 const RETRY: Duration = Duration::from_millis(1);
-/// If completing the files takes longer than this, the operator is told.
+/// The operator is told if the writer, while it completes its files, makes no progress for this long.
 const WARN_AFTER: Duration = Duration::from_secs(3);
 
-/// The work of the thread.
+/// What the thread does with the items.
 pub(super) trait Sink: Send + 'static {
-    /// The items that it takes.
+    /// The items that the sink takes.
     type Item: Send + 'static;
-    /// Those items in messages.
+    /// The word for those items in messages.
     const ITEMS: &'static str = "records";
     /// Interval of [`Sink::tick`].
     const TICK: Duration;
@@ -65,19 +65,19 @@ enum Message<T> {
     Close(Box<Manifest>),
 }
 
-/// The session thread's handle to a writer thread. A preempted writer never makes the session wait
-/// (docs/decisions/0018-tracker-queue.md).
+/// The session thread's handle to a writer thread. The queue is lock-free, so a preempted writer never makes the
+/// session wait (docs/decisions/0018-tracker-queue.md).
 pub(super) struct Worker<T> {
     queue: Producer<Message<T>>,
     /// Dropped after the queue: its last wake-up shows the writer that the run was abandoned.
     waker: Waker,
     backpressure: Backpressure,
-    /// Number of items given so far, including dropped ones.
-    pub(super) given: u64,
+    /// Number of items passed to [`Worker::send`] so far, including dropped ones.
+    pub(super) sent: u64,
     /// Number of items that did not reach the writer.
     pub(super) dropped: u64,
-    pub(super) vitals: Arc<Vitals>,
-    watch: Watch,
+    pub(super) status: Arc<ThreadStatus>,
+    watchdog: Watchdog,
     done: Receiver<WriterResult>,
 }
 
@@ -103,15 +103,15 @@ impl<T: Send + 'static> Worker<T> {
     ) -> Result<Self, TelemetryError> {
         let (queue, items) = RingBuffer::new(capacity);
         let (done_tx, done) = channel();
-        let vitals = Arc::new(Vitals::default());
-        let watch = Watch::new(writer, S::ITEMS, Instant::now());
-        let of_thread = Arc::clone(&vitals);
+        let status = Arc::new(ThreadStatus::default());
+        let watchdog = Watchdog::new(writer, S::ITEMS, Instant::now());
+        let thread_status = Arc::clone(&status);
         let run = move || {
-            let run = AssertUnwindSafe(|| serve(&mut sink, items, &of_thread));
+            let run = AssertUnwindSafe(|| serve(&mut sink, items, &thread_status));
             let result =
                 catch_unwind(run).unwrap_or_else(|_| Err("the writer panicked".to_owned()));
             if let Err(reason) = result {
-                let _ = of_thread.fault.set(reason);
+                let _ = thread_status.fault.set(reason);
             }
             // Report first: dropping a failed sink may block.
             let _ = done_tx.send(sink.result());
@@ -119,19 +119,19 @@ impl<T: Send + 'static> Worker<T> {
         let thread = thread::Builder::new().name(writer.replace(' ', "-")).spawn(run);
         let failed = |error| TelemetryError::writer_failed(writer, error);
         let waker = Waker(thread.map_err(failed)?.thread().clone());
-        let (given, dropped) = (0, 0);
-        Ok(Worker { queue, waker, backpressure, given, dropped, vitals, watch, done })
+        let (sent, dropped) = (0, 0);
+        Ok(Worker { queue, waker, backpressure, sent, dropped, status, watchdog, done })
     }
 
     /// The next change in the writer's health. Call this until it returns `None`.
     pub(super) fn news(&mut self, now: Instant) -> Option<RecordNews> {
-        let health = self.watch.health_news(&self.vitals, now);
-        health.or_else(|| self.watch.drop_news(self.dropped, now))
+        let health = self.watchdog.health_news(&self.status, now);
+        health.or_else(|| self.watchdog.drop_news(self.dropped, now))
     }
 
-    /// Gives `item` to the writer, or counts it as dropped.
-    pub(super) fn give(&mut self, item: T) {
-        self.given += 1;
+    /// Sends `item` to the writer, or counts it as dropped.
+    pub(super) fn send(&mut self, item: T) {
+        self.sent += 1;
         let taken = match self.backpressure {
             Backpressure::DropAndCount => self.push(Message::Item(item)).is_ok(),
             Backpressure::Block => self.wait_and_push(Message::Item(item)),
@@ -151,25 +151,25 @@ impl<T: Send + 'static> Worker<T> {
 
     /// Waits for room in the queue while the writer makes progress. Returns false if the message is lost.
     fn wait_and_push(&mut self, mut message: Message<T>) -> bool {
-        let mut silence = Silence::new(Instant::now());
+        let mut stall_timer = StallTimer::new(Instant::now());
         while let Err(unsent) = self.push(message) {
-            if self.queue.is_abandoned() || self.vitals.fault.get().is_some() {
+            if self.queue.is_abandoned() || self.status.fault.get().is_some() {
                 return false;
             }
-            if silence.look(&self.vitals, Instant::now()) > SILENCE_LIMIT {
-                let limit_s = SILENCE_LIMIT.as_secs_f64();
+            if stall_timer.stalled_for(&self.status, Instant::now()) > STALL_TIMEOUT {
+                let limit_s = STALL_TIMEOUT.as_secs_f64();
                 let reason = format!("took nothing for {limit_s:.1} s; is the disk stalled?");
-                let _ = self.vitals.fault.set(reason);
+                let _ = self.status.fault.set(reason);
                 return false;
             }
             message = unsent;
             thread::sleep(RETRY);
         }
-        self.vitals.fault.get().is_none()
+        self.status.fault.get().is_none()
     }
 
-    /// Tells the thread how the run ended, and waits for it at most `limit`, even if items are still queued.
-    /// If the queue is full, returns at once without telling it.
+    /// Tells the thread how the run ended, and waits at most `limit` for it to finish. If the queue is full, returns
+    /// at once without telling it.
     pub(super) fn close_within(&mut self, manifest: &Manifest, limit: Duration) {
         if self.push(Message::Close(Box::new(manifest.clone()))).is_ok() {
             let _ = self.done.recv_timeout(limit);
@@ -185,25 +185,25 @@ impl<T: Send + 'static> Worker<T> {
         manifest: &Manifest,
         limit: Duration,
     ) -> Result<(WriterResult, Option<TelemetryError>), TelemetryError> {
-        let (mut is_told, mut is_close_sent) = (false, false);
-        let mut silence = Silence::new(Instant::now());
-        let writer = self.watch.writer;
+        let (mut has_warned, mut is_close_sent) = (false, false);
+        let mut stall_timer = StallTimer::new(Instant::now());
+        let writer = self.watchdog.writer;
         loop {
             is_close_sent =
                 is_close_sent || self.push(Message::Close(Box::new(manifest.clone()))).is_ok();
             if let Ok(result) = self.done.recv_timeout(RETRY) {
                 let failed = |reason| TelemetryError::writer_failed(writer, reason);
-                return Ok((result, self.vitals.fault.get().map(failed)));
+                return Ok((result, self.status.fault.get().map(failed)));
             }
-            let silent = silence.look(&self.vitals, Instant::now());
-            if silent > WARN_AFTER && !std::mem::replace(&mut is_told, true) {
+            let silent = stall_timer.stalled_for(&self.status, Instant::now());
+            if silent > WARN_AFTER && !std::mem::replace(&mut has_warned, true) {
                 let limit_s = limit.as_secs();
                 tracing::warn!(
                     "{writer}: waiting for it to complete its files, {limit_s} s at most"
                 );
             }
             if silent > limit {
-                return Err(TelemetryError::writer_silent(writer, silent, limit));
+                return Err(TelemetryError::writer_stalled(writer, silent, limit));
             }
         }
     }
@@ -214,13 +214,13 @@ impl<T: Send + 'static> Worker<T> {
 fn serve<S: Sink>(
     sink: &mut S,
     mut queue: Consumer<Message<S::Item>>,
-    vitals: &Vitals,
+    status: &ThreadStatus,
 ) -> Result<(), String> {
     let mut next_tick = Instant::now() + S::TICK;
     loop {
         match queue.pop() {
             Ok(Message::Item(item)) => sink.take(item)?,
-            Ok(Message::Close(manifest)) => return sink.close(&manifest, &|| vitals.beat()),
+            Ok(Message::Close(manifest)) => return sink.close(&manifest, &|| status.beat()),
             // The last item may have come just before the run was dropped.
             Err(_) if queue.is_abandoned() && queue.is_empty() => {
                 sink.tick()?;
@@ -231,7 +231,7 @@ fn serve<S: Sink>(
         if Instant::now() >= next_tick {
             sink.tick()?;
             next_tick = Instant::now() + S::TICK;
-            vitals.beat();
+            status.beat();
         }
     }
 }
@@ -297,11 +297,11 @@ mod tests {
     #[test]
     fn a_stalled_writer_drops_entries_and_never_blocks_the_caller() {
         let (mut worker, begun, permit) = gated(u64::MAX, Backpressure::DropAndCount);
-        worker.give(entry());
+        worker.send(entry());
         begun.recv().unwrap();
-        // The writer holds one entry and its queue four, so six of ten more are lost. If `give` blocked, this test
+        // The writer holds one entry and its queue four, so six of ten more are lost. If `send` blocked, this test
         // would not end.
-        (0..10).for_each(|_| worker.give(entry()));
+        (0..10).for_each(|_| worker.send(entry()));
         assert_eq!(worker.dropped, 6);
         drop(permit);
         assert_eq!(entries_left(worker), 5);
@@ -311,7 +311,7 @@ mod tests {
     fn a_writer_with_back_pressure_loses_nothing() {
         let (mut worker, _begun, permit) = gated(u64::MAX, Backpressure::Block);
         let permits = thread::spawn(move || (0..50).for_each(|_| permit.send(()).unwrap()));
-        (0..50).for_each(|_| worker.give(entry()));
+        (0..50).for_each(|_| worker.send(entry()));
         permits.join().unwrap();
         assert_eq!(worker.dropped, 0);
         assert_eq!(entries_left(worker), 50);
@@ -321,15 +321,15 @@ mod tests {
     fn a_failed_writer_is_reported_and_never_blocks_the_caller() {
         for backpressure in [Backpressure::Block, Backpressure::DropAndCount] {
             let (mut worker, _begun, permit) = gated(2, backpressure);
-            assert_eq!(worker.vitals.fault.get(), None);
-            (0..2).for_each(|_| worker.give(entry()));
+            assert_eq!(worker.status.fault.get(), None);
+            (0..2).for_each(|_| worker.send(entry()));
             drop(permit);
             let (left, fault) = worker.close(&Manifest::default(), HOUR).unwrap();
             let said = "gated: no space left; what follows is not recorded";
             assert_eq!(fault.unwrap().to_string(), said);
             assert_eq!(left.entries, 2, "the result of a failed writer");
-            assert_eq!(worker.vitals.fault.get().unwrap(), "no space left");
-            (0..10).for_each(|_| worker.give(entry()));
+            assert_eq!(worker.status.fault.get().unwrap(), "no space left");
+            (0..10).for_each(|_| worker.send(entry()));
             assert_eq!(worker.dropped, 10);
         }
     }
@@ -337,9 +337,9 @@ mod tests {
     #[test]
     fn closing_gives_up_a_stalled_writer_at_the_limit() {
         let (mut worker, begun, _permit) = gated(u64::MAX, Backpressure::DropAndCount);
-        worker.give(entry());
+        worker.send(entry());
         begun.recv().unwrap();
-        (0..4).for_each(|_| worker.give(entry()));
+        (0..4).for_each(|_| worker.send(entry()));
         let given_up = worker.close(&Manifest::default(), Duration::ZERO).unwrap_err();
         assert!(given_up.to_string().starts_with("gated: no sign of life for 0."), "{given_up}");
     }
@@ -369,7 +369,7 @@ mod tests {
         for _ in 0..3 {
             // Meanwhile the writer falls asleep.
             thread::sleep(Duration::from_millis(20));
-            worker.give(entry());
+            worker.send(entry());
             assert_eq!(heard.recv_timeout(Duration::from_secs(60)), Ok("taken"));
         }
         thread::sleep(Duration::from_millis(20));
@@ -381,14 +381,14 @@ mod tests {
     #[test]
     fn closing_waits_for_a_writer_that_beats() {
         let (mut worker, begun, permit) = gated(u64::MAX, Backpressure::DropAndCount);
-        worker.give(entry());
+        worker.send(entry());
         begun.recv().unwrap();
-        let vitals = Arc::clone(&worker.vitals);
+        let status = Arc::clone(&worker.status);
         let limit = Duration::from_secs(1);
         let beats = thread::spawn(move || {
             let end = Instant::now() + 2 * limit;
             while Instant::now() < end {
-                vitals.beat();
+                status.beat();
                 thread::sleep(RETRY);
             }
             drop(permit);

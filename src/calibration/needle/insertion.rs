@@ -10,7 +10,7 @@ use nalgebra::{Matrix2, Matrix3, Rotation3, Vector2, Vector3};
 const DEPTH_MIN_MM: f64 = 20.0;
 /// Rotations are compared over this much depth, mm.
 const SPACING_MM: f64 = 1.0;
-/// Rotations above this depth, mm, do not count: so close to the skin nothing holds the needle yet.
+/// Rotations above this depth, mm, do not count: so close to the surface the tissue does not yet hold the needle.
 pub(super) const ENTRY_MM: f64 = 3.0;
 /// The tip must turn back and forth by this much, RMS, rad/mm, to show its axis.
 const TURN_MIN_RAD_PER_MM: f64 = 0.05;
@@ -138,8 +138,8 @@ impl RecordedInsertion {
     }
 }
 
-/// The angle between the shaft's heading and the chords of the path, rad, by the mean of their vector products: those
-/// of a tip that turns or scatters cancel. Zero for an insertion shorter than a chord.
+/// The angle between the shaft's heading and the chords of the path, rad, from the sum of their cross products: turns
+/// and scatter of the tip cancel. Zero for an insertion shorter than a chord.
 fn heading_off_rad(rows: &[PosedRow], axis: &Vector3<f64>) -> f64 {
     let (mut cross, mut dot, mut first) = (Vector3::zeros(), 0.0, 0);
     for (index, row) in rows.iter().enumerate() {

@@ -12,13 +12,13 @@ use insertion::RecordedInsertion;
 use nalgebra::{SMatrix, SVector, Vector3};
 use std::fmt::Display;
 
-/// Fewer insertions than this do not show how insertions differ.
+/// Fewest insertions: the standard errors come from their scatter.
 const INSERTIONS_MIN: usize = 3;
 
-/// Above this the data do not separate the parameters.
+/// Largest element of the inverse of the scaled Hessian; above it the data do not separate the parameters.
 const CONDITION_MAX: f64 = 1e8;
 
-/// A needle with its standard errors, which come from how the insertions differ.
+/// A needle with its standard errors, which come from the scatter of the insertions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct NeedleFit {
     /// Number of insertions.
@@ -36,8 +36,8 @@ fn needle_error(reason: impl Display) -> String {
 }
 
 impl NeedleFit {
-    /// The needle of `insertions`, each with its rows in the order recorded. `noise` is that of the
-    /// positions and the paths; `name` is what an error calls an insertion, by its index.
+    /// The needle of `insertions`, each with its rows in the order recorded. `noise` is the noise of the positions
+    /// and the paths; `name` returns the name of an insertion, by its index, for errors.
     ///
     /// # Errors
     /// The insertions do not determine the needle.
@@ -80,8 +80,8 @@ struct Part<const N: usize> {
 /// and independent between insertions. The jackknife: without insertion i the parameters would change by
 /// `dᵢ = (H − Hᵢ)⁻¹ gᵢ`, and the covariance is `(n − 1)/n Σᵢ dᵢ dᵢᵀ`.
 ///
-/// `None` if all insertions together do not determine the parameters. If those without insertion i do not, its change
-/// is that of a step of the whole fit, `H⁻¹ gᵢ`, which is too small.
+/// `None` if all insertions together do not determine the parameters. If the insertions without i do not determine
+/// them, `dᵢ` is a step of the whole fit, `H⁻¹ gᵢ`, which is too small.
 fn jackknife_covariance<const N: usize>(parts: &[Part<N>]) -> Option<SMatrix<f64, N, N>> {
     let hessian: SMatrix<f64, N, N> = parts.iter().map(|part| part.hessian).sum();
     // Scaled to a unit diagonal first, so that the test for singularity does not depend on units.

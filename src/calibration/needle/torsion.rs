@@ -56,7 +56,7 @@ fn config(p: &Parameters) -> TorsionConfig {
 
 /// Roll predicted by the torsion `p` minus the recorded roll, at each row of `insertion`.
 fn residuals(insertion: &RecordedInsertion, p: &Parameters) -> Result<Vec<f64>, String> {
-    // A fit that runs away finds no needle.
+    // A fit that diverges leaves the range of a needle's torsion.
     let torsion = Torsion::new(config(p)).map_err(|_| undetermined())?;
     let (mut play, mut base_rad, mut tip_rad) = (Play::default(), 0.0, 0.0);
     let mut residuals = Vec::with_capacity(insertion.steps.len());
@@ -71,8 +71,8 @@ fn residuals(insertion: &RecordedInsertion, p: &Parameters) -> Result<Vec<f64>, 
     Ok(residuals)
 }
 
-/// The least-squares problem of one insertion, linearised at `p`, and its cost `rᵀr`. Without a band its
-/// parameters are kept out.
+/// The least-squares problem of one insertion, linearised at `p`, and its cost `rᵀr`. Unless it `has_band`, the band's
+/// parameters are excluded.
 fn linearised(
     p: &Parameters,
     insertion: &RecordedInsertion,
@@ -99,7 +99,7 @@ fn linearised(
     Ok((part, dot(&residuals_at_p, &residuals_at_p)))
 }
 
-/// Keeps parameter number `k` out of a fit.
+/// Excludes parameter number `k` from a fit.
 fn exclude(part: &mut Part<PARAMETERS>, k: usize) {
     part.hessian.row_mut(k).fill(0.0);
     part.hessian.column_mut(k).fill(0.0);
@@ -108,7 +108,7 @@ fn exclude(part: &mut Part<PARAMETERS>, k: usize) {
 }
 
 impl TorsionFit {
-    /// Least squares of the tip's roll; without a band if none is clear.
+    /// The least-squares fit to the tip's roll; without a band unless the band is clear.
     pub(super) fn of(insertions: &[RecordedInsertion]) -> Result<Self, String> {
         let fit = Self::fit(insertions, true)?;
         let is_clear = |width: f64, sd: f64| width > CLEAR_SD * sd;
@@ -124,7 +124,7 @@ impl TorsionFit {
         }
     }
 
-    /// Why this is no torsion of a needle, in words.
+    /// The reason why this cannot be a needle's torsion, in words; `None` if it can.
     pub(super) fn fault(&self) -> Option<String> {
         let values = self.torsion.in_keys();
         let outside = TorsionConfig::KEYS.iter().zip(values).find_map(|(key, (name, value))| {
@@ -165,7 +165,7 @@ impl TorsionFit {
             }
             whole.hessian += Hessian::from_diagonal(&whole.hessian.diagonal()) * damping;
             for k in 0..PARAMETERS {
-                // A parameter at its bound that would pass it.
+                // A parameter at its bound must not pass it.
                 if p[k] <= MIN[k] && whole.gradient[k] > 0.0 {
                     exclude(&mut whole, k);
                 }
@@ -191,7 +191,7 @@ impl TorsionFit {
         }
         let fitted: Vec<_> = parts.iter().map(|(part, _)| *part).collect();
         let covariance = jackknife_covariance(&fitted).ok_or_else(undetermined)?;
-        // Each insertion's own offset, by one Newton step with the other parameters kept.
+        // Each insertion's own offset, by one Newton step with the other parameters fixed.
         let offsets =
             fitted.iter().map(|part| part.gradient[OFFSET] / part.hessian[(OFFSET, OFFSET)]);
         let n = insertions.len() as f64;

@@ -155,7 +155,7 @@ impl Residuals<'_> {
         let b = -(l(0.0, 1.0) - 2.0 * centre + l(0.0, -1.0)) / (g * g);
         let c = -(l(1.0, 1.0) - l(1.0, -1.0) - l(-1.0, 1.0) + l(-1.0, -1.0)) / (4.0 * h * g);
         let determinant = a * b - c * c;
-        // Where the likelihood has no peak, each variance from its own curvature, with a standard error of at
+        // If the likelihood has no peak, each variance comes from its own curvature, with a standard error of at
         // most 0.5 for the share and 2 for the logarithm of the time.
         let (share2, time2, both) = match determinant > 0.0 && a > 0.0 {
             true => (b / determinant, a / determinant, -c / determinant),

@@ -30,7 +30,8 @@ use std::time::SystemTime;
 
 /// Default limit of the RMS distance from the circle, mm.
 const RMS_MAX_MM: f64 = 0.5;
-/// Positions that scatter about the circle by less than this part of what the tracker's noise gives are not its own.
+/// Positions that scatter about the circle by less than this share of what the tracker's noise predicts are not from
+/// this tracker.
 const SCATTER_PART_MIN: f64 = 0.25;
 
 #[derive(Debug, Subcommand)]
@@ -123,7 +124,7 @@ impl Output {
     }
 
     /// Writes the result: `json` for programs, and two templates for the values of `json` and `more`: the
-    /// operator's `summary`, and `toml` for the configuration. There is no TOML of a rehearsal: it would pass for
+    /// operator's `summary`, and `toml` for the configuration. A rehearsal has no TOML, since it could be taken for
     /// a calibration of the rig.
     fn write(&self, json: &Value, more: Shown, summary: &str, toml: Option<&str>) -> Result<()> {
         let show = |template| screen(template, json, more.clone()).map_err(Failure::environment);
@@ -141,7 +142,7 @@ impl Output {
         if self.json {
             return print_result_despite(written, true, json, || Ok(String::new()));
         }
-        // A result that cannot be written is not lost.
+        // A result that cannot be written to the file goes to stdout, so that it is not lost.
         match toml.filter(|_| self.out.is_none() || written.is_err()) {
             Some(toml) => print_stdout(toml).and(written),
             None => written,

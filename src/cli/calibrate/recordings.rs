@@ -26,7 +26,7 @@ use std::sync::mpsc::{Receiver, TryRecvError, channel};
 use std::thread;
 use std::time::Duration;
 
-/// A point is the mean of the positions of this time at rest.
+/// Time at rest over which the positions of a point are averaged.
 const REST: Duration = Duration::from_secs(1);
 /// Fewest positions that give a point.
 const POSITIONS_MIN: usize = 5;
@@ -102,7 +102,7 @@ pub(super) fn collect_fiducials(path: &Path, configured: &Configured) -> Result<
     Err(Failure::configuration("no point was taken, and no file is left"))
 }
 
-/// The operator's lines, read by a thread so that Ctrl-C and the tracker are not kept waiting.
+/// The operator's lines, read by a separate thread so that Ctrl-C and the tracker need not wait.
 fn read_lines() -> Receiver<String> {
     let (send, lines) = channel();
     thread::spawn(move || {
@@ -196,7 +196,7 @@ fn residuals(text: &str) -> String {
     }
 }
 
-/// A whole turn, and back: no cable stays wound up, and a lag in one direction is a lead in the other.
+/// A whole turn and back, so that no cable stays wound up and the lags of the two directions cancel.
 const TURNS: [&str; 2] = ["360deg", "-360deg"];
 /// Smallest rotation between two rows of a turn: a base at rest gives one row.
 const ROWS_APART_DEG: f64 = 0.5;
@@ -209,7 +209,7 @@ pub(super) fn record_turn(
     configured: &Configured,
     rehearse: bool,
 ) -> Result<(String, Config)> {
-    // A rehearsal does not write it.
+    // A rehearsal does not write the file.
     refuse_unwritable(Some(path).filter(|_| !rehearse))?;
     let configured = configured.clone().rehearsed(rehearse);
     let (mut config, _) = load_stage(configured, rehearse, sensor_off_axis)?;

@@ -28,7 +28,7 @@ pub(super) struct Keys {
 
 impl Keys {
     /// Notes that no byte is waiting at `now`, and discards a sequence that has been incomplete for too long. Bytes
-    /// that wait because this thread was held up still complete a sequence.
+    /// that wait because this thread was descheduled still complete a sequence.
     pub(super) fn idle(&mut self, now: Instant) {
         let is_old = |since: Instant| now.saturating_duration_since(since) > SEQUENCE_TIME_MAX;
         if self.pending_since.is_some_and(is_old) {
@@ -124,7 +124,7 @@ fn command(key: u8, shared: &Shared, speed_mm_per_s: &mut Option<f64>) -> Option
         let set_mm_per_s = if set_mm_per_s > 0.0 { set_mm_per_s } else { speed_max };
         let from_mm_per_s = speed_mm_per_s.unwrap_or(set_mm_per_s);
         let mm_per_s = ((from_mm_per_s / speed_max * 10.0).round() + tenths) * 0.1 * speed_max;
-        // Kept within the limits, so that presses which the session refuses do not accumulate.
+        // Clamped, so that presses which the session refuses do not accumulate.
         *speed_mm_per_s = Some(mm_per_s.clamp(0.1 * speed_max, speed_max));
         Some(OperatorCommand::Speed { mm_per_s })
     };

@@ -74,7 +74,7 @@ pub(super) struct Screen {
     /// The answer to the operator's last command, unless it is the reason of the state.
     pub(super) answer: String,
     is_held: bool,
-    /// The insertion is held, and the next event of this lane says why.
+    /// The insertion is held, and the next event of this lane gives the reason.
     reason_due: Option<Lane>,
     /// The operator has asked for something, and the next event of the session answers it.
     is_answer_due: bool,
@@ -210,8 +210,8 @@ impl Screen {
             self.faults += 1;
             self.alarm();
         }
-        // The first fault explains the end. A hold is explained by the first warning of the tracker, or by the answer
-        // to the operator. Nothing else that is said meanwhile explains anything.
+        // The first fault explains the end. The first warning of the tracker, or the answer to the operator, explains a
+        // hold. No other event in the meantime explains anything.
         let is_answer = lane == Lane::Session && mem::take(&mut self.is_answer_due);
         let is_of_tracker = lane == Lane::Tracker && severity == Severity::Warning;
         let is_reason = self.reason_due == Some(lane) && (is_answer || is_of_tracker);

@@ -113,6 +113,6 @@ fn roll_rad(tip: &Tip, bend: &Vector3<f64>) -> f64 {
     let y = -bend;
     let axes = Matrix3::from_columns(&[y.cross(&tip.heading), y, tip.heading]);
     let roll_rad = FixedAngles::from_rotation(&Rotation3::from_matrix_unchecked(axes)).roll;
-    // Rounding must not make -180 deg of 180 deg.
+    // Rounding must not change 180 deg to -180 deg.
     if roll_rad < -std::f64::consts::PI + 1e-9 { -roll_rad } else { roll_rad }
 }

@@ -46,7 +46,7 @@ pub(super) fn tracker(command: &TrackerCommand) -> Result<()> {
     }
 }
 
-/// A peer that is silent for less long is not given up: a slow tracker may pause.
+/// A connection is not given up before the peer was silent for this long: a slow tracker may pause.
 const SILENCE_MIN: Duration = Duration::from_secs(1);
 
 fn link_settings(tracker: &TrackerSection, tools: Vec<String>) -> LinkSettings {
@@ -119,7 +119,7 @@ pub(super) fn source_label(config: &Config) -> String {
 /// Interval at which a listener checks for Ctrl-C.
 const SIGNAL_POLL: Duration = Duration::from_millis(100);
 
-/// Over less than this, a rate is not given: a short recording is over at once.
+/// Shortest time over which a rate is given, s: a short recording is over at once.
 const RATE_TIME_MIN_S: f64 = 0.1;
 /// A message shows at most this many characters of the reason for a lost connection, and of an unreadable message.
 const REASON_MAX: usize = 100;
@@ -301,7 +301,7 @@ impl Listener {
         self.link.passed_over().iter().for_each(|event| self.census.note(event));
         let tool = &self.config.tracker.tool;
         match &self.trouble {
-            // The tool or its name is not to blame.
+            // Neither the tool nor its name is the cause.
             Some(trouble) if self.census.messages() == 0 || self.census.has(tool) => {
                 trouble.clone()
             }

@@ -65,7 +65,7 @@ impl SampleFile {
                 let stamp = sample.source_unix_ns.unwrap_or(0);
                 let times = [sample.receive_time.as_nanos(), stamp].map(|ns| ns.to_string());
                 let position = sample.position_mm.iter().map(f64::to_string);
-                // Empty if this sample has none: no orientation is made up.
+                // Empty if this sample has no orientation.
                 let quaternion = match sample.orientation {
                     Some(q) => [q.w, q.i, q.j, q.k].map(|part| part.to_string()),
                     None => Default::default(),

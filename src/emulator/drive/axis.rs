@@ -40,19 +40,19 @@ pub(super) struct Axis {
     pub(super) behind_since: Option<Time>,
     /// The encoder position that is 0 on the bus.
     pub(super) zero: i64,
-    /// The last target was outside the software limits and was cut to them.
+    /// True if the last target was outside the software limits and was clamped to them.
     pub(super) target_limited: bool,
     /// The state to enter when the axis stands.
     after_stop: Option<DriveState>,
     last_controlword: Controlword,
     pub(super) has_voltage: bool,
-    /// Something blocks the axis.
+    /// True while something blocks the axis.
     pub(super) is_stalled: bool,
-    /// A supervised node is lost: a fault reset and Operation Enabled are refused.
-    partner_lost: bool,
+    /// True while a supervised node is lost: a fault reset and Operation Enabled are refused.
+    supervised_node_lost: bool,
     updated: Time,
     pub(super) homing: Homing,
-    /// The last homing since power-on succeeded.
+    /// True if the last homing since power-on succeeded.
     pub(super) referenced: bool,
 }
 
@@ -71,7 +71,7 @@ impl Axis {
             last_controlword: Controlword::default(),
             has_voltage: true,
             is_stalled: false,
-            partner_lost: false,
+            supervised_node_lost: false,
             updated: Time::ZERO,
             homing: Homing::default(),
             referenced: config.homed,
@@ -93,7 +93,7 @@ impl Axis {
         if self.state == DriveState::Fault {
             let reset = Controlword::FAULT_RESET_BIT;
             let rising = controlword.has(reset) && !before.has(reset);
-            if rising && self.has_torque() && !self.partner_lost {
+            if rising && self.has_torque() && !self.supervised_node_lost {
                 device.clear_all();
                 device.objects.set(object::ERROR_CODE, 0);
                 self.power_off(now); // transition 15
@@ -122,7 +122,7 @@ impl Axis {
         match next {
             DriveState::SwitchedOn => self.has_torque(),
             DriveState::OperationEnabled => {
-                self.has_torque() && !self.partner_lost && self.after_stop.is_none()
+                self.has_torque() && !self.supervised_node_lost && self.after_stop.is_none()
             }
             _ => true,
         }
@@ -392,13 +392,13 @@ impl Axis {
 
     /// A node that this one supervises fell silent or restarted. [`EmcyCode::HEARTBEAT`] is raised.
     pub(super) fn heartbeat_lost(&mut self, now: Time, device: &mut Device) {
-        self.partner_lost = true;
+        self.supervised_node_lost = true;
         self.abort_connection(now, EmcyCode::HEARTBEAT, device);
     }
 
     /// All supervised nodes that were lost are back.
     pub(super) fn heartbeat_returned(&mut self, device: &mut Device) {
-        self.partner_lost = false;
+        self.supervised_node_lost = false;
         // During a fault the error stays active until the fault is reset.
         if !self.state.is_fault() {
             device.clear(EmcyCode::HEARTBEAT);
@@ -410,7 +410,7 @@ impl Axis {
         self.power_off(now);
         self.demand = whole(self.motion.position_at(now));
         self.last_controlword = Controlword::default();
-        self.partner_lost = false;
+        self.supervised_node_lost = false;
         self.homing = Homing::default();
         self.referenced = false;
     }

@@ -22,7 +22,7 @@ pub const HOMING_METHODS: [i8; 9] = [1, 2, 17, 18, 24, 33, 34, 35, 37];
 pub(super) struct Leg {
     /// Its end, in encoder counts.
     pub(super) to_counts: i64,
-    /// At the speed of the search for the switch (0x6099:01); otherwise of the search for zero (:02).
+    /// True for the speed during search for switch (0x6099:01), false for the speed during search for zero (:02).
     pub(super) fast: bool,
     /// The limit switch that it moves onto. Any other closed limit switch is a homing error.
     pub(super) onto: Option<End>,

@@ -26,7 +26,7 @@ pub(super) struct Inputs {
     pub(super) switches: Switches,
     /// The limit switches that are stuck closed, by [`End`].
     pub(super) stuck: [bool; 2],
-    /// The safety input is open and removes the torque: bit 3 of 0x60FD.
+    /// True while the safety input is open and removes the torque: bit 3 of 0x60FD.
     pub(super) interlocked: bool,
 }
 

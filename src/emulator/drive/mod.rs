@@ -46,7 +46,7 @@ pub struct DriveConfig {
     pub switches: Switches,
     /// The make that the drive imitates.
     pub model: Model,
-    /// It was homed since power-on.
+    /// True if the drive was homed since power-on.
     pub homed: bool,
     /// Objects besides those of the data sheet, and their bits.
     pub more_objects: Vec<(ObjectAddress, u8)>,

@@ -168,7 +168,7 @@ impl Drive {
             NmtCommand::EnterPreOperational => self.enter(now, NmtState::PreOperational),
             NmtCommand::ResetCommunication => {
                 self.enter(now, NmtState::PreOperational);
-                // The error register is no parameter: it tells of the errors that the axis still has.
+                // The error register is not a parameter: it shows the errors that the axis still has.
                 self.device.objects.reset(0x1002..=0x1fff);
                 self.boot(now);
             }
@@ -324,7 +324,7 @@ impl Drive {
     }
 
     /// Writes all values of a PDO, then informs the axis, so that a command never acts on
-    /// the target of an earlier PDO. A value that an SDO could not write is left out.
+    /// the target of an earlier PDO. Ignores a value that an SDO could not write.
     fn write_values(&mut self, now: Time, values: Values) {
         let mut written = Vec::with_capacity(values.len());
         for (object, bits) in values {

@@ -10,11 +10,11 @@ use crate::units::Time;
 /// A fault on a line.
 #[derive(Debug, Clone)]
 struct FrameFault {
-    /// The fault; its count is of the frames still to be affected.
+    /// The fault; its count is the number of frames still to be affected.
     fault: Fault,
     /// The identifier of the frames it acts on; `None` for all frames.
     id: Option<CanId>,
-    /// It acts before this time.
+    /// The fault acts before this time.
     until: Time,
 }
 
@@ -33,7 +33,7 @@ impl FrameFault {
 pub(in crate::emulator) struct FaultyLine {
     faults: Vec<FrameFault>,
     /// Frames on their way with the time of their arrival, in the order of sending.
-    under_way: VecDeque<(Time, Frame)>,
+    in_flight: VecDeque<(Time, Frame)>,
     /// Reordered frames that wait for the next frame, and their delay after it.
     held: Vec<(Duration, Frame)>,
 }
@@ -71,26 +71,26 @@ impl FaultyLine {
             } else if delay.is_zero() {
                 self.pass(now, changed);
             } else {
-                self.under_way.push_back((now + delay, changed));
+                self.in_flight.push_back((now + delay, changed));
             }
         }
     }
 
     /// The next frame that has arrived by `now`.
     pub(in crate::emulator) fn poll(&mut self, now: Time) -> Option<Frame> {
-        let arrivals = self.under_way.iter().map(|(due, _)| *due).enumerate();
+        let arrivals = self.in_flight.iter().map(|(due, _)| *due).enumerate();
         let (first, _) = arrivals.min_by_key(|(_, due)| *due).filter(|(_, due)| *due <= now)?;
-        self.under_way.remove(first).map(|(_, frame)| frame)
+        self.in_flight.remove(first).map(|(_, frame)| frame)
     }
 
     /// When [`poll`](Self::poll) next has a frame.
     pub(in crate::emulator) fn deadline(&self) -> Time {
-        self.under_way.iter().map(|(due, _)| *due).min().unwrap_or(Time::NEVER)
+        self.in_flight.iter().map(|(due, _)| *due).min().unwrap_or(Time::NEVER)
     }
 
     fn pass(&mut self, now: Time, frame: Frame) {
-        self.under_way.push_back((now, frame));
-        self.under_way.extend(self.held.drain(..).map(|(delay, held)| (now + delay, held)));
+        self.in_flight.push_back((now, frame));
+        self.in_flight.extend(self.held.drain(..).map(|(delay, held)| (now + delay, held)));
     }
 }
 

@@ -1,4 +1,4 @@
-//! Paths that are found without a search.
+//! Known paths: those that are found without a search.
 
 use super::super::arc::{Arc, Tip};
 use super::super::nearest::sharpest_arc;
@@ -19,8 +19,8 @@ const CURVATURE_SLACK: f64 = 0.05;
 impl Replanner {
     /// A path that is found without a search.
     pub(super) fn known(&mut self, last: Option<&Path>) -> Option<Path> {
-        // Where one arc is too long, several may be short enough.
-        let known = self.direct().or_else(|| self.mended(last?));
+        // If one arc is too long, several may be short enough.
+        let known = self.direct().or_else(|| self.redirected(last?));
         let known = known.or_else(|| self.nearly_direct());
         known.or_else(|| self.continued(last?)).or_else(|| self.rejoined())
     }
@@ -69,7 +69,7 @@ impl Replanner {
         self.miss_mm(path) <= self.problem.tolerance_mm
     }
 
-    /// The last path as it is from here, if it is clear and ends within the tolerance.
+    /// The `last` path unchanged, if it is clear and ends within the tolerance.
     fn continued(&mut self, last: &Path) -> Option<Path> {
         let can_follow = last.arcs.iter().all(|arc| self.can_follow(arc));
         (can_follow && self.ends_near(last) && self.is_clear(last)).then(|| last.clone())
@@ -93,12 +93,12 @@ impl Replanner {
         is_free.then(|| Path { start, arcs: vec![arc] }).filter(|path| self.is_short(path))
     }
 
-    /// The last path from here up to some point, then directly to the target; the shortest of these.
-    fn mended(&mut self, last: &Path) -> Option<Path> {
+    /// The `last` path up to some point, then directly to the target; the shortest of these paths.
+    fn redirected(&mut self, last: &Path) -> Option<Path> {
         let mut best: Option<Path> = None;
         let mut arcs = Vec::new();
         for (start, arc) in last.pieces() {
-            // The needle bends by less than it was estimated to.
+            // The needle bends less than its estimate said when the path was found.
             if !self.can_follow(&arc) {
                 break;
             }

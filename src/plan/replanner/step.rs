@@ -1,4 +1,4 @@
-//! What the replanner gets at a step, and what it answers.
+//! Input and output of the replanner at a step.
 
 use crate::plan::arc::Tip;
 use crate::plan::search::Status;
@@ -77,7 +77,7 @@ pub enum StopReason {
 /// A start from which no path leads to the target.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StartRefused {
-    /// Why, in words.
+    /// The reason, in words.
     pub reason: String,
     /// The reachable point nearest to the target, mm, of those that were found; `None` if even the start is not
     /// allowed.

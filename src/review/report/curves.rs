@@ -250,7 +250,7 @@ fn depth(run: &Run) -> Column {
     column(run, "insertion_mm")
 }
 
-/// The depth at which the position of each step was acquired: that of the step in an older record, which lacks it.
+/// The depth at which the position of each step was acquired; in an older record, which lacks it, the step's depth.
 fn measured_depth(run: &Run) -> Column {
     let acquired = column(run, "tip_meas_insertion_mm");
     acquired.into_iter().zip(depth(run)).map(|(acquired, depth)| acquired.or(depth)).collect()

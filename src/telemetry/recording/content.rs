@@ -37,7 +37,7 @@ pub(super) fn builder(manifest: &Manifest) -> RecordingStreamBuilder {
         .enabled(true)
 }
 
-/// Logs the records of a run. Takes all of them on one thread, since time lines are thread-local.
+/// Logs the records of a run. They must all come on one thread, since rerun's time lines are thread-local.
 pub(super) struct Content {
     pub(super) stream: RecordingStream,
     step: u32,
@@ -167,7 +167,7 @@ impl Content {
     }
 }
 
-/// The greatest depth, µm, after `insertion_mm` was measured.
+/// The greatest depth so far, µm: `before_um`, or `insertion_mm` if it is deeper.
 fn deepest_um(before_um: i64, insertion_mm: f64) -> i64 {
     match insertion_mm.is_finite() {
         true => before_um.max((insertion_mm * 1e3).round() as i64),

@@ -30,7 +30,7 @@ fn page(manifest: &Manifest, outcome: &str) -> String {
         manifest.stop_reason.as_ref().map_or(String::new(), |reason| format!(": {reason}"));
     let mut page = format!("# {}: {outcome}{reason}\n\n| | |\n|---|---|\n", manifest.name);
     let keys = serde_json::to_value(manifest).unwrap_or_default();
-    // The seals are for programs.
+    // The seals of the files are of no use to a reader.
     for (key, value) in keys.as_object().into_iter().flatten().filter(|(key, _)| *key != "files") {
         add_rows(&mut page, key, value);
     }

@@ -29,10 +29,10 @@ const INDEXED_CHUNKS_MAX: usize = 800;
 /// The open file and the number of its chunks, or the first error. rerun's thread writes to it.
 type Written = Arc<Mutex<Result<(Encoder<BufWriter<File>>, usize), EncodeError>>>;
 
-/// The recording of a run, made after it from all of its records, in order.
+/// Makes the recording of a run after the run, from all of its records in order.
 ///
-/// It is written as `run.rrd.new`, and renamed to `run.rrd` when it is complete and synced to the disk.
-/// It must stay on the thread that created it.
+/// Writes `run.rrd.new`, and renames it to `run.rrd` when it is complete and synced to the disk. A `Recording`
+/// must stay on the thread that created it.
 pub struct Recording {
     content: Content,
     written: Written,
@@ -47,7 +47,7 @@ impl Recording {
     /// the manifest and the configuration.
     ///
     /// # Errors
-    /// It cannot be written.
+    /// The file cannot be written.
     pub fn create(
         dir: &Path,
         manifest: &Manifest,
@@ -83,8 +83,7 @@ impl Recording {
     /// Adds a record.
     ///
     /// # Errors
-    /// Rerun refuses the record. A failed write is reported by
-    /// [`finish`](Self::finish).
+    /// Rerun refuses the record. [`finish`](Self::finish) reports a failed write.
     pub fn take(&mut self, entry: Entry) -> Result<(), TelemetryError> {
         self.content.take(entry).map_err(|error| failed(&self.path, &error))
     }
@@ -92,7 +91,7 @@ impl Recording {
     /// Completes the file, syncs it, and renames it to `run.rrd`.
     ///
     /// # Errors
-    /// It cannot be written; an earlier `run.rrd` then stays.
+    /// The file cannot be written; an earlier `run.rrd` then stays.
     pub fn finish(self) -> Result<(), TelemetryError> {
         let finish = || -> Result<(), Box<dyn Error + Send + Sync>> {
             self.content.stream.flush_blocking()?;
@@ -110,7 +109,7 @@ impl Recording {
 }
 
 impl Drop for Recording {
-    /// Removes an unfinished file. After [`finish`](Recording::finish) there is none.
+    /// Removes `run.rrd.new`, which a successful [`finish`](Recording::finish) has renamed.
     fn drop(&mut self) {
         let _ = fs::remove_file(&self.new_path);
     }

@@ -19,9 +19,9 @@ use std::f64::consts::PI;
 const TARGET_PATH: &str = "bench/plane/goal/target";
 /// Distance between the points of the planned path, mm.
 const PLANNED_STEP_MM: f64 = 2.0;
-/// Smallest side of the cubes of which each shows one occupied voxel of a mask, mm.
+/// Smallest side of the cubes into which a mask is divided for display, mm: each shows one occupied voxel.
 const MASK_STEP_MM: f64 = 3.0;
-/// At most this many voxels of a mask are shown.
+/// Largest number of voxels shown per mask.
 const MASK_POINTS_MAX: usize = 50_000;
 
 /// Logs the target with its tolerance, and the obstacles.
@@ -70,13 +70,13 @@ pub(super) fn log_goal(stream: &RecordingStream, world: &World, problem: &Proble
     Ok(())
 }
 
-/// One occupied voxel's centre of each cube that has one, and the side of the cubes, mm: `side_mm`, doubled until
-/// they are few enough.
+/// Divides `mask` into cubes of `side_mm`. Returns the centre of one occupied voxel per cube, and the side of the
+/// cubes, mm, which is doubled until at most [`MASK_POINTS_MAX`] cubes have an occupied voxel.
 fn mask_points(mask: &Mask, side_mm: f64) -> (Vec<Vector3<f64>>, f64) {
     let (mut points_mm, mut last) = (BTreeMap::new(), None);
     for point_mm in mask.occupied_mm() {
         let cube = [0, 1, 2].map(|axis| (point_mm[axis] / side_mm).floor() as i64);
-        // The next voxel is mostly in the same cube.
+        // Most often the next voxel is in the same cube.
         if last.replace(cube) != Some(cube) {
             points_mm.entry(cube).or_insert(point_mm);
         }

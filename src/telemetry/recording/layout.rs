@@ -1,5 +1,5 @@
-//! The layout with which a viewer opens the recording. `layout.toml` says what it shows, where, and in
-//! which colours.
+//! The layout with which a viewer opens the recording. `layout.toml` says what it shows, where, and in which
+//! colours.
 
 use super::content::{APPLICATION, INSERTION_DEPTH, RUN_TIME, STEP};
 use super::space::{Sheet, TRAILS};
@@ -25,7 +25,7 @@ use std::error::Error;
 const SHARED: &str = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc";
 /// rerun's class of a plot.
 const PLOT: &str = "TimeSeries";
-/// Size of a dot, in points of the screen.
+/// Size of a dot, in UI points.
 const DOT: f32 = 1.8;
 
 /// A part of the layout: a container or a view.
@@ -55,7 +55,7 @@ struct Series {
     column: String,
     name: String,
     colour: String,
-    /// Width of the line, in points of the screen; dots have none.
+    /// Width of the line, in UI points; `None` for dots.
     #[serde(default)]
     width: Option<f32>,
 }
@@ -86,7 +86,7 @@ pub(super) fn send(stream: &RecordingStream, scene: &Scene, sheet: &Sheet) -> Lo
     let (layout, storage) = builder.memory()?;
     let logged = log(&layout, &parts);
     let messages = storage.take();
-    // The storage keeps the stream alive, so it must be ended here.
+    // The storage keeps the stream alive, so the stream must be closed here.
     layout.disconnect();
     logged?;
     let Some(first) = messages.first() else { return Ok(()) };

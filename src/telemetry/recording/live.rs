@@ -1,4 +1,4 @@
-//! Shows the run to viewers while it goes on. Records that its queue cannot take are dropped and counted.
+//! Shows the run to viewers while it goes on. Records that do not fit into its queue are dropped and counted.
 
 use super::content::{Content, builder};
 use super::document::log_manifest;
@@ -10,16 +10,16 @@ use std::net::{SocketAddr, TcpListener};
 use std::thread;
 use std::time::Duration;
 
-/// At most this many records wait to be logged; others are dropped and counted.
+/// Capacity of the queue, records.
 const QUEUE_ENTRIES: usize = 32_768;
 /// Memory for the history that a viewer gets when it connects late. In addition rerun holds up to 128 MiB for
 /// viewers that do not read. Beyond that this thread blocks, its queue fills, and further records are dropped
 /// and counted.
 const HISTORY_BYTES: u64 = 64 << 20;
 /// Viewers are given this long to take the end of the run.
-const FAREWELL: Duration = Duration::from_millis(300);
+const DRAIN_TIME: Duration = Duration::from_millis(300);
 /// A frozen viewer delays the end of the run at most this long.
-pub(in crate::telemetry) const FAREWELL_MAX: Duration = Duration::from_secs(2);
+pub(in crate::telemetry) const CLOSE_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Serves the run of `manifest` to viewers at `address`, from a thread of its own. Viewers see it under the same
 /// identity as `run.rrd`.
@@ -35,7 +35,7 @@ pub(in crate::telemetry) fn serve(
     let failed = |reason: String| {
         TelemetryError::Recording(format!("--live: {address}: {reason}; is the port free?"))
     };
-    // The server would report a used port only on its own thread.
+    // The server would report a port in use only on its own thread.
     TcpListener::bind(address).map_err(|e| failed(e.to_string()))?;
     let memory_limit = MemoryLimit::from_bytes(HISTORY_BYTES);
     let options = ServerOptions { memory_limit, ..ServerOptions::default() };
@@ -57,11 +57,11 @@ impl Sink for Content {
         })
     }
 
-    /// Gives viewers some time, before the stream is dropped, which would wait for frozen viewers.
+    /// Gives viewers time to take the end of the run before the stream is dropped. The drop waits for frozen viewers.
     fn close(&mut self, manifest: &Manifest, _: &dyn Fn()) -> Result<(), String> {
         let ended = log_manifest(&self.stream, manifest);
-        let _ = self.stream.flush_with_timeout(FAREWELL);
-        thread::sleep(FAREWELL);
+        let _ = self.stream.flush_with_timeout(DRAIN_TIME);
+        thread::sleep(DRAIN_TIME);
         ended.map_err(|error| error.to_string())
     }
 }

@@ -31,9 +31,9 @@ use rerun::{
 /// The result of a function that logs.
 type Logged<T = ()> = RecordingStreamResult<T>;
 
-/// Logs a row of a table at the entity `path`: the name and the number of each of its columns, all at the current
-/// time. A name has the unit; the layout has the colours. An angle comes in radians (`_rad` in its name) and is
-/// logged in degrees (`_deg`). An unknown value is NaN, which a viewer draws as a gap.
+/// Logs a row of a table at the entity `path`, at the current time: name and value of each column. A name contains
+/// the unit; the layout has the colours. An angle comes in radians (`_rad` in its name) and is logged in degrees
+/// (`_deg`). An unknown value is NaN, which a viewer draws as a gap.
 fn log_row<N: AsRef<str>>(
     stream: &RecordingStream,
     path: &str,
@@ -42,7 +42,7 @@ fn log_row<N: AsRef<str>>(
     let cells = row.into_iter().filter_map(|(name, value)| {
         let name = name.as_ref();
         let value = if name.contains("_rad") { value.to_degrees() } else { value };
-        // Only an empty name is refused.
+        // rerun refuses only an empty name.
         let column = ComponentIdentifier::try_new(name.replace("_rad", "_deg")).ok()?;
         let column = ComponentDescriptor::partial(column).with_component_type(Scalar::name());
         let value = if value.is_finite() { value } else { f64::NAN };

@@ -8,7 +8,7 @@ use crate::units::Time;
 use rerun::RecordingStream;
 use std::time::Duration;
 
-/// The interval of a row: each speed is the mean over it, each lag the largest in magnitude.
+/// The interval between two rows of `motion`: each speed is the mean over it, each lag the largest in magnitude.
 const MOTION_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Logs records of the stage as rows.

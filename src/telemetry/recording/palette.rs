@@ -1,4 +1,4 @@
-//! Colours by meaning, from the palette of Okabe and Ito, which colour-blind readers tell apart.
+//! Colours by meaning, from the palette of Okabe and Ito, which colour-blind readers can distinguish.
 
 use rerun::Color;
 

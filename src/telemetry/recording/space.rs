@@ -44,7 +44,7 @@ impl Sheet {
     const MARGIN_MM: f64 = 10.0;
     /// Least and greatest extent of the plane to one side, without the margin, mm.
     const SIDE_MM: [f64; 2] = [20.0, 1000.0];
-    /// The sheet does not follow a needle that is further away than this, mm.
+    /// The sheet does not follow a needle that starts further away than this, mm.
     const PLACE_MM_MAX: f64 = 10_000.0;
     /// At most about this many depths have a label.
     const LABELS_MAX: f64 = 6.0;
@@ -134,7 +134,7 @@ pub(super) struct Space {
 }
 
 impl Space {
-    /// Logs the layout, the plane, its labelled axes and the goal; and colours and sizes of what moves.
+    /// Logs the layout, the plane, its labelled axes and the goal, and the colours and sizes of what moves.
     pub(super) fn open(stream: &RecordingStream, scene: &Scene) -> Logged<Self> {
         let sheet = Sheet::of(scene);
         layout::send(stream, scene, &sheet)?;
@@ -260,26 +260,26 @@ fn principal(covariance_mm2: &Matrix3<f64>) -> (Vector3<f64>, Rotation3<f64>) {
     let eigen = covariance_mm2.symmetric_eigen();
     let half_sizes_mm = eigen.eigenvalues.map(|l| (CHI_SQUARE_95 * l.max(0.0)).sqrt());
     let mut axes = eigen.eigenvectors;
-    // Eigenvectors have no sign: make them a rotation.
+    // The sign of an eigenvector is arbitrary: make the three a rotation.
     if axes.determinant() < 0.0 {
         axes.column_mut(2).neg_mut();
     }
     (half_sizes_mm, Rotation3::from_matrix_unchecked(axes))
 }
 
-/// `pose` as rerun takes it.
+/// `pose` as rerun's type.
 pub(super) fn transform(pose: &Pose) -> Transform3D {
     Transform3D::update_fields()
         .with_translation(point(&pose.translation))
         .with_quaternion(quaternion(&pose.rotation))
 }
 
-/// A point, mm, as rerun takes it.
+/// A point, mm, as rerun's type.
 pub(super) fn point(mm: &Vector3<f64>) -> [f32; 3] {
     mm.cast::<f32>().into()
 }
 
-/// `rotation` as rerun takes it.
+/// `rotation` as rerun's type.
 pub(super) fn quaternion(rotation: &Rotation3<f64>) -> Quaternion {
     let q = UnitQuaternion::from_rotation_matrix(rotation).into_inner().cast::<f32>();
     Quaternion::from_xyzw([q.i, q.j, q.k, q.w])

@@ -59,7 +59,8 @@ impl States {
         stream.log(path, &StateChange::update_fields().with_state([state]))
     }
 
-    /// Notes that `lane` has entered `state`. A recent event explains it; a good state needs no earlier event.
+    /// Notes that `lane` has entered `state`. A recent event explains it; a good state is not explained by an earlier
+    /// event.
     pub(super) fn enter(&mut self, time: Time, lane: &str, state: &str, meaning: Meaning) {
         let row = self.row(lane);
         (row.state, row.since) = (state.to_owned(), time);

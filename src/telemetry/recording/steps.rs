@@ -25,7 +25,7 @@ fn column(n: usize, provenance: &str) -> String {
 }
 
 /// Columns of `steps.csv` that are in other tables or time lines.
-const ELSEWHERE: [&str; 4] = ["step", "time_s", "insertion_mm", "rotation_rad"];
+const OMITTED_COLUMNS: [&str; 4] = ["step", "time_s", "insertion_mm", "rotation_rad"];
 
 /// Logs records of steps as rows.
 #[derive(Default)]
@@ -63,9 +63,9 @@ impl Steps {
             log_row(stream, &format!("shadows/{name}"), row)?;
         }
         let cells = StepRow::new(step, known_truth);
-        let recorded = STEP_COLUMNS
-            .iter()
-            .filter(|(name, _)| !ELSEWHERE.contains(name) && (has_truth || !is_truth_column(name)));
+        let recorded = STEP_COLUMNS.iter().filter(|(name, _)| {
+            !OMITTED_COLUMNS.contains(name) && (has_truth || !is_truth_column(name))
+        });
         let recorded = recorded.map(|(name, value)| {
             let value = match *name {
                 "roll_est_rad" => estimate[ROLL],

@@ -1,4 +1,4 @@
-//! Signs of life of the recording threads, and what is reported when they stop.
+//! Heartbeats of the recording threads, and the watchdog that reports a thread that stalls, fails or loses items.
 
 use super::TelemetryError;
 use std::mem;
@@ -6,55 +6,56 @@ use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// A thread that is silent for this long is reported to the operator.
+/// After this long without a heartbeat, a stalled thread is reported to the operator.
 const WARN_AFTER: Duration = Duration::from_millis(700);
-/// A thread that is silent for this long is given up.
-pub(super) const SILENCE_LIMIT: Duration = Duration::from_secs(5);
+/// After this long without a heartbeat, a thread is given up.
+pub(super) const STALL_TIMEOUT: Duration = Duration::from_secs(5);
 /// Minimum interval between two warnings of dropped records.
 const DROP_WARNING_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Whether a recording thread works, shared without a lock.
+/// The state of a recording thread, shared without a lock.
 #[derive(Debug, Default)]
-pub(super) struct Vitals {
-    /// Signs of life so far.
+pub(super) struct ThreadStatus {
+    /// Number of heartbeats so far.
     pub(super) beats: AtomicU64,
-    /// The first reason why it has failed.
+    /// The reason of the first failure.
     pub(super) fault: OnceLock<String>,
 }
 
-impl Vitals {
-    /// A sign of life: at every tick, and now and then while the files are completed.
+impl ThreadStatus {
+    /// A heartbeat: sent at every tick, and while the files are completed.
     pub(super) fn beat(&self) {
         self.beats.fetch_add(1, Ordering::Relaxed);
     }
 }
 
-/// At most this much of the time between two looks counts as silence, since the watcher itself may have been
-/// descheduled or stopped by a debugger.
-const LOOK_MAX: Duration = Duration::from_millis(50);
+/// At most this much of the time between two checks counts as time without a heartbeat, since the watcher itself may
+/// have been descheduled or stopped by a debugger.
+const CHECK_GAP_MAX: Duration = Duration::from_millis(50);
 
-/// How long a thread has shown no sign of life.
+/// Measures the time since a thread's last heartbeat, without the watcher's own stalls.
 #[derive(Debug)]
-pub(super) struct Silence {
+pub(super) struct StallTimer {
     beats: u64,
-    last_look: Instant,
-    /// The time without a sign of life up to the last look.
-    lasted: Duration,
+    last_check: Instant,
+    /// The time without a heartbeat, up to the last check.
+    stalled: Duration,
 }
 
-impl Silence {
+impl StallTimer {
     /// Starts at `now`.
     pub(super) fn new(now: Instant) -> Self {
-        Silence { beats: 0, last_look: now, lasted: Duration::ZERO }
+        StallTimer { beats: 0, last_check: now, stalled: Duration::ZERO }
     }
 
-    /// Looks at the thread at `now`. Returns how long it has shown no sign of life.
-    pub(super) fn look(&mut self, vitals: &Vitals, now: Instant) -> Duration {
-        let elapsed = now.saturating_duration_since(mem::replace(&mut self.last_look, now));
-        let beats = vitals.beats.load(Ordering::Relaxed);
+    /// Checks the thread at `now`. Returns the time since its last heartbeat.
+    pub(super) fn stalled_for(&mut self, status: &ThreadStatus, now: Instant) -> Duration {
+        let elapsed = now.saturating_duration_since(mem::replace(&mut self.last_check, now));
+        let beats = status.beats.load(Ordering::Relaxed);
         let is_alive = mem::replace(&mut self.beats, beats) != beats;
-        self.lasted = if is_alive { Duration::ZERO } else { self.lasted + elapsed.min(LOOK_MAX) };
-        self.lasted
+        self.stalled =
+            if is_alive { Duration::ZERO } else { self.stalled + elapsed.min(CHECK_GAP_MAX) };
+        self.stalled
     }
 }
 
@@ -71,54 +72,58 @@ pub enum RecordNews {
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
 enum Health {
     Alive,
-    Silent,
+    Stalled,
     GivenUp,
     Failed,
 }
 
 /// Watches one recording thread.
 #[derive(Debug)]
-pub(super) struct Watch {
+pub(super) struct Watchdog {
     pub(super) writer: &'static str,
     /// The items that it takes.
     items: &'static str,
-    silence: Silence,
+    stall_timer: StallTimer,
     /// The last health that was reported.
     health: Health,
     /// The number of lost items in the last report, and its time.
     reported_drops: Option<(u64, Instant)>,
 }
 
-impl Watch {
+impl Watchdog {
     /// Watches `writer`, which takes `items`, from `now` on.
     pub(super) fn new(writer: &'static str, items: &'static str, now: Instant) -> Self {
-        let (silence, health) = (Silence::new(now), Health::Alive);
-        Watch { writer, items, silence, health, reported_drops: None }
+        let (stall_timer, health) = (StallTimer::new(now), Health::Alive);
+        Watchdog { writer, items, stall_timer, health, reported_drops: None }
     }
 
     /// The change of the thread's health by `now`.
-    pub(super) fn health_news(&mut self, vitals: &Vitals, now: Instant) -> Option<RecordNews> {
-        let before_s = self.silence.lasted.as_secs_f64();
-        let (writer, lasted) = (self.writer, self.silence.look(vitals, now));
-        let health = match vitals.fault.get() {
+    pub(super) fn health_news(
+        &mut self,
+        status: &ThreadStatus,
+        now: Instant,
+    ) -> Option<RecordNews> {
+        let before_s = self.stall_timer.stalled.as_secs_f64();
+        let (writer, stalled) = (self.writer, self.stall_timer.stalled_for(status, now));
+        let health = match status.fault.get() {
             Some(_) => Health::Failed,
-            None if lasted > SILENCE_LIMIT => Health::GivenUp,
-            None if lasted > WARN_AFTER => Health::Silent,
+            None if stalled > STALL_TIMEOUT => Health::GivenUp,
+            None if stalled > WARN_AFTER => Health::Stalled,
             None => Health::Alive,
         };
         if mem::replace(&mut self.health, health) == health {
             return None;
         }
-        let text = match (health, vitals.fault.get()) {
+        let text = match (health, status.fault.get()) {
             (Health::Alive, _) => format!("{writer}: alive again after {before_s:.1} s"),
             (_, Some(reason)) => TelemetryError::writer_failed(writer, reason).to_string(),
-            _ => TelemetryError::writer_silent(writer, lasted, SILENCE_LIMIT).to_string(),
+            _ => TelemetryError::writer_stalled(writer, stalled, STALL_TIMEOUT).to_string(),
         };
         let is_failed = health >= Health::GivenUp;
         Some(if is_failed { RecordNews::Failed(text) } else { RecordNews::Warning(text) })
     }
 
-    /// What is new at `now`, if `dropped` items were lost so far because the queue was full.
+    /// The report at `now` of newly lost items, if any; `dropped` items were lost so far because the queue was full.
     pub(super) fn drop_news(&mut self, dropped: u64, now: Instant) -> Option<RecordNews> {
         let (before, is_recent) = self.reported_drops.map_or((0, false), |(drops, time)| {
             (drops, now.saturating_duration_since(time) < DROP_WARNING_INTERVAL)
@@ -143,10 +148,10 @@ impl Watch {
 mod tests {
     use super::*;
 
-    /// A thread, and a watcher that looks at it every `every_ms`.
+    /// A thread, and a watcher that checks it every `every_ms`.
     struct Watched {
-        vitals: Vitals,
-        watch: Watch,
+        status: ThreadStatus,
+        watch: Watchdog,
         now: Instant,
         every_ms: u64,
     }
@@ -155,8 +160,8 @@ mod tests {
         fn new(every_ms: u64) -> Self {
             let now = Instant::now();
             Watched {
-                vitals: Vitals::default(),
-                watch: Watch::new("text files", "records", now),
+                status: ThreadStatus::default(),
+                watch: Watchdog::new("text files", "records", now),
                 now,
                 every_ms,
             }
@@ -167,7 +172,7 @@ mod tests {
             let mut reports = Vec::new();
             for n in 1..=ms / self.every_ms {
                 self.now += Duration::from_millis(self.every_ms);
-                let health = self.watch.health_news(&self.vitals, self.now);
+                let health = self.watch.health_news(&self.status, self.now);
                 let drops = self.watch.drop_news(dropped, self.now);
                 for news in health.into_iter().chain(drops) {
                     let text = match news {
@@ -184,14 +189,14 @@ mod tests {
     #[test]
     fn a_stall_is_reported_within_a_second_and_given_up_after_five() {
         let mut watched = Watched::new(5);
-        watched.vitals.beat();
+        watched.status.beat();
         let reports = watched.reports_of_next(10_000, 0);
         let stalled = "text files: no sign of life for 0.7 s (given up after 5.0); is the disk \
                       stalled?";
         assert_eq!(reports[0], (710, stalled.to_owned()));
         assert!(reports[1].1.starts_with("failed: text files: no sign of life for 5.0 s"));
         assert_eq!((reports.len(), reports[1].0), (2, 5010));
-        watched.vitals.beat();
+        watched.status.beat();
         let reports = watched.reports_of_next(100, 0);
         assert_eq!(reports, [(5, "text files: alive again after 10.0 s".to_owned())]);
     }
@@ -199,7 +204,7 @@ mod tests {
     #[test]
     fn a_watcher_that_was_descheduled_raises_no_alarm() {
         let mut watched = Watched::new(3000);
-        watched.vitals.beat();
+        watched.status.beat();
         assert_eq!(watched.reports_of_next(30_000, 0), []);
     }
 
@@ -207,7 +212,7 @@ mod tests {
     fn a_thread_that_beats_raises_no_alarm() {
         let mut watched = Watched::new(50);
         for _ in 0..100 {
-            watched.vitals.beat();
+            watched.status.beat();
             assert_eq!(watched.reports_of_next(600, 0), []);
         }
     }
@@ -215,8 +220,8 @@ mod tests {
     #[test]
     fn a_fault_is_reported_once() {
         let mut watched = Watched::new(5);
-        watched.vitals.fault.set("no space left".to_owned()).unwrap();
-        watched.vitals.fault.set("and again".to_owned()).unwrap_err();
+        watched.status.fault.set("no space left".to_owned()).unwrap();
+        watched.status.fault.set("and again".to_owned()).unwrap_err();
         let said = "failed: text files: no space left; what follows is not recorded";
         assert_eq!(watched.reports_of_next(1000, 0), [(5, said.to_owned())]);
     }
@@ -224,14 +229,14 @@ mod tests {
     #[test]
     fn lost_records_are_a_failure_once_and_then_a_warning() {
         let mut watched = Watched::new(50);
-        watched.vitals.beat();
+        watched.status.beat();
         let reports = watched.reports_of_next(100, 3);
         let said = "failed: text files: records lost: 3, its queue is full; is the disk too slow for \
                     this run?";
         assert_eq!(reports, [(50, said.to_owned())]);
         let mut reports = Vec::new();
         for _ in 0..12 {
-            watched.vitals.beat();
+            watched.status.beat();
             reports.extend(watched.reports_of_next(100, 4).into_iter().map(|(_, text)| text));
         }
         assert_eq!(reports, ["text files: records lost: 1 more, 4 in all"]);
@@ -242,7 +247,7 @@ mod tests {
         let mut watched = Watched::new(50);
         let mut reports = Vec::new();
         for dropped in 1..=20 {
-            watched.vitals.beat();
+            watched.status.beat();
             reports.extend(watched.reports_of_next(100, dropped));
         }
         let said: Vec<&str> = reports.iter().map(|(_, text)| text.as_str()).collect();
@@ -265,7 +270,7 @@ mod tests {
             given_up.starts_with("failed: text files: no sign of life for 5.0 s"),
             "{given_up}"
         );
-        watched.vitals.fault.set("Input/output error".to_owned()).unwrap();
+        watched.status.fault.set("Input/output error".to_owned()).unwrap();
         let said = "failed: text files: Input/output error; what follows is not recorded";
         assert_eq!(watched.reports_of_next(1000, 0), [(5, said.to_owned())]);
     }
@@ -274,12 +279,12 @@ mod tests {
     fn a_silence_counts_only_the_time_that_the_watcher_ran() {
         let ms = Duration::from_millis;
         let begin = Instant::now();
-        let vitals = Vitals::default();
-        let mut silence = Silence::new(begin);
-        assert_eq!(silence.look(&vitals, begin + ms(30)), ms(30));
+        let status = ThreadStatus::default();
+        let mut stall_timer = StallTimer::new(begin);
+        assert_eq!(stall_timer.stalled_for(&status, begin + ms(30)), ms(30));
         // The watcher was suspended for ten seconds.
-        assert_eq!(silence.look(&vitals, begin + ms(10_030)), ms(80));
-        vitals.beat();
-        assert_eq!(silence.look(&vitals, begin + ms(10_040)), ms(0));
+        assert_eq!(stall_timer.stalled_for(&status, begin + ms(10_030)), ms(80));
+        status.beat();
+        assert_eq!(stall_timer.stalled_for(&status, begin + ms(10_040)), ms(0));
     }
 }
