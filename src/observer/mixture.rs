@@ -99,7 +99,8 @@ pub(super) fn reduce<H: Hypothesis>(mixture: &mut Vec<H>, weight_min: f64) {
     mixture.sort_by(|a, b| b.log_weight().total_cmp(&a.log_weight()));
     let Some(most) = mixture.first().map(H::log_weight) else { return };
     mixture.iter_mut().for_each(|h| *h.log_weight_mut() -= most);
-    mixture.retain(|h| h.log_weight() > math::ln(weight_min));
+    let log_weight_min = math::ln(weight_min);
+    mixture.retain(|h| h.log_weight() > log_weight_min);
     let mut kept = 1;
     while kept < mixture.len() {
         let (likelier, others) = mixture.split_at_mut(kept);

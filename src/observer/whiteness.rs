@@ -72,8 +72,9 @@ pub struct Whiteness {
     variance_mm2: f64,
     /// The last innovations, newest first.
     last: VecDeque<Vector3<f64>>,
-    /// Sums of products at each lag, from 0; old products fade.
-    products_mm2: [f64; LAGS + 1],
+    /// Sum of the squares of the innovations, and of twice their products at each lag with Bartlett's weights (the
+    /// estimate of Newey and West, times their number); old ones fade.
+    long_run_sum_mm2: f64,
     /// Number of innovations in the sums; old ones fade.
     count: f64,
     /// The configured noise of the positions, and the variance that the observer assumes, mm².
@@ -86,8 +87,8 @@ impl Whiteness {
     pub fn new(position_sd_mm: f64) -> Self {
         Whiteness {
             variance_mm2: position_sd_mm.powi(2),
-            last: VecDeque::with_capacity(LAGS + 1),
-            products_mm2: [0.0; LAGS + 1],
+            last: VecDeque::with_capacity(LAGS),
+            long_run_sum_mm2: 0.0,
             count: 0.0,
             noise: None,
         }
@@ -106,23 +107,21 @@ impl Whiteness {
         if !innovation_mm.iter().all(|component| component.is_finite()) {
             return;
         }
-        self.last.truncate(LAGS);
-        self.last.push_front(innovation_mm);
         let keep = 1.0 - 1.0 / MEMORY;
         self.count = keep * self.count + 1.0;
-        for (product, earlier) in self.products_mm2.iter_mut().zip(&self.last) {
-            *product = keep * *product + innovation_mm.dot(earlier);
-        }
+        // With Bartlett's weights the sum is the variance of a mean, so it is never negative.
+        let weight = |lag: u32| 1.0 - f64::from(lag) / (LAGS + 1) as f64;
+        let earlier: Vector3<f64> = (1..).zip(&self.last).map(|(lag, i)| i * weight(lag)).sum();
+        self.long_run_sum_mm2 =
+            keep * self.long_run_sum_mm2 + innovation_mm.dot(&(innovation_mm + earlier * 2.0));
+        self.last.truncate(LAGS - 1);
+        self.last.push_front(innovation_mm);
     }
 
     /// The variance inflation f: how many positions, `spacing_s` apart, carry as much information as one
     /// position with the configured white noise. It is at least 1, and at least the f of the configured noise.
     pub fn inflation(&self, spacing_s: f64) -> f64 {
-        // With Bartlett's weights the sum is the variance of a mean, so it is never negative.
-        let weight = |lag: usize| 1.0 - lag as f64 / (LAGS + 1) as f64;
-        let [squares, lagged @ ..] = &self.products_mm2;
-        let correlated: f64 = (1..).zip(lagged).map(|(lag, product)| weight(lag) * product).sum();
-        let measured = (squares + 2.0 * correlated) / (3.0 * self.variance_mm2);
+        let measured = self.long_run_sum_mm2 / (3.0 * self.variance_mm2);
         let configured = self.noise.map(|(noise, variance_mm2)| {
             (noise.long_mean_variance_mm2(spacing_s) / variance_mm2).max(1.0)
         });

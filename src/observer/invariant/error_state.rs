@@ -7,8 +7,10 @@
 //! - anchor: λ where the base last reversed;
 //! - backlog: rotation that was pushed but that the tip, which creeps, has not made yet.
 
-use crate::geometry::{Pose, Twist};
+use crate::geometry::{Pose, Twist, so3};
 use nalgebra::{Matrix3, Matrix6, Vector3};
+use std::array;
+use std::ops::Mul;
 
 // Indices into the error state. The first six states are the left-invariant error of the pose, a twist
 // (v; w) in the tip frame: `g = ĝ Exp(ε)`. The others are parameters, each as true minus estimated.
@@ -47,22 +49,56 @@ pub(super) enum Extent {
     Banded,
 }
 
-impl Extent {
-    /// Number of states.
-    fn states(self) -> usize {
-        match self {
-            Extent::Rigid => CURVATURE + 1,
-            Extent::Creeping => BACKLOG + 1,
-            Extent::Banded => STATES,
+/// A linear map of pose errors, twists (v; w), of the form `v ← A v + B w`, `w ← A w`. Adjoint matrices and
+/// Jacobians of SE(3) have this form, and so have their products.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct PoseMap {
+    a: Matrix3<f64>,
+    b: Matrix3<f64>,
+}
+
+impl PoseMap {
+    fn identity() -> Self {
+        PoseMap { a: Matrix3::identity(), b: Matrix3::zeros() }
+    }
+
+    /// `Ad(g⁻¹)`.
+    pub(super) fn adjoint_inverse(g: &Pose) -> Self {
+        let a = g.rotation.matrix().transpose();
+        PoseMap { a, b: -a * so3::hat(&g.translation) }
+    }
+
+    /// The right Jacobian of SE(3) to second order, `J_r(δ) ≈ I − ad_δ/2 + ad_δ²/6`: after the pose is corrected by
+    /// δ, the remaining error η becomes `J_r(δ) η`, since `Exp(−δ) Exp(δ + η) ≈ Exp(J_r(δ) η)`.
+    pub(super) fn right_jacobian(delta: &Twist) -> Self {
+        let (v, w) = (so3::hat(&delta.v), so3::hat(&delta.w));
+        PoseMap {
+            a: Matrix3::identity() - w * 0.5 + w * w / 6.0,
+            b: (w * v + v * w) / 6.0 - v * 0.5,
         }
+    }
+
+    /// Maps one twist.
+    pub(super) fn times(&self, twist: &[f64; 6]) -> [f64; 6] {
+        let [a, b, c, d, e, f] = *twist;
+        let w = Vector3::new(d, e, f);
+        let (v, w) = (self.a * Vector3::new(a, b, c) + self.b * w, self.a * w);
+        [v.x, v.y, v.z, w.x, w.y, w.z]
     }
 }
 
-/// The transition of the error state over one or several increments.
+impl Mul for PoseMap {
+    type Output = PoseMap;
+    fn mul(self, first: PoseMap) -> PoseMap {
+        PoseMap { a: self.a * first.a, b: self.a * first.b + self.b * first.a }
+    }
+}
+
+/// The transition of the error state over a correction of the pose and the increments after it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Transition {
-    /// Motion of the tip: its pose at the end in its frame at the start.
-    pub(super) motion: Pose,
+    /// Maps the pose error.
+    pub(super) pose: PoseMap,
     /// Derivative of the pose error with respect to the error of the curvature.
     pub(super) by_curvature: [f64; 6],
     /// Derivative of the pose error with respect to the error of the backlog.
@@ -94,17 +130,6 @@ pub(super) struct Covariance {
     p: [[f64; STATES]; STATES],
 }
 
-/// `Ad(g⁻¹)` on the twist (v; w), without the matrix.
-pub(super) fn adjoint_inverse(g: &Pose, twist: &[f64; 6]) -> [f64; 6] {
-    let r = g.rotation.matrix();
-    let [x, y, z] = [g.translation.x, g.translation.y, g.translation.z];
-    let [a, b, c, d, e, f] = *twist;
-    let v = [a - (y * f - z * e), b - (z * d - x * f), c - (x * e - y * d)];
-    let turn = |k: usize, u: [f64; 3]| r[(0, k)] * u[0] + r[(1, k)] * u[1] + r[(2, k)] * u[2];
-    let w = [d, e, f];
-    [turn(0, v), turn(1, v), turn(2, v), turn(0, w), turn(1, w), turn(2, w)]
-}
-
 /// The bracket `ad_ξ τ` of twists (v; w).
 pub(super) fn bracket(xi: &Twist, tau: &[f64; 6]) -> [f64; 6] {
     let (v, w) = (Vector3::new(tau[0], tau[1], tau[2]), Vector3::new(tau[3], tau[4], tau[5]));
@@ -132,31 +157,6 @@ impl Covariance {
 
     pub(super) fn add_variance(&mut self, state: usize, variance: f64) {
         self.p[state][state] += variance;
-    }
-
-    /// Moves the covariance to the pose corrected by `delta`, to second order in δ. The remaining
-    /// error η becomes `J_r(δ) η` with the right Jacobian of SE(3),
-    /// `Exp(−δ) Exp(δ + η) ≈ Exp(J_r(δ) η)` and `J_r(δ) ≈ I − ad_δ/2 + ad_δ²/6`.
-    pub(super) fn shift(&mut self, delta: &Twist) {
-        self.transform(self.extent.states(), |error| {
-            let once = bracket(delta, &std::array::from_fn(|k| error[k]));
-            let twice = bracket(delta, &once);
-            for k in 0..6 {
-                error[k] += twice[k] / 6.0 - 0.5 * once[k];
-            }
-        });
-    }
-
-    /// Replaces P, which has so many states, by J P Jᵀ: `apply` replaces an error vector by J times it.
-    fn transform(&mut self, states: usize, apply: impl Fn(&mut ErrorState)) {
-        self.p[..states].iter_mut().for_each(&apply);
-        for i in 0..states {
-            let mut column = std::array::from_fn(|k| self.p[k][i]);
-            apply(&mut column);
-            for (row, value) in self.p[..states].iter_mut().zip(column) {
-                row[i] = value;
-            }
-        }
     }
 
     /// Adds process noise of the roll. A turn of the tip reduces the backlog by as much.
@@ -191,7 +191,9 @@ impl Covariance {
 
     /// True if every number is finite and no variance is negative.
     pub(super) fn is_sound(&self) -> bool {
-        self.p.iter().flatten().all(|v| v.is_finite()) && (0..STATES).all(|i| self.p[i][i] >= 0.0)
+        // Without a short cut, which would cost more than it saves.
+        let is_finite = self.p.iter().flatten().fold(true, |all, v| all & v.is_finite());
+        is_finite && (0..STATES).all(|i| self.p[i][i] >= 0.0)
     }
 
     /// Propagates the covariance: `P ← F P Fᵀ`, plus the variance of the push.
@@ -204,7 +206,14 @@ impl Covariance {
     }
 
     fn propagate_states<const N: usize>(&mut self, t: &Transition) {
-        self.transform(N, |error| t.apply::<N>(error));
+        // P is symmetric, so F (F P)ᵀ is F P Fᵀ.
+        t.apply::<N>(&mut self.p);
+        for i in 0..N {
+            for j in 0..i {
+                (self.p[i][j], self.p[j][i]) = (self.p[j][i], self.p[i][j]);
+            }
+        }
+        t.apply::<N>(&mut self.p);
         if t.push_variance > 0.0 {
             // A tip that creeps takes up the push later; any other turns at once.
             let tip = if t.backlog_kept < 1.0 { BACKLOG } else { ROLL };
@@ -239,15 +248,16 @@ impl Covariance {
         innovation: &Vector3<f64>,
         weight: &Matrix3<f64>,
     ) -> ErrorState {
-        let cross: [[f64; 3]; N] = std::array::from_fn(|i| [0, 1, 2].map(|k| self.p[i][k]));
+        let position: [[f64; N]; 3] = array::from_fn(|k| array::from_fn(|j| self.p[k][j]));
         let mut delta = [0.0; STATES];
         for i in 0..N {
-            let c = cross[i];
-            let gain = [0, 1, 2]
-                .map(|k| c[0] * weight[(0, k)] + c[1] * weight[(1, k)] + c[2] * weight[(2, k)]);
-            delta[i] = gain[0] * innovation.x + gain[1] * innovation.y + gain[2] * innovation.z;
-            for (p, c) in self.p[i].iter_mut().zip(&cross) {
-                *p -= gain[0] * c[0] + gain[1] * c[1] + gain[2] * c[2];
+            let [x, y, z] = [0, 1, 2].map(|k| position[k][i]);
+            let gain = |k: usize| x * weight[(0, k)] + y * weight[(1, k)] + z * weight[(2, k)];
+            let (gain_x, gain_y, gain_z) = (gain(0), gain(1), gain(2));
+            delta[i] = gain_x * innovation.x + gain_y * innovation.y + gain_z * innovation.z;
+            for j in 0..N {
+                self.p[i][j] -=
+                    gain_x * position[0][j] + gain_y * position[1][j] + gain_z * position[2][j];
             }
         }
         delta
@@ -255,10 +265,10 @@ impl Covariance {
 }
 
 impl Transition {
-    /// The transition without any motion.
+    /// The transition that changes nothing.
     pub(super) fn none() -> Self {
         Transition {
-            motion: Pose::identity(),
+            pose: PoseMap::identity(),
             by_curvature: [0.0; 6],
             by_backlog: [0.0; 6],
             backlog_kept: 1.0,
@@ -269,28 +279,44 @@ impl Transition {
         }
     }
 
-    /// Replaces an error vector, of which the first N states count, by F times it.
-    pub(super) fn apply<const N: usize>(&self, error: &mut ErrorState) {
-        let mut pose = adjoint_inverse(&self.motion, &std::array::from_fn(|i| error[i]));
-        for (p, by) in pose.iter_mut().zip(&self.by_curvature) {
-            *p += by * error[CURVATURE];
+    /// Replaces the matrix `m`, of which the first N rows and columns count, by F times it.
+    pub(super) fn apply<const N: usize>(&self, m: &mut [[f64; STATES]; STATES]) {
+        let row = |i: usize| -> [f64; N] { array::from_fn(|j| m[i][j]) };
+        let (v, w, curvature) =
+            ([row(0), row(1), row(2)], [row(3), row(4), row(5)], row(CURVATURE));
+        let PoseMap { a, b } = &self.pose;
+        for k in 0..3 {
+            let (a0, a1, a2) = (a[(k, 0)], a[(k, 1)], a[(k, 2)]);
+            let (b0, b1, b2) = (b[(k, 0)], b[(k, 1)], b[(k, 2)]);
+            let (bent, turned) = (self.by_curvature[k], self.by_curvature[3 + k]);
+            for j in 0..N {
+                m[k][j] = a0 * v[0][j]
+                    + a1 * v[1][j]
+                    + a2 * v[2][j]
+                    + bent * curvature[j]
+                    + b0 * w[0][j]
+                    + b1 * w[1][j]
+                    + b2 * w[2][j];
+                m[3 + k][j] = a0 * w[0][j] + a1 * w[1][j] + a2 * w[2][j] + turned * curvature[j];
+            }
         }
         if N > BACKLOG {
-            for (p, by) in pose.iter_mut().zip(&self.by_backlog) {
-                *p += by * error[BACKLOG];
+            let backlog: [f64; N] = array::from_fn(|j| m[BACKLOG][j]);
+            for i in 0..6 {
+                let by = self.by_backlog[i];
+                (0..N).for_each(|j| m[i][j] += by * backlog[j]);
             }
-            error[BACKLOG] *= self.backlog_kept;
+            (0..N).for_each(|j| m[BACKLOG][j] *= self.backlog_kept);
         }
         if N > LAG {
-            let edge = error[self.push_edge] - error[ANCHOR];
-            for (by, cause) in [(&self.by_edge, edge), (&self.by_growth, error[GROWTH])] {
-                for (p, by) in pose.iter_mut().zip(&by.pose) {
-                    *p += by * cause;
-                }
-                error[BACKLOG] += by.backlog * cause;
-                error[LAG] += by.lag * cause;
-            }
+            let edge: [f64; N] = array::from_fn(|j| m[self.push_edge][j] - m[ANCHOR][j]);
+            let growth: [f64; N] = array::from_fn(|j| m[GROWTH][j]);
+            let mut add = |i: usize, by_edge: f64, by_growth: f64| {
+                (0..N).for_each(|j| m[i][j] += by_edge * edge[j] + by_growth * growth[j]);
+            };
+            (0..6).for_each(|i| add(i, self.by_edge.pose[i], self.by_growth.pose[i]));
+            add(BACKLOG, self.by_edge.backlog, self.by_growth.backlog);
+            add(LAG, self.by_edge.lag, self.by_growth.lag);
         }
-        error[..6].copy_from_slice(&pose);
     }
 }

@@ -7,8 +7,8 @@
 //! and torsion are additional states.
 
 use super::error_state::{
-    ANCHOR, BACKLOG, CURVATURE, Covariance, ErrorState, Extent, GROWTH, LAG, LOWER, Transition,
-    UPPER, adjoint_inverse, bracket,
+    ANCHOR, BACKLOG, CURVATURE, Covariance, ErrorState, Extent, GROWTH, LAG, LOWER, PoseMap,
+    Transition, UPPER, bracket,
 };
 use super::positive_part::PositivePart;
 use crate::geometry::{Pose, Twist};
@@ -76,7 +76,7 @@ pub(super) struct Hypothesis {
     pub(super) insertion_mm: f64,
     stroke: Stroke,
     pub(super) covariance: Covariance,
-    /// Transition since the covariance was last propagated.
+    /// Transition since the covariance was last propagated or corrected.
     pending: Transition,
     pending_mm: f64,
     /// Logarithm of the weight, up to a constant common to the bank.
@@ -244,34 +244,30 @@ impl Hypothesis {
             w: Vector3::new(self.curvature_per_mm * bend_rad, 0.0, turn_rad),
         };
         let step = Pose::exp(&xi);
+        let back = PoseMap::adjoint_inverse(&step);
 
         let t = &mut self.pending;
-        t.by_curvature = adjoint_inverse(&step, &t.by_curvature);
+        t.by_curvature = back.times(&t.by_curvature);
         let bend = right_jacobian_times(&xi, [0.0, slip_mm, 0.0, bend_rad, 0.0, 0.0]);
         add_scaled(&mut t.by_curvature, &bend, 1.0);
         if self.covariance.extent() != Extent::Rigid {
             let roll = right_jacobian_times(&xi, [0.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
             let followed = 1.0 - backlog_kept;
-            t.by_backlog = adjoint_inverse(&step, &t.by_backlog);
+            t.by_backlog = back.times(&t.by_backlog);
             add_scaled(&mut t.by_backlog, &roll, t.backlog_kept * followed);
             t.backlog_kept *= backlog_kept;
             for (pushed, by) in [(&mut t.by_edge, by_edge), (&mut t.by_growth, by_growth)] {
-                pushed.pose = adjoint_inverse(&step, &pushed.pose);
+                pushed.pose = back.times(&pushed.pose);
                 let turn = pushed.backlog * followed + by * (1.0 - push_kept);
                 add_scaled(&mut pushed.pose, &roll, turn);
                 pushed.backlog = pushed.backlog * backlog_kept + by * push_kept;
                 pushed.lag += by;
             }
         }
-        t.motion = t.motion * step;
+        t.pose = back * t.pose;
         self.pending_mm += insertion_mm;
         self.insertion_mm += insertion_mm;
         self.x_pb = self.x_pb * step;
-    }
-
-    /// True while the covariance has not been propagated to the depth of the mean.
-    pub(super) fn is_covariance_behind(&self) -> bool {
-        self.pending_mm > 0.0 || self.pending.motion != Pose::identity()
     }
 
     /// The transition since the covariance was last propagated.
@@ -318,8 +314,7 @@ impl Hypothesis {
         self.log_weight -= 0.5 * (square + math::ln(s.determinant()));
         let delta = self.covariance.correct(&innovation, &weight);
         // The error is now that of the corrected pose: `Exp(ε⁺) = Exp(−δ) Exp(ε)`.
-        let xi = self.apply(&delta);
-        self.covariance.shift(&xi);
+        self.pending.pose = PoseMap::right_jacobian(&self.apply(&delta));
         Some(square)
     }
 

@@ -148,18 +148,13 @@ impl Observer for Invariant {
     }
 
     fn estimate_after(&self, increments: &[Increment]) -> Option<Estimate> {
-        let estimate =
-            if increments.is_empty() && self.bank.iter().all(|h| !h.is_covariance_behind()) {
-                bank::estimate(&self.bank)?
-            } else {
-                let noise = self.config.process_noise(&self.needle);
-                let mut ahead = self.bank.clone();
-                for h in &mut ahead {
-                    increments.iter().for_each(|&increment| h.predict(increment));
-                    h.propagate_covariance(Some(&noise));
-                }
-                bank::estimate(&ahead)?
-            };
+        let noise = self.config.process_noise(&self.needle);
+        let mut ahead = self.bank.clone();
+        for h in &mut ahead {
+            increments.iter().for_each(|&increment| h.predict(increment));
+            h.propagate_covariance(Some(&noise));
+        }
+        let estimate = bank::estimate(&ahead)?;
         let mut belief = estimate.belief?;
         belief.nis = self.innovations.back().copied();
         for coordinate in 0..3 {

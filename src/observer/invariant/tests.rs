@@ -307,10 +307,10 @@ proptest! {
         let h = 1e-6;
         let (low, high) = (moved(-h), moved(h));
         let difference = (low.x_pb.inverse() * high.x_pb).log().to_vector() / (2.0 * h);
-        let mut error: error_state::ErrorState = [0.0; error_state::STATES];
-        error[nudged] = 1.0;
-        moved(0.0).transition().apply::<{ error_state::STATES }>(&mut error);
-        let column = SVector::<f64, 6>::from_column_slice(&error[..6]);
+        let mut columns = [[0.0; error_state::STATES]; error_state::STATES];
+        (0..error_state::STATES).for_each(|i| columns[i][i] = 1.0);
+        moved(0.0).transition().apply::<{ error_state::STATES }>(&mut columns);
+        let column = SVector::<f64, 6>::from_fn(|i, _| columns[i][nudged]);
         prop_assert!((difference - column).amax() < 1e-3 * (1.0 + column.amax()), "{difference} {column}");
     }
 }
