@@ -10,6 +10,9 @@ const AGREEMENT_MIN: f64 = 1e-3;
 /// deviation.
 pub(super) const ALIKE_SD: f64 = 0.5;
 
+/// Hypotheses below this fraction of the largest weight are dropped.
+pub(super) const WEIGHT_MIN: f64 = 1e-5;
+
 /// One hypothesis of a mixture.
 pub(super) trait Hypothesis {
     /// Logarithm of the weight, up to a constant common to the mixture.
@@ -93,13 +96,12 @@ pub(super) fn mean<H: Hypothesis>(mixture: &[H], covariance_power: f64) -> Optio
     Some(Mean { x_pb, covariance, roll_agreement: agreement.min(1.0) })
 }
 
-/// Drops hypotheses below the fraction `weight_min` of the largest weight, and merges a hypothesis
-/// into a likelier one if the two agree.
-pub(super) fn reduce<H: Hypothesis>(mixture: &mut Vec<H>, weight_min: f64) {
+/// Drops unlikely hypotheses, and merges a hypothesis into a likelier one if the two agree.
+pub(super) fn reduce<H: Hypothesis>(mixture: &mut Vec<H>) {
     mixture.sort_by(|a, b| b.log_weight().total_cmp(&a.log_weight()));
     let Some(most) = mixture.first().map(H::log_weight) else { return };
     mixture.iter_mut().for_each(|h| *h.log_weight_mut() -= most);
-    let log_weight_min = math::ln(weight_min);
+    let log_weight_min = math::ln(WEIGHT_MIN);
     mixture.retain(|h| h.log_weight() > log_weight_min);
     let mut kept = 1;
     while kept < mixture.len() {

@@ -1,5 +1,6 @@
 //! The rolls and the covariance with which an observer starts at the first measured position.
 
+use super::mixture::WEIGHT_MIN;
 use crate::geometry::FixedAngles;
 use crate::math;
 use crate::units::wrap_angle;
@@ -15,13 +16,8 @@ pub(super) fn is_one_roll(sd_rad: f64) -> bool {
 }
 
 /// Rolls at the start: value, standard deviation, share. If one is not enough, there are `count` around the circle,
-/// and their standard deviation is half their spacing. Rolls with a smaller share than `share_min` are left out.
-pub(super) fn rolls(
-    start_rad: f64,
-    sd_rad: f64,
-    count: u32,
-    share_min: f64,
-) -> Vec<(f64, f64, f64)> {
+/// and their standard deviation is half their spacing. Rolls that would be dropped at once are left out.
+pub(super) fn rolls(start_rad: f64, sd_rad: f64, count: u32) -> Vec<(f64, f64, f64)> {
     if is_one_roll(sd_rad) {
         return vec![(start_rad, sd_rad, 1.0)];
     }
@@ -33,7 +29,7 @@ pub(super) fn rolls(
             let share = if unknown { 1.0 } else { math::exp(-0.5 * (off / sd_rad).powi(2)) };
             (start_rad + off, 0.5 * spacing_rad, share)
         })
-        .filter(|&(_, _, share)| share > share_min)
+        .filter(|&(_, _, share)| share > WEIGHT_MIN)
         .collect()
 }
 

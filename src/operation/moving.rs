@@ -1,12 +1,9 @@
 //! Moves one axis to a goal; the other is held.
 
-use crate::session::{AxisMove, Profile, Record, Shell, State, Task};
+use crate::session::{ARRIVAL_TIMEOUT, AxisMove, Profile, Record, Shell, State, Task};
 use crate::stage::{Axis, Feedback, SetPoint, StageEvent};
 use crate::units::Time;
 use std::time::Duration;
-
-/// Time after the last set-point by which the axis must be within its arrival tolerance.
-const ARRIVAL_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// A move of one axis, in mm or rad.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -2,7 +2,7 @@
 
 use super::config::SessionConfig;
 use super::target::TargetTool;
-use crate::control::{Bend, BendLaw, Command, ControlKind};
+use crate::control::{Bend, BendLaw, Command};
 use crate::geometry::Pose;
 use crate::observer::Estimate;
 use crate::plan::{
@@ -171,14 +171,11 @@ pub struct Pursuit {
 }
 
 impl Pursuit {
-    /// `None` if the control law cannot follow a path.
-    pub fn new(goal: Goal, config: &SessionConfig) -> Option<Self> {
+    /// The law is nested saturation: the configuration refuses a target with another one.
+    pub fn new(goal: Goal, config: &SessionConfig) -> Self {
         let SessionConfig { needle, control, .. } = config;
-        if control.kind != ControlKind::NestedSaturation {
-            return None;
-        }
         let stopping_mm = config.insertion.stopping_mm(&config.stage);
-        Some(Pursuit {
+        Pursuit {
             replanner: goal.replanner().with_stopping_mm(stopping_mm),
             law: BendLaw::new(*needle, control.nested_saturation),
             target_mm: goal.problem.target_mm,
@@ -187,7 +184,7 @@ impl Pursuit {
             planned_at_mm: 0.0,
             curvature_per_mm: needle.curvature_per_mm(),
             stopping_mm,
-        })
+        }
     }
 
     /// Sets the position of the target, plane frame, mm.
@@ -416,7 +413,7 @@ mod tests {
         let slack_mm = goal.world.slack_mm(&goal.problem.target_mm, 2.0);
         assert!(slack_mm + goal.problem.tolerance_mm < 0.0, "{slack_mm}");
         let config = Config::from_sources(&[], &[]).unwrap().session().unwrap();
-        assert_eq!(Pursuit::new(goal, &config).unwrap().check_target(), Ok(()));
+        assert_eq!(Pursuit::new(goal, &config).check_target(), Ok(()));
     }
 
     #[test]

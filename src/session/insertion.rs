@@ -13,8 +13,8 @@ use std::time::Duration;
 const DUE_TOLERANCE_MM: f64 = 1e-3;
 /// Time after the last set-point from which a position within `insertion.arrival_mm` counts as arrived.
 const ARRIVAL_PATIENCE: Duration = Duration::from_millis(300);
-/// Time after the last set-point by which the axis must be within its arrival tolerance.
-const ARRIVAL_TIMEOUT: Duration = Duration::from_secs(2);
+/// Time after the last set-point by which an axis must be within its arrival tolerance.
+pub(crate) const ARRIVAL_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// The phase of a step of a stepwise insertion.
 #[derive(Debug, Clone)]

@@ -39,6 +39,7 @@ pub use state::State;
 pub use steering::{Decision, Steering};
 pub use target::{MovingMean, TargetTool};
 
+pub(crate) use insertion::ARRIVAL_TIMEOUT;
 pub(crate) use news::{stage_news, tracker_news};
 pub(crate) use profile::Profile;
 pub(crate) use shell::Shell;

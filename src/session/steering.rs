@@ -66,7 +66,7 @@ impl Steering {
             observer: build(&config.observer),
             shadows,
             control: config.control.build(config.needle),
-            pursuit: config.goal.clone().and_then(|goal| Pursuit::new(goal, config)),
+            pursuit: config.goal.clone().map(|goal| Pursuit::new(goal, config)),
             depth_mm: 0.0,
             handedness,
             samples: config.insertion.corrected_by,

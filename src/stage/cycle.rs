@@ -162,10 +162,6 @@ impl Stage {
         }
     }
 
-    pub(super) fn both_heard(&self) -> bool {
-        self.drives.all(|drive| drive.statusword.is_some())
-    }
-
     /// Reports where the axes stand, and begins to enable them once they may have power. Returns whether the next
     /// SYNC may be sent.
     fn stand_by(&mut self, now: Time, give_up: Time, located: bool) -> bool {

@@ -153,7 +153,7 @@ impl Drive {
         self.seed(position);
         self.home_counts = state.home_counts;
         if let Some(fault) = state.found_in_fault {
-            self.allow_reset(fault.error_code);
+            self.reset = FaultReset::Due(fault.error_code);
         }
     }
 
@@ -240,11 +240,6 @@ impl Drive {
             self.reset = FaultReset::Sent(0);
         }
         controlword
-    }
-
-    /// Allows one reset, of the fault with this code that the drive was found in.
-    fn allow_reset(&mut self, error_code: Option<EmcyCode>) {
-        self.reset = FaultReset::Due(error_code);
     }
 
     /// Withdraws the reset once the fault that the drive was found in is over, by the reset or by itself.

@@ -305,7 +305,8 @@ impl Stage {
 
     /// Where the axes were last measured; `None` before both drives have answered a SYNC.
     pub fn position(&self) -> Option<SetPoint> {
-        self.both_heard().then(|| self.positions(Drive::measured))
+        let both_answered = self.drives.all(|drive| drive.statusword.is_some());
+        both_answered.then(|| self.positions(Drive::measured))
     }
 
     /// True once a stop has begun.

@@ -121,7 +121,10 @@ impl AxisStop {
                 // leave before the next request does.
                 self.sdo.leave_operational();
             }
-            self.wait_to_read_again(trouble).await?;
+            if self.sdo.now() >= self.give_up {
+                return Err(trouble);
+            }
+            self.sdo.pause(READ_PERIOD).await;
         }
     }
 
@@ -193,14 +196,5 @@ impl AxisStop {
 
     async fn statusword(&mut self) -> Result<Statusword, String> {
         self.sdo.statusword().await.inspect_err(|_| self.request_failed = true)
-    }
-
-    /// Waits before the next read. Once the time is over, `trouble` is the error.
-    async fn wait_to_read_again(&self, trouble: String) -> Result<(), String> {
-        if self.sdo.now() >= self.give_up {
-            return Err(trouble);
-        }
-        self.sdo.pause(READ_PERIOD).await;
-        Ok(())
     }
 }

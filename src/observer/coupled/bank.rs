@@ -13,8 +13,6 @@ use std::f64::consts::PI;
 /// Number of copies for an unknown roll. x alone corrects the roll of a copy, so they must start near enough to the
 /// true one: eight were too few (`docs/decisions/0029-coupled-from-anywhere.md`).
 const ROLLS: u32 = 16;
-/// Copies below this fraction of the largest weight are dropped.
-const WEIGHT_MIN: f64 = 1e-5;
 /// Weight of each challenger at its start, as a fraction of the weight of the last copy.
 const CHALLENGER_WEIGHT: f64 = 1e-4;
 /// x depends on the sine of the roll, so near ±90° it does not correct the roll.
@@ -183,7 +181,7 @@ impl CoupledBank {
         log_weight: f64,
     ) {
         self.since_start_mm = 0.0;
-        for (roll, roll_sd, share) in start::rolls(start.roll, start_sd.roll, ROLLS, WEIGHT_MIN) {
+        for (roll, roll_sd, share) in start::rolls(start.roll, start_sd.roll, ROLLS) {
             let angles = FixedAngles { roll, ..*start };
             let sd = FixedAngles { roll: roll_sd, ..*start_sd };
             self.bank.push(RollHypothesis {
@@ -256,7 +254,7 @@ impl Observer for CoupledBank {
         // correlated its noise is with that of the next.
         let sd_mm = variance_mm2.sqrt().min(self.config.position_sd_mm);
         self.start_copies_if_due((tip_meas, sd_mm));
-        mixture::reduce(&mut self.bank, WEIGHT_MIN);
+        mixture::reduce(&mut self.bank);
     }
 
     fn position_mm(&self) -> Option<Vector3<f64>> {

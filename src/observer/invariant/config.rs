@@ -116,7 +116,7 @@ impl InvariantConfig {
         tip_meas: &TipPosition,
     ) -> Vec<Hypothesis> {
         let priors = self.priors(torsion.config());
-        let rolls = start::rolls(self.start.roll, self.start_sd.roll, ROLLS, super::WEIGHT_MIN);
+        let rolls = start::rolls(self.start.roll, self.start_sd.roll, ROLLS);
         let each = rolls.iter().flat_map(|roll| priors.iter().map(move |prior| (roll, prior)));
         each.map(|(&(roll, roll_sd, share), prior)| {
             let angles = FixedAngles { roll, ..self.start };

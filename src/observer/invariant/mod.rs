@@ -23,8 +23,6 @@ use hypothesis::Hypothesis;
 use nalgebra::Vector3;
 use std::collections::VecDeque;
 
-/// Hypotheses below this fraction of the largest weight are dropped.
-const WEIGHT_MIN: f64 = 1e-5;
 /// Number of innovations over which divergence is judged.
 const INNOVATIONS: usize = 20;
 
@@ -110,7 +108,7 @@ impl Invariant {
             self.innovations.pop_front();
         }
         self.innovations.push_back(likeliest.1);
-        mixture::reduce(&mut self.bank, WEIGHT_MIN);
+        mixture::reduce(&mut self.bank);
     }
 }
 
