@@ -93,9 +93,26 @@ fn both_axes_are_enabled_at_one_sync_and_nothing_moves() {
 fn a_position_offset_from_an_earlier_use_does_not_move_the_axis() {
     let mut bench = Bench::new(config());
     bench.rotation.set(0x60b0, 0, 500_i32);
+    bench.rotation.set(0x60b1, 0, -3_i32);
+    bench.rotation.set(0x60b2, 0, 7_i16);
     bench.until_ready();
     bench.run_for(Duration::from_millis(200));
-    assert_eq!((bench.rotation.counts, bench.rotation.value(0x60b0, 0)), (-20, 0));
+    let offsets = [0x60b0, 0x60b1, 0x60b2].map(|index| bench.rotation.value(index, 0));
+    assert_eq!((bench.rotation.counts, offsets), (-20, [0; 3]));
+}
+
+/// Its RPDO5 would go on writing what an earlier use mapped to it.
+#[test]
+fn a_drive_with_eight_pdos_has_only_the_first_of_them_on() {
+    let mut bench = Bench::new(config());
+    for (index, cob_id) in [(0x1400, 0x0000_0581_u32), (0x1800, 0x4000_0481)] {
+        (1..8).for_each(|offset| bench.insertion.set(index + offset, 1, cob_id + u32::from(offset)));
+    }
+    bench.until_ready();
+    for index in [0x1400, 0x1800] {
+        let on = (0..8).filter(|offset| bench.insertion.value(index + offset, 1) >> 31 == 0);
+        assert_eq!(on.collect::<Vec<_>>(), [0]);
+    }
 }
 
 /// A modulo axis of an earlier use: a reading would stand for several positions.
