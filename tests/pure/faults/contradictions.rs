@@ -211,6 +211,21 @@ fn a_registration_that_is_turned() {
     assert!(bench.reason().contains("another roll at the start"), "{}", bench.reason());
 }
 
+/// The needle is clamped half a turn from where the configured roll has it, which looks like a mirrored needle too.
+#[test]
+fn a_start_roll_that_is_half_a_turn_off_is_asked_for() {
+    let told = ["observer.start.roll_deg=-150", "observer.invariant.start_sd.roll_deg=15"];
+    for seed in 1..=4 {
+        let seed = format!("emulator.seed={seed}");
+        let (bench, stopped_mm) =
+            contradicted(steered(&[&told[..], &[&seed]].concat()), 0.0, |_| {});
+        let reason = bench.reason();
+        println!("{stopped_mm:.1} mm: {reason}");
+        assert!(reason.starts_with("tracker: the positions fit "), "{reason}");
+        assert!(reason.contains("observer.start.roll_deg") && stopped_mm < 40.0, "{reason}");
+    }
+}
+
 /// By 45°, far from the heading at the start that the observer assumes.
 #[test]
 fn a_registration_that_is_tilted() {
