@@ -43,7 +43,7 @@ const COUNTS: [&str; 2] = ["step", "tip_positions"];
 
 /// The columns of `steps.csv`. Scripts rely on them: add columns at the end, and never rename or move one.
 /// A column that is added here appears in `run.rrd` too, with angles in degrees.
-pub const STEP_COLUMNS: [StepColumn; 38] = [
+pub const STEP_COLUMNS: [StepColumn; 39] = [
     ("step", |c| Some(c.step.step.into())),
     // The quotient is the f64 nearest to the decimal number; a product with 1e-9 may not be.
     ("time_s", |c| Some(c.step.time.as_nanos() as f64 / 1e9)),
@@ -83,6 +83,7 @@ pub const STEP_COLUMNS: [StepColumn; 38] = [
     ("target_z_true_mm", |c| c.target_true.map(|p| p.z)),
     ("tip_meas_insertion_mm", |c| c.step.tip_meas_insertion_mm),
     ("target_error_pred_sd_mm", |c| c.approach?.error_sd_mm),
+    ("curvature_est_per_mm", |c| Some(c.step.decision.estimate?.belief?.curvature_per_mm)),
 ];
 
 /// The first line of `steps.csv`, without its newline.
@@ -152,7 +153,7 @@ pub fn is_truth_column(column: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::observer::Estimate;
+    use crate::observer::{Belief, Estimate, Shaft};
     use crate::session::Decision;
     use nalgebra::Rotation3;
 
@@ -171,14 +172,14 @@ mod tests {
     fn header_is_frozen() {
         assert_eq!(
             steps_csv_header(),
-            "step,time_s,insertion_mm,rotation_rad,rotation_cmd_rad_per_mm,x_meas_mm,y_meas_mm,z_meas_mm,x_est_mm,y_est_mm,z_est_mm,yaw_est_rad,pitch_est_rad,roll_est_rad,x_sd_mm,y_sd_mm,z_sd_mm,yaw_sd_rad,pitch_sd_rad,roll_sd_rad,x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad,tip_positions,target_distance_mm,target_error_pred_mm,path_left_mm,target_x_mm,target_y_mm,target_z_mm,target_x_true_mm,target_y_true_mm,target_z_true_mm,tip_meas_insertion_mm,target_error_pred_sd_mm"
+            "step,time_s,insertion_mm,rotation_rad,rotation_cmd_rad_per_mm,x_meas_mm,y_meas_mm,z_meas_mm,x_est_mm,y_est_mm,z_est_mm,yaw_est_rad,pitch_est_rad,roll_est_rad,x_sd_mm,y_sd_mm,z_sd_mm,yaw_sd_rad,pitch_sd_rad,roll_sd_rad,x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad,tip_positions,target_distance_mm,target_error_pred_mm,path_left_mm,target_x_mm,target_y_mm,target_z_mm,target_x_true_mm,target_y_true_mm,target_z_true_mm,tip_meas_insertion_mm,target_error_pred_sd_mm,curvature_est_per_mm"
         );
     }
 
     #[test]
     fn unknown_values_are_empty() {
         let row = StepRow::new(&step(), None).to_string();
-        assert_eq!(row, format!("7,7.3,7.001,-0.1{},0{}", ",".repeat(22), ",".repeat(11)));
+        assert_eq!(row, format!("7,7.3,7.001,-0.1{},0{}", ",".repeat(22), ",".repeat(12)));
     }
 
     #[test]
@@ -194,7 +195,7 @@ mod tests {
                 estimate: Some(Estimate {
                     x_pb: pose(1.25, Rotation3::identity()),
                     sd: Some([0.5, 0.5, 0.5, 0.125, 0.125, 3.0]),
-                    belief: None,
+                    belief: Some(Belief::certain(0.0125, Shaft::RIGID)),
                 }),
                 approach: Some(Approach {
                     target_mm: Vector3::new(0.0, 8.0, 90.5),
@@ -213,7 +214,7 @@ mod tests {
         assert_eq!(
             StepRow::new(&full, Some(&truth)).to_string(),
             "7,7.3,7.001,-0.1,0.30000000000000004,1.5,NaN,-inf,1.25,-2.0,1e-9,0.0,0.0,0.0,\
-             0.5,0.5,0.5,0.125,0.125,3.0,1.0,-2.0,1e-9,0.0,0.5,0.0,1,3.5,0.25,,0.0,8.0,90.5,0.0,8.5,90.5,6.75,0.75"
+             0.5,0.5,0.5,0.125,0.125,3.0,1.0,-2.0,1e-9,0.0,0.5,0.0,1,3.5,0.25,,0.0,8.0,90.5,0.0,8.5,90.5,6.75,0.75,0.0125"
         );
     }
 

@@ -15,6 +15,9 @@ use std::fmt;
 use std::fs;
 use std::path::Path;
 
+/// A needle that bends by less than this part of its configured curvature misses the plane for that reason.
+const BENT_PART_MIN: f64 = 0.5;
+
 /// The exit status of a run. Success means that the run completed and left its record, whole if `config` requires
 /// that.
 pub(super) fn status(config: &Config, report: &RunReport) -> u8 {
@@ -66,10 +69,18 @@ pub(super) fn ending(config: &Config, report: &RunReport) -> String {
                 .to_owned()
         }
         (None, None) => "completed".to_owned(),
-        (None, Some(off_mm)) => format!(
-            "completed, not in the plane: {off_mm:.1} mm RMS off it over the last third by the estimate \
-             (limit {OFF_PLANE_LIMIT_MM:.1}); start nearer to it, or insert deeper if the tip was still approaching it"
-        ),
+        (None, Some(off_mm)) => match bent_part(config, report).filter(|part| *part < BENT_PART_MIN) {
+            Some(part) => format!(
+                "completed, not in the plane: {off_mm:.1} mm RMS off it by the estimate (limit \
+                 {OFF_PLANE_LIMIT_MM:.1}); the needle bent by {:.0}% of what needle.radius_mm says: check bevel, \
+                 tissue and radius (needle-bench calibrate needle)",
+                100.0 * part
+            ),
+            None => format!(
+                "completed, not in the plane: {off_mm:.1} mm RMS off it over the last third by the estimate (limit \
+                 {OFF_PLANE_LIMIT_MM:.1}); start nearer to it, or insert deeper if the tip was still approaching it"
+            ),
+        },
         (Some(reason), _) => format!("stopped: {reason}"),
     });
     lines.join("\n")
@@ -92,6 +103,12 @@ pub(super) fn plan_status(config: &Config, report: &RunReport) -> Option<PlanSta
 pub(super) fn plane_missed_by_mm(report: &RunReport) -> Option<f64> {
     let is_completed = report.outcome == Outcome::Completed;
     report.figures.plane_missed_by_mm().filter(|_| is_completed)
+}
+
+/// The estimated curvature at the end as a part of the configured one; `None` if the observer has no belief.
+fn bent_part(config: &Config, report: &RunReport) -> Option<f64> {
+    let estimated_per_mm = report.figures.curvature_per_mm()?;
+    Some((estimated_per_mm / config.needle.arc.curvature_per_mm()).max(0.0))
 }
 
 /// The lines after an insertion with the configuration at `path`: where the needle is, and the next command.

@@ -25,6 +25,8 @@ const LOG_ODDS_MAX: f64 = 7.0;
 /// Another roll at the start ends the run only if it is `e^10` times as likely, because `e^7` stopped one correct run
 /// of 2,000. Its odds grow so fast that this takes only 2 to 4 mm more.
 const TURNED_LOG_ODDS_MAX: f64 = 10.0;
+/// Two alternatives whose odds differ by at most a factor of `e^3` are both asked for.
+const ALIKE_LOG_ODDS: f64 = 3.0;
 /// At most this many positions per mm count as independent.
 const INDEPENDENT_PER_MM: f64 = 20.0;
 /// Share of the bank that searches for a torsion if none is configured: the shaft is assumed to
@@ -61,18 +63,42 @@ impl Alternative {
         }
     }
 
-    /// Advice to the operator, as a question.
-    fn question(self) -> &'static str {
+    /// Advice to the operator, as a question. That about a mirrored needle asks for the roll too if another roll
+    /// `is_likely` as well.
+    fn question(self, is_likely: impl Fn(Alternative) -> bool) -> &'static str {
         match self {
+            Alternative::Mirrored if is_likely(Alternative::Turned) => {
+                "is an axis mirrored, stage.rotation.sign or observer.start.roll_deg wrong, or the stream another's?"
+            }
             Alternative::Mirrored => {
                 "is a tracker axis mirrored, stage.rotation.sign wrong, or the stream another's?"
             }
             Alternative::Tilted => {
                 "is the registration tilted, or observer.start or start_sd wrong?"
             }
-            Alternative::Turned => "is the registration turned, or observer.start.roll_deg wrong?",
+            Alternative::Turned => {
+                "is observer.start.roll_deg or the registration wrong, did the chuck slip, or the tissue change?"
+            }
         }
     }
+}
+
+/// Why the run must stop after `depth_mm`, if the log odds of any alternative are over its limit. Names the likeliest
+/// alternative, which may be another one: a limit that is higher is reached later.
+fn contradiction(odds: &[(Alternative, f64)], depth_mm: f64) -> Option<String> {
+    let over = odds.iter().filter(|(alternative, log_odds)| *log_odds > alternative.log_odds_max());
+    let lowest = over.map(|(alternative, _)| alternative.log_odds_max()).reduce(f64::min)?;
+    let known = odds.iter().filter(|(_, log_odds)| !log_odds.is_nan());
+    let (likeliest, log_odds) = *known.max_by(|(_, a), (_, b)| a.total_cmp(b))?;
+    let own = likeliest.log_odds_max();
+    let limit = if log_odds > own { own } else { lowest };
+    let question = likeliest.question(|other| {
+        odds.iter().any(|(each, odds)| *each == other && *odds >= log_odds - ALIKE_LOG_ODDS)
+    });
+    Some(format!(
+        "the positions fit {likeliest} e^{log_odds:.0} times better after {depth_mm:.1} mm (limit e^{limit:.0}): \
+         {question}"
+    ))
 }
 
 /// Compares the configured model with its alternatives until the odds decide.
@@ -146,24 +172,17 @@ impl HandednessWatch {
         let variance_mm2 = self.position_sd_mm.powi(2) / independent;
         self.configured.correct_with(tip_meas, variance_mm2);
         let (configured, depth_mm) = (self.configured.log_evidence(), self.insertion_mm);
-        let contradiction = &mut self.contradiction;
+        let mut odds = Vec::with_capacity(self.alternatives.len());
         self.alternatives.retain_mut(|(alternative, model)| {
             model.correct_with(tip_meas, variance_mm2);
             // Noise beyond the configured standard deviation exaggerates every difference. The
             // innovations of the alternative itself show by how much.
             let log_odds = (model.log_evidence() - configured) / model.innovation_excess();
-            if log_odds > alternative.log_odds_max() {
-                let (limit, question) = (alternative.log_odds_max(), alternative.question());
-                contradiction.get_or_insert_with(|| {
-                    format!(
-                        "the positions fit {alternative} e^{log_odds:.0} times better after {depth_mm:.1} mm (limit \
-                         e^{limit:.0}): {question}"
-                    )
-                });
-            }
+            odds.push((*alternative, log_odds));
             let is_too_deep = *alternative == Alternative::Tilted && depth_mm > HEADING_JUDGED_MM;
             !model.is_lost() && log_odds > -LOG_ODDS_MAX && !is_too_deep
         });
+        self.contradiction = contradiction(&odds, depth_mm);
         // Without the configured model there is nothing to compare with.
         if self.configured.is_lost() {
             self.give_up();
@@ -187,5 +206,46 @@ impl HandednessWatch {
     /// True once the comparison is over, for or against the configured model.
     pub fn is_decided(&self) -> bool {
         self.contradiction.is_some() || self.alternatives.is_empty()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Alternative::{Mirrored, Tilted, Turned};
+    use super::*;
+
+    /// What is said of these log odds after 123.4 mm, without what is the same in all messages.
+    fn said(odds: &[(Alternative, f64)]) -> String {
+        let text = contradiction(odds, 123.4).unwrap_or_default();
+        assert!(format!("tracker: {text}").len() < 200, "{text}");
+        let text = text.replace(" times better after 123.4 mm", "");
+        text.trim_start_matches("the positions fit ").to_owned()
+    }
+
+    #[test]
+    fn the_likeliest_alternative_is_named() {
+        assert_eq!(said(&[(Mirrored, 6.9), (Tilted, 6.9), (Turned, 9.9)]), "");
+        assert_eq!(said(&[(Mirrored, f64::NAN), (Turned, f64::NAN)]), "");
+        let roll = "is observer.start.roll_deg or the registration wrong, did the chuck slip, or the tissue change?";
+        let turned = said(&[(Mirrored, 7.1), (Tilted, f64::NAN), (Turned, 9.2)]);
+        assert_eq!(turned, format!("another roll at the start e^9 (limit e^7): {roll}"));
+        let turned = said(&[(Mirrored, 8.0), (Turned, 11.4)]);
+        assert_eq!(turned, format!("another roll at the start e^11 (limit e^10): {roll}"));
+        let tilted = said(&[(Mirrored, 7.1), (Tilted, 12.0), (Turned, 10.5)]);
+        assert!(tilted.starts_with("another heading at the start e^12 (limit e^7): "), "{tilted}");
+    }
+
+    #[test]
+    fn a_mirrored_needle_asks_for_the_roll_if_another_roll_fits_as_well() {
+        let asks_for_the_roll = |roll: f64| {
+            let text = said(&[(Mirrored, 7.4), (Turned, roll)]);
+            assert!(text.starts_with("a mirrored needle e^7 (limit e^7): "), "{text}");
+            text.contains("observer.start.roll_deg")
+        };
+        assert_eq!(
+            [4.5, 7.3, 4.3, -2.0, f64::NAN].map(asks_for_the_roll),
+            [true, true, false, false, false]
+        );
+        assert!(!said(&[(Mirrored, 7.4)]).contains("roll_deg"));
     }
 }

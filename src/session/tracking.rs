@@ -46,6 +46,8 @@ pub(super) struct Jump {
     pub(super) what: String,
     /// They are those of a tip that does not move.
     pub(super) is_frozen: bool,
+    /// They lie behind the model along the heading.
+    pub(super) is_behind: bool,
 }
 
 /// The stream of the tracker.
@@ -317,8 +319,9 @@ impl Tracking {
             Some(refusal) => {
                 match refusal.effect {
                     Effect::Loses => {
+                        let is_behind = refusal.is_behind && !self.travel.is_in_metres();
                         let (what, is_frozen) = (refusal.to_string(), self.travel.is_frozen());
-                        self.jump = Some(Jump { what, is_frozen });
+                        self.jump = Some(Jump { what, is_frozen, is_behind });
                     }
                     _ if refusal.gate == GateName::Innovation => self.warn_of_jump(now, &refusal),
                     _ => {}

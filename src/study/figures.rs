@@ -95,6 +95,8 @@ pub struct RunFigures {
     steps: ByDepth<(Option<f64>, Option<TipError>)>,
     /// Estimated x, mm, at steps with an estimate.
     estimated: ByDepth<f64>,
+    /// Estimated curvature, per mm, at the last step whose estimate has one.
+    curvature_per_mm: Option<f64>,
     saturated: usize,
     /// The figures that are updated at every record; [`report`](Self::report) adds those that need all steps.
     so_far: FigureReport,
@@ -187,6 +189,9 @@ impl RunFigures {
     pub fn take_step(&mut self, step: &StepRecord, truth: Option<&Truth>) {
         let x_est_mm = step.decision.estimate.as_ref().map(|estimate| estimate.x_pb.translation.x);
         self.estimated.extend(x_est_mm.map(|x_mm| (step.insertion_meas_mm, x_mm)));
+        let belief = step.decision.estimate.as_ref().and_then(|estimate| estimate.belief);
+        self.curvature_per_mm =
+            belief.map(|belief| belief.curvature_per_mm).or(self.curvature_per_mm);
         let x_mm = truth.map(|truth| truth.x_pb.translation.x).or(x_est_mm);
         let error = truth.and_then(|truth| TipError::of(step, truth));
         self.take_scored(step.insertion_meas_mm, x_mm, error);
@@ -264,6 +269,11 @@ impl RunFigures {
         }
         let missed_by_mm = rms(last_third(&self.estimated, self.so_far.insertion_mm));
         missed_by_mm.filter(|rms_mm| *rms_mm > OFF_PLANE_LIMIT_MM)
+    }
+
+    /// The needle's curvature, per mm, as estimated at the end; `None` if the observer has no belief.
+    pub fn curvature_per_mm(&self) -> Option<f64> {
+        self.curvature_per_mm
     }
 
     /// True if the insertion made steps, but had an estimate at none of them, so that nothing steered it.

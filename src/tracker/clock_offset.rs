@@ -113,7 +113,7 @@ impl ClockOffset {
                     if receive.since(since) >= LEARNING_MAX {
                         why += "; no offset was learnt: set tracker.stamp = \"receive\"";
                     }
-                    Err(Refusal { gate, effect: Effect::None, why })
+                    Err(Refusal { effect: Effect::None, ..Refusal::new(gate, why) })
                 }
             };
         };

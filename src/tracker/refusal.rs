@@ -60,6 +60,8 @@ pub struct Refusal {
     pub effect: Effect,
     /// Why, with the numbers and the limit.
     pub why: String,
+    /// The positions lie behind the model along the heading: the tip travels less far than the needle is inserted.
+    pub is_behind: bool,
 }
 
 impl Refusal {
@@ -71,7 +73,7 @@ impl Refusal {
             }
             _ => Effect::Counts,
         };
-        Refusal { gate, effect, why: why.into() }
+        Refusal { gate, effect, why: why.into(), is_behind: false }
     }
 
     /// `position_mm` is NaN or infinite.

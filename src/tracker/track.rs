@@ -352,9 +352,13 @@ impl Track {
         let noise_mm2 = self.settings.noise_sd_mm.powi(2) / independent;
         let lag = prediction.heading * mean.dot(&prediction.heading).min(0.0);
         let lag_limit = LAG_CHI2_SHARE * limit;
+        let chi2 = |offset: &Vector3<f64>| {
+            self.chi2(offset, prediction, noise_mm2 + JUMP_MODEL_SD_MM.powi(2))
+        };
+        let is_behind = chi2(&lag) > lag_limit;
         let tests = [(mean, limit, "off the model"), (lag, lag_limit, "behind the model")];
         for (offset, limit, direction) in tests {
-            let chi2 = self.chi2(&offset, prediction, noise_mm2 + JUMP_MODEL_SD_MM.powi(2));
+            let chi2 = chi2(&offset);
             // Written so that NaN is refused.
             if chi2 <= limit {
                 continue;
@@ -365,7 +369,7 @@ impl Track {
                 short(chi2)
             );
             let refusal = Refusal::new(GateName::Innovation, why);
-            return Err(Refusal { effect: Effect::Loses, ..refusal });
+            return Err(Refusal { effect: Effect::Loses, is_behind, ..refusal });
         }
         Ok(())
     }

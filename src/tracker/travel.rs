@@ -195,6 +195,7 @@ impl TravelCheck {
             refusal.why += &match self.change_over(EXPLAINED_BINS, SLOWER) {
                 _ if self.is_in_metres() => format!(": {IN_METRES}"),
                 Some(change) => format!(": {change}"),
+                None if refusal.is_behind => ": a jump, or too small a scale".to_owned(),
                 None => ": a jump, a drift, or too large a scale".to_owned(),
             };
         }
@@ -202,7 +203,7 @@ impl TravelCheck {
     }
 
     /// Whether the last positions are in metres.
-    fn is_in_metres(&self) -> bool {
+    pub fn is_in_metres(&self) -> bool {
         let mut sums = Sums::default();
         self.weighted_bins().take(EXPLAINED_BINS).for_each(|bin| sums += bin);
         sums.is_in_metres()

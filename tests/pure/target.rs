@@ -108,7 +108,7 @@ fn a_run_reaches_its_target_and_replays() {
         let dir = json["run_dir"].as_str().unwrap();
         let steps = steps_csv(&scratch, &said);
         let last: Vec<&str> = steps.lines().last().unwrap().split(',').collect();
-        assert_eq!(last.len(), 38, "the columns of the target are the nine before the last two");
+        assert_eq!(last.len(), 39, "the columns of the target are the nine before the last three");
         assert!(last[27].parse::<f64>().unwrap() < 0.5, "{last:?}");
         let replayed = needle_bench(&scratch, &["replay", dir]);
         assert_eq!(replayed.status, 0, "{}", replayed.stdout);

@@ -4,12 +4,16 @@ use super::*;
 use crate::archive::Manifest;
 use crate::canopen::emcy::EmcyCode;
 use crate::cli::arguments::Configured;
+use crate::geometry::Pose;
+use crate::observer::{Belief, Estimate, Shaft};
 use crate::runtime::Holds;
+use crate::session::{Decision, StepRecord};
 use crate::stage::{PerAxis, SetPoint};
 use crate::study::RunFigures;
 use crate::telemetry::TelemetryError;
 use crate::tracker::GateCounts;
 use crate::units::Time;
+use nalgebra::Vector3;
 use std::path::PathBuf;
 
 fn report(outcome: Outcome, faults: &[&str]) -> RunReport {
@@ -45,6 +49,34 @@ fn a_record_left_open_is_named_with_what_closes_it() {
     let text = said("runs/gone");
     assert!(text.starts_with("record      runs/gone is no longer there: "), "{text}");
     assert!(text.contains("needle-bench review FOLDER --repair\ncompleted"), "{text}");
+}
+
+/// A needle that hardly bends misses the plane from wherever it starts.
+#[test]
+fn a_needle_that_hardly_bends_is_not_asked_to_start_nearer() {
+    let config = config(&[]);
+    let said = |part: f64| {
+        let mut report = report(Outcome::Completed, &[]);
+        for depth_mm in [40.0, 80.0, 120.0] {
+            let x_pb = Pose { translation: Vector3::new(12.3, 0.0, depth_mm), ..Pose::identity() };
+            let belief = Belief::certain(part * config.needle.arc.curvature_per_mm(), Shaft::RIGID);
+            let estimate = Some(Estimate::of_belief(x_pb, belief));
+            let decision = Decision { estimate, ..Decision::default() };
+            let step =
+                StepRecord { insertion_meas_mm: depth_mm, decision, ..StepRecord::default() };
+            report.figures.take_step(&step, None);
+        }
+        let last = ending(&config, &report).lines().last().map(str::to_owned);
+        last.filter(|last| last.chars().count() < 200).expect("a line of under 200 characters")
+    };
+    assert_eq!(
+        said(0.103),
+        "completed, not in the plane: 12.3 mm RMS off it by the estimate (limit 1.0); the needle bent by 10% of what \
+         needle.radius_mm says: check bevel, tissue and radius (needle-bench calibrate needle)"
+    );
+    for part in [0.51, 1.0] {
+        assert!(said(part).ends_with("or insert deeper if the tip was still approaching it"));
+    }
 }
 
 /// A withdrawal goes on without a record, and the command that finishes it has no recorded configuration to name.

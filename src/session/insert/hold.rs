@@ -5,7 +5,7 @@ use super::InsertTask;
 use crate::session::config::Resume;
 use crate::session::insertion::Insertion;
 use crate::session::shell::Shell;
-use crate::session::tracking::HoldReason;
+use crate::session::tracking::{HoldReason, Jump};
 use crate::session::{Lane, Severity, State};
 use crate::text::clipped;
 use crate::units::Time;
@@ -17,6 +17,8 @@ pub(super) const MESSAGE_MAX: usize = 200;
 const JUMP_ADVICE: &str = "check the tracker, needle.radius_mm, tip_offset_mm";
 /// Advice to the operator when the tip does not move: the needle may be loose, or the axes exchanged.
 const FROZEN_ADVICE: &str = "check the tracker, the needle's clamp, and which drive is which";
+/// Advice to the operator when the tip travels less far than the needle is inserted.
+const BEHIND_ADVICE: &str = "does the shaft buckle, or the clamp slip? check the tracker";
 /// Why a command is refused before the insertion.
 pub(super) const NOT_BEGUN: &str = "the insertion has not begun";
 /// Why the operator can neither prolong nor end a hold by the tracker with `tracker.resume = "stop"`.
@@ -252,7 +254,11 @@ impl InsertTask {
     ) -> Option<HoldReason> {
         let of = "tip";
         if let Some(jump) = &self.tracking.jump {
-            let why = if jump.is_frozen { FROZEN_ADVICE } else { JUMP_ADVICE };
+            let why = match jump {
+                Jump { is_frozen: true, .. } => FROZEN_ADVICE,
+                Jump { is_behind: true, .. } => BEHIND_ADVICE,
+                Jump { .. } => JUMP_ADVICE,
+            };
             return Some(HoldReason { of, what: jump.what.clone(), why: why.to_owned() });
         }
         if let Some(what) = self.blindness(now, insertion_meas_mm, insertion) {

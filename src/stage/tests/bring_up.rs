@@ -106,7 +106,8 @@ fn a_position_offset_from_an_earlier_use_does_not_move_the_axis() {
 fn a_drive_with_eight_pdos_has_only_the_first_of_them_on() {
     let mut bench = Bench::new(config());
     for (index, cob_id) in [(0x1400, 0x0000_0581_u32), (0x1800, 0x4000_0481)] {
-        (1..8).for_each(|offset| bench.insertion.set(index + offset, 1, cob_id + u32::from(offset)));
+        (1..8)
+            .for_each(|offset| bench.insertion.set(index + offset, 1, cob_id + u32::from(offset)));
     }
     bench.until_ready();
     for index in [0x1400, 0x1800] {

@@ -156,6 +156,25 @@ fn the_mean_of_refused_positions_shows_a_jump() {
     panic!("no jump was reported");
 }
 
+/// Whichever test of the mean is the first to fail.
+#[test]
+fn a_tip_behind_the_model_is_distinguished_from_one_beside_it() {
+    let lost = |off_mm: Vector3<f64>| {
+        let mut track = followed(settings());
+        let refusals = (10..40).filter_map(|n| {
+            let fix = fix(n, 0.0);
+            let prediction = Prediction { heading: Vector3::z(), ..model(&fix) };
+            let fix = Fix { position_mm: fix.position_mm + off_mm, ..fix };
+            track.judge(fix, Some(&prediction)).err()
+        });
+        let mut losing = refusals.filter(|refusal| refusal.effect == Effect::Loses);
+        losing.next().map(|refusal| refusal.is_behind)
+    };
+    let (x, z) = (Vector3::x(), Vector3::z());
+    assert_eq!([-7.0 * z, x - 7.0 * z].map(lost), [Some(true); 2]);
+    assert_eq!([7.0 * z, 7.0 * x, 7.0 * x - z].map(lost), [Some(false); 3]);
+}
+
 /// They belong to another tool: no jump of the noise's size is that far. They are refused one by one.
 #[test]
 fn positions_far_off_do_not_count_in_the_mean() {

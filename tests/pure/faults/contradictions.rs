@@ -211,6 +211,21 @@ fn a_registration_that_is_turned() {
     assert!(bench.reason().contains("another roll at the start"), "{}", bench.reason());
 }
 
+/// The needle is clamped half a turn from where the configured roll has it, which looks like a mirrored needle too.
+#[test]
+fn a_start_roll_that_is_half_a_turn_off_is_asked_for() {
+    let told = ["observer.start.roll_deg=-150", "observer.invariant.start_sd.roll_deg=15"];
+    for seed in 1..=4 {
+        let seed = format!("emulator.seed={seed}");
+        let (bench, stopped_mm) =
+            contradicted(steered(&[&told[..], &[&seed]].concat()), 0.0, |_| {});
+        let reason = bench.reason();
+        println!("{stopped_mm:.1} mm: {reason}");
+        assert!(reason.starts_with("tracker: the positions fit "), "{reason}");
+        assert!(reason.contains("observer.start.roll_deg") && stopped_mm < 40.0, "{reason}");
+    }
+}
+
 /// By 45°, far from the heading at the start that the observer assumes.
 #[test]
 fn a_registration_that_is_tilted() {
@@ -392,19 +407,36 @@ fn a_drift_that_is_taken_for_a_heading() {
     is_documented("a_drift_that_is_taken_for_a_heading", 30.0, run);
 }
 
-/// Halves the distance of each position from the first.
-fn at_half_speed() -> impl FnMut(&mut Sample) + 'static {
+/// Scales the distance of each position from the first.
+fn at_speed(scale: f64) -> impl FnMut(&mut Sample) + 'static {
     let mut from = None;
     move |sample| {
         let at = *from.get_or_insert(sample.position_mm);
-        sample.position_mm = at + (sample.position_mm - at) * 0.5;
+        sample.position_mm = at + (sample.position_mm - at) * scale;
     }
 }
 
 #[test]
 fn a_stream_at_half_speed() {
-    let run = |speed: &str| contradicted(steered(&[speed]), 20.0, at_half_speed());
+    let run = |speed: &str| contradicted(steered(&[speed]), 20.0, at_speed(0.5));
     is_documented("a_stream_at_half_speed", 8.0, run);
+}
+
+/// A shaft that buckles takes a sixth of each millimetre inserted from 40 mm on.
+#[test]
+fn a_shaft_that_buckles_is_asked_for() {
+    for seed in 1..=4 {
+        let seed = format!("emulator.seed={seed}");
+        let (bench, held_mm) = contradicted(steered(&[&seed]), 40.0, at_speed(5.0 / 6.0));
+        let reason = bench.reason();
+        println!("{held_mm:.1} mm: {reason}");
+        assert!(reason.contains(" behind the model, ") && held_mm < 20.0, "{held_mm} mm: {reason}");
+        assert!(
+            reason.contains("; held and stopped; does the shaft buckle, or the clamp slip?"),
+            "{reason}"
+        );
+        assert!(reason.chars().count() < 200, "{reason}");
+    }
 }
 
 /// The message says so; a frozen stream would ask for another mend.
@@ -434,7 +466,7 @@ fn a_stream_at_half_speed_is_reported_with_its_scale() {
             let sets =
                 [format!("insertion.speed_mm_per_s={speed}"), format!("emulator.seed={seed}")];
             let run = steered(&sets.each_ref().map(String::as_str));
-            let (bench, held_mm) = contradicted(run, struck_mm, at_half_speed());
+            let (bench, held_mm) = contradicted(run, struck_mm, at_speed(0.5));
             let scales = ["of scale 0.3", "of scale 0.4", "of scale 0.5", "of scale 0.6"];
             named += usize::from(scales.iter().any(|scale| bench.reason().contains(scale)));
             held_mm
