@@ -186,6 +186,23 @@ fn a_damaged_body_loses_the_framing_for_good() {
 }
 
 #[test]
+fn a_sender_without_checksums_is_told_to_compute_them() {
+    let mut sent = bytes(TRANSFORM_V1);
+    sent[50..58].fill(0);
+    let error = decode(&sent).expect_err("a CRC of 0");
+    assert!(error.loses_framing);
+    assert_eq!(
+        error.to_string(),
+        "openigtlink: TRANSFORM \"NeedleToTracker\": CRC 0: the sender computes no checksum; the bench needs one \
+         (CRC-64 ECMA-182)"
+    );
+    // Of an empty body it is the checksum.
+    let empty = encode(&Message::new("Tracker", None, Body::TrackingData(Vec::new())));
+    assert_eq!(empty[50..58], [0; 8]);
+    assert!(decode(&empty).is_ok());
+}
+
+#[test]
 fn a_message_of_wrong_length_is_refused_and_the_next_is_read() {
     // 47 of the 48 bytes of a TRANSFORM, with a correct checksum, as a faulty script would send them.
     let (hex, next) = &frozen()[6];
