@@ -301,7 +301,10 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
         STAMP_PACE.start,
         STAMP_PACE.end
     );
-    let stamps = stamps.unless(pace.is_none(), Warn, slow);
+    let coarse = "most differ by under 1 ms although positions arrive 5 ms or more apart (coarse resolution): set \
+                  tracker.stamp = \"receive\"";
+    let is_fine = !(is_stamped && report.has_coarse_stamps);
+    let stamps = stamps.unless(is_fine, Warn, coarse).unless(pace.is_none(), Warn, slow);
     vec![stream, rate, blind, noise, stamps, workspace(config, report)]
 }
 

@@ -9,6 +9,10 @@ use serde::Serialize;
 pub(super) const POSITIONS_MIN: usize = 10;
 /// The pace of stamps is measured over at least this time, s.
 const STAMPS_MIN_S: f64 = 0.5;
+/// Stamps are coarse if most differ by less than this, ns …
+const STAMP_STEP_MIN_NS: u64 = 1_000_000;
+/// … between different positions that arrive at least this long after one another, ns.
+const ARRIVAL_STEP_MIN_NS: i64 = 5_000_000;
 /// If two tools of one name take turns, a position is farther than this from the next, mm …
 const TURNS_MIN_MM: f64 = 3.0;
 /// … and farther by this factor than from the next but one.
@@ -34,6 +38,8 @@ pub struct TrackerReport {
     pub stamp_skew_s: Option<f64>,
     /// Seconds by which the stamps advance in a second; `None` if the positions span less than half a second.
     pub stamp_pace: Option<f64>,
+    /// True if most stamps hardly differ from the one before, although the positions arrive one by one.
+    pub has_coarse_stamps: bool,
     /// True if the last position is outside the workspace, and would be inside if it were in metres.
     pub is_in_metres: bool,
     /// True if positions jump back and forth, as they do if two tools have the same name.
@@ -60,6 +66,10 @@ pub struct Listening {
     skew_ns: Option<i64>,
     /// Receipt and stamp of the first and the last sample that has one, ns.
     stamped_ns: Option<[[i64; 2]; 2]>,
+    last_stamped_mm: Option<Vector3<f64>>,
+    /// Steps from one stamp to the next between different positions that arrive one by one, and how many of them
+    /// are too small.
+    stamp_steps: [usize; 2],
     refusal: Option<String>,
 }
 
@@ -78,6 +88,8 @@ impl Listening {
             is_in_metres: false,
             skew_ns: None,
             stamped_ns: None,
+            last_stamped_mm: None,
+            stamp_steps: [0; 2],
             refusal: None,
         }
     }
@@ -107,6 +119,16 @@ impl Listening {
         if let Some(stamp_ns) = sample.source_unix_ns {
             let received_ns = self.origin_unix_ns.saturating_add(sample.receive_time.as_nanos());
             let newest_ns = [received_ns, stamp_ns];
+            let is_new =
+                self.last_stamped_mm.replace(sample.position_mm) != Some(sample.position_mm);
+            if let Some([_, [before_ns, stamp_before_ns]]) = self.stamped_ns
+                && is_new
+                && received_ns.saturating_sub(before_ns) >= ARRIVAL_STEP_MIN_NS
+            {
+                self.stamp_steps[0] += 1;
+                self.stamp_steps[1] +=
+                    usize::from(stamp_ns.abs_diff(stamp_before_ns) < STAMP_STEP_MIN_NS);
+            }
             self.stamped_ns.get_or_insert([newest_ns; 2])[1] = newest_ns;
             let skew_ns = received_ns.saturating_sub(stamp_ns);
             self.skew_ns = Some(self.skew_ns.map_or(skew_ns, |least| least.min(skew_ns)));
@@ -145,6 +167,8 @@ impl Listening {
             noise_sd_mm: is_enough.then(|| to_next_mm / 6f64.sqrt()),
             stamp_skew_s: self.skew_ns.map(|ns| ns as f64 * 1e-9),
             stamp_pace,
+            has_coarse_stamps: self.stamp_steps[0] + 1 >= POSITIONS_MIN
+                && 2 * self.stamp_steps[1] > self.stamp_steps[0],
             is_in_metres: self.is_in_metres,
             has_two_tools: is_enough
                 && to_next_mm > TURNS_MIN_MM

@@ -150,15 +150,23 @@ fn a_drive_that_a_run_would_refuse_fails() {
 
 /// The report on 80 positions, 25 ms apart, each received `late_s` after its stamp.
 fn listened(config: &Config, late_s: f64, at: impl Fn(u32) -> Vector3<f64>) -> TrackerReport {
+    listened_stamped(config, |ns| ns - (late_s * 1e9) as i64, at)
+}
+
+/// The report on 80 positions, 25 ms apart; `stamp_ns` makes the stamp from the time of receipt, ns since 1970.
+fn listened_stamped(
+    config: &Config,
+    stamp_ns: impl Fn(i64) -> i64,
+    at: impl Fn(u32) -> Vector3<f64>,
+) -> TrackerReport {
     let gate = config.tracker.to_gate().unwrap_or_else(|_| config.tracker.to_unregistered_gate());
     let mut listening = Listening::new(gate, 1_000_000_000);
     for k in 0..80 {
         let receive_time = Time::from_secs_f64(f64::from(k) * 0.025);
-        let stamp_ns = receive_time.as_nanos() + 1_000_000_000 - (late_s * 1e9) as i64;
         listening.take(&Event::Sample(Sample {
             tool: config.tracker.tool.clone(),
             receive_time,
-            source_unix_ns: Some(stamp_ns),
+            source_unix_ns: Some(stamp_ns(receive_time.as_nanos() + 1_000_000_000)),
             position_mm: at(k),
             orientation: Some(nalgebra::UnitQuaternion::identity()),
             validity: Validity::Valid,
@@ -214,6 +222,32 @@ fn a_tracker_is_judged_by_its_positions_noise_and_stamps() {
     let [row] = &tracker(&config, &zero)[..] else { panic!("one row") };
     assert!(row.next_step.as_ref().unwrap().contains("zero"), "{row:?}");
     assert_eq!(quiet.last_position_bench_mm, Some([0.7, 2.0, 3.0]));
+}
+
+/// Whole seconds; and MITK's stamps, whole seconds with the milliseconds as nanoseconds.
+#[test]
+fn stamps_of_a_coarse_resolution_are_warned_about() {
+    let [stamped, received] = ["tracker.stamp=\"source\"", "tracker.stamp=\"receive\""]
+        .map(|stamp| rig(&[REGISTRATION, stamp]));
+    let at = |k: u32| Vector3::new(1.0 + 0.1 * f64::from(k % 7), 2.0 + 0.1 * f64::from(k % 5), 3.0);
+    let second = |ns: i64| ns - ns % 1_000_000_000;
+    let coarse: [fn(i64) -> i64; 2] = [
+        |ns| ns - ns % 1_000_000_000,
+        |ns| ns - ns % 1_000_000_000 + ns % 1_000_000_000 / 1_000_000,
+    ];
+    for stamp_ns in coarse {
+        let report = listened_stamped(&stamped, stamp_ns, at);
+        assert!(report.has_coarse_stamps);
+        let row = &tracker(&stamped, &report)[4];
+        let next = "most differ by under 1 ms although positions arrive 5 ms or more apart (coarse resolution): set \
+                    tracker.stamp = \"receive\"";
+        assert_eq!((row.verdict, row.next_step.as_deref()), (Verdict::Warn, Some(next)));
+        assert_eq!(tracker(&received, &report)[4].verdict, Verdict::Pass, "no stamp is used");
+    }
+    // Stamps of whole milliseconds; and a server that repeats its last position with its last stamp.
+    let repeated = listened_stamped(&stamped, second, |_| Vector3::new(1.0, 2.0, 3.0));
+    let fine = listened_stamped(&stamped, |ns| ns - ns % 1_000_000, at);
+    assert!(!repeated.has_coarse_stamps && !fine.has_coarse_stamps);
 }
 
 /// A run refuses such positions without a word on where they are.

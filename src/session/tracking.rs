@@ -83,7 +83,8 @@ pub(crate) struct Tracking {
     link_error: Option<String>,
     /// The error of the last malformed message, until a position is accepted.
     malformed: Option<String>,
-    /// The last STATUS of the server was OK and came after the last accepted position.
+    /// The last STATUS that came unasked was OK and came after the last accepted position. PLUS sends it while its
+    /// tracker gives no frames, not while a tool is out of view.
     status_is_ok: bool,
     /// Samples of the tool that the link dropped.
     dropped: u64,
@@ -461,7 +462,7 @@ impl Tracking {
                 format!("the tracker's messages cannot be read: {error}")
             }
             _ if self.counts.accepted > 0 && self.status_is_ok => {
-                "the server still sends STATUS OK: the tool is out of view, not the network"
+                "STATUS OK, but no position: with PLUS the tracker stopped (cable, power), else out of view"
                     .to_owned()
             }
             _ if self.counts.accepted > 0 => {

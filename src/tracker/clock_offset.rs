@@ -6,6 +6,9 @@ use std::time::Duration;
 
 /// The minimum covers this window and the one before.
 const WINDOW: Duration = Duration::from_secs(30);
+/// The first two windows are as short as this, because the first stamps may be wrong: PLUS fits a line through the
+/// times of the last 20 frames.
+const FIRST_WINDOWS: Duration = Duration::from_secs(2);
 /// A stamp that leads the quickest delivery so far by more than this is not a quicker delivery.
 const AHEAD_MAX_NS: i64 = 50_000_000;
 /// An offset is learnt from at least this many samples, over at least this time.
@@ -39,7 +42,7 @@ const LATE_SAMPLES: u32 = 10;
 
 /// Tracks the minimum of `receive − source` over the last 30 to 60 s. The quickest delivery shows the offset
 /// best, and the window follows a clock that drifts. After a gap in the samples the old minimum counts for
-/// another 30 s.
+/// another 30 s. An offset that was just learnt is believed for 4 s: then the samples of its first 2 s no longer count.
 ///
 /// - The first samples of a connection are not believed: they may have waited in a queue, and there
 ///   are no others to compare them with. The offset counts once it has stopped falling.
@@ -51,7 +54,8 @@ const LATE_SAMPLES: u32 = 10;
 ///   learnt, stamps that are a little late are dated by the old offset, and others are refused.
 /// - Stamps that are later than before but never went back may have waited. They are dated by the
 ///   old offset. If it was the clock after all, they are dated too old, never too young. The
-///   operator is told.
+///   operator is told, and told again when the old minimum no longer counts. A delay that begins within the first
+///   2 s and lasts is then taken for the clock, like one that was there from the first sample on.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ClockOffset {
     known: Option<Known>,
@@ -162,7 +166,15 @@ impl ClockOffset {
             known.before_step_back_ns = Some(offset_ns);
         }
         let dated_by_ns = known.offset.update(receive, offset_ns);
+        let rise_ns = dated_by_ns.saturating_sub(known_ns);
         self.note_late(receive, offset_ns.saturating_sub(dated_by_ns));
+        if rise_ns > DATED_BEHIND_MAX_NS {
+            self.news = Some(format!(
+                "by their stamps, positions have come {0:.3} s later for 2 s or more; this is now taken for the \
+                 sender's clock: they are dated {0:.3} s later",
+                seconds(rise_ns)
+            ));
+        }
         Ok(dated_by_ns)
     }
 
@@ -234,6 +246,7 @@ fn seconds(ns: i64) -> f64 {
 #[derive(Debug, Clone)]
 struct Minimum {
     window_start: Time,
+    window: Duration,
     current_ns: i64,
     previous_ns: Option<i64>,
 }
@@ -244,8 +257,9 @@ impl Minimum {
     }
 
     fn update(&mut self, receive: Time, offset_ns: i64) -> i64 {
-        if receive.since(self.window_start) >= WINDOW {
+        if receive.since(self.window_start) >= self.window {
             self.window_start = receive;
+            self.window = if self.previous_ns.is_none() { FIRST_WINDOWS } else { WINDOW };
             self.previous_ns = Some(self.current_ns);
             self.current_ns = offset_ns;
         }
@@ -308,7 +322,8 @@ impl Settling {
             return Err(self.samples);
         }
         let current_ns = self.least_ns;
-        Ok(Minimum { window_start: since, current_ns, previous_ns: None })
+        let window = FIRST_WINDOWS;
+        Ok(Minimum { window_start: since, window, current_ns, previous_ns: None })
     }
 }
 

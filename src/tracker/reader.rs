@@ -27,6 +27,8 @@ pub struct Reader {
     names: BTreeMap<String, bool>,
     events: VecDeque<Event>,
     messages: u64,
+    /// GET_STATUS was sent, and is not answered.
+    awaits_status: bool,
 }
 
 #[derive(Debug)]
@@ -50,6 +52,7 @@ impl Reader {
             names: BTreeMap::new(),
             events: VecDeque::new(),
             messages: 0,
+            awaits_status: false,
         }
     }
 
@@ -70,6 +73,12 @@ impl Reader {
     pub fn poll(&mut self) -> Result<Option<Event>, String> {
         while self.events.is_empty() && self.advance()? {}
         Ok(self.events.pop_front())
+    }
+
+    /// Takes note that GET_STATUS was sent. If the peer answers with OK and no text, it only says that it is alive,
+    /// and the answer becomes no event. A STATUS that comes unasked always does.
+    pub fn await_status(&mut self) {
+        self.awaits_status = true;
     }
 
     /// Ends the connection. Poll for a last line without an end.
@@ -114,6 +123,12 @@ impl Reader {
 
     fn take_message(&mut self, message: Message) {
         self.messages += 1;
+        if let Body::Status(status) = &message.body
+            && std::mem::take(&mut self.awaits_status)
+            && status.is_bare_ok()
+        {
+            return;
+        }
         let samples = Sample::from_message(&message, self.received);
         let message_type = message.body.type_name();
         if samples.is_empty() {

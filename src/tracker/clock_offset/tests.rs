@@ -20,6 +20,16 @@ fn listen(offset: &mut ClockOffset, from_ms: i64, ahead_ms: i64) -> Vec<Result<i
     times.map(|ms| update(offset, ms, ms + ahead_ms)).collect()
 }
 
+/// After 5 s of positions that are delivered at once, of which the first no longer count.
+fn known() -> ClockOffset {
+    let mut offset = ClockOffset::default();
+    for n in 0..200 {
+        let dated = update(&mut offset, 25 * n, 25 * n);
+        assert!(dated == Ok(0) || is_learning(&dated), "{n}: {dated:?}");
+    }
+    offset
+}
+
 #[test]
 fn an_offset_is_learnt_within_200_ms() {
     let mut offset = ClockOffset::default();
@@ -140,12 +150,11 @@ fn an_overtaken_stamp_is_not_taken_for_a_clock_set_back() {
 /// No stamp goes back, so it may also be a delay.
 #[test]
 fn a_clock_set_back_by_less_than_a_period_gives_a_warning() {
-    let mut offset = ClockOffset::default();
-    listen(&mut offset, 0, 0);
+    let mut offset = known();
     let mut reported = Vec::new();
-    for n in 12..260 {
+    for n in 200..448 {
         assert_eq!(update(&mut offset, 25 * n, 25 * n - 15), Ok(0), "{n}");
-        reported.extend(offset.news().map(|text| (25 * (n - 12), text)));
+        reported.extend(offset.news().map(|text| (25 * (n - 200), text)));
     }
     let (at_ms, text) = &reported[0];
     assert!(
@@ -158,17 +167,52 @@ fn a_clock_set_back_by_less_than_a_period_gives_a_warning() {
 /// A small delay that lasts must not hide a large one.
 #[test]
 fn a_delay_that_grows_is_reported_again() {
-    let mut offset = ClockOffset::default();
-    listen(&mut offset, 0, 0);
+    let mut offset = known();
     let mut reported = Vec::new();
-    for n in 12..600 {
-        let late_ms = if n < 300 { 15 } else { 300 };
+    for n in 200..788 {
+        let late_ms = if n < 488 { 15 } else { 300 };
         assert_eq!(update(&mut offset, 25 * n + late_ms, 25 * n), Ok(0), "{n}");
         reported.extend(offset.news().map(|text| (25 * n, text)));
     }
     let late_s = |text: &str| text.split(' ').nth(5).map(str::to_owned);
     let lateness: Vec<_> = reported.iter().map(|(at_ms, text)| (*at_ms, late_s(text))).collect();
-    assert_eq!(lateness, [(5300, Some("0.015".to_owned())), (8500, Some("0.300".to_owned()))]);
+    assert_eq!(lateness, [(10_000, Some("0.015".to_owned())), (13_200, Some("0.300".to_owned()))]);
+}
+
+/// The first stamps are ahead by 0.2 s, and right after 1 s, as PLUS's filter makes them. None of them goes back.
+#[test]
+fn stamps_that_are_wrong_at_first_are_forgotten_after_4_s() {
+    let mut offset = ClockOffset::default();
+    let mut reported = Vec::new();
+    for n in 0..2000 {
+        let ms = 25 * n;
+        let dated = update(&mut offset, ms, ms + (200 - ms / 5).max(0));
+        let expected_ms = if ms < 4000 { -200 } else { 0 };
+        assert!(dated == Ok(expected_ms) || is_learning(&dated) && ms < 200, "{ms}: {dated:?}");
+        reported.extend(offset.news().map(|text| (ms, text)));
+    }
+    let last = reported.pop().expect("reported");
+    let text = "by their stamps, positions have come 0.200 s later for 2 s or more; this is now taken for the \
+                sender's clock: they are dated 0.200 s later";
+    assert_eq!(last, (4000, text.to_owned()));
+    assert!(reported.len() == 1 && reported[0].1.contains(" later than before: "), "{reported:?}");
+}
+
+/// The delay grows by 10 ms a second from the first position on. Only what it was in the first 2 s counts as the
+/// clock.
+#[test]
+fn a_delay_that_only_grows_is_reported_and_dated_as_delayed() {
+    let mut offset = ClockOffset::default();
+    let mut reported = Vec::new();
+    for n in 0..1000 {
+        let ms = 25 * n;
+        let dated = update(&mut offset, ms + ms / 100, ms);
+        assert!(matches!(dated, Ok(0..=20)) || is_learning(&dated) && ms < 200, "{ms}: {dated:?}");
+        reported.extend(offset.news().map(|text| (ms, text)));
+    }
+    let [(first_ms, first), (again_ms, again)] = &reported[..] else { panic!("{reported:?}") };
+    assert!(first.contains(" later than before: ") && again.contains(" later than before: "));
+    assert!(*first_ms <= 9000 && *again_ms <= 9000, "{reported:?}");
 }
 
 /// The network delays each position by up to 60 ms and keeps their order.
@@ -197,10 +241,9 @@ fn a_clock_set_back_by_seconds_is_followed_after_1_s() {
 /// too young.
 #[test]
 fn a_lasting_delay_is_dated_by_the_old_offset_and_reported_once() {
-    let mut offset = ClockOffset::default();
-    listen(&mut offset, 0, 0);
+    let mut offset = known();
     let mut reported = Vec::new();
-    for n in 12..200 {
+    for n in 200..388 {
         assert_eq!(update(&mut offset, 25 * n + 300, 25 * n), Ok(0), "{n}");
         reported.extend(offset.news());
     }

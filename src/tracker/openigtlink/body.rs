@@ -53,12 +53,12 @@ impl ToolStream {
     /// The message that asks a server to begin, in its own coordinate system.
     pub fn start(&self) -> Vec<u8> {
         let content = [&self.period_ms.to_be_bytes()[..], &[0; COORDINATES_LEN]].concat();
-        packet(&format!("STT_{}", self.name), "", None, &content)
+        packet(1, &format!("STT_{}", self.name), "", None, &content)
     }
 
     /// The message that asks it to stop.
     pub fn stop(&self) -> Vec<u8> {
-        packet(&format!("STP_{}", self.name), "", None, &[])
+        packet(1, &format!("STP_{}", self.name), "", None, &[])
     }
 }
 
@@ -114,6 +114,11 @@ pub struct Status {
 impl Status {
     /// The code of a device without a fault.
     pub const OK: u16 = 1;
+
+    /// True if it says only that the device is without a fault.
+    pub(in super::super) fn is_bare_ok(&self) -> bool {
+        self.code == Status::OK && self.message.is_empty()
+    }
 }
 
 const STATUS_NAME_LEN: usize = 20;

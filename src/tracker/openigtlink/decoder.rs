@@ -131,6 +131,12 @@ impl StreamDecoder {
                     let len = usize::try_from(header.body_size).unwrap_or(usize::MAX);
                     let Some(body) = unread.get(..len) else { return Ok(None) };
                     let (computed, stated) = (crc64(body), header.crc);
+                    if stated == 0 && computed != 0 {
+                        return Err(DecodeError::framing(format!(
+                            "{}: CRC 0: the sender computes no checksum; the bench needs one (CRC-64 ECMA-182)",
+                            header.type_and_device()
+                        )));
+                    }
                     if computed != stated {
                         return Err(DecodeError::framing(format!(
                             "{}: CRC {computed:016x}, header says {stated:016x}; bytes were lost or \

@@ -59,24 +59,32 @@ impl Message {
 /// The bytes of a message in version 1: a device name over 20 bytes is truncated, metadata are left out.
 pub fn encode(message: &Message) -> Vec<u8> {
     let Message { device_name, timestamp, body, .. } = message;
-    packet(body.type_name(), device_name, *timestamp, &body.encode())
+    packet(1, body.type_name(), device_name, *timestamp, &body.encode())
 }
 
-/// The bytes of a version 1 message with this content.
+/// The bytes of GET_STATUS, which a server that is alive answers with STATUS.
+///
+/// They are of version 2: a server such as PLUS sends metadata only to a client that has sent this version.
+pub fn get_status() -> Vec<u8> {
+    packet(2, "GET_STATUS", "", None, &metadata::WITHOUT_CONTENT)
+}
+
+/// The bytes of a message with this header version and body.
 pub(super) fn packet(
+    version: u16,
     message_type: &str,
     device_name: &str,
     timestamp: Option<IgtlStamp>,
-    content: &[u8],
+    body: &[u8],
 ) -> Vec<u8> {
     [
-        &1_u16.to_be_bytes()[..],
+        &version.to_be_bytes()[..],
         &padded::<TYPE_LEN>(message_type),
         &padded::<DEVICE_NAME_LEN>(device_name),
         &timestamp.map_or(0, IgtlStamp::bits).to_be_bytes(),
-        &(content.len() as u64).to_be_bytes(),
-        &crc64(content).to_be_bytes(),
-        content,
+        &(body.len() as u64).to_be_bytes(),
+        &crc64(body).to_be_bytes(),
+        body,
     ]
     .concat()
 }

@@ -10,6 +10,9 @@ use super::header::printable;
 const EXTENDED_HEADER_LEN: usize = 12;
 const ENTRY_LEN: usize = 8;
 
+/// A body without content and metadata: the extended header, and an index of no entries.
+pub(super) const WITHOUT_CONTENT: [u8; 14] = [0, 12, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0];
+
 /// Key and value pairs.
 type Metadata = Vec<(String, String)>;
 

@@ -3,7 +3,8 @@
 //! Frozen bytes, do not edit. `TRANSFORM_*` and `STRING` are `pack()` of pyigtl 0.3.4 (PyPI) with
 //! timestamp 1700000000.5; `STATUS` and `POSITION_24` are the specification's tables written with
 //! Python's `struct` and checksummed by `crcmod` (polynomial 0x142F0E1EBA9EA3693); TDATA, QTDATA
-//! and their requests are the reference library's own (libopenigtlink 1.11).
+//! and their requests are the reference library's own (libopenigtlink 1.11), `GET_STATUS` that of its
+//! commit 94244fed, which has header version 2.
 
 use super::*;
 use proptest::prelude::*;
@@ -53,6 +54,9 @@ const STP_TDATA_V1: &str = "\
 const STP_QTDATA_V1: &str = "\
     00015354505f515444415441000042656e63680000000000000000000000000000006553f1007fffffff00000000\
     000000000000000000000000";
+const GET_STATUS_V2: &str = "\
+    00024745545f535441545553000000000000000000000000000000000000000000000000000000000000000000\
+    000000000eb21e4ee882505334000c000200000000000000000000";
 
 fn bytes(hex: &str) -> Vec<u8> {
     (0..hex.len())
@@ -159,6 +163,15 @@ fn requests_equal_those_of_the_reference_library() {
 }
 
 #[test]
+fn a_status_request_equals_that_of_the_reference_library() {
+    assert_eq!(get_status(), bytes(GET_STATUS_V2));
+    assert_eq!(
+        decode(&get_status()),
+        Ok(Message::new("", None, Body::Other("GET_STATUS".to_owned())))
+    );
+}
+
+#[test]
 fn a_damaged_body_loses_the_framing_for_good() {
     let mut stream = bytes(TRANSFORM_V1);
     stream[100] ^= 1;
@@ -170,6 +183,23 @@ fn a_damaged_body_loses_the_framing_for_good() {
     assert!(error.loses_framing && error.to_string().contains(": CRC "), "{error}");
     decoder.push(&bytes(TRANSFORM_V1));
     assert_eq!(decoder.poll(), first);
+}
+
+#[test]
+fn a_sender_without_checksums_is_told_to_compute_them() {
+    let mut sent = bytes(TRANSFORM_V1);
+    sent[50..58].fill(0);
+    let error = decode(&sent).expect_err("a CRC of 0");
+    assert!(error.loses_framing);
+    assert_eq!(
+        error.to_string(),
+        "openigtlink: TRANSFORM \"NeedleToTracker\": CRC 0: the sender computes no checksum; the bench needs one \
+         (CRC-64 ECMA-182)"
+    );
+    // Of an empty body it is the checksum.
+    let empty = encode(&Message::new("Tracker", None, Body::TrackingData(Vec::new())));
+    assert_eq!(empty[50..58], [0; 8]);
+    assert!(decode(&empty).is_ok());
 }
 
 #[test]

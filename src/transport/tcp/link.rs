@@ -1,10 +1,10 @@
 //! The bench's end of a tracker's connection over TCP.
 
 use super::super::link::{Link, LinkSettings, Outlet};
-use crate::tracker::openigtlink::ToolStream;
+use crate::tracker::openigtlink::{ToolStream, get_status};
 use crate::tracker::{Event, Protocol, Reader};
 use crate::units::Time;
-use std::io;
+use std::io::{self, ErrorKind};
 use std::net::SocketAddr;
 use std::pin::pin;
 use std::time::Duration;
@@ -87,13 +87,20 @@ impl<C: Fn() -> Time> LinkTask<C> {
         }
     }
 
-    /// Reads a server until the connection ends, and returns the reason.
+    /// Reads a server until the connection ends, and returns the reason. A server that is silent for half of the
+    /// limit is asked for its status: a tool out of view then does not end the connection.
     async fn read_to_end(&mut self, peer: &mut Peer) -> String {
+        peer.ask_status().await;
         if let Err(reason) = peer.request_stream().await {
             return reason;
         }
+        let half = self.settings.silence_limit / 2;
         loop {
-            let Ok(read) = timeout(self.settings.silence_limit, peer.read()).await else {
+            let read = match timeout(half, peer.read()).await {
+                Ok(read) => Ok(read),
+                Err(_) => timeout(half, peer.ask_and_read()).await,
+            };
+            let Ok(read) = read else {
                 return format!(
                     "tracker: nothing from {} for {:?}; reconnecting",
                     peer.name, self.settings.silence_limit
@@ -178,16 +185,19 @@ impl<C: Fn() -> Time> LinkTask<C> {
     /// Delivers what was read. An error ends the connection.
     fn take(&mut self, peer: &mut Peer, read: io::Result<usize>) -> Result<(), String> {
         let now = (self.clock)();
-        match read {
-            Ok(0) => {
-                let error = self.outlet.finish(now, &mut peer.reader);
-                return Err(format!("tracker: {} closed the connection{error}", peer.name));
-            }
-            Ok(len) => peer.reader.push(now, peer.buffer.get(..len).unwrap_or_default()),
+        let len = match read {
+            Ok(len) => len,
+            // The peer closed it before it read what the bench had sent.
+            Err(error) if error.kind() == ErrorKind::ConnectionReset => 0,
             Err(error) => {
                 return Err(format!("tracker: connection to {} lost: {error}", peer.name));
             }
+        };
+        if len == 0 {
+            let error = self.outlet.finish(now, &mut peer.reader);
+            return Err(format!("tracker: {} closed the connection{error}", peer.name));
         }
+        peer.reader.push(now, peer.buffer.get(..len).unwrap_or_default());
         peer.last_heard = Instant::now();
         let delivered = self.outlet.deliver_all(now, &mut peer.reader);
         delivered.map_err(|reason| format!("tracker: {} {reason}", peer.name))
@@ -214,6 +224,7 @@ struct Peer {
     reader: Reader,
     buffer: Vec<u8>,
     last_heard: Instant,
+    speaks_openigtlink: bool,
     request: Option<ToolStream>,
 }
 
@@ -228,8 +239,22 @@ impl Peer {
             reader: Reader::new(settings.protocol),
             buffer: vec![0; Self::BUFFER_LEN],
             last_heard: Instant::now(),
+            speaks_openigtlink,
             request: settings.request.filter(|_| speaks_openigtlink),
         }
+    }
+
+    /// Asks an OpenIGTLink server for its status. If the connection is lost, the next read says why.
+    async fn ask_status(&mut self) {
+        if self.speaks_openigtlink && self.stream.write_all(&get_status()).await.is_ok() {
+            self.reader.await_status();
+        }
+    }
+
+    /// Asks for the status and waits for bytes.
+    async fn ask_and_read(&mut self) -> io::Result<usize> {
+        self.ask_status().await;
+        self.read().await
     }
 
     /// Requests the stream, if one is to be requested.

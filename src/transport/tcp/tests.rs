@@ -3,7 +3,7 @@
 
 use super::*;
 use crate::tracker::openigtlink::{
-    Body, Message, Quaternion, Status, Tool, ToolStream, encode, tool_kind,
+    Body, Message, Quaternion, Status, Tool, ToolStream, encode, get_status, tool_kind,
 };
 use crate::tracker::{Event, Protocol};
 use crate::transport::link::{Link, LinkSettings};
@@ -231,6 +231,54 @@ async fn the_link_reconnects_to_a_silent_server() {
     );
 }
 
+/// A server such as PLUS sends nothing while its tool is out of view, and answers GET_STATUS.
+#[tokio::test]
+async fn a_silent_server_that_answers_a_status_request_keeps_its_connection() {
+    let settings = LinkSettings { silence_limit: Duration::from_secs(1), ..quick() };
+    let (mut link, mut peer, address) = bare_peer(settings).await;
+    let ok = |message: &str| {
+        let (error_name, message) = (String::new(), message.to_owned());
+        let status = Status { code: Status::OK, subcode: 0, error_name, message };
+        encode(&Message::new("Server", None, Body::Status(status)))
+    };
+    let ask = get_status();
+    for _ in 0..2 {
+        assert_eq!(received(&mut peer, ask.len()).await, ask);
+        peer.write_all(&ok("")).await.expect("sent");
+    }
+    // Neither an answer with a text nor a status that comes unasked is an answer only.
+    assert_eq!(received(&mut peer, ask.len()).await, ask);
+    peer.write_all(&[ok("tracking"), ok("")].concat()).await.expect("sent");
+    assert_eq!(next(&mut link).await, Event::Connected { peer: address.to_string() });
+    assert!(matches!(next(&mut link).await, Event::SawTool { .. }));
+    for text in ["tracking", ""] {
+        match next(&mut link).await {
+            Event::Status { status, .. } => assert_eq!(status.message, text),
+            other => panic!("{other:?}"),
+        }
+    }
+    // The server does not answer again.
+    assert_eq!(received(&mut peer, ask.len()).await, ask);
+    let silent = format!("tracker: nothing from {address} for 1s; reconnecting");
+    assert_eq!(until(&mut link, disconnected).await, silent);
+}
+
+/// A peer that closes with unread requests resets the connection.
+#[tokio::test]
+async fn a_reset_by_the_peer_ends_the_connection_like_its_close() {
+    let (mut link, mut peer, address) = bare_peer(quick()).await;
+    peer.write_all(&encode(&position("Needle", 1.0))).await.expect("sent");
+    // Wait for the request, without reading it.
+    let unread = get_status().len();
+    let mut bytes = vec![0; unread];
+    while timeout(HANGING, peer.peek(&mut bytes)).await.expect("in time").expect("bytes") < unread {
+    }
+    drop(peer);
+    assert_eq!(until(&mut link, tool_of_sample).await, "Needle");
+    let reason = until(&mut link, disconnected).await;
+    assert_eq!(reason, format!("tracker: {address} closed the connection"));
+}
+
 /// The next `len` bytes that a peer receives.
 async fn received(peer: &mut TcpStream, len: usize) -> Vec<u8> {
     let mut bytes = vec![0; len];
@@ -244,6 +292,8 @@ async fn a_stream_is_requested_at_the_start_and_stopped_at_the_end() {
         let request = ToolStream { name, period_ms: 25 };
         let settings = LinkSettings { request: Some(request), ..quick() };
         let (mut link, mut peer, _) = bare_peer(settings).await;
+        let ask = get_status();
+        assert_eq!(received(&mut peer, ask.len()).await, ask);
         let start = request.start();
         assert_eq!(received(&mut peer, start.len()).await, start);
         let tool = Tool { name: "Needle".to_owned(), kind: tool_kind::SIX_D, pose: [0.5; 12] };
