@@ -90,10 +90,11 @@ impl<C: Fn() -> Time> LinkTask<C> {
     /// Reads a server until the connection ends, and returns the reason. A server that is silent for half of the
     /// limit is asked for its status: a tool out of view then does not end the connection.
     async fn read_to_end(&mut self, peer: &mut Peer) -> String {
-        peer.ask_status().await;
+        // The request comes first: a server that knows only header version 1 finds no message after GET_STATUS.
         if let Err(reason) = peer.request_stream().await {
             return reason;
         }
+        peer.ask_status().await;
         let half = self.settings.silence_limit / 2;
         loop {
             let read = match timeout(half, peer.read()).await {

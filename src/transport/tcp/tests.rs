@@ -292,10 +292,9 @@ async fn a_stream_is_requested_at_the_start_and_stopped_at_the_end() {
         let request = ToolStream { name, period_ms: 25 };
         let settings = LinkSettings { request: Some(request), ..quick() };
         let (mut link, mut peer, _) = bare_peer(settings).await;
-        let ask = get_status();
-        assert_eq!(received(&mut peer, ask.len()).await, ask);
-        let start = request.start();
+        let (start, ask) = (request.start(), get_status());
         assert_eq!(received(&mut peer, start.len()).await, start);
+        assert_eq!(received(&mut peer, ask.len()).await, ask);
         let tool = Tool { name: "Needle".to_owned(), kind: tool_kind::SIX_D, pose: [0.5; 12] };
         let tools = Message::new("Tracker", None, Body::TrackingData(vec![tool]));
         peer.write_all(&encode(&tools)).await.expect("sent");
