@@ -21,7 +21,7 @@ fn written(scratch: &Scratch, settings: &[&str]) -> PathBuf {
 
 #[test]
 fn the_object_lists_of_a_sheet_name_every_object_in_it() {
-    let makes = [(&[] as &[&str], 63), (&["emulator.drives=\"epos4\""], 57)];
+    let makes = [(&[] as &[&str], 63), (&["emulator.drives=\"epos4\""], 56)];
     for (settings, objects) in makes {
         let scratch = Scratch::new();
         let dir = written(&scratch, settings);
