@@ -134,7 +134,7 @@ fn time_steps_to_targets(name: &str, set: &str) {
         let goal = drawn.to_goal(&|_, _, _| Err(String::new())).expect("no masks");
         let Ok(goal) = goal else { continue };
         let session = SessionConfig { goal, ..study.session.clone() };
-        let mut pursuit = session.goal.clone().and_then(|goal| Pursuit::new(goal, &session));
+        let mut pursuit = session.goal.clone().map(|goal| Pursuit::new(goal, &session));
         let stage = drawn.virtual_stage().expect("valid");
         let mut last = Instant::now();
         // Each step is planned once more, to take the time of the plan alone.

@@ -255,9 +255,8 @@ impl Covariance {
             let gain = |k: usize| x * weight[(0, k)] + y * weight[(1, k)] + z * weight[(2, k)];
             let (gain_x, gain_y, gain_z) = (gain(0), gain(1), gain(2));
             delta[i] = gain_x * innovation.x + gain_y * innovation.y + gain_z * innovation.z;
-            for j in 0..N {
-                self.p[i][j] -=
-                    gain_x * position[0][j] + gain_y * position[1][j] + gain_z * position[2][j];
+            for (j, p) in self.p[i][..N].iter_mut().enumerate() {
+                *p -= gain_x * position[0][j] + gain_y * position[1][j] + gain_z * position[2][j];
             }
         }
         delta
@@ -302,9 +301,8 @@ impl Transition {
         }
         if N > BACKLOG {
             let backlog: [f64; N] = array::from_fn(|j| m[BACKLOG][j]);
-            for i in 0..6 {
-                let by = self.by_backlog[i];
-                (0..N).for_each(|j| m[i][j] += by * backlog[j]);
+            for (row, by) in m.iter_mut().zip(self.by_backlog) {
+                (0..N).for_each(|j| row[j] += by * backlog[j]);
             }
             (0..N).for_each(|j| m[BACKLOG][j] *= self.backlog_kept);
         }
