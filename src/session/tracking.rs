@@ -83,7 +83,7 @@ pub(crate) struct Tracking {
     link_error: Option<String>,
     /// The error of the last malformed message, until a position is accepted.
     malformed: Option<String>,
-    /// The last STATUS that came unasked was OK and came after the last accepted position. PLUS sends it while its
+    /// The last STATUS with a text, or that came unasked, was OK and came after the last accepted position. PLUS sends it while its
     /// tracker gives no frames, not while a tool is out of view.
     status_is_ok: bool,
     /// Samples of the tool that the link dropped.
@@ -462,8 +462,7 @@ impl Tracking {
                 format!("the tracker's messages cannot be read: {error}")
             }
             _ if self.counts.accepted > 0 && self.status_is_ok => {
-                "STATUS OK, but no position: with PLUS the tracker stopped (cable, power), else out of view"
-                    .to_owned()
+                "STATUS OK but no position: PLUS's tracker off, or tool out of view".to_owned()
             }
             _ if self.counts.accepted > 0 => {
                 "the link is up: the tool is out of view, or the source has stopped sending"

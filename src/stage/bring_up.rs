@@ -79,7 +79,7 @@ pub(super) struct BringUpState {
     pub(super) statusword: Option<Statusword>,
     /// The fault that the drive was in when its statusword was read.
     pub(super) found_in_fault: Option<FoundFault>,
-    /// The drive's position when it is at home, counts: minus its home offset, if it is to be homed and has one.
+    /// The drive's position when it is at home, counts: minus its home offset, if it is to be homed.
     pub(super) home_counts: Option<i32>,
 }
 
@@ -295,7 +295,7 @@ impl Script {
     }
 }
 
-/// Objects that no drive may lack, each with the reason. Of the objects that the bring-up writes, a drive may lack:
+/// Objects that no drive may lack if the bring-up uses them, each with the reason. Of the objects that the bring-up writes, a drive may lack:
 ///
 /// - 605A: by CiA 402 the drive then brakes on its quick-stop ramp, as with option 2
 /// - 6065 and 6066: the bench compares target and position itself

@@ -336,19 +336,15 @@ impl Script {
             return Ok(());
         };
         let axis = self.axis;
-        // A drive without a home offset has its home at 0.
         let counts = f64::from(position) - f64::from(self.state().home_counts.unwrap_or(0));
         let apart = counts / self.drive().scale(axis, 0).counts_per_unit();
         if is_at_home(axis, apart) || !homing.says_homed(self.read_statusword().await?) {
             return Ok(());
         }
         let apart = axis.shown(apart.abs());
-        let home = match self.state().home_counts {
-            Some(_) => "its home, which would be lost; jog it back there",
-            None => "0 of the drive; is it at its home",
-        };
         Err(format!(
-            "homed already, and {apart} from {home}, or home it --again (take the needle off, untwist the cable)"
+            "homed already, and {apart} from its home, which would be lost; jog it back there, or home it --again \
+             (take the needle off, untwist the cable)"
         ))
     }
 
@@ -373,8 +369,8 @@ impl Script {
         self.write_counts(drive::HOMING_ACCELERATION, homing.acceleration).await?;
         let object = drive::HOME_OFFSET;
         let offset_counts = match homing.offset {
-            // Without the object home is 0. An EPOS4 has 0x30B0 in its place, and any value of it but 0 shows after the
-            // homing.
+            // Without the object home is 0. An EPOS4 has 0x30B0 in its place: over 1 mm or 5 degrees it is noticed after
+            // the homing.
             None => self.sdo.read_optional(object).await?.map_or(0, |value| value.to_u32() as i32),
             Some(offset) => {
                 let counts = self.drive().scale(self.axis, 0).relative_counts(offset);

@@ -9,6 +9,9 @@ const WINDOW: Duration = Duration::from_secs(30);
 /// The first two windows are as short as this, because the first stamps may be wrong: PLUS fits a line through the
 /// times of the last 20 frames.
 const FIRST_WINDOWS: Duration = Duration::from_secs(2);
+/// The first window counts for 30 s more if the second shows an offset that is larger by more than this: such positions
+/// are delayed, and PLUS's first stamps are not as far off.
+const FIRST_RISE_MAX_NS: i64 = 300_000_000;
 /// A stamp that leads the quickest delivery so far by more than this is not a quicker delivery.
 const AHEAD_MAX_NS: i64 = 50_000_000;
 /// An offset is learnt from at least this many samples, over at least this time.
@@ -259,8 +262,11 @@ impl Minimum {
     fn update(&mut self, receive: Time, offset_ns: i64) -> i64 {
         if receive.since(self.window_start) >= self.window {
             self.window_start = receive;
+            let first_ns = self.previous_ns.filter(|ns| {
+                self.window < WINDOW && self.current_ns.saturating_sub(*ns) > FIRST_RISE_MAX_NS
+            });
             self.window = if self.previous_ns.is_none() { FIRST_WINDOWS } else { WINDOW };
-            self.previous_ns = Some(self.current_ns);
+            self.previous_ns = Some(first_ns.unwrap_or(self.current_ns));
             self.current_ns = offset_ns;
         }
         self.current_ns = self.current_ns.min(offset_ns);

@@ -76,7 +76,7 @@ pub(super) struct Hypothesis {
     pub(super) insertion_mm: f64,
     stroke: Stroke,
     pub(super) covariance: Covariance,
-    /// Transition since the covariance was last propagated or corrected.
+    /// Transition since the covariance was last propagated; a correction's Jacobian is its first part.
     pending: Transition,
     pending_mm: f64,
     /// Logarithm of the weight, up to a constant common to the bank.
@@ -314,7 +314,7 @@ impl Hypothesis {
         self.log_weight -= 0.5 * (square + math::ln(s.determinant()));
         let delta = self.covariance.correct(&innovation, &weight);
         // The error is now that of the corrected pose: `Exp(ε⁺) = Exp(−δ) Exp(ε)`.
-        self.pending.pose = PoseMap::right_jacobian(&self.apply(&delta));
+        self.pending.pose = PoseMap::right_jacobian(&self.apply(&delta)) * self.pending.pose;
         Some(square)
     }
 

@@ -1,9 +1,9 @@
 //! Tests of the invariant observer: emulated needles, and the same needle in another frame.
 
 use super::*;
-use crate::geometry::{FixedAngles, Pose};
+use crate::geometry::{FixedAngles, Pose, Twist};
 use crate::needle::{Play, TorsionConfig};
-use nalgebra::{Matrix6, SVector, Vector3};
+use nalgebra::{Matrix6, SVector, Vector3, Vector6};
 use proptest::prelude::*;
 use std::f64::consts::PI;
 
@@ -241,6 +241,27 @@ fn divergence_is_reported() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
+    /// After a correction by δ the error η of the pose is J_r(δ) η, and so is it in the covariance.
+    #[test]
+    fn a_correction_moves_the_error_to_the_corrected_pose(
+        delta in prop::array::uniform6(-0.05..0.05f64), eta in prop::array::uniform6(-1.0..1.0f64),
+    ) {
+        let twist = |v: [f64; 6]| Twist::from_vector(&Vector6::from_row_slice(&v));
+        let (delta, small) = (twist(delta), eta.map(|component| 1e-6 * component));
+        let sum = Twist { v: delta.v + twist(small).v, w: delta.w + twist(small).w };
+        let expected = (Pose::exp(&delta).inverse() * Pose::exp(&sum)).log().to_vector() * 1e6;
+        let moved = error_state::PoseMap::right_jacobian(&delta).times(&eta);
+        let moved = Vector6::from_row_slice(&moved);
+        prop_assert!((moved - expected).amax() < 1e-4, "{moved} {expected}");
+
+        // P = η ηᵀ becomes J η (J η)ᵀ.
+        let mut covariance = error_state::Covariance::zero(error_state::Extent::Banded);
+        (0..6).for_each(|i| (i..6).for_each(|k| covariance.set(i, k, eta[i] * eta[k])));
+        let pose = error_state::PoseMap::right_jacobian(&delta);
+        covariance.propagate(&error_state::Transition { pose, ..error_state::Transition::none() });
+        prop_assert!((covariance.pose() - moved * moved.transpose()).amax() < 1e-12);
+    }
+
     /// Left invariance: a needle in another frame gets the same estimate in that frame.
     #[test]
     fn a_change_of_frame_changes_nothing(p in prop::array::uniform3(-50.0..50.0f64), yaw in -0.2..0.2f64, roll in -3.0..3.0f64) {

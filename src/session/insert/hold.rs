@@ -18,7 +18,7 @@ const JUMP_ADVICE: &str = "check the tracker, needle.radius_mm, tip_offset_mm";
 /// Advice to the operator when the tip does not move: the needle may be loose, or the axes exchanged.
 const FROZEN_ADVICE: &str = "check the tracker, the needle's clamp, and which drive is which";
 /// Advice to the operator when the tip travels less far than the needle is inserted.
-const BEHIND_ADVICE: &str = "does the shaft buckle, or the clamp slip? check the tracker";
+const BEHIND_ADVICE: &str = "buckled shaft or slipping clamp? check the tracker";
 /// Why a command is refused before the insertion.
 pub(super) const NOT_BEGUN: &str = "the insertion has not begun";
 /// Why the operator can neither prolong nor end a hold by the tracker with `tracker.resume = "stop"`.

@@ -432,7 +432,7 @@ fn a_shaft_that_buckles_is_asked_for() {
         println!("{held_mm:.1} mm: {reason}");
         assert!(reason.contains(" behind the model, ") && held_mm < 20.0, "{held_mm} mm: {reason}");
         assert!(
-            reason.contains("; held and stopped; does the shaft buckle, or the clamp slip?"),
+            reason.contains("; held and stopped; buckled shaft or slipping clamp?"),
             "{reason}"
         );
         assert!(reason.chars().count() < 200, "{reason}");

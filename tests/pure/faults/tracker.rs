@@ -75,8 +75,7 @@ fn a_server_that_is_alive_and_sends_no_position() {
         "a_server_that_is_alive_and_sends_no_position",
         510.0,
         "tracker: last tip 0.47 s old (limit 0.50), 0.93 mm blind + 0.09 to brake \
-         (limit 1.00); held and stopped; STATUS OK, but no position: with PLUS the tracker stopped (cable, power), \
-         else out of view",
+         (limit 1.00); held and stopped; STATUS OK but no position: PLUS's tracker off, or tool out of view",
     );
 }
 
