@@ -11,6 +11,7 @@ mod contradictions;
 mod faults;
 mod loads;
 mod refusals;
+mod trials;
 
 const RIG: &str = include_str!("../../../bench-config/rig-epos4.toml");
 

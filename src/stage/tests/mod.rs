@@ -3,6 +3,7 @@
 mod bring_up;
 mod disobedient;
 mod drive;
+mod earlier_use;
 mod enabling;
 mod following_error;
 mod found_in_fault;
