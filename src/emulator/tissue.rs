@@ -6,6 +6,19 @@ use crate::needle::{Cut, Increment, InsertedPath, Needle, Play, Torsion};
 /// A needle withdrawn to this depth is out of the tissue, mm.
 const OUT_MM: f64 = 0.1;
 
+/// Which part of the needle's curvature the path has, and which part of the base's turns and advances reaches the tip.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Shares {
+    pub(crate) curvature: f64,
+    pub(crate) turn: f64,
+    pub(crate) advance: f64,
+}
+
+impl Shares {
+    /// Those of needle and tissue as configured.
+    const WHOLE: Shares = Shares { curvature: 1.0, turn: 1.0, advance: 1.0 };
+}
+
 /// A needle in tissue. The true position of the stage drives it; its true tip pose follows.
 #[derive(Debug, Clone)]
 pub(crate) struct Tissue {
@@ -16,6 +29,10 @@ pub(crate) struct Tissue {
     /// True depth of the base, mm, and its rotation, rad, at the last advance.
     insertion_true_mm: f64,
     rotation_true_rad: f64,
+    /// What the faults of needle and tissue leave.
+    shares: Shares,
+    /// By how much the tip is behind the base's depth, mm: the shaft has buckled.
+    behind_mm: f64,
     /// Tip pose `X_PB`, and the sum of the tip's rotations about its own axis, rad.
     true_now: Cut,
 }
@@ -33,8 +50,15 @@ impl Tissue {
             path,
             insertion_true_mm: 0.0,
             rotation_true_rad: 0.0,
+            shares: Shares::WHOLE,
+            behind_mm: 0.0,
             true_now: start,
         }
+    }
+
+    /// Sets what the faults of needle and tissue leave from here on.
+    pub(crate) fn set_shares(&mut self, shares: Shares) {
+        self.shares = shares;
     }
 
     /// Moves the base to this true stage position; both axes move in proportion.
@@ -44,9 +68,12 @@ impl Tissue {
     /// decides how much of the base's rotation reaches the tip. A needle that was pulled out enters
     /// fresh tissue.
     pub(crate) fn advance(&mut self, insertion_true_mm: f64, rotation_true_rad: f64) {
-        let turn_rad = rotation_true_rad - self.rotation_true_rad;
+        let turn_rad = (rotation_true_rad - self.rotation_true_rad) * self.shares.turn;
         let cut_mm = self.path.depth_mm().unwrap_or(0.0);
-        let (from_mm, to_mm) = (self.insertion_true_mm, insertion_true_mm);
+        let from_mm = self.insertion_true_mm - self.behind_mm;
+        let advance_mm = (insertion_true_mm - self.insertion_true_mm).max(0.0);
+        self.behind_mm += advance_mm * (1.0 - self.shares.advance);
+        let to_mm = insertion_true_mm - self.behind_mm;
         let new_mm = (to_mm - from_mm.max(cut_mm)).max(0.0);
         let turn_cutting_rad =
             if new_mm > 0.0 { turn_rad * new_mm / (to_mm - from_mm) } else { 0.0 };
@@ -62,10 +89,11 @@ impl Tissue {
         if let Ok(base) = Increment::new(new_mm, turn_cutting_rad)
             && new_mm > 0.0
         {
+            let needle = self.needle.with_share_of_curvature(self.shares.curvature);
             let mut depth_mm = to_mm - new_mm;
             for tip in self.play.advance(&self.torsion, base) {
                 depth_mm += tip.insertion_mm();
-                self.true_now.tip = self.needle.step(&self.true_now.tip, tip);
+                self.true_now.tip = needle.step(&self.true_now.tip, tip);
                 self.true_now.roll_rad += tip.rotation_rad();
                 self.path.advance(depth_mm, self.true_now);
             }
@@ -73,7 +101,7 @@ impl Tissue {
         if to_mm < from_mm.min(OUT_MM) {
             self.leave(to_mm.clamp(0.0, cut_mm), rotation_true_rad);
         }
-        self.insertion_true_mm = to_mm;
+        self.insertion_true_mm = insertion_true_mm;
         self.rotation_true_rad = rotation_true_rad;
     }
 
@@ -87,6 +115,7 @@ impl Tissue {
     /// The needle is out: its tip follows the base's rotation, and its channel is dropped.
     fn leave(&mut self, at_mm: f64, rotation_true_rad: f64) {
         self.play = Play::default();
+        self.behind_mm = 0.0;
         self.true_now.roll_rad = rotation_true_rad;
         self.slide(at_mm);
         self.path = InsertedPath::default();
@@ -279,5 +308,27 @@ mod tests {
         tissue.advance(10.0 + 2.0 / 1.3, -0.5);
         let back = step(&free, 0.0, -0.3);
         assert!(distance(tissue.tip_true(), &back) < 1e-9, "retraced through the kink");
+    }
+
+    #[test]
+    fn tissue_chuck_and_shaft_leave_their_share() {
+        let mut tissue = tissue();
+        tissue.set_shares(Shares { curvature: 0.5, ..Shares::WHOLE });
+        tissue.advance(10.0, 0.0);
+        let softer = needle().with_share_of_curvature(0.5);
+        let mut expected = softer.step(&Pose::identity(), Increment::new(10.0, 0.0).unwrap());
+        assert!(distance(tissue.tip_true(), &expected) < 1e-9);
+        tissue.set_shares(Shares { turn: 0.5, ..Shares::WHOLE });
+        tissue.advance(10.0, 0.8);
+        expected = step(&expected, 0.0, 0.4);
+        assert!(distance(tissue.tip_true(), &expected) < 1e-9);
+        tissue.set_shares(Shares { advance: 0.5, ..Shares::WHOLE });
+        tissue.advance(14.0, 0.8);
+        expected = step(&expected, 2.0, 0.0);
+        assert!(distance(tissue.tip_true(), &expected) < 1e-9);
+        tissue.set_shares(Shares::WHOLE);
+        tissue.advance(15.0, 0.8);
+        expected = step(&expected, 1.0, 0.0);
+        assert!(distance(tissue.tip_true(), &expected) < 1e-9, "what was lost stays lost");
     }
 }

@@ -2,7 +2,7 @@
 
 use super::drive::{Drive, DriveConfig};
 use super::fault::{Fault, FaultKind, FaultyLine, Script, ScriptEvent, Toward};
-use super::tissue::Tissue;
+use super::tissue::{Shares, Tissue};
 use super::tracker::{EmulatedTracker, TargetModel, TrackedTip, TrackerModel};
 use super::truth::Truth;
 use crate::canopen::Frame;
@@ -217,6 +217,15 @@ impl VirtualStage {
 
     fn move_needle(&mut self, now: Time) {
         let (insertion_mm, rotation_rad) = self.position_true(now);
+        let left = |kind: FaultKind| -> f64 {
+            let faults = self.script.active().filter(|fault| fault.kind == kind);
+            faults.map(Fault::share_left).product()
+        };
+        self.tissue.set_shares(Shares {
+            curvature: left(FaultKind::Tissue),
+            turn: left(FaultKind::ChuckSlip),
+            advance: left(FaultKind::Buckling),
+        });
         self.tissue.advance(insertion_mm, rotation_rad);
     }
 

@@ -110,6 +110,11 @@ impl Needle {
         Ok(Needle { tip_ahead_mm, ..self })
     }
 
+    /// The same needle with `share` ≥ 0 of its curvature.
+    pub(crate) fn with_share_of_curvature(self, share: f64) -> Self {
+        Needle { curvature_per_mm: self.curvature_per_mm * share, ..self }
+    }
+
     /// Curvature κ, per mm.
     pub fn curvature_per_mm(&self) -> f64 {
         self.curvature_per_mm

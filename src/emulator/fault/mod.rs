@@ -47,6 +47,9 @@ section! {
         length: Option<u8> [within(0.0, 8.0)];
         /// For "drive-fault": the emergency code.
         code: Option<u16> [within(1.0, u16::MAX as f64)];
+        /// For "tissue", "chuck-slip" and "buckling": which part is left of the needle's curvature, of each turn of
+        /// the base, or of each advance of the base.
+        share: Option<f64> [within(0.0, 10.0)];
         /// For "foreign": the frame, as candump writes it.
         frame: Option<String> [FRAME];
         /// For "foreign": time between two frames; left out, one frame.
@@ -99,6 +102,12 @@ choice! {
         BusStuck = "bus-stuck",
         /// Another node sends a frame.
         Foreign = "foreign",
+        /// The tissue bends the needle more, or less.
+        Tissue = "tissue",
+        /// The needle turns less than its chuck.
+        ChuckSlip = "chuck-slip",
+        /// The shaft buckles outside the tissue: the tip advances less than the base.
+        Buckling = "buckling",
     }
 }
 
@@ -160,6 +169,7 @@ impl Fault {
             FaultKind::Resize if self.length.is_none() => Some("length"),
             FaultKind::DriveFault if self.code.is_none() => Some("code"),
             FaultKind::Foreign if self.frame.is_none() => Some("frame"),
+            kind if kind.has("share") && self.share.is_none() => Some("share"),
             _ => None,
         };
         if let Some(key) = needs {
@@ -199,6 +209,11 @@ impl Fault {
             (FrameClass::Sync, _) => cob::SYNC,
         };
         Some(CanId::Base(cob_id))
+    }
+
+    /// The part that is left by a fault of needle or tissue.
+    pub(super) fn share_left(&self) -> f64 {
+        self.share.unwrap_or(1.0)
     }
 
     /// The frame that another node sends.
@@ -250,6 +265,9 @@ impl fmt::Display for Fault {
                     write!(f, " every {} ms", period.as_nanos() as f64 / 1e6)
                 })
             }
+            FaultKind::Tissue => write!(f, "tissue: {} of the curvature", self.share_left()),
+            FaultKind::ChuckSlip => write!(f, "chuck: {} of each turn", self.share_left()),
+            FaultKind::Buckling => write!(f, "shaft: {} of each advance", self.share_left()),
             _ => {
                 f.write_str(match self.frames {
                     FrameClass::Any => "frames",
@@ -296,6 +314,7 @@ impl FaultKind {
             FaultKind::Resize => &["axis", "frames", "toward", "count", "length"],
             FaultKind::DriveFault => &["axis", "code"],
             FaultKind::Foreign => &["frame", "period_ms"],
+            FaultKind::Tissue | FaultKind::ChuckSlip | FaultKind::Buckling => &["share"],
             kind if kind.is_of_bus() => &[],
             _ => &["axis"],
         };
