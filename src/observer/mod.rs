@@ -51,6 +51,11 @@ pub trait Observer: Send {
         Ok(())
     }
 
+    /// What the operator should know of the last corrections, once; `None` for nothing.
+    fn take_warning(&mut self) -> Option<String> {
+        None
+    }
+
     /// The estimated position at the state's depth, plane frame, mm; `None` while the observer has
     /// none. It equals the position of [`Observer::estimate`] and costs less.
     fn position_mm(&self) -> Option<Vector3<f64>> {

@@ -46,6 +46,8 @@ pub struct Decision {
     pub approach: Option<Approach>,
     /// Why there is no command: the run must be stopped for this reason.
     pub refused: Option<String>,
+    /// A warning of the observer that steers.
+    pub warning: Option<String>,
 }
 
 impl Steering {
@@ -172,6 +174,7 @@ impl Steering {
             command_saturated: command.is_some_and(|command| command.saturated),
             approach,
             refused,
+            warning: self.observer.take_warning(),
         }
     }
 

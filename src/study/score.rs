@@ -31,6 +31,8 @@ pub struct TrialResult {
     pub nis: Option<f64>,
     /// How near the tip came to its target; `None` without a target.
     pub target: Option<TargetScore>,
+    /// True if the observer warned that the positions left its model.
+    pub is_warned: bool,
 }
 
 /// The result of a trial with a target.
@@ -86,6 +88,7 @@ pub struct TrialScorer {
     /// The normalised innovation squared at each step with a position.
     nis: ByDepth<f64>,
     goal: Option<GoalScore>,
+    is_warned: bool,
 }
 
 #[derive(Debug)]
@@ -121,12 +124,14 @@ impl TrialScorer {
                 tip_before: None,
                 clearance_mm: f64::INFINITY,
             }),
+            is_warned: false,
         }
     }
 
     /// Adds one step.
     pub fn take(&mut self, step: &StepRecord, truth: &Truth) {
         self.figures.take_step(step, Some(truth));
+        self.is_warned |= step.decision.warning.is_some();
         if let Some(goal) = &mut self.goal {
             let tip = truth.x_pb;
             let before = goal.tip_before.replace(tip).unwrap_or(tip);
@@ -173,6 +178,7 @@ impl TrialScorer {
             bound_rms: TipError::by_coordinate(&bounds, rms),
             nees: TrialNees::of(last_third(&self.nees, insertion_mm)),
             nis: mean(last_third(&self.nis, insertion_mm)),
+            is_warned: self.is_warned,
             figures,
             target,
             stage: self.stage,

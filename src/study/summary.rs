@@ -94,6 +94,8 @@ pub struct StudySummary {
     pub nees: Option<Nees>,
     /// The innovations relative to their predicted covariance, over the last third of each trial.
     pub nis: Option<Consistency>,
+    /// Share of the trials in which the observer warned that the positions left its model.
+    pub warned_fraction: f64,
     /// The figures of a study with targets; without targets these keys are absent.
     #[serde(flatten)]
     pub target: Option<Targets>,
@@ -175,6 +177,7 @@ impl StudySummary {
         let nis = trials.iter().filter_map(|trial| trial.nis);
         let failed = trials.iter().filter(|trial| !trial.is_settled());
         let settled = trials.iter().filter(|trial| trial.is_settled()).count();
+        let warned = trials.iter().filter(|trial| trial.is_warned).count();
         Some(StudySummary {
             trials: trials.len(),
             settled_fraction: settled as f64 / trials.len() as f64,
@@ -190,6 +193,7 @@ impl StudySummary {
             bound_ratio: bound_ratio(trials),
             nees: Nees::of(trials.iter().filter_map(|trial| trial.nees)),
             nis: Consistency::of_innovations(&nis.collect::<Vec<_>>()),
+            warned_fraction: warned as f64 / trials.len() as f64,
             target: Targets::of(trials),
             failed: failed
                 .map(|trial| FailedTrial {
@@ -234,6 +238,7 @@ mod tests {
             nees: None,
             nis: None,
             target: None,
+            is_warned: false,
         }
     }
 

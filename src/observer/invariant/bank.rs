@@ -1,10 +1,11 @@
 //! Combines the bank into one estimate, and decides whether two of its hypotheses agree.
 
+use super::config::ROLLS;
 use super::error_state::{CURVATURE, GROWTH, LAG, LOWER, ROLL, UPPER};
 use super::hypothesis::Hypothesis;
 use crate::geometry::Pose;
 use crate::observer::mixture::{self, ALIKE_SD};
-use crate::observer::{Belief, Estimate, Shaft, Slack};
+use crate::observer::{Belief, Estimate, Shaft, Slack, start};
 use nalgebra::Matrix6;
 use std::f64::consts::PI;
 
@@ -98,4 +99,16 @@ pub(super) fn estimate(bank: &[Hypothesis]) -> Option<Estimate> {
         },
     };
     Some(Estimate::of_belief(x_pb, belief))
+}
+
+/// The bank once the positions no longer fit it: roll, heading and curvature may have changed. Each hypothesis starts
+/// again at rolls around the circle; that it kept its roll is as likely as all the others together.
+pub(super) fn restarted(bank: &[Hypothesis]) -> Vec<Hypothesis> {
+    let rolls = start::rolls(0.0, PI, ROLLS);
+    let others = rolls.len() as f64 - 1.0;
+    let each = bank.iter().flat_map(|h| rolls.iter().map(move |roll| (h, roll)));
+    each.map(|(h, &(roll_rad, sd_rad, _))| {
+        h.restarted(roll_rad, sd_rad, if roll_rad == 0.0 { 0.5 } else { 0.5 / others })
+    })
+    .collect()
 }

@@ -9,7 +9,7 @@ use crate::needle::{Needle, TipPosition, Torsion, TorsionConfig};
 use crate::observer::start;
 
 /// Number of rolls that the bank starts with if the roll is unknown.
-const ROLLS: u32 = 8;
+pub(super) const ROLLS: u32 = 8;
 /// Relative standard deviation of a configured torsion in one half of the bank.
 const TORSION_SD_TIGHT: f64 = 0.04;
 /// The same in the other half, which takes over if the first half is wrong.
@@ -49,6 +49,9 @@ section! {
         torsion_search_rad_per_mm as "torsion_search_deg_per_mm": f64 [within(0.0, 5.0)] = 0.6;
         /// Innovations of so many times what `position_sd_mm` explains stop the run.
         innovation_max: f64 [within(2.0, 100.0)] = 3.0;
+        /// Roll, heading and curvature are estimated anew if the mean of the innovations is further from 0 than this
+        /// χ², three degrees of freedom.
+        innovation_bias_max: f64 [within(20.0, 1e6)] = 40.0;
         /// Random walks of the needle beside its model.
         noise: NoiseConfig;
     }

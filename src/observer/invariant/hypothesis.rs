@@ -7,7 +7,7 @@
 //! and torsion are additional states.
 
 use super::error_state::{
-    ANCHOR, BACKLOG, CURVATURE, Covariance, ErrorState, Extent, GROWTH, LAG, LOWER, PoseMap,
+    ANCHOR, BACKLOG, CURVATURE, Covariance, ErrorState, Extent, GROWTH, LAG, LOWER, PoseMap, ROLL,
     Transition, UPPER, bracket,
 };
 use super::positive_part::PositivePart;
@@ -22,6 +22,22 @@ use nalgebra::{Matrix3, Vector3};
 const REVERSAL_MARGIN_RAD: f64 = 0.05;
 /// The part of that margin in standard deviations of the distance to the edge.
 const REVERSAL_MARGIN_SD: f64 = 5.0;
+
+/// What a restart adds to the uncertainty of the pose and, as a part of it, of the curvature. It need not cover a large
+/// error, since the next restart adds to it again.
+const RESTART_POSITION_SD_MM: f64 = 0.1;
+const RESTART_AXIAL_SD_MM: f64 = 0.3;
+const RESTART_HEADING_SD_RAD: f64 = 0.03;
+const RESTART_CURVATURE_SD: f64 = 0.3;
+
+/// The innovation of one hypothesis.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Innovation {
+    /// Its normalised square (NIS): χ² with three degrees of freedom.
+    pub(super) square: f64,
+    /// The innovation in units of its standard deviation, in the plane frame.
+    pub(super) whitened: Vector3<f64>,
+}
 
 /// Process noise, as variances per mm of insertion.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -302,20 +318,46 @@ impl Hypothesis {
         }
     }
 
-    /// Corrects with a measured position. Returns the normalised innovation squared (NIS), χ² with three
-    /// degrees of freedom, or `None` if the innovation's covariance is not positive. The hypothesis'
-    /// covariance must have been propagated.
-    pub(super) fn correct(&mut self, tip_meas: &TipPosition, variance_mm2: f64) -> Option<f64> {
+    /// Corrects with a measured position. Returns its innovation, or `None` if the innovation's covariance is not
+    /// positive. The hypothesis' covariance must have been propagated.
+    pub(super) fn correct(
+        &mut self,
+        tip_meas: &TipPosition,
+        variance_mm2: f64,
+    ) -> Option<Innovation> {
         let off_mm = tip_meas.mm() - self.x_pb.translation;
         let innovation = self.x_pb.rotation.inverse_transform_vector(&off_mm);
         let s = self.covariance.position() + Matrix3::identity() * variance_mm2;
-        let weight = s.cholesky()?.inverse();
+        let factor = s.cholesky()?;
+        let weight = factor.inverse();
+        let whitened = factor.l_dirty().solve_lower_triangular(&innovation)?;
+        let whitened = self.x_pb.rotation * whitened;
         let square = innovation.dot(&(weight * innovation));
         self.log_weight -= 0.5 * (square + math::ln(s.determinant()));
         let delta = self.covariance.correct(&innovation, &weight);
         // The error is now that of the corrected pose: `Exp(ε⁺) = Exp(−δ) Exp(ε)`.
         self.pending.pose = PoseMap::right_jacobian(&self.apply(&delta)) * self.pending.pose;
-        Some(square)
+        Some(Innovation { square, whitened })
+    }
+
+    /// The hypothesis that the tip has turned by `roll_rad` unnoticed, known to `roll_sd_rad`, with this share of the
+    /// weight. Heading, curvature and the rest of the pose may have changed as well.
+    pub(super) fn restarted(&self, roll_rad: f64, roll_sd_rad: f64, share: f64) -> Self {
+        let mut h = self.clone();
+        h.propagate_covariance(None);
+        let turn = Pose::exp(&Twist { v: Vector3::zeros(), w: Vector3::new(0.0, 0.0, roll_rad) });
+        h.x_pb = h.x_pb * turn;
+        h.covariance
+            .propagate(&Transition { pose: PoseMap::adjoint_inverse(&turn), ..Transition::none() });
+        for across in [0, 1] {
+            h.covariance.add_variance(across, RESTART_POSITION_SD_MM.powi(2));
+            h.covariance.add_variance(3 + across, RESTART_HEADING_SD_RAD.powi(2));
+        }
+        h.covariance.add_variance(2, RESTART_AXIAL_SD_MM.powi(2));
+        h.covariance.add_variance(ROLL, roll_sd_rad.powi(2));
+        h.covariance.add_variance(CURVATURE, (RESTART_CURVATURE_SD * h.curvature_per_mm).powi(2));
+        h.log_weight += math::ln(share);
+        h
     }
 
     /// Moves the mean by `delta`. Returns the pose part of `delta`.

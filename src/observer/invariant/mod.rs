@@ -5,9 +5,11 @@
 //! of its shaft, and works from every pose. A single filter can lock on to the wrong roll, so
 //! several start around the circle, each with several torsions if the torsion is uncertain. They
 //! are weighted by their likelihood. Unlikely ones are dropped and those that agree are merged
-//! ([`mixture`]), so that soon one or a few are left.
+//! ([`mixture`]), so that soon one or a few are left. If the positions later leave them all behind ([`bias`]), the
+//! bank is restarted around the circle.
 
 mod bank;
+mod bias;
 mod config;
 mod error_state;
 mod hypothesis;
@@ -19,12 +21,16 @@ pub use config::{InvariantConfig, NoiseConfig};
 
 use super::{Estimate, Observer, mixture};
 use crate::needle::{Increment, Needle, TipPosition, Torsion};
-use hypothesis::Hypothesis;
+use bias::InnovationBias;
+use hypothesis::{Hypothesis, Innovation};
 use nalgebra::Vector3;
 use std::collections::VecDeque;
 
 /// Number of innovations over which divergence is judged.
 const INNOVATIONS: usize = 20;
+/// The bias of the innovations is judged from this depth on: before it the likeliest roll may be a wrong one, and
+/// the size of the noise is not known yet.
+const BIAS_JUDGED_FROM_MM: f64 = 15.0;
 
 /// The bank of filters.
 #[derive(Debug, Clone)]
@@ -36,6 +42,10 @@ pub struct Invariant {
     /// Normalised innovations squared (NIS) of the likeliest hypothesis, the last ones: χ² with three degrees
     /// of freedom.
     innovations: VecDeque<f64>,
+    /// Their bias since the last restart.
+    bias: InnovationBias,
+    /// Says why the bank was restarted, until it is taken.
+    warning: Option<String>,
     insertion_mm: f64,
     log_evidence: f64,
     /// No hypothesis is left.
@@ -51,6 +61,8 @@ impl Invariant {
             config,
             bank: Vec::new(),
             innovations: VecDeque::new(),
+            bias: InnovationBias::default(),
+            warning: None,
             insertion_mm: 0.0,
             log_evidence: 0.0,
             is_lost: false,
@@ -89,13 +101,14 @@ impl Invariant {
             return;
         }
         let noise = self.config.process_noise(&self.needle);
-        let mut likeliest = (f64::NEG_INFINITY, f64::INFINITY);
+        let unknown = Innovation { square: f64::INFINITY, whitened: Vector3::zeros() };
+        let mut likeliest = (f64::NEG_INFINITY, unknown);
         let log_weight_before = mixture::log_weight(&self.bank);
         self.bank.retain_mut(|h| {
             h.propagate_covariance(Some(&noise));
-            let Some(square) = h.correct(tip_meas, variance_mm2) else { return false };
+            let Some(innovation) = h.correct(tip_meas, variance_mm2) else { return false };
             if h.log_weight > likeliest.0 {
-                likeliest = (h.log_weight, square);
+                likeliest = (h.log_weight, innovation);
             }
             h.is_sound()
         });
@@ -107,8 +120,26 @@ impl Invariant {
         if self.innovations.len() == INNOVATIONS {
             self.innovations.pop_front();
         }
-        self.innovations.push_back(likeliest.1);
+        self.innovations.push_back(likeliest.1.square);
+        self.bias.take(&likeliest.1.whitened, self.insertion_mm);
         mixture::reduce(&mut self.bank);
+    }
+
+    /// Restarts the bank if the innovations have a bias. Noise beyond the configured standard deviation exaggerates it;
+    /// their mean square shows by how much.
+    fn restart_if_biased(&mut self) {
+        let (chi_squared, limit) =
+            (self.bias.chi_squared() / self.innovation_excess(), self.config.innovation_bias_max);
+        if self.insertion_mm < BIAS_JUDGED_FROM_MM || !(chi_squared > limit) {
+            return;
+        }
+        self.bank = bank::restarted(&self.bank);
+        self.bias = InnovationBias::default();
+        self.warning = Some(format!(
+            "the positions leave the model at {:.1} mm (chi2 {chi_squared:.0}, limit {limit:.0}): roll, heading and \
+             curvature are estimated anew; did the chuck slip, the tissue change or the shaft buckle?",
+            self.insertion_mm
+        ));
     }
 }
 
@@ -120,6 +151,11 @@ impl Observer for Invariant {
 
     fn correct(&mut self, tip_meas: &TipPosition, independent: f64) {
         self.correct_with(tip_meas, self.config.position_sd_mm.powi(2) / independent);
+        self.restart_if_biased();
+    }
+
+    fn take_warning(&mut self) -> Option<String> {
+        self.warning.take()
     }
 
     fn position_mm(&self) -> Option<Vector3<f64>> {

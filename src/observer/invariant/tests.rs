@@ -19,6 +19,7 @@ fn config() -> InvariantConfig {
         torsion_offset_sd_rad: 0.1,
         torsion_search_rad_per_mm: 0.0,
         innovation_max: 3.0,
+        innovation_bias_max: 40.0,
         noise: NoiseConfig {
             position_mm: 0.0,
             axial_mm: 0.0,
@@ -98,6 +99,39 @@ fn finds_the_pose_from_every_roll() {
         assert!(mm < 0.1 && rad < 0.02 && observer.bank.len() <= 3, "roll {roll}: {mm} {rad}");
         assert!(estimate.is_roll_known() && observer.check().is_ok());
     }
+}
+
+/// A chuck that slips turns the tip by an angle that nobody measures.
+#[test]
+fn a_roll_that_changes_unnoticed_is_found_again() {
+    let rigid = Torsion::default();
+    for roll in [0.0, 0.6, -0.5 * PI, PI] {
+        let mut observer = Invariant::new(needle(), rigid, config());
+        let tip = follow(&mut observer, needle(), &rigid, Pose::identity(), 60, 1);
+        assert_eq!(observer.take_warning(), None);
+        let slip = Pose::exp(&Twist { v: Vector3::zeros(), w: Vector3::new(0.0, 0.0, roll) });
+        let tip = follow(&mut observer, needle(), &rigid, tip * slip, 100, 1);
+        let (mm, rad) = apart(&observer.estimate().unwrap(), &tip);
+        assert!(mm < 0.15 && rad < 0.03, "roll {roll}: {mm} {rad}");
+        let warning = observer.take_warning();
+        assert_eq!(warning.is_some(), roll != 0.0, "roll {roll}: {warning:?}");
+        assert!(warning.is_none_or(|text| format!("observer: {text}").len() < 200));
+        assert_eq!(observer.take_warning(), None, "each is taken once");
+    }
+}
+
+/// Softer tissue from 60 mm on.
+#[test]
+fn a_curvature_that_changes_is_found_again() {
+    let rigid = Torsion::default();
+    let mut observer = Invariant::new(needle(), rigid, config());
+    let tip = follow(&mut observer, needle(), &rigid, Pose::identity(), 60, 1);
+    let softer = needle().with_share_of_curvature(0.3);
+    let tip = follow(&mut observer, softer, &rigid, tip, 100, 1);
+    let estimate = observer.estimate().unwrap();
+    let (mm, rad) = apart(&estimate, &tip);
+    let share = estimate.belief.unwrap().curvature_per_mm / needle().curvature_per_mm();
+    assert!(mm < 0.15 && rad < 0.05 && (share - 0.3).abs() < 0.06, "{mm} {rad} {share}");
 }
 
 /// In a stepwise insertion also the first one is a mean.

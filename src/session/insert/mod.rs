@@ -10,7 +10,7 @@ use self::start::Start;
 use super::config::SessionConfig;
 use super::estimation::{Estimation, Measurement};
 use super::insertion::{DueStep, Insertion};
-use super::record::{Lane, Record, StepRecord};
+use super::record::{Lane, Record, Severity, StepRecord};
 use super::shell::{Power, Shell};
 use super::state::State;
 use super::steering::Decision;
@@ -222,6 +222,9 @@ impl InsertTask {
         self.progress.x_mm = estimate.map(|estimate| estimate.x_pb.translation.x);
         let rolled = estimate.filter(Estimate::is_roll_known);
         self.progress.roll_rad = rolled.map(|estimate| coordinates(&estimate.x_pb)[5]);
+        if let Some(warning) = decision.warning.clone() {
+            shell.report_at(time, Lane::Observer, Severity::Warning, warning);
+        }
         let control = if command_saturated { State::Saturated } else { State::Steering };
         shell.enter_at(time, control);
         shell.record(Record::Step(Box::new(StepRecord {
