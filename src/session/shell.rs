@@ -52,7 +52,7 @@ pub(crate) struct Shell {
     /// The bench has stopped sending its heartbeat on purpose.
     is_silent: bool,
     /// The state of each part of the bench.
-    states: BTreeMap<Lane, State>,
+    pub(super) states: BTreeMap<Lane, State>,
     /// The follow-up reasons reported since the stop began.
     follow_ups: Vec<String>,
     /// The part of the stop that the drives did not confirm.
@@ -97,11 +97,6 @@ impl Shell {
         if self.states.insert(state.lane(), state) != Some(state) {
             self.record(Record::State { time, state });
         }
-    }
-
-    /// The state that the run itself is in.
-    pub(super) fn session_state(&self) -> State {
-        self.states.get(&Lane::Session).copied().unwrap_or_default()
     }
 
     /// Records an event, which the operator sees.

@@ -314,9 +314,11 @@ impl Stage {
 
     /// Holds, or quick-stops, until both axes stand.
     fn stop(&mut self, now: Time, quick: bool, give_up: Time) {
-        let standing = self.drives.all(|drive| drive.stands() && !(quick && drive.is_enabled()));
+        let standing =
+            self.drives.all(|drive| drive.standstill.stands() && !(quick && drive.is_enabled()));
         if !quick && !standing && now >= give_up {
-            self.fail_orderly_end(now, Drive::stands, "not seen to stand", "its last target");
+            let stands = |drive: &Drive| drive.standstill.stands();
+            self.fail_orderly_end(now, stands, "not seen to stand", "its last target");
         } else if standing || now >= give_up {
             let give_up = now + self.config.power.stop_timeout;
             self.phase = Phase::Disabling { quick, standing, give_up };
