@@ -163,11 +163,8 @@ impl TrackerSection {
     /// # Errors
     /// Those of [`TrackerSection::to_registration`].
     pub fn to_gate(&self) -> Result<Gate, ConfigError> {
-        Ok(Gate {
-            registration: self.to_registration()?,
-            workspace: self.workspace,
-            ..self.to_unregistered_gate()
-        })
+        let registration = self.to_registration()?;
+        Ok(Gate { registration, workspace: self.workspace, ..self.to_unregistered_gate() })
     }
 
     /// The same gate without a registration and a workspace: positions stay in the tracker's frame.
