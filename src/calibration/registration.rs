@@ -45,14 +45,12 @@ impl FiducialPair {
     /// # Errors
     /// A missing column, or a field that is not a finite number, with its line.
     pub fn parse(csv: &str) -> Result<Vec<Self>, String> {
-        let rows = Table::parse(csv).numbers(FIDUCIAL_COLUMNS)?;
-        Ok(rows
-            .into_iter()
-            .map(|[tx, ty, tz, wx, wy, wz]| FiducialPair {
-                tracker_mm: Vector3::new(tx, ty, tz),
-                bench_mm: Vector3::new(wx, wy, wz),
-            })
-            .collect())
+        let rows = Table::parse(csv).numbers(FIDUCIAL_COLUMNS)?.into_iter();
+        let pairs = rows.map(|[tx, ty, tz, wx, wy, wz]| FiducialPair {
+            tracker_mm: Vector3::new(tx, ty, tz),
+            bench_mm: Vector3::new(wx, wy, wz),
+        });
+        Ok(pairs.collect())
     }
 }
 

@@ -48,14 +48,13 @@ impl TurnSample {
     /// with its line.
     pub fn parse(csv: &str) -> Result<Vec<Self>, String> {
         let table = Table::parse(csv);
-        let samples = table.numbers(TURN_COLUMNS)?.into_iter().zip(table.rotations()?);
-        Ok(samples
-            .map(|([rotation_meas_rad, x, y, z], orientation_meas)| TurnSample {
-                rotation_meas_rad,
-                position_meas_mm: Vector3::new(x, y, z),
-                orientation_meas,
-            })
-            .collect())
+        let rows = table.numbers(TURN_COLUMNS)?.into_iter().zip(table.rotations()?);
+        let samples = rows.map(|([rotation_meas_rad, x, y, z], orientation_meas)| TurnSample {
+            rotation_meas_rad,
+            position_meas_mm: Vector3::new(x, y, z),
+            orientation_meas,
+        });
+        Ok(samples.collect())
     }
 }
 

@@ -309,6 +309,7 @@ impl Job<'_> {
 /// The scene that viewers show with the records of a run of `config`. For a motion of the stage, a goal that cannot be
 /// read is no error.
 pub(super) fn scene(config: &Config, is_motion: bool) -> Result<Scene, ConfigError> {
+    let shadows = config.observer.observers().skip(1);
     Ok(Scene {
         x_wp: config.plane,
         insertion_mm: config.insertion.depth_mm,
@@ -319,12 +320,7 @@ pub(super) fn scene(config: &Config, is_motion: bool) -> Result<Scene, ConfigErr
             GoalKind::Target => Some(config.to_plan(&mask_reader(None, no_warning))?),
         },
         truth: config.knows_truth(),
-        shadows: config
-            .observer
-            .observers()
-            .skip(1)
-            .map(|shadow| shadow.name().to_owned())
-            .collect(),
+        shadows: shadows.map(|shadow| shadow.name().to_owned()).collect(),
         rotation_max_rad_per_mm: config.control.rotation_max_rad_per_mm(),
         tip_meas_age_max_s: config.tracker.hold.after.as_secs_f64(),
         stage: config.to_stage()?,

@@ -7,7 +7,7 @@ use super::records::last_run_on_a_bus;
 use super::{ENVIRONMENT_FAILED, Failure, Result, finish_with};
 use crate::canopen::Frame;
 use crate::config::{Source, StopConfig};
-use crate::runtime::{BusTrouble, Clock, talk_live};
+use crate::runtime::{BusErrors, Clock, talk_live};
 use crate::stage::{Axis, QuickStop};
 use clap::Args;
 use serde_json::json;
@@ -75,7 +75,7 @@ fn settings(configured: &Configured) -> Result<StopConfig> {
 }
 
 /// Reports which stops were confirmed, which were not, and which frames were not sent.
-fn report(quick_stop: &QuickStop, trouble: &BusTrouble, as_json: bool) -> Result<()> {
+fn report(quick_stop: &QuickStop, trouble: &BusErrors, as_json: bool) -> Result<()> {
     let mut object = json!({});
     let (mut errors, mut confirmed) = (Vec::new(), Vec::new());
     for axis in Axis::BOTH {

@@ -2,11 +2,10 @@
 
 use super::reader::{Reader, contradictions};
 use super::tracker::FILE;
-use super::value::join;
 use super::{Config, ConfigError, TrackerSource};
 use crate::control::ControlKind;
 use crate::geometry::{POSITION, Pose};
-use crate::keys::{Rule, choice, not_blank, over, section, within};
+use crate::keys::{Rule, choice, join, not_blank, over, section, within};
 use crate::plan::{CLEARANCE_MIN_MM, Obstacle, Problem, Tip, Workspace, World};
 use crate::session::{Goal, TargetTool};
 use crate::text::clipped;

@@ -6,8 +6,8 @@ use toml::{Table, Value};
 
 use super::Config;
 use super::error::{ConfigError, Problem, nearest_key};
-use super::value::{self, Entries, Entry, Origin, join};
-use crate::keys::{DefaultHolds, Key, Kind, Rule, Words, expanded, find, tables};
+use super::value::{self, Entries, Entry, Origin};
+use crate::keys::{DefaultHolds, Key, Kind, Rule, Words, expanded, find, join, tables};
 
 /// The merged sources: the entry of the highest layer, by dotted key.
 pub(super) type Tree = BTreeMap<String, Entry>;

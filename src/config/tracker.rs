@@ -10,8 +10,8 @@ use crate::observer::PositionNoise;
 use crate::session::HoldConfig;
 use crate::tracker::openigtlink::ToolStream;
 use crate::tracker::{
-    ContentChecks, CsvMapping, Gate, Protocol, Registration, StampPolicy, TrackSettings,
-    TrackerKind, Workspace,
+    ContentChecks, CsvMapping, Gate, Registration, StampPolicy, TrackSettings, TrackerKind,
+    Workspace,
 };
 
 pub(super) const FILE: Rule = not_blank("the path of a file");
@@ -163,11 +163,8 @@ impl TrackerSection {
     /// # Errors
     /// Those of [`TrackerSection::to_registration`].
     pub fn to_gate(&self) -> Result<Gate, ConfigError> {
-        Ok(Gate {
-            registration: self.to_registration()?,
-            workspace: self.workspace,
-            ..self.to_unregistered_gate()
-        })
+        let registration = self.to_registration()?;
+        Ok(Gate { registration, workspace: self.workspace, ..self.to_unregistered_gate() })
     }
 
     /// The same gate without a registration and a workspace: positions stay in the tracker's frame.
@@ -186,14 +183,6 @@ impl TrackerSection {
         let configured_mm = self.noise.map_or(0.0, |noise| noise.sd_mm());
         let noise_sd_mm = self.gates.track.noise_sd_mm.max(configured_mm);
         TrackSettings { kind: self.kind, noise_sd_mm, ..self.gates.track }
-    }
-
-    /// The protocol of the tracker's connection; meaningless for a source without a connection.
-    pub fn to_protocol(&self) -> Protocol {
-        match self.source {
-            TrackerSource::Ndjson => Protocol::Ndjson,
-            _ => Protocol::OpenIgtLink,
-        }
     }
 
     /// The stream to request from the server, if any.

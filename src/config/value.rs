@@ -7,6 +7,7 @@ use toml::{Spanned, Table, Value};
 
 use super::error::{ConfigError, Problem};
 use super::reader::is_inside;
+use crate::keys::join;
 use crate::text::clipped;
 
 /// Where a value was given.
@@ -167,15 +168,6 @@ pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, ConfigError
             Ok(vec![(key.to_owned(), Entry { value, source_text, origin: Origin::Set, layer })])
         }
     }
-}
-
-/// The key `name` in the table `path`. Names that need quotes in TOML keep them, so that they are
-/// never taken for a dotted key.
-pub(super) fn join(path: &str, name: &str) -> String {
-    let bare = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
-    let quoted = !name.chars().all(bare) || name.is_empty();
-    let name = if quoted { format!("{name:?}") } else { name.to_owned() };
-    if path.is_empty() { name } else { format!("{path}.{name}") }
 }
 
 /// Line and column of a byte offset, both from 1; the column counts characters.

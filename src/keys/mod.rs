@@ -132,6 +132,15 @@ impl Kind {
     }
 }
 
+/// Methods that return the declaration with one property changed.
+macro_rules! setters {
+    ($($name:ident($($argument:ident: $type:ty)?) { $property:ident: $value:expr })*) => {$(
+        pub(crate) const fn $name(self $(, $argument: $type)?) -> Self {
+            Key { $property: $value, ..self }
+        }
+    )*};
+}
+
 impl Key {
     pub(crate) const fn new<T: Field>(name: &'static str, text: &'static str) -> Self {
         Key {
@@ -151,56 +160,20 @@ impl Key {
         }
     }
 
-    pub(crate) const fn rule(self, rule: Rule) -> Self {
-        Key { rule, ..self }
-    }
-
-    pub(crate) const fn default(self, toml: &'static str) -> Self {
-        Key { default: Some(toml), ..self }
-    }
-
-    pub(crate) const fn converted(self) -> Self {
-        Key { is_converted: true, ..self }
-    }
-
-    pub(crate) const fn flat(self) -> Self {
-        Key { is_flat: true, ..self }
-    }
-
-    pub(crate) const fn table(self, keys: &'static [Key]) -> Self {
-        Key { kind: Kind::Table(keys), ..self }
-    }
-
-    pub(crate) const fn whole(self) -> Self {
-        Key { is_whole: true, ..self }
-    }
-
-    pub(crate) const fn instead_of(self, other: &'static str) -> Self {
-        Key { instead_of: Some(other), ..self }
-    }
-
-    pub(crate) const fn at_most(self, other: &'static str) -> Self {
-        Key { at_most: Some(other), ..self }
-    }
-
-    pub(crate) const fn narrowed(self, narrowed: &'static [(&'static str, Rule)]) -> Self {
-        Key { narrowed, ..self }
-    }
-
-    pub(crate) const fn hardware_must_give(self) -> Self {
-        Key { default_holds: DefaultHolds::ForEmulatedStage, ..self }
-    }
-
-    pub(crate) const fn hardware_may_omit(self) -> Self {
-        Key { default_holds: DefaultHolds::ForHardware, ..self }
-    }
-
-    pub(crate) const fn tracker_must_give(self) -> Self {
-        Key { default_holds: DefaultHolds::ForEmulatedTracker, ..self }
-    }
-
-    pub(crate) const fn everywhere(self) -> Self {
-        Key { default_holds: DefaultHolds::Everywhere, ..self }
+    setters! {
+        rule(rule: Rule) { rule: rule }
+        default(toml: &'static str) { default: Some(toml) }
+        converted() { is_converted: true }
+        flat() { is_flat: true }
+        table(keys: &'static [Key]) { kind: Kind::Table(keys) }
+        whole() { is_whole: true }
+        instead_of(other: &'static str) { instead_of: Some(other) }
+        at_most(other: &'static str) { at_most: Some(other) }
+        narrowed(narrowed: &'static [(&'static str, Rule)]) { narrowed: narrowed }
+        hardware_must_give() { default_holds: DefaultHolds::ForEmulatedStage }
+        hardware_may_omit() { default_holds: DefaultHolds::ForHardware }
+        tracker_must_give() { default_holds: DefaultHolds::ForEmulatedTracker }
+        everywhere() { default_holds: DefaultHolds::Everywhere }
     }
 
     /// The default, if there is one.
@@ -262,6 +235,15 @@ pub(crate) fn expanded(keys: &[Key], narrowed: &[(&str, Rule)]) -> Vec<Key> {
         }
     }
     all
+}
+
+/// The key `name` in the table `path`. Names that need quotes in TOML keep them, so that they are
+/// never taken for a dotted key.
+pub(crate) fn join(path: &str, name: &str) -> String {
+    let bare = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    let quoted = !name.chars().all(bare) || name.is_empty();
+    let name = if quoted { format!("{name:?}") } else { name.to_owned() };
+    if path.is_empty() { name } else { format!("{path}.{name}") }
 }
 
 /// The key at the dotted `path` in a table with these `keys`.

@@ -2,7 +2,7 @@
 
 use serde_json::{Map, Value as Json, json};
 
-use super::{DefaultHolds, Key, Kind, Range, Rule, Words, expanded, tables};
+use super::{DefaultHolds, Key, Kind, Range, Rule, Words, expanded, join, tables};
 
 /// Longest line of a comment, characters.
 const LINE_MAX: usize = 100;
@@ -29,8 +29,7 @@ fn write_table(text: &mut String, keys: &'static [Key], path: &str, narrowed: &[
         write_key(text, key, path);
     }
     for key in keys.iter().filter(|key| is_section(key) && !key.is_optional) {
-        let path =
-            if path.is_empty() { key.name.to_owned() } else { format!("{path}.{}", key.name) };
+        let path = join(path, key.name);
         text.push('\n');
         comment(text, "# ", key.text);
         text.push_str(&format!("[{path}]\n"));

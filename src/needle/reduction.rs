@@ -41,10 +41,8 @@ impl Reduced {
     /// [`Reduced::split`] for |pitch| < π/2.
     pub fn join(&self, fibre: &Fibre) -> Pose {
         let angles = FixedAngles { yaw: fibre.yaw_rad, pitch: self.pitch_rad, roll: self.roll_rad };
-        Pose {
-            rotation: angles.to_rotation(),
-            translation: Vector3::new(self.x_mm, fibre.y_mm, fibre.z_mm),
-        }
+        let translation = Vector3::new(self.x_mm, fibre.y_mm, fibre.z_mm);
+        Pose { rotation: angles.to_rotation(), translation }
     }
 }
 

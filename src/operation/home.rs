@@ -14,10 +14,8 @@ pub(super) struct HomeAxes {
 
 impl HomeAxes {
     pub(super) fn new(axes: PerAxis<bool>) -> Self {
-        HomeAxes {
-            remaining: Axis::BOTH.into_iter().filter(|axis| axes[*axis]).collect(),
-            moves: Vec::new(),
-        }
+        let remaining = Axis::BOTH.into_iter().filter(|axis| axes[*axis]).collect();
+        HomeAxes { remaining, moves: Vec::new() }
     }
 
     fn home_next(&self, shell: &mut Shell) -> Result<(), String> {

@@ -4,16 +4,16 @@
 //! An operation is a task of a [`Session`], as an insertion is: it has the same bring-up, supervision,
 //! limits, stops and teardown, and the same record. What stops an insertion stops an operation.
 
-mod answer;
+mod handedness;
 mod home;
 mod moving;
 mod prove;
 #[cfg(test)]
 mod tests;
 
-pub use moving::{Goal, Move};
+pub use moving::{Move, MoveGoal};
 
-use self::answer::HandednessCheck;
+use self::handedness::HandednessCheck;
 use self::home::HomeAxes;
 use self::moving::MoveOneAxis;
 use self::prove::Prove;
@@ -39,12 +39,12 @@ pub enum Operation {
     Prove,
     /// The check of handedness: turn the base in air, and check that a sensor off its axis turns in the same
     /// direction.
-    Answer(Box<AnswerSettings>),
+    Handedness(Box<HandednessSettings>),
 }
 
 /// The settings of the check of handedness.
 #[derive(Debug, Clone, PartialEq)]
-pub struct AnswerSettings {
+pub struct HandednessSettings {
     /// The gate that samples must pass. Its position is that of the sensor, without the offset to the tip.
     pub gate: Gate,
     /// Direction of insertion in the bench frame W, of length 1.
@@ -67,7 +67,7 @@ impl Operation {
 
     /// Whether the operation needs a tracker.
     pub fn needs_tracker(&self) -> bool {
-        matches!(self, Operation::Answer(_))
+        matches!(self, Operation::Handedness(_))
     }
 }
 
@@ -91,13 +91,13 @@ impl RunConfig {
             Operation::Home { axes, again } if axes[axis] => AxisUse::Home { again: *again },
             Operation::Move(request) if request.axis == axis => AxisUse::Move,
             Operation::Home { .. } | Operation::Move(_) => AxisUse::Hold,
-            Operation::Prove | Operation::Answer(_) => AxisUse::Steer,
+            Operation::Prove | Operation::Handedness(_) => AxisUse::Steer,
         });
         let task: Box<dyn Task> = match operation {
             Operation::Home { axes, .. } => Box::new(HomeAxes::new(axes)),
             Operation::Move(request) => Box::new(MoveOneAxis::new(request)),
             Operation::Prove => Box::new(Prove::default()),
-            Operation::Answer(settings) => Box::new(HandednessCheck::new(*settings)),
+            Operation::Handedness(settings) => Box::new(HandednessCheck::new(*settings)),
         };
         Session::begin(Stage::for_use(*config, purpose, now), task, now)
     }

@@ -11,7 +11,7 @@ pub struct Move {
     /// The axis that moves.
     pub axis: Axis,
     /// Where it moves to.
-    pub goal: Goal,
+    pub goal: MoveGoal,
     /// Highest speed, per second.
     pub speed: f64,
     /// Acceleration and braking, per second squared.
@@ -22,7 +22,7 @@ pub struct Move {
 
 /// The goal of a move, in mm or rad.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Goal {
+pub enum MoveGoal {
     /// This far from where the axis stands, in either direction.
     By(f64),
     /// To this position, in either direction.
@@ -49,14 +49,14 @@ impl Moving {
     /// Begins at the target `from` at which both axes are held.
     ///
     /// # Errors
-    /// The axis would have to be pushed to its goal, which [`Goal::BackTo`] excludes.
+    /// The axis would have to be pushed to its goal, which [`MoveGoal::BackTo`] excludes.
     pub(super) fn new(request: Move, from: SetPoint) -> Result<Self, String> {
         let here = from.along(request.axis);
         let distance = match request.goal {
-            Goal::By(distance) => distance,
-            Goal::To(goal) => goal - here,
-            Goal::BackTo(goal) if here >= goal - request.arrival => (goal - here).min(0.0),
-            Goal::BackTo(goal) => {
+            MoveGoal::By(distance) => distance,
+            MoveGoal::To(goal) => goal - here,
+            MoveGoal::BackTo(goal) if here >= goal - request.arrival => (goal - here).min(0.0),
+            MoveGoal::BackTo(goal) => {
                 let (axis, [here, goal]) =
                     (request.axis, [here, goal].map(|at| request.axis.shown(at)));
                 return Err(format!(

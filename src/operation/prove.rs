@@ -94,7 +94,7 @@ impl Task for Prove {
         match event {
             StageEvent::Ready => {
                 shell.enter(State::Silent);
-                let since = shell.fall_silent();
+                let since = shell.stop_heartbeat();
                 self.test = Some(HeartbeatTest::new(shell.config(), shell.now, since));
             }
             StageEvent::Emergency(axis, emcy) if emcy.code == EmcyCode::HEARTBEAT => {

@@ -45,7 +45,7 @@ fn config(sets: &[&str]) -> Config {
 }
 
 fn by(axis: Axis, distance: f64) -> Move {
-    let goal = Goal::By(distance);
+    let goal = MoveGoal::By(distance);
     Move { axis, goal, speed: 2.0, acceleration: 10.0, arrival: 0.05 }
 }
 
@@ -222,7 +222,7 @@ fn a_speed_over_the_limit_is_refused() {
 #[test]
 fn withdrawing_comes_back_to_zero_and_turns_nothing() {
     let config = config(&["emulator.insertion_start_mm=40"]);
-    let back = Move { goal: Goal::BackTo(0.0), ..by(Axis::Insertion, 0.0) };
+    let back = Move { goal: MoveGoal::BackTo(0.0), ..by(Axis::Insertion, 0.0) };
     let mut bench = Bench::new(&config, Operation::Move(back));
     assert_eq!(bench.run(), Outcome::Completed);
     let (insertion_mm, rotation_rad) = bench.travel();
@@ -233,7 +233,7 @@ fn withdrawing_comes_back_to_zero_and_turns_nothing() {
 #[test]
 fn withdrawing_never_pushes() {
     let config = config(&["emulator.insertion_start_mm=-0.5"]);
-    let back = Move { goal: Goal::BackTo(0.0), ..by(Axis::Insertion, 0.0) };
+    let back = Move { goal: MoveGoal::BackTo(0.0), ..by(Axis::Insertion, 0.0) };
     let mut bench = Bench::new(&config, Operation::Move(back));
     let reason = bench.reason();
     assert!(reason.starts_with("insertion: stands at -0.500 mm, not beyond 0.000 mm"), "{reason}");

@@ -141,12 +141,14 @@ impl<'a> Field<'a> {
         slack_mm.min(depth_mm)
     }
 
+    /// The slack of the point at `along_mm` of `arc` from `tip`, mm.
+    fn slack_on_arc_mm(&mut self, tip: &Tip, arc: &Arc, along_mm: f64) -> f64 {
+        self.slack_mm(&tip.after(&arc.with_length(along_mm)).position_mm)
+    }
+
     /// True if `arc` from `tip` stays in the workspace and keeps the clearance from all obstacles.
     pub(super) fn is_clear(&mut self, tip: &Tip, arc: &Arc) -> bool {
-        let mut slack_at_mm = |along_mm| {
-            let at = tip.after(&arc.with_length(along_mm)).position_mm;
-            self.slack_mm(&at)
-        };
+        let mut slack_at_mm = |along_mm| self.slack_on_arc_mm(tip, arc, along_mm);
         let slacks_mm = [0.0, arc.length_mm].map(&mut slack_at_mm);
         // A few points first: most arcs that are not clear fail there.
         let parts = if arc.length_mm > FEW_POINTS_MM { PARTS.as_slice() } else { &[] };
@@ -160,8 +162,7 @@ impl<'a> Field<'a> {
         let mut along_mm = 0.0;
         let mut clear_mm = 0.0;
         loop {
-            let at = tip.after(&arc.with_length(along_mm)).position_mm;
-            let slack_mm = self.slack_mm(&at);
+            let slack_mm = self.slack_on_arc_mm(tip, &arc, along_mm);
             if slack_mm < 0.0 {
                 return arc.with_length(clear_mm);
             }
@@ -183,8 +184,7 @@ impl<'a> Field<'a> {
         // Within its slack the tip may go anywhere.
         let mut along_mm = slack_mm.max(TEST_STEP_MM);
         while along_mm < arc.length_mm - end_slack_mm {
-            let at = tip.after(&arc.with_length(along_mm)).position_mm;
-            let slack_mm = self.slack_mm(&at);
+            let slack_mm = self.slack_on_arc_mm(tip, arc, along_mm);
             if slack_mm < 0.0 {
                 return false;
             }

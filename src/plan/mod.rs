@@ -19,7 +19,6 @@ mod search;
 
 pub use arc::{Arc, Tip};
 pub use field::CLEARANCE_MIN_MM;
-pub use lattice::Resolution;
 pub use mask::Mask;
 pub use obstacle::{Obstacle, Workspace, World};
 pub use path::Path;

@@ -11,7 +11,8 @@ use crate::units::Time;
 pub(super) struct RecordedInputs {
     started_unix_us: i64,
     inputs: Inputs,
-    received: Entries<LoggedFrame>,
+    /// The received frames that `inputs.log` has not referred to yet.
+    pub(super) received: Entries<LoggedFrame>,
     samples: Entries<Sample>,
 }
 
@@ -82,11 +83,6 @@ impl RecordedInputs {
     /// The error for files that do not belong together; `what` says how the last input contradicts the others.
     pub(super) fn mismatch(&self, what: &str) -> String {
         format!("the files are not of one run: {} line {} {what}", file::INPUTS, self.inputs.line)
-    }
-
-    /// The next received frame that `inputs.log` does not refer to.
-    pub(super) fn unused_frame(&self) -> Option<&LoggedFrame> {
-        self.received.peek()
     }
 }
 

@@ -149,7 +149,7 @@ pub fn replay_to(
             }
         }
     }
-    if let Some(logged) = inputs.unused_frame()
+    if let Some(logged) = inputs.received.peek()
         && !replay.comparison.is_truncated()
     {
         return Err(format!(

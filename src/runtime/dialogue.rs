@@ -15,7 +15,7 @@ const RETRY_PERIOD: Duration = Duration::from_millis(100);
 
 /// The bus errors of a dialogue that continued in spite of them.
 #[derive(Debug, Default)]
-pub struct BusTrouble {
+pub struct BusErrors {
     /// Attempts to send that the bus refused.
     pub refused: u32,
     /// Frames that the bus refused until the end.
@@ -24,7 +24,7 @@ pub struct BusTrouble {
     pub first: Option<CanError>,
 }
 
-impl BusTrouble {
+impl BusErrors {
     /// Tries to send each unsent frame, even if the bus refuses those before it.
     fn send(&mut self, bus: &mut dyn CanBus) {
         for frame in std::mem::take(&mut self.unsent) {
@@ -45,8 +45,8 @@ pub fn talk_live(
     bus: &mut dyn CanBus,
     clock: Clock,
     give_up: Option<Time>,
-) -> BusTrouble {
-    let mut trouble = BusTrouble::default();
+) -> BusErrors {
+    let mut trouble = BusErrors::default();
     let mut retry = Time::NEVER;
     loop {
         let now = clock.now();
@@ -185,7 +185,7 @@ mod tests {
     fn stop<F: FnMut(&Frame) -> bool + Send>(
         refuses: F,
         receive_errors: u32,
-    ) -> (RefusingBus<F>, QuickStop, BusTrouble, Duration) {
+    ) -> (RefusingBus<F>, QuickStop, BusErrors, Duration) {
         let (config, stage) = stage();
         let clock = Clock::start();
         let mut bus = RefusingBus { stage, clock, refuses, sent: Vec::new(), receive_errors };

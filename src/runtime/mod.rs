@@ -16,7 +16,7 @@ mod study;
 mod timing;
 mod virtual_time;
 
-pub use dialogue::{BusTrouble, talk_live, talk_virtual};
+pub use dialogue::{BusErrors, talk_live, talk_virtual};
 pub use interrupt::Interrupt;
 pub use live::run_live;
 pub use realtime::{RealTime, enter_real_time};

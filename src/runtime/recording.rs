@@ -181,7 +181,7 @@ impl Log<'_> {
                 return;
             }
             let Some(Ok((time, record))) = earlier.next_if(Result::is_ok) else { return };
-            self.take(time, Entry::from(record));
+            self.take(time, Entry { record, truth: None });
         }
     }
 }
@@ -273,7 +273,8 @@ mod tests {
                 .unwrap();
         let (time, text) = (Time::from_secs_f64(7.0), "late".to_owned());
         let (lane, severity) = (Lane::Session, Severity::Warning);
-        recorder.record(Entry::from(Record::Event { time, lane, severity, text }));
+        let record = Record::Event { time, lane, severity, text };
+        recorder.record(Entry { record, truth: None });
         let run_dir = recorder.run_dir.clone();
         recorder.finish(|manifest| manifest.set_outcome(&Outcome::Completed)).unwrap();
         (scratch, run_dir, time)

@@ -319,7 +319,8 @@ impl Machine for Session {
     }
 
     fn progress(&self) -> Progress {
-        let (time, state) = (self.shell.now, self.shell.session_state());
+        let time = self.shell.now;
+        let state = self.shell.states.get(&Lane::Session).copied().unwrap_or_default();
         let Counters { syncs_skipped, sync_late_max, .. } = self.stage_counters();
         Progress { time, state, syncs_skipped, sync_late_max, ..self.task.progress(time) }
     }

@@ -24,7 +24,6 @@ mod target;
 mod task;
 mod tracking;
 
-pub use crate::control::ControlConfig;
 pub use crate::observer::ObserverConfig;
 pub use config::{
     HoldConfig, InsertionConfig, InsertionMode, PlaneOutOfReach, Resume, Samples, SessionConfig,

@@ -66,14 +66,9 @@ pub struct SampleRecord {
 }
 
 impl SampleRecord {
-    /// `sample` as received, not judged yet.
-    pub fn received(sample: Sample) -> Self {
-        SampleRecord {
-            received: sample,
-            position_plane_mm: None,
-            acquisition_time: None,
-            refused: None,
-        }
+    /// The sample `received`, not judged yet.
+    pub fn received(received: Sample) -> Self {
+        SampleRecord { received, position_plane_mm: None, acquisition_time: None, refused: None }
     }
 }
 

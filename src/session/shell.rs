@@ -5,7 +5,7 @@ use super::record::{Lane, Record, Severity};
 use super::state::State;
 use super::{Output, stage_news, unconfirmed_stop};
 use crate::canopen::{Frame, cob};
-use crate::stage::{self, Axis, Progress, SetPoint, Stage, StageConfig, StageEvent};
+use crate::stage::{self, Axis, SetPoint, Stage, StageConfig, StageEvent, StageProgress};
 use crate::units::Time;
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
@@ -52,7 +52,7 @@ pub(crate) struct Shell {
     /// The bench has stopped sending its heartbeat on purpose.
     is_silent: bool,
     /// The state of each part of the bench.
-    states: BTreeMap<Lane, State>,
+    pub(super) states: BTreeMap<Lane, State>,
     /// The follow-up reasons reported since the stop began.
     follow_ups: Vec<String>,
     /// The part of the stop that the drives did not confirm.
@@ -97,11 +97,6 @@ impl Shell {
         if self.states.insert(state.lane(), state) != Some(state) {
             self.record(Record::State { time, state });
         }
-    }
-
-    /// The state that the run itself is in.
-    pub(super) fn session_state(&self) -> State {
-        self.states.get(&Lane::Session).copied().unwrap_or_default()
     }
 
     /// Records an event, which the operator sees.
@@ -164,9 +159,9 @@ impl Shell {
     }
 
     /// Stops the bench's heartbeat, and returns when the last one was sent. SYNC and set-points go on.
-    pub(crate) fn fall_silent(&mut self) -> Time {
+    pub(crate) fn stop_heartbeat(&mut self) -> Time {
         self.is_silent = true;
-        self.stage.fall_silent().unwrap_or(self.now)
+        self.stage.stop_heartbeat().unwrap_or(self.now)
     }
 
     /// The drives' heartbeat timeout; `None` while they would not notice a stall: before they are enabled,
@@ -180,7 +175,7 @@ impl Shell {
     pub(super) fn take_stage_event(&mut self, event: &StageEvent) {
         let is_expected = match event {
             // The task refused the position in the event before: the axes stay without power.
-            StageEvent::Progress(Progress::Enabling) => !self.is_running(),
+            StageEvent::Progress(StageProgress::Enabling) => !self.is_running(),
             // The reply to an SDO request of the task, which reads the drives while the bench is silent.
             StageEvent::Ignored { frame, .. } => self.is_silent && self.is_sdo_answer(frame),
             _ => false,
@@ -192,7 +187,7 @@ impl Shell {
             self.report(Lane::Stage, severity, text);
         }
         match event {
-            StageEvent::Progress(Progress::Enabling) => self.power = Power::Enabling,
+            StageEvent::Progress(StageProgress::Enabling) => self.power = Power::Enabling,
             StageEvent::Located(_) => self.power = Power::Awaited(self.now),
             StageEvent::Ready => {
                 self.power = Power::On(self.now);

@@ -7,7 +7,7 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use super::dialogue::{ScriptRunner, Sdo};
-use super::{Axis, AxisConfig, AxisUse, Progress, StageConfig, StageEvent};
+use super::{Axis, AxisConfig, AxisUse, StageConfig, StageEvent, StageProgress};
 use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::Statusword;
 use crate::canopen::emcy::EmcyCode;
@@ -103,7 +103,7 @@ impl BringUp {
         if found && self.restarts_left > 0 {
             self.restarts_left -= 1;
             self.script.state.take();
-            self.script.emit(Progress::Restarted(self.script.axis));
+            self.script.emit(StageProgress::Restarted(self.script.axis));
             let script = self.script.clone();
             self.runner = ScriptRunner::begin(&self.script.sdo, now, script.run());
         } else if found {
@@ -164,10 +164,10 @@ impl Script {
     /// Begins a part of the bring-up.
     pub(super) fn begin(&self, part: &'static str) {
         self.note(|state| state.part = part);
-        self.emit(Progress::BringUp(self.axis, part));
+        self.emit(StageProgress::BringUp(self.axis, part));
     }
 
-    fn emit(&self, progress: Progress) {
+    fn emit(&self, progress: StageProgress) {
         self.sdo.emit(StageEvent::Progress(progress));
     }
 
@@ -192,7 +192,7 @@ impl Script {
             SdoError::Aborted(AbortCode::NO_SUCH_OBJECT | AbortCode::NO_SUCH_SUBINDEX)
         );
         if is_absent && may_lack {
-            self.emit(Progress::Skipped(self.axis, object));
+            self.emit(StageProgress::Skipped(self.axis, object));
             return Ok(None);
         }
         let hint = match (why_needed(object.index), &error) {

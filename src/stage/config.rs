@@ -144,11 +144,6 @@ impl RawSdo {
 }
 
 impl AxisConfig {
-    /// True if a raw SDO sets the quick-stop deceleration (6085).
-    pub fn has_raw_quick_stop(&self) -> bool {
-        self.sdo.iter().any(RawSdo::is_quick_stop)
-    }
-
     /// The drive's following-error window: how far its position may be from its demand, mm or rad.
     pub fn following_error_window(&self) -> f64 {
         let lag = self.limits.speed_max * FOLLOWING_LAG.as_secs_f64();

@@ -3,7 +3,7 @@
 use super::drive::Drive;
 use super::machine::Phase;
 use super::supervision::refused_to_switch_on;
-use super::{Axis, Feedback, PerAxis, Progress, SetPoint, Stage, StageEvent};
+use super::{Axis, Feedback, PerAxis, SetPoint, Stage, StageEvent, StageProgress};
 use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};
 use crate::canopen::nmt::NmtState;
 use crate::canopen::sdo::codec::ServerFrame;
@@ -182,7 +182,7 @@ impl Stage {
         }
         if self.power_permitted {
             self.phase = Phase::Enabling { give_up: now + self.config.power.enable_timeout };
-            self.emit(StageEvent::Progress(Progress::Enabling));
+            self.emit(StageEvent::Progress(StageProgress::Enabling));
             // The drives are armed in a later cycle: until then the caller may refuse to go on from here.
             self.lead_to_enabled();
         }
@@ -314,13 +314,15 @@ impl Stage {
 
     /// Holds, or quick-stops, until both axes stand.
     fn stop(&mut self, now: Time, quick: bool, give_up: Time) {
-        let standing = self.drives.all(|drive| drive.stands() && !(quick && drive.is_enabled()));
+        let standing =
+            self.drives.all(|drive| drive.standstill.stands() && !(quick && drive.is_enabled()));
         if !quick && !standing && now >= give_up {
-            self.fail_orderly_end(now, Drive::stands, "not seen to stand", "its last target");
+            let stands = |drive: &Drive| drive.standstill.stands();
+            self.fail_orderly_end(now, stands, "not seen to stand", "its last target");
         } else if standing || now >= give_up {
             let give_up = now + self.config.power.stop_timeout;
             self.phase = Phase::Disabling { quick, standing, give_up };
-            self.emit(StageEvent::Progress(Progress::Disabling));
+            self.emit(StageEvent::Progress(StageProgress::Disabling));
             if quick {
                 // A drive does not leave Quick Stop Active by Shutdown.
                 self.set_controlwords(Controlword::DISABLE_VOLTAGE);
@@ -353,7 +355,7 @@ impl Stage {
 
     pub(super) fn begin_stop(&mut self, now: Time, quick: bool) {
         self.phase = Phase::Stopping { quick, give_up: now + self.config.power.stop_timeout };
-        self.emit(StageEvent::Progress(Progress::Stopping));
+        self.emit(StageEvent::Progress(StageProgress::Stopping));
         for axis in Axis::BOTH {
             self.drives[axis].begin_stop(now, self.sync_count, quick);
         }

@@ -102,7 +102,7 @@ pub(super) struct Drive {
     /// The last emergency message, and how many times in a row it came.
     emcy: (Option<Emcy>, u64),
     pub(super) controlword: Controlword,
-    standstill: Standstill,
+    pub(super) standstill: Standstill,
 }
 
 impl Drive {
@@ -468,16 +468,6 @@ impl Drive {
         let speed = speeds.unwrap_or(counts_per_s / self.limits().scale.counts_per_unit());
         let braking_s = quick_stop_deceleration.map_or(0.0, |by| speed / by);
         Duration::try_from_secs_f64(braking_s).unwrap_or(Duration::MAX)
-    }
-
-    /// Starts to watch for standstill.
-    pub(super) fn watch_standstill(&mut self) {
-        self.standstill.watch_from(self.position.counts());
-    }
-
-    /// See [`Standstill`].
-    pub(super) fn stands(&self) -> bool {
-        self.standstill.stands()
     }
 
     /// True if the drive is in Operation Enabled although it has had time to take the command to stop.

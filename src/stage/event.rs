@@ -64,7 +64,7 @@ pub struct Feedback {
 
 /// How far the stage has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, derive_more::Display)]
-pub enum Progress {
+pub enum StageProgress {
     /// The stage sends nothing yet, and listens for another master.
     #[display("listening for another master")]
     Listening,
@@ -147,7 +147,7 @@ pub struct Counters {
 #[derive(Debug, Clone, PartialEq)]
 pub enum StageEvent {
     /// The stage has come this far.
-    Progress(Progress),
+    Progress(StageProgress),
     /// A drive's identity was read.
     Identity(Axis, Identity),
     /// Where both axes stand, before they have power: the moment to refuse a goal

@@ -102,8 +102,9 @@ impl Stage {
         let (Phase::Ready, Some(config)) = (self.phase, homing) else {
             return Err("the stage is not ready to home".to_owned());
         };
-        self.drives[axis].controlword = Controlword::START_HOMING;
-        self.drives[axis].watch_standstill();
+        let drive = &mut self.drives[axis];
+        drive.controlword = Controlword::START_HOMING;
+        drive.standstill.watch_from(drive.position.counts());
         self.phase = Phase::Homing(Homing {
             axis,
             first_sync: self.sync_count + 1,
@@ -143,7 +144,8 @@ impl Stage {
         let Some(statusword) = self.drives[axis].statusword else { return };
         let has_failed = statusword.has(Statusword::HOMING_ERROR);
         let has_ended = has_failed || statusword.has(Statusword::HOMING_ATTAINED);
-        let must_have_begun = now.since(started) >= BEGUN_AFTER && self.drives[axis].stands();
+        let must_have_begun =
+            now.since(started) >= BEGUN_AFTER && self.drives[axis].standstill.stands();
         homing.bits_are_valid |= !has_ended || must_have_begun;
         let is_home = homing.bits_are_valid && is_home(statusword);
         homing.attained = homing.attained.or(is_home.then_some(now));

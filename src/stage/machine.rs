@@ -10,7 +10,8 @@ use super::flood::FloodWatch;
 use super::homing::Homing;
 use super::silence::SilenceTest;
 use super::{
-    Axis, AxisUse, Counters, Ignored, Output, PerAxis, Progress, SetPoint, StageConfig, StageEvent,
+    Axis, AxisUse, Counters, Ignored, Output, PerAxis, SetPoint, StageConfig, StageEvent,
+    StageProgress,
 };
 use crate::canopen::cia402::{Controlword, object};
 use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatProducer};
@@ -73,7 +74,7 @@ pub struct Stage {
     pub(super) repeat_due: Time,
     /// A fault was reported.
     faulted: bool,
-    /// The bench has stopped its heartbeat on purpose, see [`Stage::fall_silent`].
+    /// The bench has stopped its heartbeat on purpose, see [`Stage::stop_heartbeat`].
     pub(super) silence_test: Option<SilenceTest>,
     /// The positions at the last SYNC before power, counts.
     pub(super) before_power_counts: PerAxis<i64>,
@@ -125,7 +126,7 @@ impl Stage {
             outputs: VecDeque::new(),
             config,
         };
-        stage.emit(StageEvent::Progress(Progress::Listening));
+        stage.emit(StageEvent::Progress(StageProgress::Listening));
         stage.handle_timeout(now);
         stage
     }
@@ -404,7 +405,7 @@ impl Stage {
             let give_up = now + self.config.power.enable_timeout;
             self.phase = Phase::Standby { give_up, located: false };
             self.sync.deadline = now + self.config.bus.sync_period();
-            self.emit(StageEvent::Progress(Progress::Standby));
+            self.emit(StageEvent::Progress(StageProgress::Standby));
         }
     }
 

@@ -64,8 +64,8 @@ pub use bring_up::{Identity, SOFTWARE_LIMITS, why_needed};
 pub use config::{AxisConfig, BusConfig, PowerConfig, RawSdo, StageConfig};
 pub use dialogue::Dialogue;
 pub use event::{
-    Counters, DriveFlag, DriveReport, Feedback, Ignored, Output, Progress, SetPoint, StageEvent,
-    may_have_power,
+    Counters, DriveFlag, DriveReport, Feedback, Ignored, Output, SetPoint, StageEvent,
+    StageProgress, may_have_power,
 };
 pub use homing::{HomingConfig, Reference};
 pub use limits::{AxisLimits, Commanded, LimitCheck};

@@ -219,7 +219,8 @@ impl Script {
         }
         let window = Some(config.following_error_window());
         self.write_counts(drive::FOLLOWING_ERROR_WINDOW, window).await?;
-        let deceleration = config.quick_stop_deceleration.filter(|_| !config.has_raw_quick_stop());
+        let is_raw = config.sdo.iter().any(|raw| raw.is_quick_stop());
+        let deceleration = config.quick_stop_deceleration.filter(|_| !is_raw);
         self.write_counts(drive::QUICK_STOP_DECELERATION, deceleration).await
     }
 

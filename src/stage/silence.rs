@@ -21,7 +21,7 @@ impl Stage {
     /// send emergency message 0x8130. A drive that has sent it may leave Operation Enabled and NMT Operational, and
     /// may send no TPDO1. Anything else stops the axes as before. Returns when the last heartbeat was sent; `None`
     /// if there was none.
-    pub fn fall_silent(&mut self) -> Option<Time> {
+    pub fn stop_heartbeat(&mut self) -> Option<Time> {
         self.silence_test = Some(SilenceTest::default());
         for axis in Axis::BOTH {
             self.drives[axis].restart_emcy_count();

@@ -175,7 +175,12 @@ impl StudySummary {
         let shortest: Vec<f64> = shortest.map(|mm| mm.unwrap_or(f64::INFINITY)).collect();
         let errors = trials.iter().filter_map(|trial| trial.figures.estimate_rms);
         let nis = trials.iter().filter_map(|trial| trial.nis);
-        let failed = trials.iter().filter(|trial| !trial.is_settled());
+        let failed = trials.iter().filter(|trial| !trial.is_settled()).map(|trial| FailedTrial {
+            seed: trial.seed,
+            off_plane_rms_mm: trial.figures.off_plane_rms_mm,
+            stop_reason: trial.outcome.stop_reason().map(str::to_owned),
+            refused: trial.target.is_some_and(|target| target.is_refused),
+        });
         let settled = trials.iter().filter(|trial| trial.is_settled()).count();
         let warned = trials.iter().filter(|trial| trial.is_warned).count();
         Some(StudySummary {
@@ -195,14 +200,7 @@ impl StudySummary {
             nis: Consistency::of_innovations(&nis.collect::<Vec<_>>()),
             warned_fraction: warned as f64 / trials.len() as f64,
             target: Targets::of(trials),
-            failed: failed
-                .map(|trial| FailedTrial {
-                    seed: trial.seed,
-                    off_plane_rms_mm: trial.figures.off_plane_rms_mm,
-                    stop_reason: trial.outcome.stop_reason().map(str::to_owned),
-                    refused: trial.target.is_some_and(|target| target.is_refused),
-                })
-                .collect(),
+            failed: failed.collect(),
         })
     }
 }

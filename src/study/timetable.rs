@@ -80,9 +80,7 @@ impl Timetable {
                 self.stage.push((stage.time, stage.measured.insertion_mm));
                 self.command_mm = stage.commanded.insertion_mm;
             }
-            Record::State { state: State::Inserting, .. } => {
-                self.is_inserting = true;
-            }
+            Record::State { state: State::Inserting, .. } => self.is_inserting = true,
             Record::Sample(sample) if self.is_inserting => {
                 let acquired = sample.acquisition_time;
                 self.received
@@ -120,10 +118,7 @@ impl Timetable {
         let acquired_s = step.time.as_secs_f64() - age_s;
         let off_s = |&&(acquired, _): &&(Time, Time)| (acquired.as_secs_f64() - acquired_s).abs();
         let newest = received.iter().min_by(|a, b| off_s(a).total_cmp(&off_s(b)));
-        newest
-            .map(|&(_, received)| self.sample_due(received, insertion_meas_mm))
-            .into_iter()
-            .collect()
+        Vec::from_iter(newest.map(|&(_, received)| self.sample_due(received, insertion_meas_mm)))
     }
 
     /// The position received at `received`, or the mean of it and those before it.

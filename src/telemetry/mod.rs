@@ -51,15 +51,8 @@ use std::time::SystemTime;
 pub struct Entry {
     /// The record.
     pub record: Record,
-    /// The truth at that moment, in an emulated run.
+    /// The truth at that moment, for a step of an emulated run.
     pub truth: Option<Truth>,
-}
-
-impl From<Record> for Entry {
-    /// An entry without the truth: in a live run, or for a record that is not a step.
-    fn from(record: Record) -> Self {
-        Entry { record, truth: None }
-    }
 }
 
 /// `time` in the format of a run's files, RFC 3339: `2026-03-01T14:30:00.123456Z`.

@@ -280,12 +280,9 @@ mod tests {
     }
 
     fn entry() -> Entry {
-        Entry::from(Record::Event {
-            time: Time::ZERO,
-            lane: Lane::Session,
-            severity: Severity::Info,
-            text: "x".to_owned(),
-        })
+        let (lane, severity) = (Lane::Session, Severity::Info);
+        let record = Record::Event { time: Time::ZERO, lane, severity, text: "x".to_owned() };
+        Entry { record, truth: None }
     }
 
     const HOUR: Duration = Duration::from_secs(3600);

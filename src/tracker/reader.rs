@@ -2,7 +2,7 @@
 
 use super::event::{Event, NDJSON, has_positions};
 use super::ndjson::LineDecoder;
-use super::openigtlink::{Body, Message, StreamDecoder};
+use super::openigtlink::{Body, Message, Status, StreamDecoder};
 use super::sample::Sample;
 use crate::units::Time;
 use std::collections::{BTreeMap, VecDeque};
@@ -123,9 +123,11 @@ impl Reader {
 
     fn take_message(&mut self, message: Message) {
         self.messages += 1;
+        // The answer to GET_STATUS of a device without a fault has nothing to report.
         if let Body::Status(status) = &message.body
             && std::mem::take(&mut self.awaits_status)
-            && status.is_bare_ok()
+            && status.code == Status::OK
+            && status.message.is_empty()
         {
             return;
         }
@@ -167,7 +169,7 @@ impl Reader {
 
 #[cfg(test)]
 mod tests {
-    use super::super::openigtlink::{Status, Tool, encode, tool_kind};
+    use super::super::openigtlink::{Tool, encode, tool_kind};
     use super::*;
     use proptest::prelude::*;
     use proptest::sample::Index;

@@ -112,11 +112,6 @@ impl GateCounts {
         }
     }
 
-    /// Samples that `gate` refused.
-    pub fn of(&self, gate: GateName) -> u64 {
-        self.refused.get(&gate).copied().unwrap_or_default()
-    }
-
     /// Samples of the tool that were refused.
     pub fn refused(&self) -> u64 {
         self.by_gate().map(|(_, count)| count).sum()
@@ -163,6 +158,7 @@ mod tests {
             counts.count(Some(&Refusal::new(gate, "")));
         }
         assert_eq!(counts.to_string(), "1 accepted, 3 refused: 1 rotation, 2 zero");
-        assert_eq!((counts.of(GateName::Zero), counts.of(GateName::Step)), (2, 0));
+        let by_gate: Vec<_> = counts.by_gate().collect();
+        assert_eq!(by_gate, [(GateName::Rotation, 1), (GateName::Zero, 2)]);
     }
 }

@@ -12,7 +12,7 @@ use std::collections::VecDeque;
 const GIVEN_UP_MAX: usize = 64;
 
 /// Own frames that wait for their echo, which the kernel delivers once the frame was sent.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Unconfirmed {
     /// Maximum number of waiting SYNCs.
     syncs_max: usize,
@@ -30,13 +30,7 @@ pub struct Unconfirmed {
 impl Unconfirmed {
     /// No frames yet. The frames of up to `syncs_max` SYNCs, at least one, may wait.
     pub fn new(syncs_max: usize) -> Self {
-        Unconfirmed {
-            syncs_max: syncs_max.max(1),
-            frames: VecDeque::new(),
-            dropped_before: VecDeque::new(),
-            given_up: VecDeque::new(),
-            overtaken: Default::default(),
-        }
+        Unconfirmed { syncs_max: syncs_max.max(1), ..Unconfirmed::default() }
     }
 
     /// The numbers of waiting frames and SYNCs, if so many SYNCs wait that no more frames may be sent; otherwise

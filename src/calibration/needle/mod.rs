@@ -55,11 +55,9 @@ impl NeedleFit {
         }
         let axis = insertion::shaft_axis(insertions)?;
         let r_sa = insertion::shaft_frame(&axis);
-        let tracks = insertions
-            .iter()
-            .enumerate()
-            .map(|(index, rows)| RecordedInsertion::of(&name(index), rows, &r_sa))
-            .collect::<Result<Vec<_>, _>>()?;
+        let tracks = insertions.iter().enumerate();
+        let tracks = tracks.map(|(index, rows)| RecordedInsertion::of(&name(index), rows, &r_sa));
+        let tracks = tracks.collect::<Result<Vec<_>, _>>()?;
         Ok(NeedleFit {
             insertions: insertions.len(),
             axis,

@@ -232,9 +232,7 @@ impl TrackerFit {
             latency_p99_ms,
         })
     }
-}
 
-impl TrackerFit {
     /// What the operator should know about this noise, if anything.
     pub fn remark(&self) -> Option<String> {
         let NoiseFit { sd_mm, white_sd_mm, correlated_sd_mm, correlation_time_s } = &self.together;

@@ -14,7 +14,7 @@ use super::records::last_run_on_a_bus;
 use super::stop::stop;
 use super::{Failure, Result};
 use crate::config::{CanInterface, Config};
-use crate::operation::{AnswerSettings, Goal, Move, Operation, RunConfig};
+use crate::operation::{HandednessSettings, Move, MoveGoal, Operation, RunConfig};
 use crate::session::AxisMove;
 use crate::stage::{Axis, Reference, StageConfig};
 use crate::tracker::{Gate, Registration};
@@ -269,7 +269,7 @@ impl Motion {
                 let withdrawal = withdrawal_move(config, *by)
                     .and_then(|withdrawal| with_speed(withdrawal, *speed, &stage))
                     .map_err(Failure::configuration)?;
-                if let (true, Goal::By(mm)) = (unhomed, withdrawal.goal) {
+                if let (true, MoveGoal::By(mm)) = (unhomed, withdrawal.goal) {
                     let axis = &mut stage.insertion;
                     if axis.reference != Reference::Homing {
                         return Err(Failure::configuration(
@@ -285,8 +285,8 @@ impl Motion {
                 let gate = config.tracker.to_gate()?;
                 // The sensor's own position: the tip is on the axis.
                 let registration = Registration::new(*gate.registration.x_wt());
-                let turn = Goal::By(HANDEDNESS_TURN_DEG.to_radians());
-                Operation::Answer(Box::new(AnswerSettings {
+                let turn = MoveGoal::By(HANDEDNESS_TURN_DEG.to_radians());
+                Operation::Handedness(Box::new(HandednessSettings {
                     gate: Gate { registration, workspace: None, ..gate },
                     axis: config.plane.rotation * Vector3::z(),
                     turn: jog_move(config, Axis::Rotation, turn),
@@ -407,10 +407,10 @@ fn jog_goal(
     axis: Axis,
     by: Option<Distance>,
     to: Option<Distance>,
-) -> Result<Goal, String> {
+) -> Result<MoveGoal, String> {
     match (by, to) {
-        (Some(by), _) => by.nonzero_along(axis, stage.axis(axis).ratio).map(Goal::By),
-        (None, Some(to)) if stage.axis(axis).zero.is_some() => to.along(axis).map(Goal::To),
+        (Some(by), _) => by.nonzero_along(axis, stage.axis(axis).ratio).map(MoveGoal::By),
+        (None, Some(to)) if stage.axis(axis).zero.is_some() => to.along(axis).map(MoveGoal::To),
         (None, Some(_)) => Err(format!(
             "--to: stage.{axis}.zero is \"start\": positions count from where each command begins, \
              so --to would mean --by; give --by, or set stage.{axis}.zero in counts of the drive"
@@ -434,7 +434,7 @@ fn with_speed(jog: Move, speed: Option<Distance>, stage: &StageConfig) -> Result
 }
 
 /// A move of `axis` at its jog speed.
-fn jog_move(config: &Config, axis: Axis, goal: Goal) -> Move {
+fn jog_move(config: &Config, axis: Axis, goal: MoveGoal) -> Move {
     let arrival = match axis {
         Axis::Insertion => config.insertion.arrival_mm,
         Axis::Rotation => ROTATION_ARRIVAL_DEG.to_radians(),
@@ -449,14 +449,14 @@ fn withdrawal_move(config: &Config, by: Option<Distance>) -> Result<Move, String
     let insertion = &config.stage.insertion;
     let along = |by: Distance| by.nonzero_along(Axis::Insertion, insertion.ratio);
     let goal = match by.map(along).transpose()? {
-        Some(mm) if mm > 0.0 => Goal::By(-mm),
+        Some(mm) if mm > 0.0 => MoveGoal::By(-mm),
         Some(mm) => {
             let by = mm.abs();
             return Err(format!(
                 "withdraw pulls back: --by {mm}mm is not over 0; give the distance alone, --by {by}mm"
             ));
         }
-        None if insertion.zero.is_some() => Goal::BackTo(0.0),
+        None if insertion.zero.is_some() => MoveGoal::BackTo(0.0),
         None => {
             return Err(
                 "stage.insertion.zero is \"start\": the bench does not know the depth where the \

@@ -7,7 +7,7 @@ fn a_speed_over_the_limit_is_refused_with_the_configured_limit() {
     let config = Config::from_sources(&[], &[]).unwrap();
     let mut stage = config.to_stage().unwrap();
     stage.rotation.limits.speed_max = 3_f64.to_radians();
-    let jog = jog_move(&config, Axis::Rotation, Goal::By(1.0));
+    let jog = jog_move(&config, Axis::Rotation, MoveGoal::By(1.0));
     let speed = |text| with_speed(jog, Some(Distance::parse_speed(text).unwrap()), &stage);
     let message = speed("5deg/s").unwrap_err().to_string();
     assert!(message.ends_with("up to 3deg/s"), "{message}");

@@ -16,7 +16,7 @@ use crate::config::{Config, TrackerMode, TrackerSection, TrackerSource};
 use crate::runtime::{Clock, Interrupt};
 use crate::session::{HoldConfig, Resume};
 use crate::text::clipped;
-use crate::tracker::{Census, Event, Sample, Sieve, StreamReplay, csv, ndjson};
+use crate::tracker::{Census, Event, Protocol, Sample, Sieve, StreamReplay, csv, ndjson};
 use crate::transport::link::{Link, LinkSettings};
 use crate::units::Time;
 use clap::Subcommand;
@@ -58,7 +58,11 @@ fn link_settings(tracker: &TrackerSection, tools: Vec<String>) -> LinkSettings {
         Resume::Stop => default.silence_limit,
         Resume::Automatic | Resume::Operator => default.silence_limit.min(in_a_hold),
     };
-    let (protocol, request) = (tracker.to_protocol(), tracker.to_request());
+    let protocol = match tracker.source {
+        TrackerSource::Ndjson => Protocol::Ndjson,
+        _ => Protocol::OpenIgtLink,
+    };
+    let request = tracker.to_request();
     LinkSettings { protocol, tools, request, silence_limit, ..default }
 }
 

@@ -67,7 +67,7 @@ fn shipped() -> Vec<(String, String)> {
 /// The dotted names of `keys` and of the keys inside them.
 fn dotted(keys: &[keys::Key], path: &str) -> Vec<String> {
     let inside = |key: keys::Key| {
-        let at = value::join(path, key.name);
+        let at = keys::join(path, key.name);
         let tables = keys::tables(&key.kind);
         let mut names: Vec<String> = tables.iter().flat_map(|keys| dotted(keys, &at)).collect();
         names.push(at);

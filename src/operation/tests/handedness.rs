@@ -5,12 +5,12 @@ use super::*;
 /// A check of handedness with this sensor.
 fn answer(sensor: Option<Sensor>) -> Bench {
     let config = config(&[]);
-    let settings = AnswerSettings {
+    let settings = HandednessSettings {
         gate: config.session().unwrap().tracker.gate,
         axis: Vector3::z(),
         turn: Move { arrival: 0.002, speed: 1.0, ..by(Axis::Rotation, FRAC_PI_4) },
     };
-    let mut bench = Bench::new(&config, Operation::Answer(Box::new(settings)));
+    let mut bench = Bench::new(&config, Operation::Handedness(Box::new(settings)));
     bench.sensor = sensor;
     bench
 }

@@ -21,7 +21,7 @@ pub(super) fn fault_of(config: StageConfig, setup: impl FnOnce(&mut Bench)) -> S
 #[test]
 fn bring_up_sends_these_frames_in_this_order() {
     let mut bench = Bench::new(config());
-    bench.until_progress(Progress::Enabling);
+    bench.until_progress(StageProgress::Enabling);
     let sent: Vec<String> = bench
         .sent
         .iter()
@@ -64,7 +64,7 @@ fn the_identity_and_the_missing_objects_of_a_drive_are_reported() {
         serial: None,
     };
     assert_eq!(event, StageEvent::Identity(Axis::Insertion, identity));
-    let skipped = Progress::Skipped(Axis::Insertion, ObjectAddress::new(0x1402, 1));
+    let skipped = StageProgress::Skipped(Axis::Insertion, ObjectAddress::new(0x1402, 1));
     bench.until_progress(skipped);
     assert_eq!(skipped.to_string(), "insertion: drive has no 0x1402:01, skipped");
 }
@@ -407,7 +407,7 @@ fn a_drive_left_in_nmt_stopped_is_brought_up() {
 fn reboot(bench: &mut Bench, times: u32) {
     for _ in 0..times {
         let step = "taking power off, looking for faults";
-        bench.until_progress(Progress::BringUp(Axis::Insertion, step));
+        bench.until_progress(StageProgress::BringUp(Axis::Insertion, step));
         bench.receive(heartbeat_frame(bench.insertion.node, NmtState::BootUp));
     }
 }
@@ -419,7 +419,7 @@ fn a_drive_that_restarts_in_bring_up_is_brought_up_again() {
     bench.rotation.mute = Some((ObjectAddress::new(0x1018, 4), 2));
     reboot(&mut bench, 1);
     bench.insertion.mute = None;
-    bench.until_progress(Progress::Restarted(Axis::Insertion));
+    bench.until_progress(StageProgress::Restarted(Axis::Insertion));
     bench.until_ready();
     assert_eq!(bench.insertion.value(0x1800, 2), 1);
 }

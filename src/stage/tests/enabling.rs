@@ -63,14 +63,14 @@ fn a_drive_that_refuses_to_switch_on_is_a_fault_at_once() {
                 check safety input";
     let mut bench = Bench::new(config());
     bench.insertion.safety_open = true;
-    bench.until_progress(Progress::Enabling);
+    bench.until_progress(StageProgress::Enabling);
     let begun = bench.now;
     assert!(bench.until_fault().starts_with(refused));
     assert!(bench.now.since(begun) < Duration::from_millis(600));
 
     let mut bench = Bench::new(config());
     bench.insertion.charge_cycles = 20;
-    bench.until_progress(Progress::Enabling);
+    bench.until_progress(StageProgress::Enabling);
     bench.run_for(Duration::from_millis(50));
     assert_eq!(bench.insertion.state, DriveState::ReadyToSwitchOn);
     bench.insertion.safety_open = true;
@@ -134,7 +134,7 @@ fn a_node_that_ignores_the_start_command_is_named_by_its_state() {
     let mut bench = Bench::new(config());
     bench.rotation.tpdos_lost = u32::MAX;
     bench.rotation.heartbeat_off = true;
-    bench.run_until(|event| *event == StageEvent::Progress(Progress::Standby));
+    bench.run_until(|event| *event == StageEvent::Progress(StageProgress::Standby));
     while !bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))) {
         bench.receive(heartbeat_frame(bench.rotation.node, NmtState::PreOperational));
         bench.run_for(Duration::from_millis(100));
@@ -160,7 +160,7 @@ fn a_node_whose_heartbeat_does_not_say_operational_is_a_fault() {
         config.bus.heartbeat_timeout_ms = 60_000;
         let mut bench = Bench::new(config);
         bench.rotation.heartbeat_off = true;
-        bench.until_progress(Progress::Enabling);
+        bench.until_progress(StageProgress::Enabling);
         if let Some(state) = heard {
             bench.receive(heartbeat_frame(bench.rotation.node, state));
         }
@@ -176,7 +176,7 @@ fn drives_enabled_just_as_the_timeout_ends_are_a_fault_that_says_so() {
     config.bus.heartbeat_timeout_ms = 60_000;
     let mut bench = Bench::new(config);
     bench.rotation.heartbeat_off = true;
-    bench.until_progress(Progress::Enabling);
+    bench.until_progress(StageProgress::Enabling);
     let late = bench.now + Duration::from_millis(2_999);
     while bench.stage.deadline() < late {
         bench.step();
@@ -194,7 +194,7 @@ fn one_wrong_position_as_power_comes_on_moves_no_axis() {
     let (mut ready, mut faults) = (0, 0);
     for wrong_after in 0..12 {
         let mut bench = Bench::new(config());
-        bench.until_progress(Progress::Enabling);
+        bench.until_progress(StageProgress::Enabling);
         bench.run_for(Duration::from_millis(10 * wrong_after));
         bench.rotation.frozen_at = Some(-20 + 2000);
         bench.run_for(Duration::from_millis(10));
@@ -224,7 +224,7 @@ fn one_wrong_position_as_power_comes_on_moves_no_axis() {
 #[test]
 fn an_axis_whose_position_does_not_rest_gets_no_target() {
     let mut bench = Bench::new(config());
-    bench.until_progress(Progress::Enabling);
+    bench.until_progress(StageProgress::Enabling);
     for n in 0..400 {
         bench.rotation.frozen_at = Some(-20 + 1500 * (n % 2));
         bench.run_for(Duration::from_millis(10));
@@ -239,7 +239,7 @@ fn an_axis_whose_position_does_not_rest_gets_no_target() {
 fn an_axis_that_moves_while_its_drive_takes_long_to_enable_is_a_fault() {
     let mut bench = Bench::new(config());
     bench.rotation.brake_cycles = 50;
-    bench.until_progress(Progress::Enabling);
+    bench.until_progress(StageProgress::Enabling);
     while !bench.has_sent("202#0F00") {
         bench.step();
     }

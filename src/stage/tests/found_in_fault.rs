@@ -36,9 +36,11 @@ fn a_fault_that_a_reset_does_not_end_is_not_reset_again() {
 /// A later fault has a cause in this run. If it ended by itself, the axes must not start to move.
 #[test]
 fn a_fault_that_comes_later_is_never_reset() {
-    let enabling = StageEvent::Progress(Progress::Enabling);
-    let configuring =
-        StageEvent::Progress(Progress::BringUp(Axis::Rotation, "writing the configured objects"));
+    let enabling = StageEvent::Progress(StageProgress::Enabling);
+    let configuring = StageEvent::Progress(StageProgress::BringUp(
+        Axis::Rotation,
+        "writing the configured objects",
+    ));
     for begun in [configuring, enabling] {
         let mut bench = Bench::new(resetting_config());
         bench.run_until(|event| *event == begun);
@@ -56,7 +58,7 @@ fn a_fault_that_comes_later_is_never_reset() {
 fn enabling_after_a_fault() -> Bench {
     let mut bench = Bench::new(resetting_config());
     bench.rotation.state = DriveState::Fault;
-    bench.until_progress(Progress::Standby);
+    bench.until_progress(StageProgress::Standby);
     bench
 }
 
@@ -102,7 +104,7 @@ fn only_the_emergency_of_the_found_fault_is_ignored() {
     let mut bench = Bench::new(resetting_config());
     bench.rotation.state = DriveState::Fault;
     bench.rotation.objects.remove(&ObjectAddress::new(0x603f, 0));
-    bench.until_progress(Progress::Enabling);
+    bench.until_progress(StageProgress::Enabling);
     bench.receive(bench.rotation.emergency(0x7320));
     assert!(
         bench.until_fault().contains("emergency 0x7320"),

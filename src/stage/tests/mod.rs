@@ -243,7 +243,7 @@ impl Bench {
         self.run_until(|event| *event == StageEvent::Ready);
     }
 
-    fn until_progress(&mut self, progress: Progress) {
+    fn until_progress(&mut self, progress: StageProgress) {
         self.run_until(|event| *event == StageEvent::Progress(progress));
     }
 

@@ -123,7 +123,7 @@ fn extra_answers_are_no_fault_while_another_client_asks_the_drive() {
     let mut bench = Bench::new(config());
     bench.twin_later = Some(Duration::ZERO);
     bench.sdo_delay = Duration::from_millis(1);
-    bench.until_progress(Progress::BringUp(Axis::Insertion, "checking its identity"));
+    bench.until_progress(StageProgress::BringUp(Axis::Insertion, "checking its identity"));
     bench.receive(Frame::new(0x601, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0]));
     bench.until_ready();
     assert_eq!(bench.fault(), None);

@@ -181,7 +181,7 @@ fn standstill_takes_50_ms_even_with_a_short_sync_period() {
     bench.until_feedback();
     bench.stage.disable(bench.now);
     let begun = bench.now;
-    bench.until_progress(Progress::Disabling);
+    bench.until_progress(StageProgress::Disabling);
     assert!(bench.now.since(begun) >= Duration::from_millis(50));
 }
 
@@ -242,7 +242,7 @@ fn standstill_is_not_early_when_positions_come_by_pdo_and_by_sdo() {
     bench.until_feedback();
     bench.stage.quick_stop(bench.now);
     let begun = bench.now;
-    while !bench.events.contains(&StageEvent::Progress(Progress::Disabling)) {
+    while !bench.events.contains(&StageEvent::Progress(StageProgress::Disabling)) {
         // After each lost TPDO the stage reads the position by SDO.
         bench.insertion.tpdos_lost = u32::from(bench.stage.sync_count % 10 == 6);
         bench.step();

@@ -36,11 +36,7 @@ struct Shown {
 impl Selection {
     /// Chooses among the frames of this stage.
     pub(super) fn new(stage: &StageConfig) -> Self {
-        Selection {
-            nodes: stage.nodes(),
-            states: PerAxis::from_fn(|_| None),
-            shown: HashMap::new(),
-        }
+        Selection { nodes: stage.nodes(), states: PerAxis::default(), shown: HashMap::new() }
     }
 
     /// If `frame` is a TPDO1 that reports a new drive state: the axis and that state.

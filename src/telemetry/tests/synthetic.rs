@@ -107,7 +107,7 @@ impl Run {
     }
 
     fn push(&mut self, record: Record) {
-        self.entries.push(Entry::from(record));
+        self.entries.push(Entry { record, truth: None });
     }
 
     fn state(&mut self, time: Time, state: State) {

@@ -114,11 +114,6 @@ pub struct Status {
 impl Status {
     /// The code of a device without a fault.
     pub const OK: u16 = 1;
-
-    /// True if it says only that the device is without a fault.
-    pub(in super::super) fn is_bare_ok(&self) -> bool {
-        self.code == Status::OK && self.message.is_empty()
-    }
 }
 
 const STATUS_NAME_LEN: usize = 20;

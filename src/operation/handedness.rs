@@ -5,7 +5,7 @@
 //! shows at once, before anything is inserted.
 
 use super::moving::{Move, Moving};
-use super::{AnswerSettings, Goal};
+use super::{HandednessSettings, MoveGoal};
 use crate::math;
 use crate::session::{
     Lane, MovingMean, PROVED, Record, SampleRecord, Severity, Shell, State, Task, tracker_news,
@@ -39,24 +39,16 @@ enum Leg {
     Returning(Box<Moving>),
 }
 
-impl AnswerSettings {
+impl HandednessSettings {
     fn turn_rad(&self) -> f64 {
-        match self.turn.goal {
-            Goal::By(turn_rad) => turn_rad,
-            Goal::To(_) | Goal::BackTo(_) => 0.0,
-        }
-    }
-
-    /// The end of both turns from `at`.
-    fn farthest(&self, at: SetPoint) -> SetPoint {
-        SetPoint { rotation_rad: at.rotation_rad + 2.0 * self.turn_rad(), ..at }
+        if let MoveGoal::By(turn_rad) = self.turn.goal { turn_rad } else { 0.0 }
     }
 }
 
 /// A check under way: rest, turn, rest, turn, rest, and back.
 #[derive(Debug)]
 pub(super) struct HandednessCheck {
-    settings: AnswerSettings,
+    settings: HandednessSettings,
     counts: GateCounts,
     leg: Leg,
     /// The means of the rests that have ended.
@@ -70,7 +62,7 @@ pub(super) struct HandednessCheck {
 }
 
 impl HandednessCheck {
-    pub(super) fn new(settings: AnswerSettings) -> Self {
+    pub(super) fn new(settings: HandednessSettings) -> Self {
         HandednessCheck {
             settings,
             counts: GateCounts::default(),
@@ -141,7 +133,7 @@ impl HandednessCheck {
         let verdict = if is_seen { self.verdict() } else { Err(self.too_few()) };
         // The base turns back whatever the verdict is, so that no cable stays wound up.
         let turned = self.means.len() as f64 - 1.0;
-        let goal = Goal::By(-turned * self.settings.turn_rad());
+        let goal = MoveGoal::By(-turned * self.settings.turn_rad());
         let back = Moving::new(Move { goal, ..turn }, feedback.commanded)?;
         self.leg = Leg::Returning(Box::new(back));
         match verdict {
@@ -225,7 +217,10 @@ impl Task for HandednessCheck {
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
         match event {
             // Refuses the turn before the axes have power.
-            StageEvent::Located(at) => shell.check_goal(self.settings.farthest(*at)),
+            StageEvent::Located(at) => {
+                let rotation_rad = at.rotation_rad + 2.0 * self.settings.turn_rad();
+                shell.check_goal(SetPoint { rotation_rad, ..*at })
+            }
             StageEvent::Ready => {
                 shell.enter(State::TurningInAir);
                 Ok(())
