@@ -50,15 +50,16 @@ fn check_limits(config: &Config, reader: &mut Reader) {
     limit(timeout, "at least twice", period, |timeout, period| timeout < 2.0 * period);
 }
 
-/// Checks that the needle moves at most one step per SYNC period.
+/// Checks that a step lasts for two SYNC periods at least: with one, each turn comes a whole step late, and the law
+/// may overshoot.
 fn check_step(config: &Config, reader: &mut Reader) {
     let (step, speed) = (config.insertion.step_mm, config.insertion.speed_mm_per_s);
     let sync_ms = config.can.bus.sync_ms;
-    let per_sync = speed * f64::from(sync_ms) / 1e3;
+    let least = speed * 2.0 * f64::from(sync_ms) / 1e3;
     contradictions! { reader;
-        ["insertion.step_mm", "insertion.speed_mm_per_s", "can.sync_ms"] if per_sync > step =>
+        ["insertion.step_mm", "insertion.speed_mm_per_s", "can.sync_ms"] if least > step =>
             "insertion.step_mm is {step}, allowed: at least what insertion.speed_mm_per_s = {speed} \
-             moves in can.sync_ms = {sync_ms}, which is {per_sync}";
+             moves in two periods of can.sync_ms = {sync_ms}, which is {least}";
     }
 }
 
@@ -284,9 +285,9 @@ fn check_delays(config: &Config, reader: &mut Reader) {
     let least_mm = speed * noticed_s + 0.5 * speed * speed / braking;
     let [key, brake] = ["tracker.hold_after_mm", "tracker.hold_braking_mm_per_s2"];
     contradictions! { reader;
-        ["tracker.latency_ms", "tracker.hold_after_s"] if latency_ms * 1e-3 >= after_s =>
-            "tracker.latency_ms is {latency_ms}, allowed: under tracker.hold_after_s, which is {after_s} s: \
-             no position would be young enough to steer by";
+        ["tracker.latency_ms", "tracker.hold_after_s"] if latency_ms * 2e-3 >= after_s =>
+            "tracker.latency_ms is {latency_ms}, allowed: under half of tracker.hold_after_s, which is {after_s} s: \
+             the first position of an insertion arrives one latency after it, and must then be young enough";
         [key, "insertion.speed_mm_per_s", brake, "tracker.latency_ms"] if hold_mm <= least_mm =>
             "{key} is {hold_mm}, allowed: over the {:.3} mm to standstill from {speed} mm/s with {brake} = \
              {braking} and tracker.latency_ms = {latency_ms}: insert slower or brake harder",

@@ -14,6 +14,7 @@ pub(super) fn all(config: &Config, tree: &Tree) -> Vec<String> {
     warnings.extend(missing_registration(config, tree));
     warnings.extend(unsuitable_pair(config));
     warnings.extend(exact_model(config));
+    warnings.extend(torsion_not_followed(config));
     warnings
 }
 
@@ -80,6 +81,26 @@ fn exact_model(config: &Config) -> Option<String> {
          more than it states; rig-epos4.toml has values to start with"
             .to_owned()
     })
+}
+
+/// A warning for a torsion that the steering observer does not follow, as measured in studies.
+fn torsion_not_followed(config: &Config) -> Option<String> {
+    let torsion = config.needle.torsion;
+    let has_band = torsion.half_width_rad > 0.0 || torsion.half_width_rad_per_mm > 0.0;
+    let creeps = torsion.creep_mm > 0.0 || torsion.creep_mm_per_mm > 0.0;
+    match config.observer.kind {
+        ObserverKind::Invariant if has_band && creeps => Some(
+            "needle.torsion has a band and a creep: the observer follows either, but is wrong by far more than it \
+             states with both; keep the one that fits the needle better"
+                .to_owned(),
+        ),
+        ObserverKind::Coupled if has_band || creeps || torsion.offset_rad != 0.0 => Some(
+            "needle.torsion has no effect on observer.kind = \"coupled\", which takes the shaft to be rigid: its roll \
+             will be wrong by the torsion; use \"invariant\""
+                .to_owned(),
+        ),
+        _ => None,
+    }
 }
 
 /// A warning if the steering observer and the control law do not work together, as measured

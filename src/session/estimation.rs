@@ -161,7 +161,8 @@ impl Estimation {
     }
 
     /// Corrects the handedness watch with the mean of the batch, once the first position of the batch
-    /// was acquired before `due`. Without any position the watch is predicted along `history` to
+    /// was acquired before `due`. The first correction does not wait, because the watch is predicted only from there
+    /// on: it must not miss how the needle begins to turn. Without any position the watch is predicted along `history` to
     /// `oldest`, so that the history need not reach back further.
     ///
     /// # Errors
@@ -174,7 +175,10 @@ impl Estimation {
     ) -> Result<(), String> {
         match self.batch.mean() {
             None => self.predict_watch_to(oldest, history),
-            Some((time, tip_meas)) if self.batch.first.is_some_and(|first| first <= due) => {
+            Some((time, tip_meas))
+                if self.watched_to.is_none()
+                    || self.batch.first.is_some_and(|first| first <= due) =>
+            {
                 self.predict_watch_to(time, history)?;
                 self.watched_to.get_or_insert(time);
                 self.steering.correct_handedness(&tip_meas, self.batch.count, self.spacing_s);

@@ -2,9 +2,11 @@
 
 use super::refusal::{Effect, GateName, Refusal, short};
 use crate::keys::{choice, over, section, within};
+use crate::math;
 use crate::units::Time;
 use nalgebra::{Matrix3, Vector3};
 use std::collections::VecDeque;
+use std::time::Duration;
 
 choice! {
     /// What a repeated value means.
@@ -42,6 +44,8 @@ section! {
     beside {
         /// What a repeated value means.
         pub kind: TrackerKind = TrackerKind::Electromagnetic,
+        /// The share of the noise's variance whose correlation decays with time, and the time after which it is 1/e.
+        pub correlated: Option<(f64, Duration)> = None,
     }
 }
 
@@ -252,7 +256,8 @@ impl Track {
         let agrees = self.check_innovation(fix, prediction);
         if self.innovations_mm.len() == JUMP_POSITIONS {
             let limit = JUMP_CHI2_TIMES * self.settings.innovation_chi2;
-            self.check_jump(prediction, JUMP_POSITIONS, JUMP_INDEPENDENT, limit)?;
+            let independent = self.independent(JUMP_POSITIONS).min(JUMP_INDEPENDENT);
+            self.check_jump(prediction, JUMP_POSITIONS, independent, limit)?;
         }
         step?;
         if self.is_lost { self.check_found(agrees, prediction) } else { agrees }
@@ -273,7 +278,7 @@ impl Track {
         }
         let positions = self.innovations_mm.len().min(agreeing as usize);
         let limit = self.settings.innovation_chi2;
-        self.check_jump(prediction, positions, positions as f64, limit)?;
+        self.check_jump(prediction, positions, self.independent(positions), limit)?;
         self.is_lost = false;
         Ok(())
     }
@@ -335,6 +340,16 @@ impl Track {
             short(chi2)
         );
         Err(Refusal::new(GateName::Innovation, why))
+    }
+
+    /// The number of independent positions whose mean has as much noise as that of `positions` positions of this stream.
+    fn independent(&self, positions: usize) -> f64 {
+        let count = positions as f64;
+        let Some((share, time)) = self.settings.correlated else { return count };
+        let after = self.period_s.unwrap_or(0.0) / time.as_secs_f64();
+        let pairs =
+            (1..positions).map(|lag| 2.0 * (count - lag as f64) * math::exp(-after * lag as f64));
+        count / (1.0 + share * pairs.sum::<f64>() / count)
     }
 
     /// Tests the mean of the last `positions` innovations, which has the noise of `independent` independent

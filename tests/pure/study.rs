@@ -38,6 +38,7 @@ fn study_json_has_its_documented_keys() {
     assert_eq!(json["trials"], 8);
     let settled = json["settled_fraction"].as_f64().unwrap();
     assert!((0.0..=1.0).contains(&settled));
+    assert_eq!(json["warned_fraction"], 0.0);
     for (key, parts) in [
         ("off_plane_rms_mm", &["median", "p95", "max"][..]),
         ("settling_mm", &["median", "p95"]),

@@ -152,6 +152,11 @@ fn shipped_files_give_no_warning_and_keys_without_effect_do() {
     for (text, expected) in [
         ("observer = { kind = \"coupled\", coupled.gains = \"placed\" }", "15% of 300 insertions"),
         ("observer.kind = \"finite-difference\"", "its roll is noise"),
+        ("needle.torsion = { half_width_deg = 40, creep_mm = 2 }", "has a band and a creep"),
+        (
+            "observer.kind = \"coupled\"\nneedle.torsion.half_width_deg = 40",
+            "takes the shaft to be rigid",
+        ),
     ] {
         let warnings = warnings("a.toml", text);
         assert!(matches!(&warnings[..], [warning] if warning.contains(expected)), "{warnings:?}");

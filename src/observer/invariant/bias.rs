@@ -1,4 +1,5 @@
-//! The bias of the innovations: it shows that needle or tissue are no longer as the observer estimates them.
+//! The bias of the innovations across the heading: it shows that needle or tissue are no longer as the observer
+//! estimates them. Along the heading only the tracker and the stage can be wrong, and the track's gates judge that.
 
 use crate::math;
 use nalgebra::Vector3;
@@ -18,15 +19,16 @@ pub(super) struct InnovationBias {
 }
 
 impl InnovationBias {
-    /// Adds an innovation at the depth `at_mm`, plane frame, in units of its standard deviation.
-    pub(super) fn take(&mut self, whitened: &Vector3<f64>, at_mm: f64) {
+    /// Adds the part of an innovation across the heading, plane frame, in units of its standard deviation, made at the
+    /// depth `at_mm`.
+    pub(super) fn take(&mut self, across: &Vector3<f64>, at_mm: f64) {
         let keep = math::exp((self.at_mm - at_mm) / MEMORY_MM);
-        self.sum = self.sum * keep + whitened;
+        self.sum = self.sum * keep + across;
         self.variance = self.variance * keep * keep + 1.0;
         self.at_mm = at_mm;
     }
 
-    /// χ² of the sum: three degrees of freedom if the model is right; 0 before the first innovation.
+    /// χ² of the sum: two degrees of freedom if the model is right; 0 before the first innovation.
     pub(super) fn chi_squared(&self) -> f64 {
         if self.variance > 0.0 { self.sum.norm_squared() / self.variance } else { 0.0 }
     }

@@ -25,6 +25,8 @@ const SEARCH_SHARE: f64 = 0.02;
 const PART: Rule = within(0.0, 0.5);
 /// A standard deviation of an angle; over 90 degrees a roll is not known at all.
 const ANGLE_SD: Rule = within(0.0, 180.0);
+/// The same at the start: with 0 the covariance would lose its last digits after 200 mm.
+const START_SD: Rule = within(0.1, 180.0);
 /// Standard deviation of a random walk after 1 mm.
 const WALK_MM: Rule = within(0.0, 10.0);
 const WALK_DEG: Rule = within(0.0, 45.0);
@@ -35,7 +37,7 @@ section! {
     pub struct InvariantConfig {
         /// Standard deviations of `observer.start`. A roll of over 90 is not known at all.
         start_sd: FixedAngles => "{ yaw_deg = 12.0, pitch_deg = 8.0, roll_deg = 180.0 }", narrowed(
-            &[("yaw_deg", ANGLE_SD), ("pitch_deg", ANGLE_SD), ("roll_deg", ANGLE_SD)]
+            &[("yaw_deg", START_SD), ("pitch_deg", START_SD), ("roll_deg", START_SD)]
         );
         /// Standard deviation of each coordinate of a measured position, mm; ±1 mm uniform has 0.577.
         position_sd_mm: f64 [within(0.001, 100.0)] = 0.577;
@@ -49,8 +51,8 @@ section! {
         torsion_search_rad_per_mm as "torsion_search_deg_per_mm": f64 [within(0.0, 5.0)] = 0.6;
         /// Innovations of so many times what `position_sd_mm` explains stop the run.
         innovation_max: f64 [within(2.0, 100.0)] = 3.0;
-        /// Roll, heading and curvature are estimated anew if the mean of the innovations is further from 0 than this
-        /// χ², three degrees of freedom.
+        /// Roll, heading and curvature are estimated anew if the mean of the innovations across the heading
+        /// is further from 0 than this χ², two degrees of freedom.
         innovation_bias_max: f64 [within(20.0, 1e6)] = 40.0;
         /// Random walks of the needle beside its model.
         noise: NoiseConfig;

@@ -26,7 +26,6 @@ const REVERSAL_MARGIN_SD: f64 = 5.0;
 /// What a restart adds to the uncertainty of the pose and, as a part of it, of the curvature. It need not cover a large
 /// error, since the next restart adds to it again.
 const RESTART_POSITION_SD_MM: f64 = 0.1;
-const RESTART_AXIAL_SD_MM: f64 = 0.3;
 const RESTART_HEADING_SD_RAD: f64 = 0.03;
 const RESTART_CURVATURE_SD: f64 = 0.3;
 
@@ -35,8 +34,8 @@ const RESTART_CURVATURE_SD: f64 = 0.3;
 pub(super) struct Innovation {
     /// Its normalised square (NIS): χ² with three degrees of freedom.
     pub(super) square: f64,
-    /// The innovation in units of its standard deviation, in the plane frame.
-    pub(super) whitened: Vector3<f64>,
+    /// Its part across the heading in units of its standard deviation, in the plane frame.
+    pub(super) across: Vector3<f64>,
 }
 
 /// Process noise, as variances per mm of insertion.
@@ -331,13 +330,13 @@ impl Hypothesis {
         let factor = s.cholesky()?;
         let weight = factor.inverse();
         let whitened = factor.l_dirty().solve_lower_triangular(&innovation)?;
-        let whitened = self.x_pb.rotation * whitened;
+        let across = self.x_pb.rotation * Vector3::new(whitened.x, whitened.y, 0.0);
         let square = innovation.dot(&(weight * innovation));
         self.log_weight -= 0.5 * (square + math::ln(s.determinant()));
         let delta = self.covariance.correct(&innovation, &weight);
         // The error is now that of the corrected pose: `Exp(ε⁺) = Exp(−δ) Exp(ε)`.
         self.pending.pose = PoseMap::right_jacobian(&self.apply(&delta)) * self.pending.pose;
-        Some(Innovation { square, whitened })
+        Some(Innovation { square, across })
     }
 
     /// The hypothesis that the tip has turned by `roll_rad` unnoticed, known to `roll_sd_rad`, with this share of the
@@ -353,7 +352,6 @@ impl Hypothesis {
             h.covariance.add_variance(across, RESTART_POSITION_SD_MM.powi(2));
             h.covariance.add_variance(3 + across, RESTART_HEADING_SD_RAD.powi(2));
         }
-        h.covariance.add_variance(2, RESTART_AXIAL_SD_MM.powi(2));
         h.covariance.add_variance(ROLL, roll_sd_rad.powi(2));
         h.covariance.add_variance(CURVATURE, (RESTART_CURVATURE_SD * h.curvature_per_mm).powi(2));
         h.log_weight += math::ln(share);

@@ -101,7 +101,7 @@ impl Invariant {
             return;
         }
         let noise = self.config.process_noise(&self.needle);
-        let unknown = Innovation { square: f64::INFINITY, whitened: Vector3::zeros() };
+        let unknown = Innovation { square: f64::INFINITY, across: Vector3::zeros() };
         let mut likeliest = (f64::NEG_INFINITY, unknown);
         let log_weight_before = mixture::log_weight(&self.bank);
         self.bank.retain_mut(|h| {
@@ -121,7 +121,7 @@ impl Invariant {
             self.innovations.pop_front();
         }
         self.innovations.push_back(likeliest.1.square);
-        self.bias.take(&likeliest.1.whitened, self.insertion_mm);
+        self.bias.take(&likeliest.1.across, self.insertion_mm);
         mixture::reduce(&mut self.bank);
     }
 
@@ -137,7 +137,7 @@ impl Invariant {
         self.bias = InnovationBias::default();
         self.warning = Some(format!(
             "the positions leave the model at {:.1} mm (chi2 {chi_squared:.0}, limit {limit:.0}): roll, heading and \
-             curvature are estimated anew; did the chuck slip, the tissue change or the shaft buckle?",
+             curvature are estimated anew; did the chuck slip, or the tissue change?",
             self.insertion_mm
         ));
     }

@@ -15,6 +15,7 @@ fn settings() -> TrackSettings {
         lost_after: 5,
         found_after: 3,
         coast_after_periods: 2.0,
+        correlated: None,
     }
 }
 
@@ -278,6 +279,20 @@ fn the_innovation_gate_is_as_wide_as_the_observers_covariance() {
         refused.to_string(),
         "innovation: 1.5 mm off the model, chi2 22.5 (limit 16.3); a jump, or needle.radius_mm?"
     );
+}
+
+/// Positions that come every 25 ms.
+#[test]
+fn a_mean_of_correlated_noise_counts_for_fewer_positions() {
+    let independent = |correlated: Option<(f64, u64)>| {
+        let correlated = correlated.map(|(share, ms)| (share, Duration::from_millis(ms)));
+        followed(TrackSettings { correlated, ..settings() }).independent(8)
+    };
+    assert_eq!(independent(None), 8.0);
+    assert!((independent(Some((1.0, 1))) - 8.0).abs() < 1e-6, "as good as white");
+    assert!((independent(Some((1.0, 1_000_000))) - 1.0).abs() < 1e-3, "as good as constant");
+    let half = independent(Some((0.5, 200)));
+    assert!((2.0..3.0).contains(&half), "{half}");
 }
 
 proptest! {

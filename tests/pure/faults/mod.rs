@@ -12,6 +12,7 @@ mod drives;
 mod hostile;
 mod law;
 mod limits;
+mod needle;
 mod operations;
 mod operator;
 mod scripted;
