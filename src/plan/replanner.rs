@@ -169,9 +169,10 @@ impl Replanner {
     /// Known paths are tried first, in this order: one arc to the target; the last path up to some point, then
     /// directly to the target; the sharpest arc toward the target, or the last path as it is, if that ends
     /// within the tolerance; in the plane, back onto the remembered path. They keep the clearance, plus twice the
-    /// standard deviation of the position, plus the reserve if a path is left with it. Then a path is searched
-    /// for. If that fails and the estimate is so uncertain that the tip may still be on the remembered path,
-    /// this path is followed. The last resort is a known path at the clearance minus twice the deviation.
+    /// standard deviation of the position, plus the reserve if a path is left with it. Then a
+    /// path is searched for. If that fails and the estimate is so uncertain that the tip may still be on the remembered
+    /// path, and this may end within the tolerance, it is followed. The last resort is a known path at the clearance
+    /// minus twice the deviation.
     ///
     /// No path is much longer than the rest of the last one that was found. At the end of the path, with the target
     /// beside or behind the tip and no path to it, the tip has arrived, however far off it is.
@@ -205,7 +206,14 @@ impl Replanner {
         if let Some((_, along_mm)) = &mut self.remembered {
             *along_mm += inserted_mm;
         }
-        let path = self.find(estimate, next_mm, last.as_ref());
+        let mut path = self.find(estimate, last.as_ref());
+        // The remembered path is followed, but not found again: it may not lead to the target any more.
+        let mut followed = None;
+        if path.is_none() {
+            self.set_last_limits(estimate);
+            followed = self.remembered_from(tip, estimate, next_mm);
+            path = followed.is_none().then(|| self.known(last.as_ref())).flatten();
+        }
         self.without_path_mm = match path {
             Some(_) => 0.0,
             None => self.without_path_mm + inserted_mm,
@@ -219,6 +227,7 @@ impl Replanner {
         let is_ahead = ahead_mm > ARRIVED_MM;
         let clear_mm = next_mm.max(CLEAR_AHEAD_MM);
         let path = path
+            .or(followed)
             .or_else(|| self.last_path_within_uncertainty(last?, heading_sd_rad, clear_mm))
             .or_else(|| self.nearest_path(estimate))
             .or_else(|| self.toward_target(heading_sd_rad, clear_mm).filter(|_| is_ahead));
@@ -319,34 +328,37 @@ impl Replanner {
 
     /// A path whose distance from obstacles suits the uncertainty of the estimate. The searches share one budget; each
     /// may spend half of what remains.
-    fn find(&mut self, estimate: &TipEstimate, next_mm: f64, last: Option<&Path>) -> Option<Path> {
+    fn find(&mut self, estimate: &TipEstimate, last: Option<&Path>) -> Option<Path> {
         let uncertainty_mm = SDS * estimate.position_sd_mm;
         let (clearance_mm, margin) = (self.problem.clearance_mm, self.curvature_margin);
-        let (cautious_mm, tip) = (clearance_mm + uncertainty_mm, self.problem.start);
+        let cautious_mm = clearance_mm + uncertainty_mm;
         self.expansions_left = self.problem.expansions_max;
-        let set_limits = |this: &mut Self, clearance_mm, margin| {
-            this.field.clearance_mm = clearance_mm;
-            this.problem.curvature_per_mm = estimate.curvature_per_mm * (1.0 - margin);
-        };
         let known =
             [(cautious_mm + self.reserve_mm, margin), (cautious_mm, margin), (cautious_mm, 0.0)];
         for (clearance_mm, margin) in known {
-            set_limits(self, clearance_mm, margin);
+            self.set_limits(estimate, clearance_mm, margin);
             if let Some(path) = self.known(last) {
                 return Some(path);
             }
         }
-        set_limits(self, cautious_mm, margin);
-        let searched = self.search().or_else(|| {
-            set_limits(self, clearance_mm, 0.0);
+        self.set_limits(estimate, cautious_mm, margin);
+        self.search().or_else(|| {
+            self.set_limits(estimate, clearance_mm, 0.0);
             self.known(last).or_else(|| self.search())
-        });
-        searched.or_else(|| {
-            // A path leads through no obstacle, however uncertain the estimate is.
-            let least_mm = (clearance_mm - uncertainty_mm).max(CLEARANCE_MIN_MM.min(clearance_mm));
-            set_limits(self, least_mm, 0.0);
-            self.remembered_from(tip, estimate, next_mm).or_else(|| self.known(last))
         })
+    }
+
+    fn set_limits(&mut self, estimate: &TipEstimate, clearance_mm: f64, margin: f64) {
+        self.field.clearance_mm = clearance_mm;
+        self.problem.curvature_per_mm = estimate.curvature_per_mm * (1.0 - margin);
+    }
+
+    /// Sets the limits of the last resort: the clearance less the uncertainty, and all of the curvature.
+    fn set_last_limits(&mut self, estimate: &TipEstimate) {
+        let clearance_mm = self.problem.clearance_mm;
+        // A path leads through no obstacle, however uncertain the estimate is.
+        let least_mm = clearance_mm - SDS * estimate.position_sd_mm;
+        self.set_limits(estimate, least_mm.max(CLEARANCE_MIN_MM.min(clearance_mm)), 0.0);
     }
 
     fn search(&mut self) -> Option<Path> {
@@ -398,8 +410,8 @@ impl Replanner {
         is_free.then_some(last)
     }
 
-    /// The rest of the remembered path, moved to start at `tip`, if the tip may still be on it and its next
-    /// `next_mm` are clear.
+    /// The rest of the remembered path, moved to start at `tip`, if the tip may still be on it, its next `next_mm` are
+    /// clear and, given the uncertainty of the heading, it may end within the tolerance: the target may have moved.
     fn remembered_from(&mut self, tip: Tip, estimate: &TipEstimate, next_mm: f64) -> Option<Path> {
         let (path, along_mm) = self.remembered.as_ref()?;
         let (expected, _) = path.at(*along_mm);
@@ -411,7 +423,9 @@ impl Replanner {
             return None;
         }
         let rest = rest_of(path, *along_mm, tip);
-        self.begins_clear(&rest, next_mm).then_some(rest)
+        let is_free =
+            self.may_end_near(&rest, estimate.heading_sd_rad) && self.begins_clear(&rest, next_mm);
+        is_free.then_some(rest)
     }
 
     fn may_end_near(&self, path: &Path, heading_sd_rad: f64) -> bool {
