@@ -6,7 +6,7 @@ use super::nearest::path_to_nearest;
 use super::obstacle::World;
 use super::path::{Path, bend_after};
 use super::problem::Problem;
-use super::reserve::RESERVE_MM;
+use super::reserve::{MISS_MORE_MAX_MM, RESERVE_MM};
 use super::route::Route;
 use super::search::{Answer, Status, plan_thoroughly, search_only};
 use nalgebra::Vector3;
@@ -169,7 +169,7 @@ impl Replanner {
     /// Known paths are tried first, in this order: one arc to the target; the last path up to some point, then
     /// directly to the target; the sharpest arc toward the target, or the last path as it is, if that ends
     /// within the tolerance; in the plane, back onto the remembered path. They keep the clearance, plus twice the
-    /// standard deviation of the position, plus the reserve if a path is left with it. Then a
+    /// standard deviation of the position, plus the reserve if a path with it ends about as near to the target. Then a
     /// path is searched for. If that fails and the estimate is so uncertain that the tip may still be on the remembered
     /// path, and this may end within the tolerance, it is followed. The last resort is a known path at the clearance
     /// minus twice the deviation.
@@ -335,11 +335,20 @@ impl Replanner {
         self.expansions_left = self.problem.expansions_max;
         let known =
             [(cautious_mm + self.reserve_mm, margin), (cautious_mm, margin), (cautious_mm, 0.0)];
+        let mut nearest: Option<Path> = None;
         for (clearance_mm, margin) in known {
-            self.set_limits(estimate, clearance_mm, margin);
-            if let Some(path) = self.known(last) {
-                return Some(path);
+            let miss_mm = nearest.as_ref().map_or(f64::INFINITY, |path| self.miss_mm(path));
+            // The target outranks the reserve, but not the margin.
+            if miss_mm <= MISS_MORE_MAX_MM || (nearest.is_some() && margin < self.curvature_margin)
+            {
+                break;
             }
+            self.set_limits(estimate, clearance_mm, margin);
+            let path = self.known(last);
+            nearest = path.filter(|it| self.miss_mm(it) < miss_mm - MISS_MORE_MAX_MM).or(nearest);
+        }
+        if nearest.is_some() {
+            return nearest;
         }
         self.set_limits(estimate, cautious_mm, margin);
         self.search().or_else(|| {

@@ -12,6 +12,9 @@ pub(super) const RESERVE_MM: f64 = 2.0;
 /// The parts of the reserve that are tried, the largest first.
 const PARTS: [f64; 3] = [1.0, 0.5, 0.25];
 
+/// A known path that keeps the reserve may end farther from the target than one without it by this much, mm.
+pub(super) const MISS_MORE_MAX_MM: f64 = 0.1;
+
 /// The path with which a run begins.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RoomyPath {

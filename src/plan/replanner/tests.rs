@@ -239,6 +239,20 @@ fn a_plan_is_followed_while_the_heading_is_hardly_known() {
     assert!(toward_y(path) > 0.0 && toward_y(None) < 0.0);
 }
 
+/// The path with which the run begins ends short of the target, to keep the reserve from the ball behind it.
+#[test]
+fn a_step_goes_to_the_target_although_the_path_before_keeps_more_reserve() {
+    let mut problem = problem([0.0, 0.0, 100.0], true);
+    problem.tolerance_mm = 3.0;
+    let centre_mm = Vector3::new(0.0, 0.0, 110.0 + problem.clearance_mm + 0.7);
+    let world = world(vec![Obstacle::Sphere { centre_mm, radius_mm: 10.0 }]);
+    let roomy = Problem { clearance_mm: problem.clearance_mm + 2.0, ..problem.clone() };
+    let path = plan(&world, &roomy).path;
+    let mut planner = Replanner::new(world, problem.clone(), 0.0, path);
+    let step = planner.step(&exact(problem.start), 0.0, STEP_MM);
+    assert!(matches!(step, Step::Steer(Steer { error_mm, .. }) if error_mm <= 0.1), "{step:?}");
+}
+
 /// The needle does not bend. It stops before it comes nearer than the clearance.
 #[test]
 fn when_no_path_is_left_the_insertion_stops() {
