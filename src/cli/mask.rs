@@ -180,9 +180,10 @@ fn is_compressed(path: &Path) -> bool {
 fn check_length(path: &Path, header: &NiftiHeader, voxels: usize) -> Result<(), String> {
     let unreadable = |error: io::Error| reason(&NiftiError::Io(error));
     // `nifti` reads extensions into memory.
-    if f64::from(header.vox_offset) > VOXEL_OFFSET_MAX {
+    if !(HEADER_BYTES as f64..=VOXEL_OFFSET_MAX).contains(&f64::from(header.vox_offset)) {
         return Err(format!(
-            "its voxels begin at byte {} (vox_offset), allowed: {VOXEL_OFFSET_MAX}; remove its extensions",
+            "its voxels begin at byte {} (vox_offset), allowed: {HEADER_BYTES} to {VOXEL_OFFSET_MAX}; remove its \
+             extensions, or correct the header",
             header.vox_offset
         ));
     }
@@ -218,6 +219,8 @@ fn reason(error: &NiftiError) -> String {
         NiftiError::IncompatibleLength(..) => {
             "the image is cut off: its header announces more voxels; copy it again".to_owned()
         }
+        // Its own text is for developers: `Io(Custom { kind: …`.
+        NiftiError::Io(error) => format!("no NIfTI image can be read: {error}; copy it again"),
         error => format!("no NIfTI image can be read: {error}"),
     }
 }

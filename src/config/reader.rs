@@ -1,6 +1,7 @@
 //! Reads the merged configuration by its declared keys, and collects everything that is wrong with it.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Bound;
 
 use toml::{Table, Value};
 
@@ -188,7 +189,7 @@ impl Reader {
 
     /// True if the key `path` or a key inside it is present.
     pub(super) fn is_present(&self, path: &str) -> bool {
-        self.tree.contains_key(path) || self.tree.keys().any(|key| is_inside(key, path))
+        self.tree.contains_key(path) || inside(&self.tree, path).next().is_some()
     }
 
     /// Reports `message` at the place of that one of `keys` whose source has the highest precedence. Reports nothing if
@@ -370,15 +371,24 @@ pub(super) fn merge(mut entries: Entries) -> Tree {
             _ => find(Config::KEYS, &key).filter(|key| key.is_whole).map(|_| key.as_str()),
         };
         if let Some(replaced) = replaced {
-            tree.retain(|other, below: &mut Entry| {
+            let below = inside(&tree, replaced).filter(|(other, below)| {
                 // Two alternatives in one source are both kept, so that the reader refuses them.
                 let is_alternative = !is_inside(other, &key) && below.is_same_source(&entry);
-                below.layer >= entry.layer || is_alternative || !is_inside(other, replaced)
+                below.layer < entry.layer && !is_alternative
             });
+            let removed: Vec<String> = below.map(|(other, _)| other.clone()).collect();
+            removed.iter().for_each(|other| drop(tree.remove(other)));
         }
         tree.insert(key, entry);
     }
     tree
+}
+
+/// The entries inside `outer`. They are looked up: a goal may have thousands of obstacles.
+fn inside<'a>(tree: &'a Tree, outer: &'a str) -> impl Iterator<Item = (&'a String, &'a Entry)> {
+    let from = tree.range::<str, _>((Bound::Included(outer), Bound::Unbounded));
+    let alike = from.take_while(move |(key, _)| key.starts_with(outer));
+    alike.filter(move |(key, _)| is_inside(key, outer))
 }
 
 /// True if `key` is a key of the table `outer` or an element of the array `outer`, at any depth.

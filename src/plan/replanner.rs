@@ -170,8 +170,9 @@ impl Replanner {
     /// directly to the target; the sharpest arc toward the target, or the last path as it is, if that ends
     /// within the tolerance; in the plane, back onto the remembered path. They keep the clearance, plus twice the
     /// standard deviation of the position, plus the reserve if a path is left with it. Then a path is searched
-    /// for. If that fails and the estimate is so uncertain that the tip may still be on the remembered path,
-    /// this path is followed. The last resort is a known path at the clearance minus twice the deviation.
+    /// for. If that fails and the estimate is so uncertain that the tip may still be on the remembered path, and this
+    /// may end within the tolerance, it is followed. The last resort is a known path at the clearance minus twice the
+    /// deviation.
     ///
     /// No path is much longer than the rest of the last one that was found. At the end of the path, with the target
     /// beside or behind the tip and no path to it, the tip has arrived, however far off it is.
@@ -398,8 +399,8 @@ impl Replanner {
         is_free.then_some(last)
     }
 
-    /// The rest of the remembered path, moved to start at `tip`, if the tip may still be on it and its next
-    /// `next_mm` are clear.
+    /// The rest of the remembered path, moved to start at `tip`, if the tip may still be on it, its next `next_mm` are
+    /// clear and, given the uncertainty of the heading, it may end within the tolerance: the target may have moved.
     fn remembered_from(&mut self, tip: Tip, estimate: &TipEstimate, next_mm: f64) -> Option<Path> {
         let (path, along_mm) = self.remembered.as_ref()?;
         let (expected, _) = path.at(*along_mm);
@@ -411,7 +412,9 @@ impl Replanner {
             return None;
         }
         let rest = rest_of(path, *along_mm, tip);
-        self.begins_clear(&rest, next_mm).then_some(rest)
+        let is_free =
+            self.may_end_near(&rest, estimate.heading_sd_rad) && self.begins_clear(&rest, next_mm);
+        is_free.then_some(rest)
     }
 
     fn may_end_near(&self, path: &Path, heading_sd_rad: f64) -> bool {

@@ -27,7 +27,8 @@ pub enum Status {
     /// A path. At this resolution no path is shorter by more than 1%, or no other path was found.
     #[display("plan")]
     Plan,
-    /// There is no path at this resolution: the search was exhausted.
+    /// No path was found at this resolution, and the search was exhausted. In space a path with little room beside
+    /// obstacles may be missed.
     #[display("none")]
     None,
     /// The budget was spent; in space, where each resolution has a share of it, that share. There may be a path, or one
@@ -415,7 +416,10 @@ impl Search<'_, '_> {
             let reason = format!("the target is {place}, goal.clearance_mm is {clearance_mm}");
             return (reason, false);
         }
-        if self.route.length_mm(&start.position_mm).is_infinite() && self.moved_mm.is_finite() {
+        // The route leads to the target itself, but a path may end beside it. So only a search that was not cut short
+        // shows that there is none.
+        let is_closed = self.route.length_mm(&start.position_mm).is_infinite();
+        if is_closed && self.moved_mm.is_finite() && status == Status::None {
             let reason =
                 "the obstacles close every way to the target, even for a needle that bends at will";
             return (reason.to_owned(), false);
@@ -442,15 +446,13 @@ impl Search<'_, '_> {
                 (reason, false)
             }
             _ => {
-                let coarse = self.lattice.is_coarse.then(|| {
-                    let cell_mm = self.lattice.resolution.cell_mm;
-                    format!(
-                        ", but only to {cell_mm:.1} mm, since goal.workspace_mm is large: narrow it"
-                    )
-                });
-                let coarse = coarse.unwrap_or_default();
+                let cell_mm = self.lattice.resolution.cell_mm;
+                let coarse = match self.lattice.is_coarse {
+                    true => " (goal.workspace_mm is large: narrow it)",
+                    false => "",
+                };
                 let reason = format!(
-                    "every tip within reach was tried{coarse}, and none comes to the target"
+                    "no path was found, and all cells of {cell_mm:.1} mm{coarse} within reach were tried"
                 );
                 (reason, true)
             }

@@ -124,7 +124,7 @@ impl Goal {
 fn explain_nearest(at_mm: &Vector3<f64>, target_mm: &Vector3<f64>, status: Status) -> String {
     let what = match status {
         Status::Budget => "the nearest point that was reached",
-        _ => "the nearest reachable point",
+        _ => "the nearest point found",
     };
     let (at, off_mm) = (shown(at_mm), (at_mm - target_mm).norm());
     format!("; {what} is {at}, {off_mm:.1} mm from the target")
@@ -333,7 +333,7 @@ mod tests {
             let config = Config::from_sources(&[], &sets).unwrap();
             config.session().expect_err("no path").to_string()
         };
-        let [can_help, reachable] = ["see goal.curvature_margin", "the nearest reachable point is"];
+        let [can_help, reachable] = ["see goal.curvature_margin", "the nearest point found is"];
         let said = refusal(&["goal.position_mm=[0.0, 60.0, 70.0]"]);
         assert!(said.contains(can_help) && said.contains(reachable), "{said}");
         let said = refusal(&["goal.position_mm=[0.0, 60.0, 70.0]", "goal.curvature_margin=0"]);

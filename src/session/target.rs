@@ -202,7 +202,7 @@ impl TargetTracking {
             }
             _ if !self.track.is_established() => {
                 let (refused, limit) = (self.track.refused_in_a_row(), self.track.lost_after());
-                format!("the target is lost, {refused} refused in a row (limit {limit})")
+                explain_loss(refused, limit)
             }
             Some(age_s) if age_s > limit_s => {
                 format!("the target was last seen {age_s:.2} s ago (limit {limit_s:.2})")
@@ -217,9 +217,23 @@ impl TargetTracking {
     }
 }
 
+/// Says that the target is lost. Positions that disagree with their mean lose it before `limit` are refused in a row.
+fn explain_loss(refused: u32, limit: u32) -> String {
+    match refused >= limit {
+        true => format!("the target is lost, {refused} refused in a row (limit {limit})"),
+        false => "the target is lost".to_owned(),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_count_under_its_limit_is_no_reason() {
+        assert_eq!(explain_loss(5, 5), "the target is lost, 5 refused in a row (limit 5)");
+        assert_eq!(explain_loss(1, 5), "the target is lost");
+    }
 
     #[test]
     fn the_moving_mean_covers_the_newest_positions() {

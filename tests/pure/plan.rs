@@ -376,6 +376,9 @@ fn a_file_that_is_not_a_mask_is_refused() {
     padded[VOX_OFFSET].copy_from_slice(&400f32.to_le_bytes());
     let mut beyond = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
     beyond[VOX_OFFSET].copy_from_slice(&1e9f32.to_le_bytes());
+    let [mut no_number, mut before] = [(); 2].map(|()| nifti([2, 2, 2], [1.0; 3], &[1; 8]));
+    no_number[VOX_OFFSET].copy_from_slice(&f32::NAN.to_le_bytes());
+    before[VOX_OFFSET].copy_from_slice(&(-1f32).to_le_bytes());
     let mut negative = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
     negative[42..44].copy_from_slice(&(-2i16).to_le_bytes());
     let mut two_lengths = nifti([2, 2, 2], [1.0; 3], &[1; 16]);
@@ -397,6 +400,8 @@ fn a_file_that_is_not_a_mask_is_refused() {
         nifti([2, 2, 2], [0.001; 3], &[1; 8]),
         padded,
         beyond,
+        no_number,
+        before,
         negative,
         vec![0x1f, 0x8b, 8, 0],
         nifti([50, 50, 120], [1.0; 3], &[1; 300_000]),
@@ -443,5 +448,6 @@ fn a_damaged_compressed_mask_is_refused() {
         assert_eq!(said.status, status, "{}{}", said.stdout, said.stderr);
         let is_named = said.stderr.contains("mask.nii.gz: no NIfTI image");
         assert_eq!(is_named, status != 0, "{}", said.stderr);
+        assert!(!said.stderr.contains("Custom"), "{}", said.stderr);
     }
 }

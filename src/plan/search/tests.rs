@@ -137,6 +137,22 @@ fn each_answer_without_a_path_gives_its_reason() {
     insta::assert_snapshot!(reasons);
 }
 
+/// The wall closes the way to the target, but a path may end before it.
+#[test]
+fn a_spent_budget_is_not_blamed_on_a_wall() {
+    let at = |y, z| Vector3::new(40.0 * f64::signum(y), y, z);
+    let world = world(vec![Obstacle::Box { min_mm: at(-75.0, 101.9), max_mm: at(75.0, 102.1) }]);
+    let behind = Problem { tolerance_mm: 5.0, ..problem([0.0, 0.0, 104.2], true) };
+    assert_eq!(plan(&world, &behind).status, Status::Plan);
+    let answer = plan(&world, &Problem { expansions_max: 20, ..behind });
+    assert_eq!((answer.status, answer.path), (Status::Budget, None));
+    assert!(
+        answer.reason.as_ref().is_some_and(|why| why.contains("was spent")),
+        "{:?}",
+        answer.reason
+    );
+}
+
 /// A search that ends early says so. A path that it has found by then can be followed.
 #[test]
 fn a_budget_ends_the_search() {
