@@ -173,7 +173,9 @@ fn a_run_with_the_seed_of_a_trial_repeats_it() {
 
 #[test]
 fn trials_that_were_stopped_have_no_distance() {
-    let sets = ["--set", "study.curvature_error=[-0.9,9]", "--set", DEPTH];
+    let curvature = "study.curvature_error=[-0.9,9]";
+    let no_restart = "observer.invariant.innovation_bias_max=1e6";
+    let sets = ["--set", curvature, "--set", no_restart, "--set", DEPTH];
     let study = ["study", "--trials", "3", "--through-session"];
     let said = needle_bench(&Scratch::new(), &[&study[..], &sets].concat());
     assert_eq!(said.status, 0, "{}", said.stderr);

@@ -193,7 +193,7 @@ fn a_shaft_that_buckles_by_5_mm_in_30() {
     is_documented(
         "a_shaft_that_buckles_by_5_mm_in_30",
         r#"kind = "buckling", share = 0.833, at_mm = 40, duration_s = 15"#,
-        1.2,
+        2.0,
     );
 }
 
@@ -202,7 +202,7 @@ fn a_shaft_that_buckles_by_5_mm_in_70() {
     is_documented(
         "a_shaft_that_buckles_by_5_mm_in_70",
         r#"kind = "buckling", share = 0.93, at_mm = 30, duration_s = 35"#,
-        1.0,
+        2.0,
     );
 }
 
