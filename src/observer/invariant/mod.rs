@@ -130,7 +130,8 @@ impl Invariant {
     fn restart_if_biased(&mut self) {
         let (chi_squared, limit) =
             (self.bias.chi_squared() / self.innovation_excess(), self.config.innovation_bias_max);
-        if self.insertion_mm < BIAS_JUDGED_FROM_MM || !(chi_squared > limit) {
+        let is_biased = self.insertion_mm >= BIAS_JUDGED_FROM_MM && chi_squared > limit;
+        if !is_biased {
             return;
         }
         self.bank = bank::restarted(&self.bank);
