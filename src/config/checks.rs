@@ -281,13 +281,14 @@ fn check_delays(config: &Config, reader: &mut Reader) {
     let (hold_mm, braking) = (hold.after_mm, hold.braking_mm_per_s2);
     let is_seen_here = config.tip_source() == TrackerSource::Emulated;
     let period_s = if is_seen_here { config.emulator.tracker_rate_hz.recip() } else { 0.0 };
+    let latency_max_ms = rounded_down((after_s - period_s) * 5e2, 1);
     let noticed_s = period_s + (latency_ms + 2.0 * f64::from(config.can.bus.sync_ms)) * 1e-3;
     let least_mm = speed * noticed_s + 0.5 * speed * speed / braking;
     let [key, brake] = ["tracker.hold_after_mm", "tracker.hold_braking_mm_per_s2"];
     contradictions! { reader;
-        ["tracker.latency_ms", "tracker.hold_after_s"] if latency_ms * 2e-3 >= after_s =>
-            "tracker.latency_ms is {latency_ms}, allowed: under half of tracker.hold_after_s, which is {after_s} s: \
-             the first position of an insertion arrives one latency after it, and must then be young enough";
+        ["tracker.latency_ms", "tracker.hold_after_s"] if latency_ms > 0.0 && latency_ms >= latency_max_ms =>
+            "tracker.latency_ms is {latency_ms}, allowed: under {latency_max_ms}, as tracker.hold_after_s is {after_s}: \
+             until the first position of an insertion arrives, the one before grows two latencies old";
         [key, "insertion.speed_mm_per_s", brake, "tracker.latency_ms"] if hold_mm <= least_mm =>
             "{key} is {hold_mm}, allowed: over the {:.3} mm to standstill from {speed} mm/s with {brake} = \
              {braking} and tracker.latency_ms = {latency_ms}: insert slower or brake harder",

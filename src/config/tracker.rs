@@ -182,9 +182,10 @@ impl TrackerSection {
     pub fn to_track(&self) -> TrackSettings {
         let configured_mm = self.noise.map_or(0.0, |noise| noise.sd_mm());
         let noise_sd_mm = self.gates.track.noise_sd_mm.max(configured_mm);
-        let correlated = self.noise.filter(|noise| noise.correlated_sd_mm > 0.0).map(|noise| {
-            ((noise.correlated_sd_mm / noise.sd_mm()).powi(2), noise.correlation_time)
-        });
+        let correlated = self
+            .noise
+            .filter(|noise| noise.correlated_sd_mm > 0.0)
+            .map(|noise| ((noise.correlated_sd_mm / noise_sd_mm).powi(2), noise.correlation_time));
         TrackSettings { kind: self.kind, noise_sd_mm, correlated, ..self.gates.track }
     }
 

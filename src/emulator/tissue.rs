@@ -33,6 +33,8 @@ pub(crate) struct Tissue {
     shares: Shares,
     /// By how much the tip is behind the base's depth, mm: the shaft has buckled.
     behind_mm: f64,
+    /// Turns of the base that have not reached the needle, rad: it has slipped in the chuck.
+    slipped_rad: f64,
     /// Tip pose `X_PB`, and the sum of the tip's rotations about its own axis, rad.
     true_now: Cut,
 }
@@ -52,6 +54,7 @@ impl Tissue {
             rotation_true_rad: 0.0,
             shares: Shares::WHOLE,
             behind_mm: 0.0,
+            slipped_rad: 0.0,
             true_now: start,
         }
     }
@@ -68,7 +71,9 @@ impl Tissue {
     /// decides how much of the base's rotation reaches the tip. A needle that was pulled out enters
     /// fresh tissue.
     pub(crate) fn advance(&mut self, insertion_true_mm: f64, rotation_true_rad: f64) {
-        let turn_rad = (rotation_true_rad - self.rotation_true_rad) * self.shares.turn;
+        let base_turn_rad = rotation_true_rad - self.rotation_true_rad;
+        let turn_rad = base_turn_rad * self.shares.turn;
+        self.slipped_rad += base_turn_rad - turn_rad;
         let cut_mm = self.path.depth_mm().unwrap_or(0.0);
         let from_mm = self.insertion_true_mm - self.behind_mm;
         let advance_mm = (insertion_true_mm - self.insertion_true_mm).max(0.0);
@@ -115,8 +120,7 @@ impl Tissue {
     /// The needle is out: its tip follows the base's rotation, and its channel is dropped.
     fn leave(&mut self, at_mm: f64, rotation_true_rad: f64) {
         self.play = Play::default();
-        self.behind_mm = 0.0;
-        self.true_now.roll_rad = rotation_true_rad;
+        self.true_now.roll_rad = rotation_true_rad - self.slipped_rad;
         self.slide(at_mm);
         self.path = InsertedPath::default();
         self.path.advance(at_mm, self.true_now);
@@ -330,5 +334,10 @@ mod tests {
         tissue.advance(15.0, 0.8);
         expected = step(&expected, 1.0, 0.0);
         assert!(distance(tissue.tip_true(), &expected) < 1e-9, "what was lost stays lost");
+        tissue.advance(0.0, 0.8);
+        assert!(distance(tissue.tip_true(), &step(&Pose::identity(), 0.0, 0.4)) < 1e-9);
+        tissue.advance(3.0, 0.8);
+        let again = step(&step(&Pose::identity(), 0.0, 0.4), 1.0, 0.0);
+        assert!(distance(tissue.tip_true(), &again) < 1e-9, "also outside the tissue");
     }
 }

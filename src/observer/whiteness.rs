@@ -6,6 +6,8 @@ use nalgebra::Vector3;
 use std::collections::VecDeque;
 use std::time::Duration;
 
+/// Innovations that come faster are summed until they span this time, s, so that the lags span as much time at any rate.
+const SPACING_TAKEN_S: f64 = 0.02;
 /// Number of lags, in positions: 0.8 s at 40 Hz.
 const LAGS: usize = 32;
 /// Memory of the fading sums, in positions: half an insertion of 100 mm at 2 mm/s and 40 Hz.
@@ -70,6 +72,8 @@ impl PositionNoise {
 pub struct Whiteness {
     /// σ², as configured.
     variance_mm2: f64,
+    /// The sum of the innovations that span less than [`SPACING_TAKEN_S`] so far, their number, and what they span, s.
+    waiting: (Vector3<f64>, u32, f64),
     /// The last innovations, newest first.
     last: VecDeque<Vector3<f64>>,
     /// Sum of the squares of the innovations, and of twice their products at each lag with Bartlett's weights (the
@@ -87,6 +91,7 @@ impl Whiteness {
     pub fn new(position_sd_mm: f64) -> Self {
         Whiteness {
             variance_mm2: position_sd_mm.powi(2),
+            waiting: (Vector3::zeros(), 0, 0.0),
             last: VecDeque::with_capacity(LAGS),
             long_run_sum_mm2: 0.0,
             count: 0.0,
@@ -101,12 +106,22 @@ impl Whiteness {
         Whiteness { noise: noise.map(|noise| (noise, observer_sd_mm.powi(2))), ..self }
     }
 
-    /// Adds the next innovation, mm. An innovation that is not finite comes from a lost estimate
-    /// and is ignored.
-    pub fn take(&mut self, innovation_mm: Vector3<f64>) {
+    /// Adds the next innovation, mm, `spacing_s` after the one before. An innovation that is not finite comes from a
+    /// lost estimate and is ignored.
+    pub fn take(&mut self, innovation_mm: Vector3<f64>, spacing_s: f64) {
         if !innovation_mm.iter().all(|component| component.is_finite()) {
             return;
         }
+        let (sum_mm, count, span_s) = &mut self.waiting;
+        *sum_mm += innovation_mm;
+        *count += 1;
+        *span_s += spacing_s;
+        if *span_s < SPACING_TAKEN_S {
+            return;
+        }
+        // If the innovations are independent this sum has the variance of one.
+        let innovation_mm = *sum_mm / f64::from(*count).sqrt();
+        self.waiting = (Vector3::zeros(), 0, 0.0);
         let keep = 1.0 - 1.0 / MEMORY;
         self.count = keep * self.count + 1.0;
         // With Bartlett's weights the sum is the variance of a mean, so it is never negative.
@@ -146,7 +161,9 @@ mod tests {
     fn inflation(noise: impl FnMut() -> Vector3<f64>, count: usize) -> f64 {
         // Uniform within 1 mm.
         let mut whiteness = Whiteness::new((1.0f64 / 3.0).sqrt());
-        std::iter::repeat_with(noise).take(count).for_each(|noise| whiteness.take(noise));
+        std::iter::repeat_with(noise)
+            .take(count)
+            .for_each(|noise| whiteness.take(noise, SPACING_S));
         whiteness.inflation(SPACING_S)
     }
 
@@ -189,9 +206,9 @@ mod tests {
     #[test]
     fn an_innovation_that_is_not_finite_is_left_out() {
         let mut whiteness = Whiteness::new(0.1);
-        (0..1000).for_each(|_| whiteness.take(Vector3::x()));
+        (0..1000).for_each(|_| whiteness.take(Vector3::x(), SPACING_S));
         let before = whiteness.inflation(SPACING_S);
-        whiteness.take(Vector3::new(0.0, f64::NAN, f64::INFINITY));
+        whiteness.take(Vector3::new(0.0, f64::NAN, f64::INFINITY), SPACING_S);
         assert!(before > 100.0 && whiteness.inflation(SPACING_S) == before);
     }
 
@@ -218,6 +235,20 @@ mod tests {
             4000,
         );
         assert!((5.0..9.0).contains(&inflation), "{inflation}");
+    }
+
+    /// Half of the variance is correlated over 0.2 s. A position counts for as little as one of 200.
+    #[test]
+    fn correlated_noise_is_seen_at_a_high_rate() {
+        let (mut rng, mut slow, spacing_s) = (Pcg64::seed_from_u64(6), Vector3::zeros(), 1e-3);
+        let kept = (-spacing_s / 0.2f64).exp();
+        let mut whiteness = Whiteness::new((1.0f64 / 3.0).sqrt());
+        for _ in 0..20_000 {
+            slow = slow * kept + draw(&mut rng) * (1.0 - kept * kept).sqrt();
+            whiteness.take((slow + draw(&mut rng)) * 0.5f64.sqrt(), spacing_s);
+        }
+        let inflation = whiteness.inflation(spacing_s);
+        assert!((100.0..220.0).contains(&inflation), "{inflation}");
     }
 
     /// A position that is sent five times counts once.
@@ -255,7 +286,7 @@ mod tests {
         assert!((whiteness.inflation(1.0) - 1.007).abs() < 1e-3);
         assert!(close(whiteness.inflation(f64::INFINITY), 1.0), "the first counts in full");
         assert!(whiteness.inflation(0.0).is_finite());
-        (0..4000).for_each(|_| whiteness.take(Vector3::zeros()));
+        (0..4000).for_each(|_| whiteness.take(Vector3::zeros(), SPACING_S));
         assert!(
             close(whiteness.inflation(0.025), expected),
             "less noise than configured does not count"
@@ -275,7 +306,7 @@ mod tests {
         };
         let mut whiteness = Whiteness::new((1.0f64 / 3.0).sqrt()).with_noise(Some(white), 0.577);
         assert_eq!(whiteness.inflation(SPACING_S), 1.0);
-        (0..4000).for_each(|_| whiteness.take(draw(&mut rng) * 2.0));
+        (0..4000).for_each(|_| whiteness.take(draw(&mut rng) * 2.0, SPACING_S));
         assert!(whiteness.inflation(SPACING_S) > 3.2);
     }
 }

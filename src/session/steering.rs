@@ -102,7 +102,7 @@ impl Steering {
         self.observers().for_each(|observer| observer.correct(tip_meas, independent));
         let innovation_mm = tip_meas.mm() - predicted_mm?;
         // The watch expects the noise of one position. The mean of n independent positions has 1/√n of it.
-        self.whiteness.take(innovation_mm * f64::from(positions).sqrt());
+        self.whiteness.take(innovation_mm * f64::from(positions).sqrt(), spacing_s);
         Some(innovation_mm)
     }
 

@@ -203,7 +203,8 @@ pub fn evaluate(
         };
         observer.correct(&step.tip_meas, independent);
         if let Some(predicted) = &predicted {
-            whiteness.take(step.tip_meas.mm() - predicted.x_pb.translation);
+            let innovation_mm = step.tip_meas.mm() - predicted.x_pb.translation;
+            whiteness.take(innovation_mm, f64::INFINITY);
         }
         diverged = diverged.or_else(|| {
             let divergence = observer.check().err()?;

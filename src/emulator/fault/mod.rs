@@ -170,6 +170,12 @@ impl Fault {
             FaultKind::DriveFault if self.code.is_none() => Some("code"),
             FaultKind::Foreign if self.frame.is_none() => Some("frame"),
             kind if kind.has("share") && self.share.is_none() => Some("share"),
+            FaultKind::ChuckSlip | FaultKind::Buckling if self.share_left() > 1.0 => {
+                return Err((
+                    "share",
+                    format!("a fault of kind \"{}\" leaves a share of at most 1", self.kind),
+                ));
+            }
             _ => None,
         };
         if let Some(key) = needs {

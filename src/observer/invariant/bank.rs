@@ -4,6 +4,7 @@ use super::config::ROLLS;
 use super::error_state::{CURVATURE, GROWTH, LAG, LOWER, ROLL, UPPER};
 use super::hypothesis::Hypothesis;
 use crate::geometry::Pose;
+use crate::needle::Needle;
 use crate::observer::mixture::{self, ALIKE_SD};
 use crate::observer::{Belief, Estimate, Shaft, Slack, start};
 use nalgebra::Matrix6;
@@ -18,6 +19,9 @@ const ALIKE_VARIANCE: f64 = 1.5;
 /// times as likely, even if it is wrong. It then dominates the mean, but the other one still widens
 /// the covariance.
 const COVARIANCE_POWER: f64 = 0.2;
+
+/// What a restart adds to the standard deviation of the curvature, as a part of the configured curvature.
+const RESTART_CURVATURE_SD: f64 = 0.3;
 
 impl mixture::Hypothesis for Hypothesis {
     fn log_weight(&self) -> f64 {
@@ -103,12 +107,14 @@ pub(super) fn estimate(bank: &[Hypothesis]) -> Option<Estimate> {
 
 /// The bank once the positions no longer fit it: roll, heading and curvature may have changed. Each hypothesis starts
 /// again at rolls around the circle; that it kept its roll is as likely as all the others together.
-pub(super) fn restarted(bank: &[Hypothesis]) -> Vec<Hypothesis> {
+pub(super) fn restarted(bank: &[Hypothesis], needle: &Needle) -> Vec<Hypothesis> {
+    let curvature_sd_per_mm = RESTART_CURVATURE_SD * needle.curvature_per_mm();
     let rolls = start::rolls(0.0, PI, ROLLS);
     let others = rolls.len() as f64 - 1.0;
     let each = bank.iter().flat_map(|h| rolls.iter().map(move |roll| (h, roll)));
     each.map(|(h, &(roll_rad, sd_rad, _))| {
-        h.restarted(roll_rad, sd_rad, if roll_rad == 0.0 { 0.5 } else { 0.5 / others })
+        let share = if roll_rad == 0.0 { 0.5 } else { 0.5 / others };
+        h.restarted(roll_rad, sd_rad, curvature_sd_per_mm, share)
     })
     .collect()
 }

@@ -23,11 +23,10 @@ const REVERSAL_MARGIN_RAD: f64 = 0.05;
 /// The part of that margin in standard deviations of the distance to the edge.
 const REVERSAL_MARGIN_SD: f64 = 5.0;
 
-/// What a restart adds to the uncertainty of the pose and, as a part of it, of the curvature. It need not cover a large
-/// error, since the next restart adds to it again.
+/// What a restart adds to the uncertainty of the pose. It need not cover a large error, since the next restart adds to
+/// it again.
 const RESTART_POSITION_SD_MM: f64 = 0.1;
 const RESTART_HEADING_SD_RAD: f64 = 0.03;
-const RESTART_CURVATURE_SD: f64 = 0.3;
 
 /// The innovation of one hypothesis.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -340,8 +339,14 @@ impl Hypothesis {
     }
 
     /// The hypothesis that the tip has turned by `roll_rad` unnoticed, known to `roll_sd_rad`, with this share of the
-    /// weight. Heading, curvature and the rest of the pose may have changed as well.
-    pub(super) fn restarted(&self, roll_rad: f64, roll_sd_rad: f64, share: f64) -> Self {
+    /// weight. Heading, curvature and position may have changed as well; `curvature_sd_per_mm` says how much the curvature.
+    pub(super) fn restarted(
+        &self,
+        roll_rad: f64,
+        roll_sd_rad: f64,
+        curvature_sd_per_mm: f64,
+        share: f64,
+    ) -> Self {
         let mut h = self.clone();
         h.propagate_covariance(None);
         let turn = Pose::exp(&Twist { v: Vector3::zeros(), w: Vector3::new(0.0, 0.0, roll_rad) });
@@ -353,7 +358,7 @@ impl Hypothesis {
             h.covariance.add_variance(3 + across, RESTART_HEADING_SD_RAD.powi(2));
         }
         h.covariance.add_variance(ROLL, roll_sd_rad.powi(2));
-        h.covariance.add_variance(CURVATURE, (RESTART_CURVATURE_SD * h.curvature_per_mm).powi(2));
+        h.covariance.add_variance(CURVATURE, curvature_sd_per_mm.powi(2));
         h.log_weight += math::ln(share);
         h
     }

@@ -31,6 +31,10 @@ const INNOVATIONS: usize = 20;
 /// The bias of the innovations is judged from this depth on: before it the likeliest roll may be a wrong one, and
 /// the size of the noise is not known yet.
 const BIAS_JUDGED_FROM_MM: f64 = 15.0;
+/// So long after a restart it is judged again, mm.
+const RESTART_AFTER_MM: f64 = 10.0;
+/// A needle that bends so many times as much as configured is another one.
+const CURVATURE_MAX_TIMES: f64 = 2.5;
 
 /// The bank of filters.
 #[derive(Debug, Clone)]
@@ -44,6 +48,8 @@ pub struct Invariant {
     innovations: VecDeque<f64>,
     /// Their bias since the last restart.
     bias: InnovationBias,
+    /// Depth from which on the bias is judged, mm.
+    judged_from_mm: f64,
     /// Says why the bank was restarted, until it is taken.
     warning: Option<String>,
     insertion_mm: f64,
@@ -62,6 +68,7 @@ impl Invariant {
             bank: Vec::new(),
             innovations: VecDeque::new(),
             bias: InnovationBias::default(),
+            judged_from_mm: BIAS_JUDGED_FROM_MM,
             warning: None,
             insertion_mm: 0.0,
             log_evidence: 0.0,
@@ -130,14 +137,15 @@ impl Invariant {
     fn restart_if_biased(&mut self) {
         let (chi_squared, limit) =
             (self.bias.chi_squared() / self.innovation_excess(), self.config.innovation_bias_max);
-        let is_biased = self.insertion_mm >= BIAS_JUDGED_FROM_MM && chi_squared > limit;
+        let is_biased = self.insertion_mm >= self.judged_from_mm && chi_squared > limit;
         if !is_biased {
             return;
         }
-        self.bank = bank::restarted(&self.bank);
+        self.bank = bank::restarted(&self.bank, &self.needle);
         self.bias = InnovationBias::default();
+        self.judged_from_mm = self.insertion_mm + RESTART_AFTER_MM;
         self.warning = Some(format!(
-            "the positions leave the model at {:.1} mm (chi2 {chi_squared:.0}, limit {limit:.0}): roll, heading and \
+            "the positions leave the model at {:.1} mm (chi2 {chi_squared:.1}, limit {limit:.1}): roll, heading and \
              curvature are estimated anew; did the chuck slip, or the tissue change?",
             self.insertion_mm
         ));
@@ -167,6 +175,15 @@ impl Observer for Invariant {
         if self.is_lost {
             return Err(format!(
                 "the estimate is no longer finite, or its covariance no longer positive, at {:.1} mm",
+                self.insertion_mm
+            ));
+        }
+        let likeliest = mixture::likeliest(&self.bank);
+        let bends = likeliest.map_or(0.0, |h| h.curvature_per_mm) / self.needle.curvature_per_mm();
+        if bends > CURVATURE_MAX_TIMES {
+            return Err(format!(
+                "the needle bends {bends:.1} times as much as needle.radius_mm says (limit {CURVATURE_MAX_TIMES}) at \
+                 {:.1} mm: is it another needle, or another tissue?",
                 self.insertion_mm
             ));
         }

@@ -3,7 +3,7 @@
 use super::*;
 use crate::geometry::{FixedAngles, Pose, Twist};
 use crate::needle::{Play, TorsionConfig};
-use nalgebra::{Matrix6, SVector, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix6, SVector, Vector3, Vector6};
 use proptest::prelude::*;
 use std::f64::consts::PI;
 
@@ -118,6 +118,44 @@ fn a_roll_that_changes_unnoticed_is_found_again() {
         assert!(warning.is_none_or(|text| format!("observer: {text}").len() < 200));
         assert_eq!(observer.take_warning(), None, "each is taken once");
     }
+}
+
+/// No hypothesis gains weight, and the position is known as before, but for the same in all directions across.
+#[test]
+fn a_restart_changes_roll_heading_and_curvature_alone() {
+    let rigid = Torsion::default();
+    let mut observer = Invariant::new(needle(), rigid, config());
+    follow(&mut observer, needle(), &rigid, Pose::identity(), 60, 1);
+    let restarted = bank::restarted(&observer.bank, &needle());
+    assert_eq!(restarted.len(), 8 * observer.bank.len());
+    let (before, after) = (mixture::log_weight(&observer.bank), mixture::log_weight(&restarted));
+    assert!((before - after).abs() < 1e-12, "{before} {after}");
+    let kept = &observer.bank[0];
+    for h in &restarted[..8] {
+        assert!((h.x_pb.translation - kept.x_pb.translation).norm() < 1e-12);
+        let heading = |h: &Hypothesis| h.x_pb.rotation * Vector3::z();
+        assert!((heading(h) - heading(kept)).norm() < 1e-12);
+        let [position, before] = [h, kept].map(|h| {
+            let r = h.x_pb.rotation.matrix();
+            r * h.covariance.position() * r.transpose()
+        });
+        let across = Matrix3::identity() - heading(kept) * heading(kept).transpose();
+        let added = position - before - across * 0.01;
+        assert!(added.norm() < 1e-4, "{added}");
+    }
+}
+
+/// The handedness watch compares models by such observers.
+#[test]
+fn an_observer_of_the_watch_never_restarts() {
+    let mut observer = Invariant::new(needle(), Torsion::default(), config());
+    for mm in 0..60 {
+        let across_mm = if mm < 30 { 0.0 } else { 0.3 };
+        let position = TipPosition::new(Vector3::new(across_mm, 0.0, f64::from(mm))).unwrap();
+        observer.correct_with(&position, 0.01);
+        observer.predict(Increment::new(1.0, 2.0).unwrap());
+    }
+    assert_eq!(observer.take_warning(), None);
 }
 
 /// Softer tissue from 60 mm on.

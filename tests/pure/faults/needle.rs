@@ -101,7 +101,7 @@ fn rig_noise() -> String {
     let keys: Vec<&str> =
         keys.map(|line| line.split('#').next().unwrap_or_default().trim()).collect();
     let noise = format!("observer.invariant.noise={{ {} }}", keys.join(", "));
-    Config::from_sources(&[] as &[Source], &[noise.clone()]).expect("valid");
+    Config::from_sources(&[] as &[Source], std::slice::from_ref(&noise)).expect("valid");
     noise
 }
 
