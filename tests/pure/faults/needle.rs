@@ -143,6 +143,16 @@ fn tissue_that_bends_more_from_50_mm_on() {
     );
 }
 
+/// It is stopped as another needle.
+#[test]
+fn tissue_that_bends_five_times_as_much() {
+    is_documented(
+        "tissue_that_bends_five_times_as_much",
+        r#"kind = "tissue", share = 5, at_mm = 20"#,
+        2.5,
+    );
+}
+
 #[test]
 fn a_chuck_that_slips_from_60_mm_on() {
     is_documented(
