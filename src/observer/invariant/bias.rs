@@ -1,5 +1,5 @@
 //! The bias of the innovations across the heading: it shows that needle or tissue are no longer as the observer
-//! estimates them. Along the heading only the tracker and the stage can be wrong, and the track's gates judge that.
+//! estimates them. A lag along the heading is left to the gates of the track.
 
 use crate::math;
 use nalgebra::Vector3;
