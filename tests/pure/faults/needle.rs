@@ -1,12 +1,12 @@
-//! A needle or tissue unlike the model, scripted in TOML, through the command line: 110 mm at 2 mm/s with the default
-//! noise, observer and law. Each row of `docs/hazards.md` has two runs with the model taken as exact, and two with
-//! the process noise of `bench-config/rig-epos4.toml`. And a needle as in the model, from a known start.
+//! A needle or tissue unlike the model, scripted in TOML: 110 mm at 2 mm/s with the default noise, observer and law.
+//! Each row of `docs/hazards.md` has two runs with the model taken as exact, and two with the process noise of
+//! `bench-config/rig-epos4.toml`. And a needle as in the model, from a known start.
 
 use crate::support::bench::{Bench, configured_with};
-use crate::support::program::{Scratch, needle_bench};
 use crate::support::stop::is_row;
 use needle_bench::config::{Config, Source};
-use serde_json::Value;
+use needle_bench::session::{Machine, Record};
+use std::time::Duration;
 
 const SEEDS: [u32; 2] = [1, 2];
 /// The start; the observer knows its roll to 20 degrees.
@@ -19,7 +19,7 @@ const SETTINGS: [&str; 4] = [
 /// Estimates are judged from this depth on, mm, or in a run that ends before it from the start.
 const JUDGED_FROM_MM: f64 = 40.0;
 /// What the observer warns of.
-const WARNING: &str = "observer  warning  the positions leave the model at ";
+const WARNING: &str = "the positions leave the model at ";
 
 /// Two runs with a fault.
 #[derive(Debug, Default)]
@@ -43,44 +43,43 @@ impl Runs {
     }
 
     fn add(&mut self, fault: &str, noise: &str, seed: u32) {
-        let scratch = Scratch::new();
         let (fault, seed) =
             (format!("emulator.fault=[{{ {fault} }}]"), format!("emulator.seed={seed}"));
-        let mut arguments = vec!["run", "--json", "--set", noise, "--set", &fault, "--set", &seed];
-        SETTINGS.iter().for_each(|set| arguments.extend(["--set", set]));
-        let said = needle_bench(&scratch, &arguments);
-        let json = said.json();
-        self.stopped += u32::from(json["stop_reason"] != Value::Null);
-        let run_dir = scratch.path().join(json["run_dir"].as_str().expect("recorded"));
-        let events = std::fs::read_to_string(run_dir.join("events.log")).expect("recorded");
-        if let Some((_, after)) = events.split_once(WARNING) {
-            let depth_mm = after.split(' ').next().and_then(|mm| mm.parse().ok());
-            self.warned += 1;
-            self.warned_by_mm = self.warned_by_mm.max(depth_mm.expect("a depth"));
+        let mut bench =
+            Bench::new(configured_with(&[&SETTINGS[..], &[noise, &fault, &seed]].concat()));
+        let (mut taken, mut errors, mut warned_mm) = (0, Vec::new(), None);
+        while bench.session.outcome().is_none() {
+            bench.run_for(Duration::from_millis(2));
+            let tip_true_mm = bench.stage.truth(bench.now).x_pb.translation;
+            for record in &bench.records[taken..] {
+                match record {
+                    Record::Step(step) => {
+                        let Some(estimate) = step.decision.estimate else { continue };
+                        let error_mm = estimate.x_pb.translation - tip_true_mm;
+                        let sds = estimate.sd.expect("stated");
+                        let worst = (0..3).map(|axis| error_mm[axis].abs() / sds[axis]);
+                        let worst = worst.fold(0.0, f64::max);
+                        errors.push((step.insertion_meas_mm, error_mm.norm(), worst));
+                    }
+                    Record::Event { text, .. } if warned_mm.is_none() => {
+                        let depth_mm =
+                            text.strip_prefix(WARNING).and_then(|text| text.split(' ').next());
+                        warned_mm = depth_mm.map(|mm| mm.parse::<f64>().expect("a depth"));
+                    }
+                    _ => {}
+                }
+            }
+            taken = bench.records.len();
         }
-        let mut steps = csv::Reader::from_path(run_dir.join("steps.csv")).expect("recorded");
-        let names = steps.headers().expect("names").clone();
-        let rows: Vec<csv::StringRecord> = steps.records().map(|row| row.expect("a row")).collect();
-        let number = |row: &csv::StringRecord, name: &str| -> Option<f64> {
-            row[names.iter().position(|other| other == name).expect("a column")].parse().ok()
-        };
-        let last_mm = number(rows.last().expect("a step"), "insertion_mm").expect("a depth");
-        for row in &rows {
-            let is_early = number(row, "insertion_mm").expect("a depth") < JUDGED_FROM_MM;
-            if is_early && last_mm > JUDGED_FROM_MM {
-                continue;
+        self.stopped += u32::from(!bench.completed());
+        self.warned += u32::from(warned_mm.is_some());
+        self.warned_by_mm = self.warned_by_mm.max(warned_mm.unwrap_or(0.0));
+        let (last_mm, ..) = *errors.last().expect("an estimate");
+        for (depth_mm, error_mm, sds) in errors {
+            if depth_mm >= JUDGED_FROM_MM || last_mm <= JUDGED_FROM_MM {
+                self.error_mm = self.error_mm.max(error_mm);
+                self.error_sds = self.error_sds.max(sds);
             }
-            let mut square_mm2 = 0.0;
-            for axis in ["x", "y", "z"] {
-                let of = |what: &str| number(row, &format!("{axis}_{what}_mm"));
-                let (Some(estimated), Some(actual), Some(sd)) = (of("est"), of("true"), of("sd"))
-                else {
-                    continue;
-                };
-                square_mm2 += (estimated - actual).powi(2);
-                self.error_sds = self.error_sds.max((estimated - actual).abs() / sd);
-            }
-            self.error_mm = self.error_mm.max(square_mm2.sqrt());
         }
     }
 
