@@ -83,8 +83,8 @@ pub(crate) struct Tracking {
     link_error: Option<String>,
     /// The error of the last malformed message, until a position is accepted.
     malformed: Option<String>,
-    /// The last STATUS with a text, or that came unasked, was OK and came after the last accepted position. PLUS sends it while its
-    /// tracker gives no frames, not while a tool is out of view.
+    /// The last STATUS with a text, or that came unasked, was OK and came after the last accepted position. PLUS sends
+    /// it while its tracker gives no frames, not while a tool is out of view.
     status_is_ok: bool,
     /// Samples of the tool that the link dropped.
     dropped: u64,

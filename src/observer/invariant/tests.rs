@@ -101,7 +101,7 @@ fn finds_the_pose_from_every_roll() {
     }
 }
 
-/// A chuck that slips turns the tip by an angle that nobody measures.
+/// The chuck slips: the tip's roll changes by an angle that no encoder measures.
 #[test]
 fn a_roll_that_changes_unnoticed_is_found_again() {
     let rigid = Torsion::default();
