@@ -6,7 +6,7 @@ use nalgebra::Vector3;
 use std::collections::VecDeque;
 use std::time::Duration;
 
-/// Innovations that come faster are summed until they span this time, s, so that the lags span as much time at any rate.
+/// Innovations that come faster are summed until they span this time, s: so the lags span as much at any rate.
 const SPACING_TAKEN_S: f64 = 0.02;
 /// Number of lags, in positions: 0.8 s at 40 Hz.
 const LAGS: usize = 32;

@@ -160,9 +160,9 @@ impl Estimation {
         }
     }
 
-    /// Corrects the handedness watch with the mean of the batch, once the first position of the batch
-    /// was acquired before `due`. The first correction does not wait, because the watch is predicted only from there
-    /// on: it must not miss how the needle begins to turn. Without any position the watch is predicted along `history` to
+    /// Corrects the handedness watch with the mean of the batch, once the first position of the batch was acquired
+    /// before `due`. The first correction does not wait, because the watch is predicted only from there on: it must
+    /// not miss how the needle begins to turn. Without any position the watch is predicted along `history` to
     /// `oldest`, so that the history need not reach back further.
     ///
     /// # Errors

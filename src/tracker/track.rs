@@ -342,7 +342,7 @@ impl Track {
         Err(Refusal::new(GateName::Innovation, why))
     }
 
-    /// The number of independent positions whose mean has as much noise as that of `positions` positions of this stream.
+    /// The number of independent positions whose mean has as much noise as that of `positions` of this stream.
     fn independent(&self, positions: usize) -> f64 {
         let count = positions as f64;
         let Some((share, time)) = self.settings.correlated else { return count };

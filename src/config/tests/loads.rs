@@ -111,6 +111,20 @@ fn correlated_noise_is_read_besides_white_noise() {
     assert_eq!(tracker.correlated, Some(CorrelatedNoise { sd_mm: 0.4, time_s: 0.2 }));
 }
 
+/// The jump test takes the larger of two standard deviations: the correlated part is a share of that one.
+#[test]
+fn correlated_noise_is_a_share_of_what_the_track_assumes() {
+    let share = |gate_sd_mm: &str| {
+        let noise =
+            "tracker.noise={ white_sd_mm = 0.3, correlated_sd_mm = 0.4, correlation_time_s = 0.2 }";
+        let gate = format!("tracker.gates.noise_sd_mm={gate_sd_mm}");
+        loaded("", &[noise, &gate]).tracker.to_track().correlated.map(|(share, _)| share)
+    };
+    assert!(share("0.1").is_some_and(|share| (share - 0.64).abs() < 1e-12));
+    assert!(share("0.8").is_some_and(|share| (share - 0.25).abs() < 1e-12));
+    assert_eq!(loaded("", &[]).tracker.to_track().correlated, None);
+}
+
 /// The warning about a section without effect finds the section by this name.
 #[test]
 fn each_observer_and_each_law_has_its_section() {

@@ -338,8 +338,8 @@ impl Hypothesis {
         Some(Innovation { square, across })
     }
 
-    /// The hypothesis that the tip has turned by `roll_rad` unnoticed, known to `roll_sd_rad`, with this share of the
-    /// weight. Heading, curvature and position may have changed as well; `curvature_sd_per_mm` says how much the curvature.
+    /// The hypothesis that the tip has turned by `roll_rad` unnoticed, with the standard deviation `roll_sd_rad` and this
+    /// share of the weight. Heading, position and, by `curvature_sd_per_mm`, the curvature may have changed as well.
     pub(super) fn restarted(
         &self,
         roll_rad: f64,

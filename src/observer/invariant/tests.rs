@@ -145,6 +145,23 @@ fn a_restart_changes_roll_heading_and_curvature_alone() {
     }
 }
 
+/// A needle that bends eight times as much as told. Each restart is soon contradicted.
+#[test]
+fn restarts_are_at_least_10_mm_apart() {
+    let mut observer = Invariant::new(needle(), Torsion::default(), config());
+    let bent = needle().with_share_of_curvature(8.0);
+    let (mut tip, mut restarted) = (Pose::identity(), Vec::new());
+    for step in 0..800 {
+        observer.correct(&TipPosition::new(tip.translation + noise(step)).unwrap(), 1.0);
+        restarted.extend(observer.take_warning().map(|_| step));
+        let increment = Increment::new(0.1, 0.0).unwrap();
+        observer.predict(increment);
+        tip = bent.step(&tip, increment);
+    }
+    let least = restarted.windows(2).map(|pair| pair[1] - pair[0]).min();
+    assert!(restarted[0] >= 150 && (100..110).contains(&least.unwrap()), "{restarted:?}");
+}
+
 /// The handedness watch compares models by such observers.
 #[test]
 fn an_observer_of_the_watch_never_restarts() {
